@@ -1,0 +1,1 @@
+"""One node: capture, detect, publish and record."""

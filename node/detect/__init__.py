@@ -1,0 +1,1 @@
+"""Find the other node's lights in a picture."""

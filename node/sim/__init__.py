@@ -1,0 +1,1 @@
+"""The simulated twin of a node: world, camera, inertial and depth sensors."""

@@ -1,0 +1,1 @@
+"""The shared vocabulary: messages, topics, bus, dive log, clock. Imports nothing else of ours."""

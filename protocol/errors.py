@@ -1,0 +1,5 @@
+"""Errors that a person can act on."""
+
+
+class BuddylineError(Exception):
+    """A known error: one line that names what is wrong and what to do; commands exit with 2."""

@@ -1,0 +1,404 @@
+"""The messages of the bus and of dive logs, as validated structures.
+
+One JSON object a message, UTF-8. A message that decodes is sound: types, lengths, finite numbers, unit
+quaternions, blobs inside their picture. `encode` lets nothing out that `decode` would refuse, and
+writes every number that is not an integer by nature as a float.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar
+
+import msgspec
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from protocol.errors import BuddylineError
+
+NODE_ID_PATTERN: Final = r"^[a-z0-9_]{1,32}\Z"
+MAX_BLOBS: Final = 64
+MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+
+NodeId: TypeAlias = Annotated[str, Meta(pattern=NODE_ID_PATTERN)]
+StampNs: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+NonNegative: TypeAlias = Annotated[float, Meta(ge=0)]
+Positive: TypeAlias = Annotated[float, Meta(gt=0)]
+Vector3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+
+Reason: TypeAlias = Literal[
+    "unmatched",
+    "no_info",
+    "too_few_candidates",
+    "range_gap",
+    "twist_gap",
+    "attitude",
+    "depth",
+    "out_of_range",
+    "ambiguous",
+    "degenerate",
+    "late",
+    "duplicate",
+]
+
+
+class MessageError(BuddylineError):
+    """A payload that is not a sound message; the text names the field."""
+
+
+def _check_unit(field: str, q_xyzw: Quaternion) -> None:
+    norm = math.sqrt(sum(x * x for x in q_xyzw))
+    if not abs(norm - 1.0) <= 1e-3:
+        raise ValueError(f"{field}: norm {norm:.6g} is not 1")
+
+
+def _check_finite(field: str, values: tuple[float, ...]) -> None:
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{field}: not finite")
+
+
+class Message(Struct, frozen=True, kw_only=True):
+    """What every message has in common: its schema's name."""
+
+
+class CameraModel(Struct, frozen=True, kw_only=True):
+    """Camera intrinsics. pinhole: OpenCV's k1 k2 p1 p2 k3; fisheye: k1..k4. Pixel centres at integers."""
+
+    model: Literal["pinhole", "fisheye"]
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: float
+    cy_px: float
+    distortion: list[float]
+
+    def __post_init__(self) -> None:
+        """Check the number of distortion coefficients."""
+        expected = 5 if self.model == "pinhole" else 4
+        if len(self.distortion) != expected:
+            raise ValueError(f"distortion: {len(self.distortion)} coefficients, {self.model} has {expected}")
+        _check_finite("distortion", tuple(self.distortion))
+
+
+class NodeInfo(Message, frozen=True, kw_only=True):
+    """Calibration and identity of a node.
+
+    light_left_m, light_right_m, depth_port_m: in the node's camera frame. sigma_px: candidate noise, 1 sd.
+    row_time_ns: 0 for a global shutter. q_body_camera_xyzw: camera to body. declination_rad: 0 where headings
+    are magnetic.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    width_px: Annotated[int, Meta(ge=1, le=65535)]
+    height_px: Annotated[int, Meta(ge=1, le=65535)]
+    camera: CameraModel
+    light_left_m: Vector3
+    light_right_m: Vector3
+    sigma_px: Positive
+    trigger_period_ns: Annotated[int, Meta(ge=1, le=2**63 - 1)]
+    row_time_ns: Count = 0
+    q_body_camera_xyzw: Quaternion = (0.5, 0.5, 0.5, 0.5)
+    depth_port_m: Vector3 = (0.0, 0.0, 0.0)
+    declination_rad: float = 0.0
+    software: str = ""
+    config_sha256: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the mount's quaternion and that the two lights are apart."""
+        _check_unit("q_body_camera_xyzw", self.q_body_camera_xyzw)
+        if math.dist(self.light_left_m, self.light_right_m) < 1e-3:
+            raise ValueError("light_left_m, light_right_m: less than 1 mm apart")
+
+
+class Blob(Struct, frozen=True, kw_only=True):
+    """One light candidate. Pixel centres at integers, distorted image.
+
+    dt_ns: exposure of its row minus the frame's stamp_ns. score: how likely a light, 0-1.
+    """
+
+    u_px: float
+    v_px: float
+    sigma_px: Positive
+    area_px: NonNegative
+    peak: Annotated[float, Meta(ge=0, le=255)]
+    elongation: NonNegative
+    dt_ns: int = 0
+    score: Annotated[float, Meta(ge=0, le=1)] | UnsetType = UNSET
+
+
+class Candidates(Message, frozen=True, kw_only=True):
+    """Light candidates of one frame, the likeliest first.
+
+    stamp_ns: middle of exposure of the image's middle row. trigger: round(stamp_ns / trigger_period_ns).
+    seq: consecutive per boot. truncated: how many candidates were left out.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    trigger: Count
+    seq: Count
+    boot: str
+    width_px: Annotated[int, Meta(ge=1, le=65535)]
+    height_px: Annotated[int, Meta(ge=1, le=65535)]
+    blobs: Annotated[list[Blob], Meta(max_length=MAX_BLOBS)]
+    truncated: Count = 0
+
+    def __post_init__(self) -> None:
+        """Check that every blob lies inside the picture."""
+        for i, blob in enumerate(self.blobs):
+            if not -0.5 <= blob.u_px <= self.width_px - 0.5:
+                raise ValueError(
+                    f"blobs[{i}].u_px: {blob.u_px:g} is outside the image, width {self.width_px}"
+                )
+            if not -0.5 <= blob.v_px <= self.height_px - 0.5:
+                raise ValueError(
+                    f"blobs[{i}].v_px: {blob.v_px:g} is outside the image, height {self.height_px}"
+                )
+
+
+class Imu(Message, frozen=True, kw_only=True):
+    """Raw inertial sample in the body frame; mag_t is left out where there is no magnetometer."""
+
+    node: NodeId
+    stamp_ns: StampNs
+    accel_mps2: Vector3
+    gyro_radps: Vector3
+    mag_t: Vector3 | UnsetType = UNSET
+
+
+class Attitude(Message, frozen=True, kw_only=True):
+    """Orientation, body to NED; sigma_rad: [roll, pitch, yaw], 1 sd."""
+
+    node: NodeId
+    stamp_ns: StampNs
+    q_ned_body_xyzw: Quaternion
+    sigma_rad: tuple[Positive, Positive, Positive]
+
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        _check_unit("q_ned_body_xyzw", self.q_ned_body_xyzw)
+
+
+class Depth(Message, frozen=True, kw_only=True):
+    """Depth of the pressure port, down, 0 at the surface."""
+
+    node: NodeId
+    stamp_ns: StampNs
+    depth_m: float
+    sigma_m: Positive
+    pressure_pa: float | UnsetType = UNSET
+    temperature_degc: float | UnsetType = UNSET
+
+
+class FoxgloveTime(Struct, frozen=True, kw_only=True):
+    """A Foxglove timestamp."""
+
+    sec: Annotated[int, Meta(ge=0, le=2**32 - 1)]
+    nsec: Annotated[int, Meta(ge=0, le=999_999_999)]
+
+
+class CompressedImage(Message, frozen=True, kw_only=True):
+    """A frame as JPEG or PNG (foxglove.CompressedImage); frame_id is `<node>_camera`."""
+
+    timestamp: FoxgloveTime
+    frame_id: str
+    data: bytes
+    format: str
+
+    @property
+    def stamp_ns(self) -> int:
+        """Middle of exposure of the image's middle row."""
+        return self.timestamp.sec * 1_000_000_000 + self.timestamp.nsec
+
+
+class NodeStatus(Message, frozen=True, kw_only=True):
+    """Health of a node, 1 Hz.
+
+    rates: messages a second by topic; drops: lost messages by cause; ages_s: time since the newest sample of a
+    device; problem: what is wrong in words, empty where nothing is.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    boot: str
+    software: str
+    uptime_s: NonNegative
+    rates_hz: dict[str, float]
+    drops: dict[str, int]
+    ages_s: dict[str, float]
+    trigger_residual_s: float | UnsetType = UNSET
+    detect_s: float | UnsetType = UNSET
+    clock_offset_s: float | UnsetType = UNSET
+    disk_free_bytes: Count | UnsetType = UNSET
+    temperature_degc: float | UnsetType = UNSET
+    log: str = ""
+    problem: str = ""
+
+
+class RelativePose(Message, frozen=True, kw_only=True):
+    """T_a_b: maps B's camera frame into A's.
+
+    covariance: 6x6 row-major, position in A's camera frame (m), then the small rotation w (rad) with
+    R_true = exp(w) R_a_b, in A's camera frame. blobs_a: [left, right] of B's lights, as indices into A's
+    Candidates (-1: that light was not seen); blobs_b likewise. skew_ns: stamp_a - stamp_b.
+    t_ned_m, azimuth_rad (from north, clockwise), inclination_rad (up positive): with attitude only.
+    """
+
+    node_a: NodeId
+    node_b: NodeId
+    stamp_ns: StampNs
+    trigger: Count
+    t_a_b_m: Vector3
+    q_a_b_xyzw: Quaternion
+    covariance: Annotated[list[float], Meta(min_length=36, max_length=36)]
+    range_m: NonNegative
+    range_a_m: float
+    range_b_m: float
+    range_gap_m: float
+    twist_gap_rad: float
+    chi2: NonNegative
+    hypotheses: Count
+    blobs_a: tuple[int, int]
+    blobs_b: tuple[int, int]
+    method: str
+    checks: list[str]
+    skew_ns: int
+    t_ned_m: Vector3 | UnsetType = UNSET
+    azimuth_rad: float | UnsetType = UNSET
+    inclination_rad: float | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        _check_unit("q_a_b_xyzw", self.q_a_b_xyzw)
+
+
+class Rejected(Message, frozen=True, kw_only=True):
+    """A trigger without a pose, and why."""
+
+    node_a: NodeId
+    node_b: NodeId
+    stamp_ns: StampNs
+    trigger: Count
+    reason: Reason
+    detail: str = ""
+
+
+class Truth(Message, frozen=True, kw_only=True):
+    """True T_a_b of a simulated or surveyed dive."""
+
+    stamp_ns: StampNs
+    t_a_b_m: Vector3
+    q_a_b_xyzw: Quaternion
+    trigger: Count | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        _check_unit("q_a_b_xyzw", self.q_a_b_xyzw)
+
+
+class TrueLight(Struct, frozen=True, kw_only=True):
+    """Where one light of the other node truly is in a picture; merged: its halo is one with the other's."""
+
+    name: Literal["left", "right"]
+    u_px: float
+    v_px: float
+    visible: bool
+    merged: bool
+
+
+class LightTruth(Message, frozen=True, kw_only=True):
+    """Where the other node's lights truly are in this node's picture."""
+
+    node: NodeId
+    stamp_ns: StampNs
+    trigger: Count
+    lights: list[TrueLight]
+
+
+class SolverStatus(Message, frozen=True, kw_only=True):
+    """Health of the solver, 1 Hz; counts since its start.
+
+    latency: from the middle of exposure to the pose, over the last second's poses (live dives only).
+    """
+
+    node_a: NodeId
+    node_b: NodeId
+    stamp_ns: StampNs
+    software: str
+    received_a: Count
+    received_b: Count
+    matched: Count
+    solved: Count
+    rejected: dict[str, int]
+    late: Count
+    duplicates: Count
+    bad_messages: Count
+    pending: Count
+    latency_median_s: float | UnsetType = UNSET
+    latency_p99_s: float | UnsetType = UNSET
+    clock_skew_s: float | UnsetType = UNSET
+    problem: str = ""
+
+
+M = TypeVar("M", bound=Message)
+
+_ENCODER = msgspec.json.Encoder(enc_hook=lambda value: _plain(value))
+_DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
+
+
+def _plain(value: object) -> object:
+    """Give numpy scalars and arrays as Python's own numbers and lists."""
+    to_list = getattr(value, "tolist", None)
+    if to_list is None:
+        raise TypeError(f"cannot encode {type(value).__name__}")
+    return to_list()
+
+
+def decode(payload: bytes, schema: type[M]) -> M:
+    """Decode and validate one message; raise MessageError naming the field."""
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise MessageError(f"{schema.__name__}: {len(payload)} bytes, at most {MAX_MESSAGE_BYTES}")
+    decoder = _DECODERS.get(schema)
+    if decoder is None:
+        decoder = _DECODERS.setdefault(schema, msgspec.json.Decoder(schema))
+    try:
+        message: M = decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        where = _non_finite_field(payload)
+        raise MessageError(f"{schema.__name__}: {where or error}") from error
+    return message
+
+
+def _non_finite_field(payload: bytes) -> str | None:
+    """Name the NaN or infinity that makes a payload malformed JSON, where that is what ails it."""
+    if not any(word in payload for word in (b"NaN", b"Infinity")):
+        return None
+    try:
+        root = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    stack: list[tuple[str, object]] = [("$", root)]
+    while stack:
+        path, value = stack.pop()
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"not a finite number: {value} - at `{path}`"
+        if isinstance(value, dict):
+            stack.extend((f"{path}.{key}", item) for key, item in value.items())
+        elif isinstance(value, list):
+            stack.extend((f"{path}[{i}]", item) for i, item in enumerate(value))
+    return None
+
+
+def encode(message: Message) -> bytes:
+    """Encode one message; raise MessageError where it is not sound.
+
+    What goes out is read back first: a NaN, an integer in place of a float or a numpy scalar never reaches
+    the bus.
+    """
+    try:
+        first = _ENCODER.encode(message)
+    except (TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
+        raise MessageError(f"{type(message).__name__}: {error}") from error
+    return _ENCODER.encode(decode(first, type(message)))

@@ -1,0 +1,218 @@
+"""The table of topics: publishing, recording, schemas and health all follow from it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from protocol import messages
+from protocol.errors import BuddylineError
+from protocol.messages import NODE_ID_PATTERN, Message
+
+Priority = Literal["interactive_high", "data_high", "data", "data_low", "background"]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One kind of message.
+
+    template: its key, with {node} or {a} and {b}. schema: the message's type; rate_hz: nominal, 0 where it comes
+    on change. latest_only: late joiners get the newest one (else the cache serves to recover what was missed).
+    express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never).
+    """
+
+    name: str
+    template: str
+    schema: type[Message]
+    schema_name: str
+    rate_hz: float
+    priority: Priority
+    express: bool = False
+    latest_only: bool = False
+    stale_s: float = 0.0
+
+    def key(self, *ids: str) -> str:
+        """Return the Zenoh key and MCAP topic for these node ids: one, or a and b."""
+        for node_id in ids:
+            check_node_id(node_id)
+        names = ("node",) if "{node}" in self.template else ("a", "b")
+        if len(ids) != len(names):
+            raise ValueError(f"topic {self.name} takes {len(names)} node ids, got {len(ids)}")
+        return self.template.format(**dict(zip(names, ids, strict=True)))
+
+    def key_any(self) -> str:
+        """Return the key expression that matches this topic of all nodes or pairs."""
+        return self.template.format(node="*", a="*", b="*")
+
+    @property
+    def encoding(self) -> str:
+        """Zenoh encoding of the payload."""
+        return f"application/json;{self.schema_name}"
+
+
+INFO: Final = Topic(
+    "info",
+    "buddyline/node/{node}/info",
+    messages.NodeInfo,
+    "buddyline.NodeInfo",
+    0.0,
+    "data",
+    latest_only=True,
+)
+CANDIDATES: Final = Topic(
+    "candidates",
+    "buddyline/node/{node}/candidates",
+    messages.Candidates,
+    "buddyline.Candidates",
+    10.0,
+    "interactive_high",
+    express=True,
+    stale_s=1.0,
+)
+IMU: Final = Topic(
+    "imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=0.5
+)
+ATTITUDE: Final = Topic(
+    "attitude",
+    "buddyline/node/{node}/attitude",
+    messages.Attitude,
+    "buddyline.Attitude",
+    100.0,
+    "data_high",
+    express=True,
+    stale_s=0.5,
+)
+DEPTH: Final = Topic(
+    "depth",
+    "buddyline/node/{node}/depth",
+    messages.Depth,
+    "buddyline.Depth",
+    20.0,
+    "data_high",
+    express=True,
+    stale_s=1.0,
+)
+IMAGE: Final = Topic(
+    "image",
+    "buddyline/node/{node}/image",
+    messages.CompressedImage,
+    "foxglove.CompressedImage",
+    1.0,
+    "background",
+)
+NODE_STATUS: Final = Topic(
+    "node_status",
+    "buddyline/node/{node}/status",
+    messages.NodeStatus,
+    "buddyline.NodeStatus",
+    1.0,
+    "data_low",
+    latest_only=True,
+    stale_s=3.0,
+)
+LIGHT_TRUTH: Final = Topic(
+    "light_truth",
+    "buddyline/node/{node}/light_truth",
+    messages.LightTruth,
+    "buddyline.LightTruth",
+    10.0,
+    "data_low",
+)
+POSE: Final = Topic(
+    "pose",
+    "buddyline/pair/{a}/{b}/pose",
+    messages.RelativePose,
+    "buddyline.RelativePose",
+    10.0,
+    "interactive_high",
+    express=True,
+    stale_s=1.0,
+)
+REJECTED: Final = Topic(
+    "rejected",
+    "buddyline/pair/{a}/{b}/rejected",
+    messages.Rejected,
+    "buddyline.Rejected",
+    10.0,
+    "interactive_high",
+    express=True,
+)
+TRUTH: Final = Topic(
+    "truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low"
+)
+SOLVER_STATUS: Final = Topic(
+    "solver_status",
+    "buddyline/pair/{a}/{b}/status",
+    messages.SolverStatus,
+    "buddyline.SolverStatus",
+    1.0,
+    "data_low",
+    latest_only=True,
+    stale_s=3.0,
+)
+
+TOPICS: Final = (
+    INFO,
+    CANDIDATES,
+    IMU,
+    ATTITUDE,
+    DEPTH,
+    IMAGE,
+    NODE_STATUS,
+    LIGHT_TRUTH,
+    POSE,
+    REJECTED,
+    TRUTH,
+    SOLVER_STATUS,
+)
+
+EVERYTHING: Final = "buddyline/**"
+
+_NODE_ID = re.compile(NODE_ID_PATTERN)
+_PATTERNS: Final = [
+    (
+        topic,
+        re.compile(
+            topic.template.replace("{node}", "([a-z0-9_]{1,32})")
+            .replace("{a}", "([a-z0-9_]{1,32})")
+            .replace("{b}", "([a-z0-9_]{1,32})")
+            + r"\Z"
+        ),
+    )
+    for topic in TOPICS
+]
+
+
+def check_node_id(node_id: str) -> str:
+    """Return node_id; raise BuddylineError where it is not one."""
+    if not _NODE_ID.match(node_id):
+        raise BuddylineError(f"node id {node_id!r}: use 1 to 32 of a-z, 0-9 and _")
+    return node_id
+
+
+def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
+    """Return the topic and node ids of a key, or None where it is none of ours."""
+    for topic, pattern in _PATTERNS:
+        match = pattern.match(key)
+        if match:
+            return topic, match.groups()
+    return None
+
+
+def topic_of(message: Message) -> Topic:
+    """Return the topic of a message by its type."""
+    for topic in TOPICS:
+        if topic.schema is type(message):
+            return topic
+    raise TypeError(f"no topic carries {type(message).__name__}")
+
+
+def key_of(message: Message) -> str:
+    """Return the key that a message is published on (truth needs its pair and goes by Topic.key)."""
+    topic = topic_of(message)
+    if isinstance(message, messages.CompressedImage):
+        return topic.key(message.frame_id.removesuffix("_camera"))
+    if "{node}" in topic.template:
+        return topic.key(str(getattr(message, "node")))  # noqa: B009
+    return topic.key(str(getattr(message, "node_a")), str(getattr(message, "node_b")))  # noqa: B009

@@ -1,0 +1,1 @@
+"""Match two nodes' candidates, reject outliers, solve the relative pose, publish it."""

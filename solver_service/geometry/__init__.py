@@ -1,0 +1,1 @@
+"""Relative pose from mutual bearings: numpy alone."""
