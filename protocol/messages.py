@@ -149,13 +149,9 @@ class Candidates(Message, frozen=True, kw_only=True):
         """Check that every blob lies inside the picture."""
         for i, blob in enumerate(self.blobs):
             if not -0.5 <= blob.u_px <= self.width_px - 0.5:
-                raise ValueError(
-                    f"blobs[{i}].u_px: {blob.u_px:g} is outside the image, width {self.width_px}"
-                )
+                raise ValueError(f"blobs[{i}].u_px: {blob.u_px:g} is outside the image, width {self.width_px}")
             if not -0.5 <= blob.v_px <= self.height_px - 0.5:
-                raise ValueError(
-                    f"blobs[{i}].v_px: {blob.v_px:g} is outside the image, height {self.height_px}"
-                )
+                raise ValueError(f"blobs[{i}].v_px: {blob.v_px:g} is outside the image, height {self.height_px}")
 
 
 class Imu(Message, frozen=True, kw_only=True):
@@ -344,9 +340,6 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 
 M = TypeVar("M", bound=Message)
 
-_ENCODER = msgspec.json.Encoder(enc_hook=lambda value: _plain(value))
-_DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
-
 
 def _plain(value: object) -> object:
     """Give numpy scalars and arrays as Python's own numbers and lists."""
@@ -354,6 +347,10 @@ def _plain(value: object) -> object:
     if to_list is None:
         raise TypeError(f"cannot encode {type(value).__name__}")
     return to_list()
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
 
 
 def decode(payload: bytes, schema: type[M]) -> M:

@@ -70,9 +70,7 @@ CANDIDATES: Final = Topic(
     express=True,
     stale_s=1.0,
 )
-IMU: Final = Topic(
-    "imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=0.5
-)
+IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=0.5)
 ATTITUDE: Final = Topic(
     "attitude",
     "buddyline/node/{node}/attitude",
@@ -138,9 +136,7 @@ REJECTED: Final = Topic(
     "interactive_high",
     express=True,
 )
-TRUTH: Final = Topic(
-    "truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low"
-)
+TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(
     "solver_status",
     "buddyline/pair/{a}/{b}/status",

@@ -1,0 +1,82 @@
+"""Strict TOML configuration: an unknown key, a wrong type or value is refused, naming file, field and value."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from protocol.errors import BuddylineError
+
+C = TypeVar("C", bound=msgspec.Struct)
+
+
+class ConfigError(BuddylineError):
+    """A configuration that cannot be used."""
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Base of all configuration tables: unknown keys are errors."""
+
+
+def load_config(path: Path | str, schema: type[C]) -> C:
+    """Read a TOML file as schema; raise ConfigError naming file, field and value."""
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    return parse_config(text, schema, str(path))
+
+
+def parse_config(text: str, schema: type[C], name: str) -> C:
+    """Read TOML text as schema; name: what errors call it."""
+    try:
+        table = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{name}: not TOML: {error}") from error
+    try:
+        return msgspec.convert(table, schema)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{name}: {_explain(str(error), table, schema)}") from error
+
+
+def config_sha256(config: msgspec.Struct) -> str:
+    """Return the SHA-256 of a configuration as it is in force, defaults included."""
+    return hashlib.sha256(msgspec.json.encode(config, order="sorted")).hexdigest()
+
+
+def _explain(error: str, table: dict[str, Any], schema: type[msgspec.Struct]) -> str:
+    """Add the value, or the nearest known key, to msgspec's message."""
+    place = re.search(r"at `\$\.?(.*?)`\Z", error)
+    field = place.group(1) if place else ""
+    unknown = re.search(r"unknown field `(.*?)`", error)
+    if unknown:
+        known = _keys_at(schema, field)
+        near = difflib.get_close_matches(unknown.group(1), known, 1)
+        where = f"[{field}] " if field else ""
+        hint = f"did you mean `{near[0]}`?" if near else f"known: {', '.join(known)}"
+        return f"{where}unknown key `{unknown.group(1)}`; {hint}"
+    value: Any = table
+    for part in re.findall(r"[^.\[\]]+", field):
+        try:
+            value = value[int(part)] if isinstance(value, list) else value[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return error
+    message = error.removesuffix(f" - at `$.{field}`")
+    return f"{field} = {value!r}: {message}" if field else error
+
+
+def _keys_at(schema: type[msgspec.Struct], field: str) -> list[str]:
+    kind: msgspec.inspect.Type = msgspec.inspect.type_info(schema)
+    for part in re.findall(r"[^.\[\]]+", field):
+        if isinstance(kind, msgspec.inspect.StructType):
+            kind = next((f.type for f in kind.fields if f.encode_name == part), kind)
+        if isinstance(kind, msgspec.inspect.UnionType):
+            kind = next((t for t in kind.types if isinstance(t, msgspec.inspect.StructType)), kind)
+    return [f.encode_name for f in kind.fields] if isinstance(kind, msgspec.inspect.StructType) else []

@@ -1,0 +1,332 @@
+"""Dive logs: MCAP files that describe themselves, survive a cut power, and are read tolerantly."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Final
+
+import msgspec
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from protocol import topics
+from protocol.errors import BuddylineError
+from protocol.messages import FoxgloveTime, Message, MessageError, decode, encode
+from protocol.schemas import json_schema
+
+CHUNK_BYTES: Final = 1024 * 1024
+MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
+_CHANNEL_METADATA: Final = "buddyline.channel"
+_DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError)
+
+
+class _Stamp(msgspec.Struct):
+    """The measurement time of any message of ours."""
+
+    stamp_ns: int | None = None
+    timestamp: FoxgloveTime | None = None
+
+
+_STAMP_DECODER = msgspec.json.Decoder(_Stamp)
+
+
+def payload_stamp_ns(payload: bytes) -> int | None:
+    """Return the measurement time that a payload carries, or None."""
+    try:
+        stamp = _STAMP_DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    if stamp.timestamp is not None:
+        return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
+    return stamp.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One message of a log: its key, times in ns, and payload as it went over the bus."""
+
+    key: str
+    schema_name: str
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
+
+    def decode(self) -> Message | None:
+        """Return the message, None where the key is none of ours; raise MessageError where it is not sound."""
+        parsed = topics.parse_key(self.key)
+        return decode(self.payload, parsed[0].schema) if parsed else None
+
+
+class DiveLogWriter:
+    """Writes one MCAP file, which must not exist yet."""
+
+    def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None) -> None:
+        self.path = Path(path)
+        try:
+            self._file: IO[bytes] = open(self.path, "xb")
+        except FileExistsError:
+            raise BuddylineError(
+                f"{self.path}: exists; a log is never overwritten, name another or remove it first"
+            ) from None
+        except OSError as error:
+            raise BuddylineError(f"{self.path}: cannot be written: {error.strerror}") from error
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="buddyline", library="buddyline")
+        self._channels: dict[tuple[str, str], int] = {}
+        self._schemas: dict[str, int] = {}
+        self.count = 0
+        if metadata:
+            self._writer.add_metadata("buddyline.log", metadata)
+        self._writer.flush()
+
+    def write(
+        self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int | None = None, schema: str = ""
+    ) -> None:
+        """Add one payload; publish_time_ns: its stamp, by default read from it; schema: for keys not ours."""
+        if publish_time_ns is None:
+            publish_time_ns = payload_stamp_ns(payload)
+        if publish_time_ns is None:
+            publish_time_ns = log_time_ns
+        channel = self._channels.get((key, schema))
+        if channel is None:
+            channel = self._channels[key, schema] = self._register(key, schema)
+        self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, self.count & 0xFFFFFFFF)
+        self.count += 1
+
+    def write_message(self, message: Message, log_time_ns: int | None = None, key: str | None = None) -> None:
+        """Add one message; log_time_ns: by default its own stamp; key: by default its topic's."""
+        payload = encode(message)
+        stamp_ns = payload_stamp_ns(payload) or 0
+        self.write(key or topics.key_of(message), payload, stamp_ns if log_time_ns is None else log_time_ns, stamp_ns)
+
+    def _register(self, key: str, schema: str) -> int:
+        parsed = topics.parse_key(key)
+        name = parsed[0].schema_name if parsed else (schema or "object")
+        schema_id = self._schemas.get(name)
+        if schema_id is None:
+            described = json_schema(parsed[0].schema) if parsed else b'{"type":"object"}'
+            schema_id = self._schemas[name] = self._writer.register_schema(name, "jsonschema", described)
+        channel = self._writer.register_channel(key, "json", schema_id)
+        # Outside the chunks, so that a later chunk can be read where the one that declares it is damaged.
+        self._writer.add_metadata(_CHANNEL_METADATA, {"id": str(channel), "topic": key, "schema": name})
+        return channel
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Finish the chunk and hand it to the system; sync: and to the disk."""
+        self._writer.flush()
+        if sync:
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Write index and end, and close the file."""
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> DiveLogWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+@dataclass
+class _Contents:
+    """Where the chunks of a log stand, by log time, and what of it is readable."""
+
+    chunks: list[tuple[int, int, int]] = field(default_factory=list)  # start, end (ns), offset in the file
+    channels: dict[int, tuple[str, str]] = field(default_factory=dict)  # id: topic, schema name
+    loose: list[McapMessage] = field(default_factory=list)
+
+
+class DiveLogReader:
+    """Reads one MCAP file, whole or damaged; `damage` says in words what could not be read."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.damage: list[str] = []
+        try:
+            size = self.path.stat().st_size
+            self._file = open(self.path, "rb")
+        except OSError as error:
+            raise BuddylineError(f"{self.path}: cannot be read: {error.strerror}") from error
+        try:
+            if size == 0:
+                raise BuddylineError(f"{self.path}: is empty; nothing was recorded in it")
+            if self._file.read(8) != b"\x89MCAP0\r\n":
+                raise BuddylineError(f"{self.path}: is not a dive log (an MCAP file begins with other bytes)")
+            self._contents = self._index() or self._scan()
+        except BaseException:
+            self._file.close()
+            raise
+
+    @property
+    def keys(self) -> list[str]:
+        """Topics of the log, sorted, as far as they are declared."""
+        return sorted({topic for topic, _ in self._contents.channels.values()})
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message, None for a log without messages."""
+        starts = [start for start, _, _ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
+        return min(starts, default=None)
+
+    @property
+    def end_ns(self) -> int | None:
+        """Log time of the last message, None for a log without messages."""
+        ends = [end for _, end, _ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
+        return max(ends, default=None)
+
+    def metadata(self) -> dict[str, str]:
+        """Return what the writer noted about the log itself."""
+        self._file.seek(0)
+        try:
+            for record in StreamReader(self._file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
+                if isinstance(record, Metadata) and record.name == "buddyline.log":
+                    return dict(record.metadata)
+                if isinstance(record, Chunk):
+                    break
+        except _DAMAGE:
+            pass
+        return {}
+
+    def records(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
+        """Yield the records by log time (ties: as in the file); memory holds only chunks that overlap.
+
+        wanted: whether a topic is to be read.
+        """
+        heap: list[tuple[int, int, Record]] = []
+        order = 0
+        for message in self._contents.loose:
+            record = self._record(message, wanted)
+            if record is not None:
+                heap.append((record.log_time_ns, order, record))
+                order += 1
+        heapq.heapify(heap)
+        for start_ns, _, offset in sorted(self._contents.chunks):
+            while heap and heap[0][0] < start_ns:
+                yield heapq.heappop(heap)[2]
+            for message in self._chunk_messages(offset):
+                record = self._record(message, wanted)
+                if record is not None:
+                    heapq.heappush(heap, (record.log_time_ns, order, record))
+                    order += 1
+        while heap:
+            yield heapq.heappop(heap)[2]
+
+    def _record(self, message: McapMessage, wanted: Callable[[str], bool] | None) -> Record | None:
+        channel = self._contents.channels.get(message.channel_id)
+        if channel is None:
+            self._note(f"channel {message.channel_id} is not declared: its messages are left out")
+            return None
+        topic, schema = channel
+        if wanted is not None and not wanted(topic):
+            return None
+        return Record(topic, schema, message.log_time, message.publish_time, message.data)
+
+    def _note(self, text: str) -> None:
+        if text not in self.damage:
+            self.damage.append(text)
+
+    def _chunk_messages(self, offset: int) -> list[McapMessage]:
+        self._file.seek(offset)
+        stream = StreamReader(self._file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
+        try:
+            chunk = next(iter(stream.records))
+            if not isinstance(chunk, Chunk):
+                raise ValueError("no chunk where the index says")
+            contents = breakup_chunk(chunk, validate_crc=True)
+        except _DAMAGE as error:
+            self._note(f"chunk at byte {offset}: {error or type(error).__name__}; its messages are lost")
+            return []
+        self._declare(contents)
+        return [record for record in contents if isinstance(record, McapMessage)]
+
+    def _declare(self, records: Iterable[object]) -> None:
+        schemas: dict[int, str] = {}
+        for record in records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel) and record.id not in self._contents.channels:
+                self._contents.channels[record.id] = (record.topic, schemas.get(record.schema_id, ""))
+
+    def _index(self) -> _Contents | None:
+        """Take the summary at the end of a log that was closed; None where there is none."""
+        self._file.seek(0)
+        try:
+            summary = make_reader(self._file).get_summary()
+        except _DAMAGE:
+            return None
+        if summary is None or not summary.chunk_indexes or not summary.channels:
+            return None
+        contents = _Contents()
+        for index in summary.chunk_indexes:
+            contents.chunks.append((index.message_start_time, index.message_end_time, index.chunk_start_offset))
+        for channel in summary.channels.values():
+            schema = summary.schemas.get(channel.schema_id)
+            contents.channels[channel.id] = (channel.topic, schema.name if schema else "")
+        return contents
+
+    def _scan(self) -> _Contents:
+        """Walk through a log without a summary, up to where it breaks off."""
+        contents = self._contents = _Contents()
+        self._file.seek(0)
+        stream = StreamReader(self._file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
+        declared: list[object] = []
+        closed = False
+        try:
+            offset = 8
+            for record in stream.records:
+                if isinstance(record, Chunk):
+                    contents.chunks.append((record.message_start_time, record.message_end_time, offset))
+                    record.data = b""
+                elif isinstance(record, McapMessage):
+                    contents.loose.append(record)
+                elif isinstance(record, Schema | Channel):
+                    declared.append(record)
+                elif isinstance(record, Metadata) and record.name == _CHANNEL_METADATA:
+                    noted = record.metadata
+                    contents.channels[int(noted["id"])] = (noted["topic"], noted["schema"])
+                offset = self._file.tell()
+            closed = True
+        except (*_DAMAGE, KeyError) as error:
+            self._note(f"breaks off at byte {self._file.tell()} ({error or type(error).__name__})")
+        self._declare(declared)
+        if not closed and not self.damage:
+            self._note("was not closed")
+        if not contents.channels:
+            for _, _, offset in contents.chunks:
+                self._chunk_messages(offset)
+        return contents
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> DiveLogReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def read_logs(readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
+    """Yield the records of several logs as one, by log time."""
+    return heapq.merge(*(reader.records(wanted) for reader in readers), key=lambda record: record.log_time_ns)
+
+
+__all__ = ["DiveLogReader", "DiveLogWriter", "MessageError", "Record", "payload_stamp_ns", "read_logs"]
