@@ -1,1 +1,50 @@
-"""Find the other node's lights in a picture."""
+"""Find the other node's lights in a picture.
+
+`source` looks for the sources of light themselves and adapts to the water; `paper` is the baseline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from node.detect import paper, source
+from node.detect.detection import Detection, Detector, ImageError
+from node.detect.drawing import draw
+from protocol.errors import BuddylineError
+
+METHODS: Final = ("source", "paper")
+ENVIRONMENTS: Final = ("auto", "cavern", "night_reef", "lake", "basin")
+
+__all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "draw", "make_detector", "presets"]
+
+
+def presets(method: str) -> Mapping[str, Mapping[str, float]]:
+    """Give a method's values for each environment; raise BuddylineError where there is no such method."""
+    if method == "source":
+        return source.PRESETS
+    if method == "paper":
+        return paper.PRESETS
+    raise BuddylineError(f"detector method {method!r}: choose one of {', '.join(METHODS)}")
+
+
+def make_detector(
+    method: str = "source", environment: str = "auto", overrides: Mapping[str, float] | None = None
+) -> Detector:
+    """Make the detector of one camera.
+
+    overrides: values that replace the environment's own, by the names that `presets` gives. Raises BuddylineError
+    for an unknown method, environment or name, and for a negative or non-finite value.
+    """
+    known = presets(method)
+    if environment not in ENVIRONMENTS:
+        raise BuddylineError(f"environment {environment!r}: choose one of {', '.join(ENVIRONMENTS)}")
+    names = next(iter(known.values()))
+    for name, value in (overrides or {}).items():
+        if name not in names:
+            raise BuddylineError(f"detector value {name!r}: {method} has {', '.join(names)}")
+        if not 0 <= value < float("inf"):
+            raise BuddylineError(f"detector value {name} = {value}: must be a finite number, 0 or more")
+    if method == "paper":
+        return paper.PaperDetector(environment, overrides or {})
+    return source.SourceDetector(environment, overrides or {})

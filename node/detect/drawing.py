@@ -1,0 +1,58 @@
+"""Pictures marked for a person: what was found, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.detect.detection import Detection, check_image
+
+_LIKELY = (80, 255, 80)
+_UNLIKELY = (60, 60, 255)
+_TRUTH = (255, 80, 255)
+
+
+def draw(
+    image: NDArray[np.uint8],
+    detections: Sequence[Detection],
+    truth: Sequence[tuple[float, float]] | None = None,
+) -> NDArray[np.uint8]:
+    """Mark every candidate: outline of its region, axis with the chosen end, centre, 3 sigma circle, rank and score.
+
+    truth: (u, v) px of the true lights, marked with a cross. Likely candidates are green, unlikely ones red. Returns
+    a new (H, W, 3) BGR picture.
+    """
+    check_image(image)
+    marked = np.array(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+    size = max(0.3, image.shape[1] / 1800)
+    for rank, detection in reversed(list(enumerate(detections, start=1))):
+        _mark(marked, rank, detection, size)
+    for u_px, v_px in truth or ():
+        cv2.drawMarker(marked, (round(u_px), round(v_px)), _TRUTH, cv2.MARKER_TILTED_CROSS, round(24 * size), 1)
+    return marked
+
+
+def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: float) -> None:
+    blob = detection.blob
+    score = blob.score if isinstance(blob.score, float) else 0.0
+    colour = tuple(round(score * a + (1 - score) * b) for a, b in zip(_LIKELY, _UNLIKELY, strict=True))
+    outline = np.round(detection.outline_px).astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(marked, [outline], True, colour, 1, cv2.LINE_AA)
+    chosen, other = np.round(detection.axis_px).astype(int).tolist()
+    cv2.line(marked, chosen, other, colour, 1, cv2.LINE_AA)
+    cv2.circle(marked, chosen, max(2, round(5 * size)), colour, cv2.FILLED, cv2.LINE_AA)
+
+    # Eight times finer than a pixel: the centres are sub-pixel.
+    fine = (round(blob.u_px * 8), round(blob.v_px * 8))
+    cv2.circle(marked, fine, max(8, round(3 * blob.sigma_px * 8)), colour, 1, cv2.LINE_AA, 3)
+    cv2.drawMarker(marked, (round(blob.u_px), round(blob.v_px)), colour, cv2.MARKER_CROSS, round(16 * size), 1)
+    text = f"{rank}: {score:.2f} s{blob.sigma_px:.1f}"
+    corner = detection.outline_px.max(axis=0)
+    where = (round(float(corner[0])) + 3, round(float(corner[1])) + 3)
+    cv2.putText(marked, text, where, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    if rank <= 3:
+        below = (where[0], where[1] + round(26 * size))
+        cv2.putText(marked, detection.why, below, cv2.FONT_HERSHEY_SIMPLEX, 0.7 * size, colour, 1, cv2.LINE_AA)

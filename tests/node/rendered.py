@@ -1,0 +1,40 @@
+"""Small pictures of lamps under water for the detector's tests: core, glow, cone, ground, noise, clipping."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+WATER_BGR = np.array([1.0, 0.9, 0.45])
+
+
+def lamp_picture(
+    lamps_px: Sequence[tuple[float, float]],
+    *,
+    size: tuple[int, int] = (410, 308),
+    core: float = 900.0,
+    core_px: float = 2.0,
+    glow: float = 0.0,
+    lean: float = 0.0,
+    ground: float = 10.0,
+    noise: float = 2.0,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    """Render lamps into a (H, W, 3) BGR picture.
+
+    A lamp is a gaussian core (peak `core`, sd core_px) and a glow that falls as 1/distance (`glow` at 1 px), leaning
+    towards +u by the factor exp(lean cos phi): scattered light along a beam that points to the right.
+    """
+    width, height = size
+    v, u = np.mgrid[:height, :width].astype(np.float64)
+    light = np.zeros((height, width))
+    for u_px, v_px in lamps_px:
+        distance = np.hypot(u - u_px, v - v_px)
+        cosine = (u - u_px) / np.maximum(distance, 1e-6)
+        light += core * np.exp(-0.5 * (distance / core_px) ** 2)
+        light += glow * np.exp(lean * (cosine - 1.0)) / np.maximum(distance, 1.0)
+    picture = ground + light[:, :, None] * WATER_BGR
+    picture += np.random.default_rng(seed).normal(0.0, noise, picture.shape)
+    return np.clip(np.round(picture), 0, 255).astype(np.uint8)

@@ -1,0 +1,85 @@
+"""Every detector: what it takes, what it gives, what it refuses."""
+
+import numpy as np
+import pytest
+
+from node.detect import ENVIRONMENTS, METHODS, ImageError, draw, make_detector
+from protocol.errors import BuddylineError
+from tests.node.rendered import lamp_picture
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_a_plain_lamp_is_found_first_in_every_environment(method, environment):
+    image = lamp_picture([(300.3, 120.6)], seed=3)
+    found = make_detector(method, environment).detect(image)
+    blob = found[0].blob
+    assert np.hypot(blob.u_px - 300.3, blob.v_px - 120.6) < 0.6
+    assert blob.sigma_px > 0
+    assert 0 <= blob.score <= 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((1, 1), np.uint8),
+        np.zeros((1, 1, 3), np.uint8),
+        np.full((1, 700, 3), 7, np.uint8),
+        np.zeros((60, 80, 3), np.uint8),
+        np.full((60, 80), 128, np.uint8),
+    ],
+    ids=["1x1 grey", "1x1", "one row", "black", "grey"],
+)
+def test_a_picture_with_nothing_in_it_gives_nothing(method, image):
+    assert make_detector(method).detect(image) == []
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_all_white_is_no_likely_light(method):
+    found = make_detector(method).detect(np.full((120, 160, 3), 255, np.uint8))
+    assert all(d.blob.score < 0.5 for d in found)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.zeros((4, 4), np.uint16), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4), np.uint8), None],
+    ids=["16 bit", "four channels", "empty", "not decoded"],
+)
+@pytest.mark.parametrize("method", METHODS)
+def test_an_unusable_picture_is_refused_by_name(method, image):
+    with pytest.raises(ImageError, match="picture: "):
+        make_detector(method).detect(image)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_candidates_lie_inside_a_picture_full_of_noise(method):
+    image = np.random.default_rng(5).integers(0, 256, (90, 130, 3)).astype(np.uint8)
+    for d in make_detector(method).detect(image):
+        assert -0.5 <= d.blob.u_px <= 129.5
+        assert -0.5 <= d.blob.v_px <= 89.5
+        assert d.blob.sigma_px > 0
+
+
+def test_what_is_unknown_is_refused_with_the_choices():
+    with pytest.raises(BuddylineError, match="source"):
+        make_detector("sauce")
+    with pytest.raises(BuddylineError, match="night_reef"):
+        make_detector("source", "pond")
+    with pytest.raises(BuddylineError, match="value_min"):
+        make_detector("paper", "lake", {"value_mix": 3.0})
+    with pytest.raises(BuddylineError, match="finite"):
+        make_detector("paper", "lake", {"value_min": float("nan")})
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("grey", [False, True])
+def test_drawing_marks_a_copy(method, grey):
+    image = lamp_picture([(80.0, 60.0)], size=(160, 120), seed=1)
+    image = image[:, :, 1].copy() if grey else image
+    before = image.copy()
+    found = make_detector(method).detect(image)
+    marked = draw(image, found, truth=[(80.0, 60.0)])
+    assert marked.shape == (120, 160, 3)
+    assert np.array_equal(image, before)
+    assert np.any(marked[55:66, 75:86] != np.atleast_3d(before)[55:66, 75:86])
