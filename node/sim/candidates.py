@@ -1,0 +1,61 @@
+"""Light candidates without pictures: what a detector of stated noise would publish, and what it would get wrong."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from node.sim.randomness import generator
+from node.sim.scenario import Scenario
+from node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, View
+from protocol.messages import MAX_BLOBS, Blob
+
+
+def in_picture(lamp: Lamp, scenario: Scenario) -> bool:
+    """Tell whether a lamp's image lies inside the picture."""
+    u, v = lamp.pixel
+    return bool(-0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5)
+
+
+def blobs(scene: Scene, index: int, view: View, stamp_ns: int) -> tuple[list[Blob], int]:
+    """Return the candidates of one picture in no order, and how many of them were too many for a message.
+
+    Lights in view are seen with noise sigma_px, some grossly off, some missed; other lamps and reflections are
+    seen as well as lights are; false_lights more stand anywhere.
+    """
+    scenario = scene.scenario
+    rng = generator(scenario.seed, "candidates", index, stamp_ns)
+    found: list[Blob] = []
+    for lamp in (*view.lights, *view.others):
+        draw = rng.standard_normal(4)
+        missed, gross = rng.random(2) < (scenario.miss_share, scenario.gross_share)
+        if missed or not in_picture(lamp, scenario) or view.hidden(lamp.pixel):
+            continue
+        pixel = lamp.pixel + scenario.sigma_px * draw[:2] + gross * scenario.gross_px * draw[2:]
+        size_px = 2 + 2 * LAMP_RADIUS_M * scene.rigs[index].camera.fx_px / lamp.range_m
+        found += _blob(scene, pixel, math.pi * size_px**2 * float(rng.uniform(0.8, 1.25)))
+    for _ in range(scenario.false_lights):
+        pixel = rng.uniform((-0.5, -0.5), (scenario.width_px - 0.5, scenario.height_px - 0.5))
+        found += _blob(scene, pixel, float(rng.lognormal(4.5, 0.7)))
+    order = rng.permutation(len(found))[:MAX_BLOBS]
+    return [found[i] for i in order], len(found) - len(order)
+
+
+def _blob(scene: Scene, pixel: np.ndarray[tuple[int], np.dtype[np.float64]], area_px: float) -> list[Blob]:
+    """Return a candidate, or none where noise has put it outside the picture."""
+    scenario = scene.scenario
+    u, v = float(pixel[0]), float(pixel[1])
+    if not (-0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5):
+        return []
+    return [
+        Blob(
+            u_px=u,
+            v_px=v,
+            sigma_px=scenario.sigma_px,
+            area_px=area_px,
+            peak=255.0,
+            elongation=1.0,
+            dt_ns=round(scene.row_delay_s(v) * 1e9),
+        )
+    ]

@@ -1,0 +1,150 @@
+"""Light of a lamp in water: its disc, its scattered halo and beam, and the lens's own glare.
+
+Single scattering along the sight rays, integrated over the scattering angle: at perpendicular distance D from the
+lamp, L = b / D * integral of p(phi) I(beam) exp(-k (d1 + d2)) d(phi), with d1, d2 from the law of sines. The
+1 / D is smooth in (azimuth, log distance) once multiplied out, so a small polar table of L * rho gives every pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.sim.rig import beam
+from node.sim.scenario import Water
+from node.sim.scene import LAMP_RADIUS_M, Lamp
+
+Image = NDArray[np.float32]
+
+COARSE: Final = 4
+NEAR_PX: Final = 48.0
+FAR_PX: Final = 96.0
+BLUR_PX: Final = 0.8
+AZIMUTHS: Final = 32
+STEPS: Final = 36
+NODES: Final = 10
+RHO_MIN_PX: Final = 0.5
+FORWARD_SHARE: Final = 0.7
+"""Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
+GLARE: Final = 0.004
+"""Share of a lamp's light that the lens spreads widely."""
+
+
+class GlowRenderer:
+    """Adds lamps to a picture of one size: their wide glow on a coarse grid, what is near on the full one."""
+
+    def __init__(self, water: Water, width_px: int, height_px: int, f_px: float) -> None:
+        self._water = water
+        self._f_px = f_px
+        self._size_px = width_px, height_px
+        self._k = np.array(water.absorption_per_m) + (1 - FORWARD_SHARE) * np.array(water.scattering_per_m)
+        self._b = np.array(water.scattering_per_m)
+        shape = -(-height_px // COARSE), -(-width_px // COARSE)
+        self.coarse_shape = shape
+        self._coarse_u = (np.arange(shape[1], dtype=np.float32) + 0.5) * COARSE - 0.5
+        self._coarse_v = (np.arange(shape[0], dtype=np.float32) + 0.5) * COARSE - 0.5
+        self._scale = f_px / 900.0
+        reach = 1.6 * math.hypot(width_px, height_px)
+        self._log_step = math.log(reach / RHO_MIN_PX) / (STEPS - 1)
+        self._rho = (RHO_MIN_PX * np.exp(self._log_step * np.arange(STEPS))).astype(np.float32)
+        azimuth = 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+        self._ring = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+        x, w = np.polynomial.legendre.leggauss(NODES)
+        self._node_x, self._node_w = ((x + 1) / 2).astype(np.float32), (w / 2).astype(np.float32)
+
+    def table(self, lamp: Lamp) -> Image:
+        """Return L * rho, (STEPS, AZIMUTHS, 3), of a lamp's scattered light; rho in px, L in full scales."""
+        r = lamp.range_m
+        source = lamp.position_m / r
+        centre = lamp.position_m[:2] / lamp.position_m[2]
+        offsets = self._rho[:, None, None] / self._f_px * self._ring
+        rays = np.empty((STEPS, AZIMUTHS, 3))
+        rays[..., :2] = centre + offsets
+        rays[..., 2] = 1.0
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        foot = rays * (rays @ source)[..., None] - source
+        sin_psi = np.linalg.norm(foot, axis=-1)
+        psi = np.arctan2(sin_psi, rays @ source).astype(np.float32)
+        n = foot / sin_psi[..., None]
+        span = np.log(np.pi / psi)
+        phi = psi[..., None] * np.exp(span[..., None] * self._node_x)
+        sin_phi = np.maximum(np.sin(phi), 1e-4)
+        cos_phi = np.cos(phi)
+        cos_beam = (
+            sin_phi * (n @ lamp.aim).astype(np.float32)[..., None]
+            - cos_phi * (rays @ lamp.aim).astype(np.float32)[..., None]
+        )
+        path_m = (r * (sin_psi.astype(np.float32)[..., None] + np.sin(phi - psi[..., None])) / sin_phi).astype(
+            np.float32
+        )
+        g = self._water.forwardness
+        phase = (1 - g * g) / (4 * np.pi) * (1 + g * g - 2 * g * cos_phi) ** -1.5
+        weight = self._node_w * phi * span[..., None] * phase * beam(cos_beam)
+        table = np.empty((STEPS, AZIMUTHS, 3), np.float32)
+        front = (self._rho[:, None] / (r * sin_psi)).astype(np.float32)
+        for channel in range(3):
+            scattered = np.einsum("ijk,ijk->ij", weight, np.exp(-self._k[channel] * path_m))
+            table[..., channel] = scattered * front * self._b[channel]
+        table *= self._water.lamp_gain * lamp.intensity
+        rho = self._rho / self._scale
+        glare = GLARE / (2 * np.pi) / (rho * rho + 9.0) ** 1.25 * self._rho
+        table += (glare[:, None] * self._flux_px(lamp)).astype(np.float32)[:, None, :]
+        return table
+
+    def _flux_px(self, lamp: Lamp) -> NDArray[np.float64]:
+        """Return the light that reaches the picture directly, (3,): full scales times square pixels."""
+        direct = np.exp(-self._k * lamp.range_m) * lamp.towards_camera / lamp.range_m**2
+        return np.asarray(self._water.lamp_gain * direct * self._f_px**2)
+
+    def core_px(self, lamp: Lamp, table: Image) -> float:
+        """Return the radius within which a lamp clips the green channel."""
+        bright = table[..., 1].max(axis=1) > self._rho
+        glow_px = float(self._rho[bright].max()) if bright.any() else 0.0
+        return max(glow_px, LAMP_RADIUS_M * self._f_px / lamp.range_m)
+
+    def add_wide(self, coarse: Image, lamp: Lamp, table: Image) -> None:
+        """Add a lamp's light beyond NEAR_PX to the coarse picture."""
+        du = np.broadcast_to(self._coarse_u - np.float32(lamp.pixel[0]), self.coarse_shape)
+        dv = np.broadcast_to(self._coarse_v[:, None] - np.float32(lamp.pixel[1]), self.coarse_shape)
+        radiance, rho = self._look_up(table, du, dv)
+        coarse += radiance * (1.0 - self._window(rho))[..., None]
+
+    def add_near(self, full: Image, lamp: Lamp, table: Image) -> None:
+        """Add a lamp's disc and its light within FAR_PX to the full picture."""
+        reach = math.ceil(FAR_PX * self._scale) + 1
+        u, v = float(lamp.pixel[0]), float(lamp.pixel[1])
+        width_px, height_px = self._size_px
+        u0, u1 = max(int(u) - reach, 0), min(int(u) + reach + 1, width_px)
+        v0, v1 = max(int(v) - reach, 0), min(int(v) + reach + 1, height_px)
+        if u0 >= u1 or v0 >= v1:
+            return
+        du, dv = np.meshgrid(
+            np.arange(u0, u1, dtype=np.float32) - np.float32(u),
+            (np.arange(v0, v1, dtype=np.float32) - np.float32(v)) / np.float32(lamp.stretch),
+        )
+        radiance, rho = self._look_up(table, du, dv)
+        radiance *= self._window(rho)[..., None]
+        size_px = LAMP_RADIUS_M * self._f_px / lamp.range_m * math.sqrt(lamp.stretch)
+        edge_px = BLUR_PX / 1.702 * lamp.stretch
+        area_px = math.pi * (size_px**2 + (math.pi * edge_px) ** 2 / 3)
+        near = rho < size_px + 14 * edge_px
+        disc = 1.0 / (1.0 + np.exp((rho[near] - size_px) / edge_px))
+        radiance[near] += disc[:, None] * (self._flux_px(lamp) / area_px).astype(np.float32)
+        full[v0:v1, u0:u1] += radiance
+
+    def _look_up(self, table: Image, du: Image, dv: Image) -> tuple[Image, Image]:
+        distance, azimuth = cv2.cartToPolar(du, dv)
+        rho: Image = np.asarray(np.maximum(distance, np.float32(RHO_MIN_PX)), np.float32)
+        row = np.log(rho * np.float32(1 / RHO_MIN_PX)) * np.float32(1 / self._log_step)
+        column = np.asarray(azimuth, np.float32) * np.float32(AZIMUTHS / (2 * np.pi))
+        closed = np.concatenate([table, table[:, :1]], axis=1)
+        radiance = cv2.remap(closed, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(radiance, np.float32) / rho[..., None], rho
+
+    def _window(self, rho: Image) -> Image:
+        x = np.clip((FAR_PX - rho / np.float32(self._scale)) / np.float32(FAR_PX - NEAR_PX), 0, 1)
+        return np.asarray(x * x * (3 - 2 * x), np.float32)

@@ -1,0 +1,100 @@
+"""Pictures of a simulated camera: scenery, glow, lamps, what passes by, snow, noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.sim.glow import GlowRenderer
+from node.sim.randomness import generator
+from node.sim.scenario import Scenario
+from node.sim.scene import Lamp, Passer, Scene, View
+from node.sim.scenery import Scenery
+from node.sim.snow import Snow
+
+Image = NDArray[np.float32]
+NOISE_MARGIN_PX = 64
+
+
+class Painter:
+    """Renders the pictures of one node. Linear light throughout; the camera's tone curve is a square root.
+
+    Under a square root shot noise has one size at every brightness, so that one tile of noise, shifted at random
+    for every frame, serves.
+    """
+
+    def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
+        water, camera = scenario.water, scene.rigs[index].camera
+        self._seed, self._index = scenario.seed, index
+        self._size_px = scenario.width_px, scenario.height_px
+        self._glow = GlowRenderer(water, scenario.width_px, scenario.height_px, camera.fx_px)
+        self._scenery = Scenery(scenario, camera)
+        self._snow = Snow(scenario, camera, index)
+        self._noise = _noise_tile(scenario, index)
+        self._full: Image = np.empty((scenario.height_px, scenario.width_px, 3), np.float32)
+
+    def paint(self, view: View, t_s: float, frame: int) -> NDArray[np.uint8]:
+        """Return the picture, (H, W, 3) uint8, blue green red. frame: names the frame's own noise."""
+        rng = generator(self._seed, "frame", self._index, frame)
+        lamps = [lamp for lamp in (*view.lights, *view.others) if self._matters(lamp)]
+        tables = [self._glow.table(lamp) for lamp in lamps]
+        full = self._full
+        coarse = self._scenery.coarse(view, self._glow.coarse_shape)
+        for lamp, table in zip(lamps, tables, strict=True):
+            self._glow.add_wide(coarse, lamp, table)
+        cv2.resize(coarse, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
+        self._scenery.add(full, view, t_s)
+        for lamp, table in zip(lamps, tables, strict=True):
+            self._glow.add_near(full, lamp, table)
+        for passer in view.passers:
+            _darken(full, passer, self._scenery.passer_radiance)
+        self._snow.add(full, view, t_s)
+        np.multiply(full, np.float32(255.0**2), out=full)
+        cv2.sqrt(full, dst=full)
+        left, top = rng.integers(0, NOISE_MARGIN_PX, 2)
+        width_px, height_px = self._size_px
+        noise = self._noise[top : top + height_px, left : left + width_px]
+        return np.asarray(cv2.add(full, noise, dtype=cv2.CV_8U), np.uint8)
+
+    def merged(self, left: Lamp, right: Lamp) -> bool:
+        """Tell whether the clipped cores of two lights are one."""
+        if not (self._matters(left) and self._matters(right)):
+            return False
+        cores_px = sum(self._glow.core_px(lamp, self._glow.table(lamp)) for lamp in (left, right))
+        return bool(np.linalg.norm(left.pixel - right.pixel) < cores_px)
+
+    def _matters(self, lamp: Lamp) -> bool:
+        """Tell whether a lamp stands near enough to the picture to be seen or to light the water in it."""
+        if np.isnan(lamp.pixel).any() or lamp.position_m[2] < 0.1:
+            return False
+        beyond = np.abs(lamp.pixel / self._size_px - 0.5) - 0.5
+        return bool(beyond.max() < 0.4)
+
+
+def _noise_tile(scenario: Scenario, index: int) -> Image:
+    """Return a tile of sensor noise in grey levels, smeared a little as demosaicing does."""
+    rng = generator(scenario.seed, "noise", index)
+    shape = scenario.height_px + NOISE_MARGIN_PX, scenario.width_px + NOISE_MARGIN_PX, 3
+    tile = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (3, 3), 0.6)
+    tile *= scenario.water.noise / tile.std()
+    return np.asarray(tile, np.float32)
+
+
+def _darken(full: Image, passer: Passer, radiance: Image) -> None:
+    """Put a dark body with a soft edge over the picture."""
+    reach = int(passer.radii_px.max()) + 3
+    u, v = passer.centre_px
+    height_px, width_px = full.shape[:2]
+    u0, u1 = max(int(u) - reach, 0), min(int(u) + reach + 1, width_px)
+    v0, v1 = max(int(v) - reach, 0), min(int(v) + reach + 1, height_px)
+    if u0 >= u1 or v0 >= v1:
+        return
+    du, dv = np.meshgrid(np.arange(u0, u1) - u, np.arange(v0, v1) - v)
+    c, s = np.cos(passer.angle_rad), np.sin(passer.angle_rad)
+    along = (c * du + s * dv) / passer.radii_px[0]
+    across = (c * dv - s * du) / passer.radii_px[1]
+    edge_px = float(passer.radii_px.min())
+    cover = np.clip((1.0 - np.hypot(along, across)) * edge_px / 1.5 + 0.5, 0, 1).astype(np.float32)[..., None]
+    patch = full[v0:v1, u0:u1]
+    patch += cover * (radiance - patch)

@@ -1,0 +1,52 @@
+"""What stands on a node: two lamps on a bar, their aims, the pressure port, the camera's mount."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from node.sim import rotation
+from node.sim.randomness import generator
+from node.sim.rotation import Vector
+from node.sim.scenario import Scenario
+from protocol.messages import CameraModel
+
+Q_BODY_CAMERA: Final = (0.5, 0.5, 0.5, 0.5)
+R_BODY_CAMERA: Final = rotation.from_quaternion(Q_BODY_CAMERA)
+LEFT, RIGHT = 0, 1
+
+
+@dataclass(frozen=True)
+class Rig:
+    """One node as built. lights_m, aims: (2, 3), left and right, in its camera frame; aims are unit vectors."""
+
+    camera: CameraModel
+    lights_m: Vector
+    aims: Vector
+    depth_port_m: Vector
+
+
+def build(scenario: Scenario, index: int) -> Rig:
+    """Return the rig of A (0) or B (1): lamps toed out by 3 to 8 degrees, a few millimetres off the bar."""
+    rng = generator(scenario.seed, "rig", index)
+    half_m = scenario.baseline_m(index) / 2
+    lights_m = np.array([[-half_m, 0.0, 0.0], [half_m, 0.0, 0.0]])
+    lights_m += rng.normal(0.0, scenario.rig_sigma_m, (2, 3))
+    toe_rad = np.radians(rng.uniform(3, 8, 2)) * (-1, 1)
+    tilt_rad = np.radians(rng.uniform(-3, 3, 2))
+    aims = np.stack([np.sin(toe_rad) * np.cos(tilt_rad), np.sin(tilt_rad), np.cos(toe_rad) * np.cos(tilt_rad)], axis=1)
+    port_m = np.array([0.0, 0.06, -0.12]) if scenario.rig_sigma_m > 0 else np.zeros(3)
+    return Rig(scenario.camera(index), lights_m, aims, port_m)
+
+
+BEAM_RAD: Final = math.radians(17)
+SPILL: Final = 0.02
+
+
+def beam(cos_off_axis: Vector) -> Vector:
+    """Return a lamp's intensity against its axis (1): a Gaussian beam and some spill all around."""
+    off_axis_rad2 = 2.0 * (1.0 - cos_off_axis)
+    return np.asarray(SPILL + (1.0 - SPILL) * np.exp(-0.5 * off_axis_rad2 / BEAM_RAD**2))

@@ -1,0 +1,167 @@
+"""What is simulated: one frozen description from which everything else follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias, get_args
+
+from node.sim.camera import pinhole
+from protocol.errors import BuddylineError
+from protocol.messages import CameraModel
+from protocol.topics import check_node_id
+
+Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
+Trajectory: TypeAlias = Literal["circles", "rest"]
+ENVIRONMENTS: Final[tuple[str, ...]] = get_args(Environment)
+TRAJECTORIES: Final[tuple[str, ...]] = get_args(Trajectory)
+
+Bgr: TypeAlias = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Water:
+    """Optics and layout of an environment; colours in the order of OpenCV: blue, green, red.
+
+    absorption_per_m, scattering_per_m: coefficients by colour. forwardness: Henyey-Greenstein's g.
+    ambient: radiance of the open water as a share of full scale (0: dark); lamp_gain: exposure, as the radiance
+    (share of full scale) that a lamp's light of unit intensity has per steradian. noise: sd in grey levels.
+    depth_m: of A; floor_depth_m: of the sea floor, 0 where none is in view. density_kgpm3: for pressure.
+    snow: particles in view. caustics, surface: contrast of both, 0 without sun. range_max_m: how far B goes.
+    """
+
+    absorption_per_m: Bgr
+    scattering_per_m: Bgr
+    forwardness: float
+    ambient: Bgr
+    lamp_gain: float
+    noise: float
+    depth_m: float
+    floor_depth_m: float
+    density_kgpm3: float
+    snow: int
+    caustics: float
+    surface: float
+    range_max_m: float
+
+
+WATERS: Final[dict[str, Water]] = {
+    "cavern": Water(
+        (0.05, 0.06, 0.40), (0.05, 0.05, 0.05), 0.92, (0.0, 0.0, 0.0), 3.0, 2.4, 13.0, 0.0, 998.0, 12, 0, 0, 9.0
+    ),
+    "night_reef": Water(
+        (0.06, 0.07, 0.42), (0.12, 0.12, 0.12), 0.92, (0.0, 0.0, 0.0), 3.0, 2.4, 8.0, 0.0, 1025.0, 30, 0, 0, 9.0
+    ),
+    "lake": Water(
+        (0.55, 0.25, 0.38), (0.60, 0.60, 0.60), 0.90, (0.12, 0.28, 0.21), 0.8, 1.2, 2.6, 0.0, 998.0, 18, 0, 0, 4.5
+    ),
+    "basin": Water(
+        (0.06, 0.06, 0.30), (0.08, 0.08, 0.08), 0.90, (0.075, 0.070, 0.040), 1.2, 1.4, 2.2, 3.8, 998.0, 8, 1.0,
+        1.0, 10.0,
+    ),
+    "day_reef": Water(
+        (0.05, 0.08, 0.40), (0.10, 0.10, 0.10), 0.90, (0.24, 0.20, 0.02), 1.2, 1.4, 8.0, 10.5, 1025.0, 14, 0.8,
+        0.0, 9.0,
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Two nodes in some water: with its seed, all there is to know of a simulated dive.
+
+    start_ns: epoch of t = 0. camera_a, camera_b: None for the default pinhole. rig_sigma_m: how far the lights are
+    off the ideal bar (NodeInfo states where they truly are). range_max_m: 0 for the environment's own.
+    sigma_px: noise of synthetic candidates; gross_share of them off by gross_px; miss_share are missing;
+    false_lights are put in at random places of each picture. other_lamps: other divers' lamps in the water.
+    interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
+    magnetometer_off_rad: constant error of B's heading, outside what its sigma says.
+    """
+
+    environment: Environment = "cavern"
+    seed: int = 0
+    start_ns: int = 0
+    node_a: str = "a"
+    node_b: str = "b"
+    width_px: int = 820
+    height_px: int = 616
+    camera_a: CameraModel | None = None
+    camera_b: CameraModel | None = None
+    row_time_ns: int = 0
+    baseline_a_m: float = 0.88
+    baseline_b_m: float = 0.88
+    rig_sigma_m: float = 0.004
+    trajectory: Trajectory = "circles"
+    range_min_m: float = 1.5
+    range_max_m: float = 0.0
+    sigma_px: float = 0.7
+    gross_share: float = 0.03
+    gross_px: float = 6.0
+    miss_share: float = 0.03
+    false_lights: int = 3
+    other_lamps: int = 1
+    interruptions: bool = True
+    clock_offset_ns: int = 0
+    magnetometer_off_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated, naming the field."""
+        check_node_id(self.node_a)
+        check_node_id(self.node_b)
+        if self.node_a == self.node_b:
+            raise BuddylineError(f"node_b: {self.node_b!r} is node_a's name as well")
+        for name, known in (("environment", ENVIRONMENTS), ("trajectory", TRAJECTORIES)):
+            if getattr(self, name) not in known:
+                raise BuddylineError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
+        for name, lowest in _LOWEST.items():
+            if not getattr(self, name) >= lowest:
+                raise BuddylineError(f"{name}: {getattr(self, name)} is below {lowest}")
+        for name in ("gross_share", "miss_share"):
+            if getattr(self, name) > 1:
+                raise BuddylineError(f"{name}: {getattr(self, name)} is above 1")
+        if self.far_m < self.range_min_m:
+            raise BuddylineError(f"range_max_m: {self.far_m} is below range_min_m, {self.range_min_m}")
+
+    @property
+    def water(self) -> Water:
+        """Optics of the environment."""
+        return WATERS[self.environment]
+
+    @property
+    def far_m(self) -> float:
+        """Return the longest range."""
+        return self.range_max_m or max(self.water.range_max_m, self.range_min_m)
+
+    def index(self, node: str) -> int:
+        """Return 0 for A, 1 for B."""
+        if node not in (self.node_a, self.node_b):
+            raise BuddylineError(f"node {node!r} is not simulated: {self.node_a} and {self.node_b} are")
+        return int(node == self.node_b)
+
+    def camera(self, index: int) -> CameraModel:
+        """Return the camera of A (0) or B (1)."""
+        own = (self.camera_a, self.camera_b)[index]
+        return own if own is not None else pinhole(self.width_px, self.height_px)
+
+    def baseline_m(self, index: int) -> float:
+        """Return the spacing of the lights of A (0) or B (1)."""
+        return (self.baseline_a_m, self.baseline_b_m)[index]
+
+
+_LOWEST: Final = {
+    "seed": 0,
+    "start_ns": 0,
+    "width_px": 32,
+    "height_px": 32,
+    "row_time_ns": 0,
+    "baseline_a_m": 0.05,
+    "baseline_b_m": 0.05,
+    "rig_sigma_m": 0.0,
+    "range_min_m": 0.5,
+    "range_max_m": 0.0,
+    "sigma_px": 1e-6,
+    "gross_share": 0.0,
+    "gross_px": 0.0,
+    "miss_share": 0.0,
+    "false_lights": 0,
+    "other_lamps": 0,
+}

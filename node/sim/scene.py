@@ -1,0 +1,211 @@
+"""What stands before a camera at one time: lamps, in its frame and in its picture, and what hides them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from node.sim.camera import project
+from node.sim.randomness import Sway, generator
+from node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, Rig, beam, build
+from node.sim.rotation import Matrix, Vector
+from node.sim.scenario import Scenario
+from node.sim.trajectory import Motion, Placement
+
+LAMP_RADIUS_M = 0.02
+PASSING_PERIOD_S = 12.0
+PASSING_SHARE = 0.6
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture.
+
+    intensity: on its axis. stretch: how much ripples draw its image out, up and down (a reflection), 1 for none.
+    """
+
+    position_m: Vector
+    aim: Vector
+    pixel: Vector
+    intensity: float = 1.0
+    stretch: float = 1.0
+
+    @property
+    def range_m(self) -> float:
+        """Distance from the camera."""
+        return float(np.linalg.norm(self.position_m))
+
+    @property
+    def towards_camera(self) -> float:
+        """Intensity in the camera's direction."""
+        return self.intensity * float(beam(np.array(-self.position_m @ self.aim / self.range_m)))
+
+
+@dataclass(frozen=True)
+class Passer:
+    """Something dark that passes before a lamp: an ellipse in the picture, pixels and radians."""
+
+    centre_px: Vector
+    radii_px: Vector
+    angle_rad: float
+
+    def hides(self, pixel: Vector) -> bool:
+        """Tell whether a pixel lies behind it."""
+        c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = np.array([[c, s], [-s, c]]) @ (pixel - self.centre_px) / self.radii_px
+        return bool(along**2 + across**2 < 1.0)
+
+
+@dataclass(frozen=True)
+class View:
+    """All that one camera sees at one time. lights: the other node's, left and right."""
+
+    placement: Placement
+    lights: tuple[Lamp, Lamp]
+    others: tuple[Lamp, ...]
+    passers: tuple[Passer, ...]
+
+    @property
+    def R_ned_camera(self) -> Matrix:
+        """Camera to NED."""
+        return self.placement.R_ned_body @ R_BODY_CAMERA
+
+    def hidden(self, pixel: Vector) -> bool:
+        """Tell whether something stands before a pixel."""
+        return any(passer.hides(pixel) for passer in self.passers)
+
+
+class Scene:
+    """Both rigs, other divers, the surface, and what passes by. Times in seconds since the start."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self.motion = Motion(scenario)
+        self.rigs: tuple[Rig, Rig] = (build(scenario, 0), build(scenario, 1))
+        rng = generator(scenario.seed, "divers")
+        self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
+        self._ripple = [[Sway(rng, 0.4, 3.0) for _ in range(2)] for _ in range(2)]
+
+    def view(self, index: int, t_s: float) -> View:
+        """Return what A (0) or B (1) sees at t_s, with every lamp where its row of the picture has it."""
+        placement = self.motion.placement(index, t_s)
+        lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))
+        other_a_b = self.motion.placement(0, t_s), self.motion.placement(1, t_s)
+        others = [self._lamp(index, placement, *diver.lamp(other_a_b, t_s), diver.intensity) for diver in self._divers]
+        if self.scenario.water.surface > 0:
+            others += [self._reflection(index, placement, side, t_s) for side in (LEFT, RIGHT)]
+        return View(placement, (lights[0], lights[1]), tuple(others), self._passers(index, t_s, lights))
+
+    def _light(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
+        lamp = self._lamp(index, placement, *self._light_ned(1 - index, side, t_s))
+        row_time_ns = self.scenario.row_time_ns
+        if row_time_ns == 0 or math.isnan(lamp.pixel[1]):
+            return lamp
+        for _ in range(2):
+            row_s = t_s + self.row_delay_s(float(lamp.pixel[1]))
+            lamp = self._lamp(index, self.motion.placement(index, row_s), *self._light_ned(1 - index, side, row_s))
+        return lamp
+
+    def row_delay_s(self, v_px: float) -> float:
+        """Return when a row is exposed, against the middle row."""
+        return (v_px - (self.scenario.height_px - 1) / 2) * self.scenario.row_time_ns * 1e-9
+
+    def _light_ned(self, index: int, side: int, t_s: float) -> tuple[Vector, Vector]:
+        """Return a node's light and its aim in NED."""
+        placement, rig = self.motion.placement(index, t_s), self.rigs[index]
+        R_ned_camera = placement.R_ned_body @ R_BODY_CAMERA
+        return placement.position_ned_m + R_ned_camera @ rig.lights_m[side], R_ned_camera @ rig.aims[side]
+
+    def _lamp(
+        self,
+        index: int,
+        placement: Placement,
+        position_ned_m: Vector,
+        aim_ned: Vector,
+        intensity: float = 1.0,
+        stretch: float = 1.0,
+    ) -> Lamp:
+        R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
+        position_m = R_camera_ned @ (position_ned_m - placement.position_ned_m)
+        pixel = project(position_m[None], self.rigs[index].camera)[0]
+        return Lamp(position_m, R_camera_ned @ aim_ned, pixel, intensity, stretch)
+
+    def _reflection(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
+        """Return a light's mirror image in the surface; ripples move it and draw it out."""
+        position_m, aim = self._light_ned(1 - index, side, t_s)
+        mirror = np.array([1.0, 1.0, -1.0])
+        ripple_m = 0.05 * self._ripple[side][0](t_s), 0.05 * self._ripple[side][1](t_s)
+        wobble = np.array([ripple_m[0], ripple_m[0], ripple_m[1]])
+        return self._lamp(index, placement, position_m * mirror + wobble, aim * mirror, 0.25, 3.0)
+
+    def _passers(self, index: int, t_s: float, lights: tuple[Lamp, ...]) -> tuple[Passer, ...]:
+        if not self.scenario.interruptions or self.scenario.trajectory == "rest":
+            return ()
+        passing = _passing(self.scenario.seed, index, math.floor(t_s / PASSING_PERIOD_S))
+        if passing is None or abs(t_s - passing.middle_s) > 1.5 * passing.covers_s:
+            return ()
+        lamp = lights[passing.side]
+        if np.isnan(lamp.pixel).any():
+            return ()
+        size_px = self.rigs[index].camera.fx_px * passing.size_m / (0.6 * lamp.range_m)
+        radii_px = size_px * np.array([passing.aspect, 1.0])
+        way = 2 * (t_s - passing.middle_s) / passing.covers_s * size_px
+        heading = np.array([-math.sin(passing.angle_rad), math.cos(passing.angle_rad)])
+        return (Passer(lamp.pixel + way * heading, radii_px, passing.angle_rad),)
+
+
+@dataclass(frozen=True)
+class _Passing:
+    middle_s: float
+    covers_s: float
+    side: int
+    size_m: float
+    aspect: float
+    angle_rad: float
+
+
+@lru_cache(maxsize=64)
+def _passing(seed: int, index: int, window: int) -> _Passing | None:
+    """Return what passes in a window of time before one light, if anything does."""
+    if window < 0:
+        return None
+    rng = generator(seed, "passing", index, window)
+    covers_s = float(rng.uniform(0.4, 1.6))
+    begin_s = window * PASSING_PERIOD_S
+    passing = _Passing(
+        middle_s=begin_s + float(rng.uniform(3.0, PASSING_PERIOD_S - 3.0)),
+        covers_s=covers_s,
+        side=int(rng.integers(2)),
+        size_m=float(rng.uniform(0.05, 0.14)),
+        aspect=float(rng.uniform(1.2, 2.6)),
+        angle_rad=float(rng.uniform(-math.pi, math.pi)),
+    )
+    return passing if rng.random() < PASSING_SHARE else None
+
+
+class _Diver:
+    """Another diver with one lamp, who swims to and fro beside the line between the nodes."""
+
+    def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        self.intensity = float(rng.uniform(0.3, 1.0))
+        self._along = float(rng.uniform(0.2, 0.9))
+        self._side_m = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.2))
+        self._climb_m = float(rng.uniform(-0.8, 0.8))
+        self._ways = [Sway(rng, 12.0, 40.0) for _ in range(3)]
+        self._aims = [Sway(rng, 6.0, 25.0) for _ in range(2)]
+
+    def lamp(self, nodes: tuple[Placement, Placement], t_s: float) -> tuple[Vector, Vector]:
+        """Return the lamp's position and aim in NED."""
+        start_m, end_m = (node.position_ned_m for node in nodes)
+        line_m = end_m - start_m
+        right = np.array([-line_m[1], line_m[0], 0.0]) / math.hypot(line_m[0], line_m[1])
+        ways = [way(t_s) for way in self._ways]
+        position_m = start_m + line_m * (self._along + 0.3 * ways[0]) + right * (self._side_m + ways[1])
+        position_m[2] = max(position_m[2] + self._climb_m + 0.5 * ways[2], 0.3)
+        azimuth = math.pi * 2 * self._aims[0](t_s)
+        tilt = 0.6 * self._aims[1](t_s)
+        aim = np.array([math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt)])
+        return position_m, aim

@@ -1,0 +1,55 @@
+"""Marine snow: particles that drift past and shine in the lamps' light."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.sim.randomness import generator
+from node.sim.scenario import Scenario
+from node.sim.scene import View
+from protocol.messages import CameraModel
+
+Image = NDArray[np.float32]
+BOX_M = 2.4
+
+
+class Snow:
+    """Particles at rest in drifting water: a box of them that repeats, and that the camera swims through."""
+
+    def __init__(self, scenario: Scenario, camera: CameraModel, index: int) -> None:
+        rng = generator(scenario.seed, "snow")
+        count = scenario.water.snow * 6
+        self._home_m = rng.uniform(0, BOX_M, (count, 3))
+        self._drift_mps = rng.normal(0, 0.03, (count, 3)) + rng.normal(0, 0.06, 3)
+        self._shine = rng.lognormal(-1.0, 0.8, count)
+        self._camera = camera
+
+    def add(self, full: Image, view: View, t_s: float) -> None:
+        """Add the particles in view to the full picture."""
+        position_m = view.placement.position_ned_m
+        centre_m = position_m + view.R_ned_camera[:, 2] * BOX_M / 2
+        relative_m = self._home_m + self._drift_mps * t_s - centre_m
+        relative_m -= BOX_M * np.floor(relative_m / BOX_M + 0.5)
+        points = (relative_m + centre_m - position_m) @ view.R_ned_camera
+        ahead = points[:, 2] > 0.15
+        height_px, width_px = full.shape[:2]
+        camera = self._camera
+        for (x, y, z), shine in zip(points[ahead], self._shine[ahead], strict=True):
+            u, v = camera.cx_px + camera.fx_px * x / z, camera.cy_px + camera.fy_px * y / z
+            if not (2 < u < width_px - 3 and 2 < v < height_px - 3):
+                continue
+            focus_px = camera.fx_px / 900.0 * (0.7 + 1.2 * max(0.6 / z - 1.0, 0.0))
+            light = 0.05 * shine / (z * z * focus_px * focus_px) * min(1.0, (z / 0.5) ** 2)
+            _add_spot(full, u, v, focus_px, light)
+
+
+def _add_spot(full: Image, u_px: float, v_px: float, sd_px: float, light: float) -> None:
+    reach = int(3 * sd_px) + 1
+    u0, v0 = round(u_px), round(v_px)
+    height_px, width_px = full.shape[:2]
+    left, right = max(u0 - reach, 0), min(u0 + reach + 1, width_px)
+    top, bottom = max(v0 - reach, 0), min(v0 + reach + 1, height_px)
+    across = np.exp(-0.5 * ((np.arange(left, right) - u_px) / sd_px) ** 2)
+    down = np.exp(-0.5 * ((np.arange(top, bottom) - v_px) / sd_px) ** 2)
+    full[top:bottom, left:right] += (light * down[:, None] * across).astype(np.float32)[..., None]

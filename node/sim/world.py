@@ -1,0 +1,159 @@
+"""The simulated world of two nodes: everything in it follows from (scenario, node, time).
+
+Two processes that hold the same Scenario see the same world; any time can be asked for, in any order.
+Stamps are on the asking node's own clock (B's may be off by Scenario.clock_offset_ns); truth is on A's.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.sim import candidates, rotation
+from node.sim.picture import Painter
+from node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
+from node.sim.rotation import Matrix, Vector
+from node.sim.scenario import Scenario
+from node.sim.scene import Lamp, Scene, View
+from node.sim.sensors import Sensors
+from protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    Imu,
+    LightTruth,
+    NodeInfo,
+    TrueLight,
+    Truth,
+)
+
+SOFTWARE = "buddyline simulator"
+
+
+class World:
+    """Two nodes in water, as their cameras and sensors see each other."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self._scene = Scene(scenario)
+        self._sensors = [Sensors(scenario, self._scene, i) for i in range(2)]
+        self._painters: dict[int, Painter] = {}
+
+    def info(self, node: str, stamp_ns: int, trigger_period_ns: int) -> NodeInfo:
+        """Return a node's description; its lights are where they truly are."""
+        s, index = self.scenario, self.scenario.index(node)
+        rig = self._scene.rigs[index]
+        return NodeInfo(
+            node=node,
+            stamp_ns=stamp_ns,
+            width_px=s.width_px,
+            height_px=s.height_px,
+            camera=rig.camera,
+            light_left_m=_triple(rig.lights_m[LEFT]),
+            light_right_m=_triple(rig.lights_m[RIGHT]),
+            sigma_px=s.sigma_px,
+            trigger_period_ns=trigger_period_ns,
+            row_time_ns=s.row_time_ns,
+            q_body_camera_xyzw=Q_BODY_CAMERA,
+            depth_port_m=_triple(rig.depth_port_m),
+            software=SOFTWARE,
+        )
+
+    def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:
+        """Return R (3, 3) and t (3,), metres: a node's camera frame to NED, down from the surface."""
+        index = self.scenario.index(node)
+        placement = self._scene.motion.placement(index, self._seconds(index, stamp_ns))
+        return placement.R_ned_body @ R_BODY_CAMERA, placement.position_ned_m
+
+    def truth(self, stamp_ns: int, trigger: int) -> Truth:
+        """Return the true T_a_b at stamp_ns on A's clock."""
+        t_s = self._seconds(0, stamp_ns)
+        a, b = (self._scene.motion.placement(i, t_s) for i in range(2))
+        R_camera_a_ned = (a.R_ned_body @ R_BODY_CAMERA).T
+        t_a_b_m = R_camera_a_ned @ (b.position_ned_m - a.position_ned_m)
+        R_a_b = R_camera_a_ned @ b.R_ned_body @ R_BODY_CAMERA
+        return Truth(
+            stamp_ns=stamp_ns,
+            trigger=trigger,
+            t_a_b_m=_triple(t_a_b_m),
+            q_a_b_xyzw=rotation.to_quaternion(R_a_b),
+        )
+
+    def light_truth(self, node: str, stamp_ns: int, trigger: int) -> LightTruth:
+        """Return where the other node's lights truly are in the picture taken at stamp_ns.
+
+        A light behind the camera, which has no place in the picture, is left out.
+        """
+        index = self.scenario.index(node)
+        view = self._scene.view(index, self._seconds(index, stamp_ns))
+        merged = self._painter(index).merged(*view.lights)
+        names: tuple[Literal["left", "right"], Literal["left", "right"]] = ("left", "right")
+        lights = [
+            TrueLight(
+                name=name,
+                u_px=float(lamp.pixel[0]),
+                v_px=float(lamp.pixel[1]),
+                visible=self._visible(view, lamp),
+                merged=merged,
+            )
+            for name, lamp in zip(names, view.lights, strict=True)
+            if not np.isnan(lamp.pixel).any()
+        ]
+        return LightTruth(node=node, stamp_ns=stamp_ns, trigger=trigger, lights=lights)
+
+    def render(self, node: str, stamp_ns: int) -> NDArray[np.uint8]:
+        """Return the picture taken at stamp_ns, (H, W, 3) uint8, blue green red."""
+        index = self.scenario.index(node)
+        t_s = self._seconds(index, stamp_ns)
+        return self._painter(index).paint(self._scene.view(index, t_s), t_s, stamp_ns)
+
+    def imu(self, node: str, stamp_ns: int) -> Imu:
+        """Return the inertial sample at stamp_ns."""
+        index = self.scenario.index(node)
+        return self._sensors[index].imu(stamp_ns, self._seconds(index, stamp_ns))
+
+    def attitude(self, node: str, stamp_ns: int) -> Attitude:
+        """Return the attitude filter's output at stamp_ns."""
+        index = self.scenario.index(node)
+        return self._sensors[index].attitude(stamp_ns, self._seconds(index, stamp_ns))
+
+    def depth(self, node: str, stamp_ns: int) -> Depth:
+        """Return the depth gauge's output at stamp_ns."""
+        index = self.scenario.index(node)
+        return self._sensors[index].depth(stamp_ns, self._seconds(index, stamp_ns))
+
+    def candidates(self, node: str, stamp_ns: int, trigger: int, seq: int, boot: str) -> Candidates:
+        """Return synthetic light candidates of the picture taken at stamp_ns, without rendering it."""
+        s, index = self.scenario, self.scenario.index(node)
+        view = self._scene.view(index, self._seconds(index, stamp_ns))
+        blobs, truncated = candidates.blobs(self._scene, index, view, stamp_ns)
+        return Candidates(
+            node=node,
+            stamp_ns=stamp_ns,
+            trigger=trigger,
+            seq=seq,
+            boot=boot,
+            width_px=s.width_px,
+            height_px=s.height_px,
+            blobs=blobs,
+            truncated=truncated,
+        )
+
+    def _seconds(self, index: int, stamp_ns: int) -> float:
+        """Return the time since the start of a stamp on a node's clock."""
+        offset_ns = self.scenario.clock_offset_ns if index == 1 else 0
+        return (stamp_ns - offset_ns - self.scenario.start_ns) * 1e-9
+
+    def _visible(self, view: View, lamp: Lamp) -> bool:
+        return candidates.in_picture(lamp, self.scenario) and not view.hidden(lamp.pixel)
+
+    def _painter(self, index: int) -> Painter:
+        if index not in self._painters:
+            self._painters[index] = Painter(self.scenario, self._scene, index)
+        return self._painters[index]
+
+
+def _triple(vector: Vector) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])
