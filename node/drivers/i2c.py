@@ -1,0 +1,102 @@
+"""One I2C bus: one lock, bounded retries, and errors that name bus, address and register."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from fcntl import ioctl
+from typing import Any, Final, Self
+
+from node.drivers.samples import DeviceError
+
+# linux/i2c-dev.h: how long the adapter waits for a transfer, in units of 10 ms. Its default, one second,
+# would let one chip that holds the bus down silence the others for that long.
+I2C_TIMEOUT: Final = 0x0702
+TRANSFER_TIMEOUT_10MS: Final = 5
+
+ATTEMPTS: Final = 3
+# NACK, lost arbitration, and what some adapters say in their place. A timeout is not among them: it has
+# waited long enough.
+_PASSING: Final = frozenset({errno.EREMOTEIO, errno.EIO, errno.ENXIO, errno.EAGAIN})
+
+_MEANING: Final = {
+    errno.EREMOTEIO: "no answer: check the chip's wiring and power",
+    errno.ETIMEDOUT: "the bus hangs: a chip or a short holds SCL or SDA down",
+    errno.EBUSY: "claimed by a kernel driver: remove its overlay from config.txt",
+}
+
+
+class I2cBus:
+    """Bus number /dev/i2c-<number>, shared by all chips on it and by all threads.
+
+    retries: transfers that had to be repeated; a growing count is a wire going bad.
+    """
+
+    def __init__(self, number: int = 1) -> None:
+        try:
+            from smbus2 import SMBus, i2c_msg
+        except ModuleNotFoundError as error:
+            raise DeviceError(f"I2C bus {number}: needs smbus2: pip install 'buddyline[pi]'") from error
+        self.number = number
+        self.retries = 0
+        self._lock = threading.Lock()
+        self._message: Any = i2c_msg
+        try:
+            self._bus: Any = SMBus(number)
+        except FileNotFoundError as error:
+            raise DeviceError(
+                f"I2C bus {number}: no /dev/i2c-{number}: add dtparam=i2c_arm=on to config.txt and reboot"
+            ) from error
+        except PermissionError as error:
+            raise DeviceError(f"I2C bus {number}: not allowed: add this user to the group i2c") from error
+        try:
+            ioctl(int(self._bus.fd or 0), I2C_TIMEOUT, TRANSFER_TIMEOUT_10MS)
+        except OSError as error:
+            self._bus.close()
+            raise DeviceError(f"I2C bus {number}: cannot set its timeout: {error.strerror}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the bus; a second call does nothing."""
+        with self._lock:
+            self._bus.close()
+
+    def read(self, address: int, register: int, count: int) -> bytes:
+        """Read count bytes from a register on, in one transfer."""
+        reply = self._message.read(address, count)
+        self._transfer(address, register, self._message.write(address, [register]), reply)
+        return bytes(reply)
+
+    def write(self, address: int, register: int, value: int) -> None:
+        """Write one register."""
+        self._transfer(address, register, self._message.write(address, [register, value]))
+
+    def command(self, address: int, command: int) -> None:
+        """Send a command byte without data."""
+        self._transfer(address, command, self._message.write(address, [command]))
+
+    def _transfer(self, address: int, register: int, *messages: object) -> None:
+        with self._lock:
+            for attempt in range(1, ATTEMPTS + 1):
+                try:
+                    self._bus.i2c_rdwr(*messages)
+                    return
+                except OSError as error:
+                    if error.errno in _PASSING and attempt < ATTEMPTS:
+                        self.retries += 1
+                        continue
+                    raise self.error(address, register, _explain(error)) from error
+
+    def error(self, address: int, register: int, what: str) -> DeviceError:
+        """Return an error that names where it happened."""
+        return DeviceError(f"I2C bus {self.number}, address 0x{address:02x}, register 0x{register:02x}: {what}")
+
+
+def _explain(error: OSError) -> str:
+    meaning = _MEANING.get(error.errno or 0, error.strerror or "failed")
+    return f"{meaning} (errno {error.errno})"

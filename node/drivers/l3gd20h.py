@@ -1,0 +1,36 @@
+"""L3GD20H: gyroscope of the MinIMU-9 v3 (ST DocID023469)."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from node.drivers.samples import Vector
+from node.drivers.st_chip import StChip, decode_vector
+
+AUTO_INCREMENT: Final = 0x80
+OUT_GYRO: Final = 0x28
+
+GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
+
+
+def decode_gyro(data: bytes) -> Vector:
+    """Return the angular rate in rad/s, (3,) in the chip's frame, of six bytes at +-500 deg/s."""
+    return decode_vector(data) * GYRO_RADPS_PER_COUNT
+
+
+class L3gd20h(StChip):
+    """Gyroscope at 200 Hz nominal (189.4 Hz measured), +-500 deg/s."""
+
+    NAME = "L3GD20H"
+    ADDRESSES = (0x6B, 0x6A)
+    IDENTITIES = (0xD7,)
+    SETTINGS = (
+        (0x39, 0x00),  # LOW_ODR: off
+        (0x23, 0x90),  # CTRL4: no update between low and high byte, +-500 deg/s
+        (0x20, 0x6F),  # CTRL1: 200 Hz, all axes on
+    )
+
+    def read_gyro(self) -> Vector:
+        """Return the angular rate in rad/s, (3,)."""
+        return decode_gyro(self.bus.read(self.address, OUT_GYRO | AUTO_INCREMENT, 6))

@@ -1,0 +1,48 @@
+"""LSM303D: accelerometer and magnetometer of the MinIMU-9 v3 (ST DocID023312)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
+from node.drivers.st_chip import StChip, decode_vector
+
+AUTO_INCREMENT: Final = 0x80
+OUT_MAG: Final = 0x08
+OUT_ACCEL: Final = 0x28
+
+ACCEL_MPS2_PER_COUNT: Final = 0.061e-3 * STANDARD_GRAVITY_MPS2  # +-2 g
+MAG_T_PER_COUNT: Final = 0.160e-3 * 1e-4  # +-4 gauss
+
+
+def decode_accel(data: bytes) -> Vector:
+    """Return the specific force in m/s2, (3,) in the chip's frame, of six bytes at +-2 g."""
+    return decode_vector(data) * ACCEL_MPS2_PER_COUNT
+
+
+def decode_mag(data: bytes) -> Vector:
+    """Return the magnetic field in T, (3,) in the chip's frame, of six bytes at +-4 gauss."""
+    return decode_vector(data) * MAG_T_PER_COUNT
+
+
+class Lsm303d(StChip):
+    """Accelerometer at 100 Hz, +-2 g; magnetometer at 50 Hz, +-4 gauss, high resolution."""
+
+    NAME = "LSM303D"
+    ADDRESSES = (0x1D, 0x1E)
+    IDENTITIES = (0x49,)
+    SETTINGS = (
+        (0x20, 0x6F),  # CTRL1: 100 Hz, all axes, no update between low and high byte
+        (0x21, 0x00),  # CTRL2: +-2 g
+        (0x24, 0x70),  # CTRL5: magnetometer 50 Hz, high resolution
+        (0x25, 0x20),  # CTRL6: +-4 gauss
+        (0x26, 0x00),  # CTRL7: continuous conversion
+    )
+
+    def read_accel(self) -> Vector:
+        """Return the specific force in m/s2, (3,)."""
+        return decode_accel(self.bus.read(self.address, OUT_ACCEL | AUTO_INCREMENT, 6))
+
+    def read_mag(self) -> Vector:
+        """Return the magnetic field in T, (3,)."""
+        return decode_mag(self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6))

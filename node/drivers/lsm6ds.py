@@ -1,0 +1,50 @@
+"""LSM6DS33 and LSM6DSO: accelerometer and gyroscope of the MinIMU-9 v5 and v6 (ST DocID027423, DS12140)."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final
+
+from node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
+from node.drivers.st_chip import StChip, decode_vector
+
+OUT_GYRO: Final = 0x22  # the accelerometer follows at 0x28: one burst of twelve bytes
+
+ACCEL_MPS2_PER_COUNT: Final = 0.061e-3 * STANDARD_GRAVITY_MPS2  # +-2 g
+GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
+
+
+def decode_motion(data: bytes) -> tuple[Vector, Vector]:
+    """Return specific force in m/s2 and angular rate in rad/s, (3,) each, of twelve bytes from OUTX_L_G on."""
+    return decode_vector(data[6:]) * ACCEL_MPS2_PER_COUNT, decode_vector(data[:6]) * GYRO_RADPS_PER_COUNT
+
+
+class Lsm6ds(StChip):
+    """Both at 208 Hz, +-2 g and +-500 deg/s; the registers used are alike in the two chips."""
+
+    NAME = "LSM6DS33 or LSM6DSO"
+    ADDRESSES = (0x6B, 0x6A)
+    IDENTITIES: ClassVar[tuple[int, ...]] = (0x69, 0x6C)
+    SETTINGS = (
+        (0x12, 0x44),  # CTRL3_C: no update between low and high byte, addresses advance in a burst
+        (0x10, 0x50),  # CTRL1_XL: 208 Hz, +-2 g
+        (0x11, 0x54),  # CTRL2_G: 208 Hz, +-500 deg/s
+    )
+
+    def read_motion(self) -> tuple[Vector, Vector]:
+        """Return specific force in m/s2 and angular rate in rad/s, (3,) each."""
+        return decode_motion(self.bus.read(self.address, OUT_GYRO, 12))
+
+
+class Lsm6ds33(Lsm6ds):
+    """The chip of the MinIMU-9 v5."""
+
+    NAME = "LSM6DS33"
+    IDENTITIES = (0x69,)
+
+
+class Lsm6dso(Lsm6ds):
+    """The chip of the MinIMU-9 v6."""
+
+    NAME = "LSM6DSO"
+    IDENTITIES = (0x6C,)

@@ -1,0 +1,252 @@
+"""MS5837-30BA and -02BA, the pressure sensors of Bar30 and Bar02 (TE Connectivity, MS5837 data sheets).
+
+The arithmetic is the data sheets', in integers with floor shifts.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Literal, Self
+
+from node.drivers.i2c import I2cBus
+from node.drivers.samples import DepthSample
+from protocol.clock import MS_NS, Clock
+from protocol.errors import BuddylineError
+
+ADDRESS: Final = 0x76
+RESET: Final = 0x1E
+PROM: Final = 0xA0
+CONVERT_PRESSURE: Final = 0x40
+CONVERT_TEMPERATURE: Final = 0x50
+READ_ADC: Final = 0x00
+
+RESET_NS: Final = 10 * MS_NS
+RETRY_NS: Final = 200 * MS_NS
+PERIOD_NS: Final = 50 * MS_NS
+OVERSAMPLING: Final = 5  # of 0..5: 8192 samples, 0.2 mbar of noise on the 30BA
+CONVERSION_NS: Final = (600_000, 1_170_000, 2_280_000, 4_540_000, 9_040_000, 18_080_000)
+
+Model = Literal["30ba", "02ba"]
+
+# Word 0 does not tell the ranges apart: 30BA parts with the 02BA01's type 0 are sold. Their sensitivity at
+# 20 degC (C1) does (production figures given by TE in ArduPilot pull request 29122).
+TYPES: Final[dict[int, Model]] = {0x1A: "30ba", 0x15: "02ba"}
+SENSITIVITY: Final[dict[Model, range]] = {"30ba": range(26_000, 37_001), "02ba": range(37_001, 49_001)}
+
+# What the chips can measure, in Pa and degC; anything else is a transfer gone wrong.
+PRESSURE_PA: Final[dict[Model, tuple[float, float]]] = {"30ba": (0.0, 3.1e6), "02ba": (1e4, 2.1e5)}
+TEMPERATURE_DEGC: Final = (-20.0, 85.0)
+
+
+def crc4(words: Sequence[int]) -> int:
+    """Return the four-bit checksum of the seven PROM words, as word 0 carries it in bits 15:12."""
+    remainder = 0
+    for word in (words[0] & 0x0FFF, *words[1:7], 0):
+        for byte in word.to_bytes(2, "big"):
+            remainder ^= byte
+            for _ in range(8):
+                remainder = (remainder << 1) ^ 0x3000 if remainder & 0x8000 else remainder << 1
+            remainder &= 0xFFFF
+    return remainder >> 12
+
+
+def decode_prom(words: Sequence[int]) -> tuple[int, ...]:
+    """Return C1..C6 of seven PROM words; raise BuddylineError where the checksum fails."""
+    stored, computed = words[0] >> 12, crc4(words)
+    if not any(words) or stored != computed:
+        raise BuddylineError(f"PROM checksum {computed}, stored {stored}: bad contact or a damaged chip")
+    return tuple(words[1:7])
+
+
+def decode_model(words: Sequence[int]) -> Model:
+    """Return which chip it is; raise BuddylineError where type and sensitivity disagree or are unknown."""
+    kind, sensitivity = words[0] >> 5 & 0x7F, words[1]
+    model = next((model for model, known in SENSITIVITY.items() if sensitivity in known), None)
+    if model is None or TYPES.get(kind, model) != model:
+        raise BuddylineError(
+            f"cannot tell 30BA from 02BA (type 0x{kind:02x}, C1 {sensitivity}): name the depth sensor "
+            "ms5837_30ba or ms5837_02ba"
+        )
+    return model
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """First-order terms: difference to the reference temperature, 0.01 degC, offset, sensitivity."""
+
+    dt: int
+    temp: int
+    off: int
+    sens: int
+
+
+def first_order_30ba(c: Sequence[int], d2: int) -> Terms:
+    """Return the first-order terms of C1..C6 and the raw temperature."""
+    dt = d2 - (c[4] << 8)
+    return Terms(dt, 2000 + (dt * c[5] >> 23), (c[1] << 16) + (c[3] * dt >> 7), (c[0] << 15) + (c[2] * dt >> 8))
+
+
+def first_order_02ba(c: Sequence[int], d2: int) -> Terms:
+    """Return the first-order terms of C1..C6 and the raw temperature."""
+    dt = d2 - (c[4] << 8)
+    return Terms(dt, 2000 + (dt * c[5] >> 23), (c[1] << 17) + (c[3] * dt >> 6), (c[0] << 16) + (c[2] * dt >> 7))
+
+
+def second_order_30ba(terms: Terms) -> tuple[int, int, int]:
+    """Return Ti, OFFi and SENSi."""
+    dt, t = terms.dt, terms.temp - 2000
+    if t >= 0:
+        return 2 * dt * dt >> 37, t * t >> 4, 0
+    ti, offi, sensi = 3 * dt * dt >> 33, 3 * t * t >> 1, 5 * t * t >> 3
+    cold = terms.temp + 1500
+    if cold < 0:
+        offi += 7 * cold * cold
+        sensi += 4 * cold * cold
+    return ti, offi, sensi
+
+
+def second_order_02ba(terms: Terms) -> tuple[int, int, int]:
+    """Return Ti, OFFi and SENSi."""
+    dt, t = terms.dt, terms.temp - 2000
+    if t >= 0:
+        return 0, 0, 0
+    return 11 * dt * dt >> 35, 31 * t * t >> 3, 63 * t * t >> 5
+
+
+def compensate_30ba(c: Sequence[int], d1: int, d2: int) -> tuple[int, int]:
+    """Return pressure in 0.1 mbar and temperature in 0.01 degC of C1..C6 and both raw values."""
+    terms = first_order_30ba(c, d2)
+    ti, offi, sensi = second_order_30ba(terms)
+    return (d1 * (terms.sens - sensi) >> 21) - (terms.off - offi) >> 13, terms.temp - ti
+
+
+def compensate_02ba(c: Sequence[int], d1: int, d2: int) -> tuple[int, int]:
+    """Return pressure in 0.01 mbar and temperature in 0.01 degC of C1..C6 and both raw values."""
+    terms = first_order_02ba(c, d2)
+    ti, offi, sensi = second_order_02ba(terms)
+    return (d1 * (terms.sens - sensi) >> 21) - (terms.off - offi) >> 15, terms.temp - ti
+
+
+class _State(Enum):
+    LOST = 0
+    RESETTING = 1
+    IDLE = 2
+    PRESSURE = 3
+    TEMPERATURE = 4
+
+
+class Ms5837:
+    """The sensor as a state machine: each step is at most one command and one short read.
+
+    model: None finds out by the PROM. After any failure the chip is reset and its PROM read again.
+    """
+
+    def __init__(self, bus: I2cBus, model: Model | None = None) -> None:
+        self.model = model
+        self.next_due_ns = 0
+        self._bus = bus
+        self._state = _State.LOST
+        self._since_ns = 0
+        self._cycle_ns = 0
+        self._c: tuple[int, ...] = ()
+        self._d1 = 0
+        self._pressure_stamp_ns = 0
+
+    @classmethod
+    def open(cls, bus: I2cBus, model: Model | None, clock: Clock) -> Self:
+        """Return the sensor once its PROM has been read; raise DeviceError where it cannot be."""
+        device, never = cls(bus, model), threading.Event()
+        while not device.ready:
+            clock.wait_until_ns(device.next_due_ns, never)
+            device.step(clock.now_ns())
+        return device
+
+    @property
+    def name(self) -> str:
+        """What it is called in the configuration."""
+        return f"ms5837_{self.model}" if self.model else "ms5837"
+
+    @property
+    def ready(self) -> bool:
+        """Whether the PROM has been read and the chip converts."""
+        return self._state not in (_State.LOST, _State.RESETTING)
+
+    def step(self, now_ns: int) -> DepthSample | None:
+        """Do what is due at now_ns; return a sample where one is complete.
+
+        A clock set back starts the conversion in hand anew; one set forward is met by the chip's own 0.
+        Raises DeviceError; the chip is tried again RETRY_NS later.
+        """
+        if self._since_ns <= now_ns < self.next_due_ns:
+            return None
+        backwards = now_ns < self._since_ns
+        try:
+            return self._advance(now_ns, backwards)
+        except BuddylineError:
+            self._enter(_State.LOST, now_ns, RETRY_NS)
+            raise
+
+    def _advance(self, now_ns: int, backwards: bool) -> DepthSample | None:
+        if self._state is _State.LOST:
+            self._bus.command(ADDRESS, RESET)
+            self._enter(_State.RESETTING, now_ns, RESET_NS)
+        elif backwards:
+            self._convert_pressure(now_ns)
+        elif self._state is _State.RESETTING:
+            self._read_prom()
+            self._enter(_State.IDLE, now_ns, 0)
+        elif self._state is _State.IDLE:
+            self._convert_pressure(now_ns)
+        elif self._state is _State.PRESSURE:
+            self._d1 = self._read_adc()
+            self._pressure_stamp_ns = self._since_ns + CONVERSION_NS[OVERSAMPLING] // 2
+            self._bus.command(ADDRESS, CONVERT_TEMPERATURE + 2 * OVERSAMPLING)
+            self._enter(_State.TEMPERATURE, now_ns, CONVERSION_NS[OVERSAMPLING])
+        else:
+            sample = self._compensate(self._read_adc())
+            self._enter(_State.IDLE, now_ns, max(0, self._cycle_ns + PERIOD_NS - now_ns))
+            return sample
+        return None
+
+    def _enter(self, state: _State, now_ns: int, wait_ns: int) -> None:
+        self._state = state
+        self._since_ns = now_ns
+        self.next_due_ns = now_ns + wait_ns
+
+    def _convert_pressure(self, now_ns: int) -> None:
+        self._bus.command(ADDRESS, CONVERT_PRESSURE + 2 * OVERSAMPLING)
+        self._cycle_ns = now_ns
+        self._enter(_State.PRESSURE, now_ns, CONVERSION_NS[OVERSAMPLING])
+
+    def _read_prom(self) -> None:
+        words = [int.from_bytes(self._bus.read(ADDRESS, PROM + 2 * i, 2), "big") for i in range(7)]
+        try:
+            self._c = decode_prom(words)
+            if self.model is None:
+                self.model = decode_model(words)
+        except BuddylineError as error:
+            raise self._bus.error(ADDRESS, PROM, f"{self.name}: {error}") from error
+
+    def _read_adc(self) -> int:
+        value = int.from_bytes(self._bus.read(ADDRESS, READ_ADC, 3), "big")
+        if value == 0:
+            raise self._bus.error(ADDRESS, READ_ADC, f"{self.name}: read 0: no conversion was ready")
+        return value
+
+    def _compensate(self, d2: int) -> DepthSample:
+        if self.model == "02ba":
+            pressure, temperature = compensate_02ba(self._c, self._d1, d2)
+            pressure_pa = float(pressure)
+        else:
+            pressure, temperature = compensate_30ba(self._c, self._d1, d2)
+            pressure_pa = 10.0 * pressure
+        temperature_degc = temperature / 100.0
+        low_pa, high_pa = PRESSURE_PA[self.model or "30ba"]
+        if not low_pa < pressure_pa < high_pa or not (TEMPERATURE_DEGC[0] < temperature_degc < TEMPERATURE_DEGC[1]):
+            raise self._bus.error(
+                ADDRESS, READ_ADC, f"{self.name}: {pressure_pa:.0f} Pa, {temperature_degc:.2f} degC: out of its range"
+            )
+        return DepthSample(self._pressure_stamp_ns, pressure_pa, temperature_degc)

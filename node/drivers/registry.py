@@ -1,0 +1,75 @@
+"""Sensors by name, and finding out which are on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.drivers.i2c import I2cBus
+from node.drivers.samples import DepthDevice, DeviceError, ImuDevice
+from protocol.clock import Clock, SystemClock
+from protocol.errors import BuddylineError
+
+AUTO: Final = "auto"
+
+# In the order in which `auto` looks: nine axes before six.
+IMUS: Final[Mapping[str, str]] = {
+    "minimu9_v3": "node.drivers.imu:MinImu9V3",
+    "minimu9_v5": "node.drivers.imu:MinImu9V5",
+    "minimu9_v6": "node.drivers.imu:MinImu9V6",
+    "lsm6ds": "node.drivers.imu:Lsm6dsAlone",
+}
+
+DEPTHS: Final[Mapping[str, tuple[str, str | None]]] = {
+    AUTO: ("node.drivers.ms5837:Ms5837", None),
+    "ms5837_30ba": ("node.drivers.ms5837:Ms5837", "30ba"),
+    "ms5837_02ba": ("node.drivers.ms5837:Ms5837", "02ba"),
+}
+
+
+def open_imu(
+    bus: I2cBus,
+    name: str = AUTO,
+    R_body_chip: NDArray[np.float64] | None = None,
+    clock: Clock | None = None,
+) -> ImuDevice:
+    """Open the IMU of that name, or the first that `auto` finds by identity.
+
+    R_body_chip: (3, 3), maps the board's axes to the body's; default: they are the same.
+    Raises DeviceError where it is not on the bus.
+    """
+    _check_name("imu", name, (AUTO, *IMUS))
+    R = np.eye(3) if R_body_chip is None else R_body_chip
+    for candidate in IMUS if name == AUTO else [name]:
+        device: Any = _load(IMUS[candidate]).find(candidate, bus, R, clock or SystemClock())
+        if device is not None:
+            device.start()
+            found: ImuDevice = device
+            return found
+    wanted = " or ".join(IMUS) if name == AUTO else name
+    raise DeviceError(f"I2C bus {bus.number}: no {wanted} answers: check power and wiring (i2cdetect -y {bus.number})")
+
+
+def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> DepthDevice:
+    """Open the depth sensor of that name; `auto` tells the model by its PROM.
+
+    Returns once the PROM has been read, after 10 ms. Raises DeviceError where it cannot be.
+    """
+    _check_name("depth", name, tuple(DEPTHS))
+    target, model = DEPTHS[name]
+    device: DepthDevice = _load(target).open(bus, model, clock or SystemClock())
+    return device
+
+
+def _check_name(kind: str, name: str, known: tuple[str, ...]) -> None:
+    if name not in known:
+        raise BuddylineError(f"{kind} {name!r}: known are {', '.join(known)}")
+
+
+def _load(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(import_module(module), attribute)

@@ -1,0 +1,73 @@
+"""What sensors give: samples, the two kinds of device, and the error of a device that fails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import BuddylineError
+
+Vector = NDArray[np.float64]
+
+STANDARD_GRAVITY_MPS2 = 9.80665
+
+
+class DeviceError(BuddylineError):
+    """A device that does not do its work; the text names bus, address and register."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuSample:
+    """One reading in the body frame, (3,) each.
+
+    accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None where there is none.
+    """
+
+    stamp_ns: int
+    accel_mps2: Vector
+    gyro_radps: Vector
+    mag_t: Vector | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSample:
+    """Absolute pressure at the port, and the water's temperature there. stamp_ns: middle of its conversion."""
+
+    stamp_ns: int
+    pressure_pa: float
+    temperature_degc: float
+
+
+class ImuDevice(Protocol):
+    """Accelerometer, gyroscope and, where there is one, magnetometer.
+
+    problem: what is wrong although samples come, "" where nothing is.
+    """
+
+    name: str
+    problem: str
+
+    def read(self) -> ImuSample:
+        """Return the newest sample; raise DeviceError where there is none. The next call tries again."""
+        ...
+
+
+class DepthDevice(Protocol):
+    """A pressure sensor whose conversions run beside everything else: nothing here waits."""
+
+    next_due_ns: int
+
+    @property
+    def name(self) -> str:
+        """What it is called in the configuration."""
+        ...
+
+    def step(self, now_ns: int) -> DepthSample | None:
+        """Do what is due, if anything is; return a sample where one is complete.
+
+        Call it at every turn of the loop that owns the bus. Raises DeviceError; later calls try again.
+        """
+        ...

@@ -1,0 +1,59 @@
+"""What ST's inertial chips have in common: identity, settings that stay written, six-byte vectors."""
+
+from __future__ import annotations
+
+import struct
+from typing import ClassVar, Self
+
+import numpy as np
+
+from node.drivers.i2c import I2cBus
+from node.drivers.samples import DeviceError, Vector
+
+WHO_AM_I = 0x0F
+
+
+def decode_vector(data: bytes) -> Vector:
+    """Return three little-endian 16-bit counts, (3,)."""
+    return np.array(struct.unpack("<3h", data), dtype=np.float64)
+
+
+class StChip:
+    """One chip on a bus. Subclasses say what it answers, where it can be, and how it is set up."""
+
+    NAME: ClassVar[str]
+    ADDRESSES: ClassVar[tuple[int, ...]]
+    IDENTITIES: ClassVar[tuple[int, ...]]
+    SETTINGS: ClassVar[tuple[tuple[int, int], ...]]
+
+    def __init__(self, bus: I2cBus, address: int) -> None:
+        self.bus = bus
+        self.address = address
+
+    @classmethod
+    def find(cls, bus: I2cBus) -> Self | None:
+        """Return the chip where one of its addresses answers with its identity, else None."""
+        for address in cls.ADDRESSES:
+            try:
+                identity = bus.read(address, WHO_AM_I, 1)[0]
+            except DeviceError:
+                continue
+            if identity in cls.IDENTITIES:
+                return cls(bus, address)
+        return None
+
+    def start(self) -> None:
+        """Check the identity, write the settings and read them back."""
+        identity = self.bus.read(self.address, WHO_AM_I, 1)[0]
+        if identity not in self.IDENTITIES:
+            expected = " or ".join(f"0x{value:02x}" for value in self.IDENTITIES)
+            raise self.bus.error(
+                self.address,
+                WHO_AM_I,
+                f"answers 0x{identity:02x}, {self.NAME} would answer {expected}: name the chip that is there",
+            )
+        for register, value in self.SETTINGS:
+            self.bus.write(self.address, register, value)
+            kept = self.bus.read(self.address, register, 1)[0]
+            if kept != value:
+                raise self.bus.error(self.address, register, f"{self.NAME} kept 0x{kept:02x} in place of 0x{value:02x}")

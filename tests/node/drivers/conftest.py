@@ -1,0 +1,32 @@
+"""An adapter with chips on the wire, and our bus over unmodified smbus2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from node.drivers.i2c import I2cBus
+from protocol.clock import ManualClock
+from tests.node.drivers.wire import Adapter
+
+START_NS = 1_764_000_000_000_000_000
+
+
+@pytest.fixture
+def clock() -> ManualClock:
+    return ManualClock(START_NS)
+
+
+@pytest.fixture
+def adapter(clock: ManualClock, monkeypatch: pytest.MonkeyPatch) -> Adapter:
+    adapter = Adapter(clock)
+    adapter.attach(monkeypatch)
+    return adapter
+
+
+@pytest.fixture
+def bus(adapter: Adapter) -> Iterator[I2cBus]:
+    with I2cBus(1) as bus:
+        yield bus
+    assert adapter.opened == 0

@@ -1,0 +1,61 @@
+"""Depth out of pressure, and the zero at the surface."""
+
+from __future__ import annotations
+
+import pytest
+
+from node.drivers.depth import STANDARD_AIR_PA, ZERO_SAMPLES, SurfaceZero, depth_m
+from node.drivers.samples import DepthSample
+
+
+def feed(zero: SurfaceZero, pressures_pa: list[float]) -> list[bool]:
+    return [zero.update(DepthSample(i * 50_000_000, p, 12.0)) for i, p in enumerate(pressures_pa)]
+
+
+@pytest.mark.parametrize(("density", "depth"), [(997.0, 30.55), (1025.0, 29.71)])
+def test_depth_of_the_datasheet_pressure(density, depth):
+    assert depth_m(399_980.0, 399_980.0 - 298_660.0, density) == pytest.approx(depth, abs=0.005)
+
+
+def test_depth_is_zero_at_the_surface_and_negative_above():
+    assert depth_m(98_000.0, 98_000.0, 997.0) == 0.0
+    assert depth_m(97_000.0, 98_000.0, 997.0) < 0.0
+
+
+def test_zero_is_the_median_of_two_seconds_of_air():
+    zero = SurfaceZero()
+    told = feed(zero, [95_000.0 + (i % 3 - 1) * 20.0 for i in range(ZERO_SAMPLES - 1)] + [95_400.0] * 100)
+    assert told.index(True) == ZERO_SAMPLES - 1
+    assert sum(told) == 1
+    assert zero.measured
+    assert zero.surface_pa == 95_000.0
+
+
+def test_splashes_do_not_set_a_zero():
+    zero = SurfaceZero()
+    feed(zero, [101_000.0, 102_500.0] * 100)
+    assert not zero.measured
+    assert zero.surface_pa == STANDARD_AIR_PA
+
+
+def test_started_under_water_keeps_the_standard_and_says_how_wrong_it_may_be():
+    zero = SurfaceZero()
+    feed(zero, [130_000.0] * 100)
+    assert not zero.measured
+    assert zero.sigma_m(3.0) > 0.25
+
+
+@pytest.mark.parametrize(("pressure_pa", "surface_pa"), [(104_000.0, 101_000.0), (101_500.0, 101_500.0)])
+def test_the_days_zero_outlives_a_restart(pressure_pa, surface_pa):
+    """At 30 cm a restart must not make that the surface; weather since the morning may."""
+    zero = SurfaceZero(remembered_pa=101_000.0)
+    feed(zero, [pressure_pa] * ZERO_SAMPLES)
+    assert zero.surface_pa == surface_pa
+    assert zero.sigma_m(0.0) < 0.05
+
+
+def test_sigma_grows_with_depth():
+    zero = SurfaceZero()
+    feed(zero, [101_000.0] * ZERO_SAMPLES)
+    assert zero.sigma_m(0.0) < 0.04
+    assert 0.08 < zero.sigma_m(30.0) < 0.12

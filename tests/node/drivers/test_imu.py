@@ -1,0 +1,246 @@
+"""Inertial units over chips on the wire: one contract for all of them, then what each decodes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from node.drivers import l3gd20h, lis3mdl, lsm6ds, lsm303d
+from node.drivers.i2c import I2cBus
+from node.drivers.imu import FROZEN_READINGS, Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
+from node.drivers.ms5837 import Ms5837
+from node.drivers.registry import open_depth, open_imu
+from node.drivers.samples import DeviceError
+from protocol.clock import MS_NS, S_NS
+from protocol.errors import BuddylineError
+from tests.node.drivers import wire
+from tests.node.drivers.wire import Adapter, Sky, StWire
+
+UNITS = ("minimu9_v3", "minimu9_v5", "minimu9_v6", "lsm6ds")
+
+
+def plug(adapter: Adapter, name: str, sky: Sky) -> dict[int, StWire]:
+    chips = {
+        "minimu9_v3": lambda: {0x1D: wire.lsm303d(sky), 0x6B: wire.l3gd20h(sky)},
+        "minimu9_v5": lambda: {0x6B: wire.lsm6ds(sky, 0x69), 0x1E: wire.lis3mdl(sky)},
+        "minimu9_v6": lambda: {0x6B: wire.lsm6ds(sky, 0x6C), 0x1E: wire.lis3mdl(sky)},
+        "lsm6ds": lambda: {0x6A: wire.lsm6ds(sky, 0x6C)},
+    }[name]()
+    adapter.chips.update(chips)
+    return chips
+
+
+def test_vectors_are_little_endian_and_signed():
+    data = bytes([0x00, 0x40, 0xFF, 0xFF, 0x00, 0x80])
+    g = 9.80665
+    assert lsm303d.decode_accel(data) == pytest.approx(np.array([16384, -1, -32768]) * 0.061e-3 * g)
+    assert lsm303d.decode_mag(data) == pytest.approx(np.array([16384, -1, -32768]) * 0.160e-7)
+    assert l3gd20h.decode_gyro(data) == pytest.approx(np.radians(np.array([16384, -1, -32768]) * 17.5e-3))
+    assert lis3mdl.decode_mag(data) == pytest.approx(np.array([16384, -1, -32768]) / 6842 * 1e-4)
+    accel, gyro = lsm6ds.decode_motion(bytes([1, 0, 2, 0, 3, 0]) + data)
+    assert accel == pytest.approx(np.array([16384, -1, -32768]) * 0.061e-3 * g)
+    assert gyro == pytest.approx(np.radians(np.array([1, 2, 3]) * 17.5e-3))
+
+
+@pytest.fixture(params=UNITS)
+def unit(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def sky() -> Sky:
+    return Sky()
+
+
+def test_auto_finds_each_unit(unit, adapter, bus, clock, sky):
+    plug(adapter, unit, sky)
+    device = open_imu(bus, "auto", clock=clock)
+    assert device.name == unit
+    assert open_imu(bus, unit, clock=clock).name == unit
+
+
+def test_a_sample_is_in_si_units_and_stamped(unit, adapter, bus, clock, sky):
+    sky.gyro = (1000, -2000, 3000)
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    clock.set_ns(clock.now_ns() + S_NS)
+    sample = device.read()
+    assert sample.stamp_ns == clock.now_ns()
+    assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
+    assert sample.accel_mps2[2] < 0
+    assert np.degrees(sample.gyro_radps) == pytest.approx([17.5, -35.0, 52.5], abs=0.05)
+    if unit == "lsm6ds":
+        assert sample.mag_t is None
+    else:
+        assert 15e-6 < np.linalg.norm(sample.mag_t) < 60e-6
+    assert device.problem == ""
+
+
+def test_the_mount_turns_all_three_vectors(unit, adapter, bus, clock, sky):
+    """Board's x forward, y left, z up, in a body of x forward, y right, z down."""
+    sky.noisy = False
+    sky.accel, sky.gyro, sky.mag = (0, 100, 16384), (0, 1000, 0), (1000, 500, 0)
+    plug(adapter, unit, sky)
+    sample = open_imu(bus, unit, np.diag([1.0, -1.0, -1.0]), clock).read()
+    assert sample.accel_mps2[2] < -9.7
+    assert sample.gyro_radps[1] == pytest.approx(-math.radians(17.5))
+    if sample.mag_t is not None:
+        assert sample.mag_t[1] / sample.mag_t[0] == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize("R", [np.eye(2), np.diag([1.0, 1.0, -1.0]), np.eye(3) * 2])
+def test_a_mount_that_is_no_rotation_is_refused(R, adapter, bus, clock, sky):
+    plug(adapter, "minimu9_v6", sky)
+    with pytest.raises(BuddylineError, match="mount"):
+        open_imu(bus, "auto", R, clock)
+
+
+def test_nothing_on_the_bus(adapter, bus, clock):
+    with pytest.raises(DeviceError, match=r"bus 1: no minimu9_v3 or .*lsm6ds answers.*i2cdetect"):
+        open_imu(bus, "auto", clock=clock)
+
+
+def test_a_wrong_identity_is_not_taken_for_the_chip(adapter, bus, clock, sky):
+    plug(adapter, "minimu9_v5", sky)
+    adapter.chips[0x6B].registers[0x0F] = 0x6A  # an LSM6DSL
+    for name in ("minimu9_v5", "auto"):
+        with pytest.raises(DeviceError, match="answers"):
+            open_imu(bus, name, clock=clock)
+
+
+def test_unknown_names_are_refused_with_the_known_ones(bus, clock):
+    with pytest.raises(BuddylineError, match="minimu9_v6"):
+        open_imu(bus, "mpu6050", clock=clock)
+    with pytest.raises(BuddylineError, match="ms5837_02ba"):
+        open_depth(bus, "bar100", clock)
+
+
+def test_a_setting_that_does_not_stick_is_named(adapter, bus, clock, sky):
+    chips = plug(adapter, "minimu9_v6", sky)
+    chip = chips[0x6B]
+
+    class Stubborn(dict):
+        def __setitem__(self, register, value):
+            super().__setitem__(register, 0x00 if register == 0x11 else value)
+
+    chip.registers = Stubborn(chip.registers)
+    with pytest.raises(DeviceError, match=r"address 0x6b, register 0x11: .*kept 0x00 in place of 0x54"):
+        open_imu(bus, "minimu9_v6", clock=clock)
+
+
+def test_a_brown_out_in_mid_dive_is_set_up_again(unit, adapter, bus, clock, sky):
+    """The chip NACKs for a while, then is back with everything at its defaults: asleep."""
+    chips = plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    device.read()
+    for chip in chips.values():
+        chip.absent = True
+    for _ in range(5):
+        with pytest.raises(DeviceError, match="no answer"):
+            device.read()
+    for chip in chips.values():
+        chip.absent = False
+        chip.power_cycle()
+    clock.set_ns(clock.now_ns() + 2 * S_NS)
+    sample = device.read()
+    assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
+    assert (sample.mag_t is None) == (unit == "lsm6ds")
+
+
+def test_a_brown_out_that_nobody_saw_is_never_published(unit, adapter, bus, clock, sky):
+    chips = plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    device.read()
+    for chip in chips.values():
+        chip.power_cycle()
+    good = 0
+    for _ in range(60):
+        clock.set_ns(clock.now_ns() + 30 * MS_NS)
+        try:
+            sample = device.read()
+        except DeviceError:
+            continue
+        good += 1
+        assert np.linalg.norm(sample.accel_mps2) > 9.0
+    assert good > 50
+    assert device.problem == ""
+
+
+def test_a_frozen_chip_is_noticed_and_set_up_again(unit, adapter, bus, clock, sky):
+    sky.noisy = False
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    for _ in range(FROZEN_READINGS):
+        device.read()
+    with pytest.raises(DeviceError, match="stopped"):
+        device.read()
+    sky.noisy = True
+    for _ in range(FROZEN_READINGS * 3):
+        device.read()
+
+
+@pytest.mark.parametrize("name", ["minimu9_v5", "minimu9_v6"])
+def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sky):
+    chips = plug(adapter, name, sky)
+    device = open_imu(bus, name, clock=clock)
+    chips[0x1E].absent = True
+    transfers = []
+    for _ in range(100):
+        sample = device.read()
+        assert sample.mag_t is None
+        assert "address 0x1e" in device.problem
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+        transfers.append(chips[0x1E].transfers)
+    assert transfers[-2] == transfers[0]  # not asked at each reading
+    chips[0x1E].absent = False
+    chips[0x1E].power_cycle()
+    clock.set_ns(clock.now_ns() + S_NS)
+    assert device.read().mag_t is not None
+    assert device.problem == ""
+
+
+@pytest.mark.parametrize(
+    ("cls", "name"), [(MinImu9V3, "v3"), (MinImu9V5, "v5"), (MinImu9V6, "v6"), (Lsm6dsAlone, "six")]
+)
+def test_find_answers_none_on_an_empty_bus(cls, name, bus, clock):
+    assert cls.find(name, bus, np.eye(3), clock) is None
+
+
+@pytest.mark.parametrize(
+    ("bit_hz", "unit_name"), [(100_000, "minimu9_v3"), (100_000, "minimu9_v6"), (400_000, "minimu9_v6")]
+)
+def test_100_hz_and_the_depth_fit_on_one_bus(clock, monkeypatch, sky, bit_hz, unit_name):
+    """Wire time alone, at the Pi's default 100 kHz and at 400 kHz: no turn of the loop takes 10 ms."""
+    adapter = Adapter(clock, bit_hz=bit_hz)
+    adapter.attach(monkeypatch)
+    plug(adapter, unit_name, sky)
+    adapter.chips[0x76] = wire.Ms5837Wire(clock, wire.WORDS_30BA, wire.D1_30BA, wire.D2_30BA)
+    with I2cBus(1) as bus:
+        imu, depth = open_imu(bus, "auto", clock=clock), Ms5837.open(bus, None, clock)
+        start_ns, longest_ns, depths = clock.now_ns(), 0, 0
+        for turn in range(200):
+            clock.set_ns(max(clock.now_ns(), start_ns + turn * 10 * MS_NS))
+            before_ns = clock.now_ns()
+            imu.read()
+            depths += depth.step(clock.now_ns()) is not None
+            longest_ns = max(longest_ns, clock.now_ns() - before_ns)
+    assert longest_ns < 5 * MS_NS
+    assert depths >= 38
+    assert clock.now_ns() - start_ns < 2 * S_NS
+
+
+def test_a_hanging_depth_sensor_delays_the_imu_once(bus, adapter, clock, sky):
+    plug(adapter, "minimu9_v6", sky)
+    chip = adapter.chips[0x76] = wire.Ms5837Wire(clock, wire.WORDS_30BA, wire.D1_30BA, wire.D2_30BA)
+    imu, depth = open_imu(bus, clock=clock), Ms5837.open(bus, None, clock)
+    chip.hangs = 1
+    clock.set_ns(depth.next_due_ns)
+    with pytest.raises(DeviceError, match="hangs"):
+        depth.step(clock.now_ns())
+    stalled_ns = clock.now_ns()
+    for _ in range(10):
+        imu.read()
+        assert depth.step(clock.now_ns()) is None
+    assert clock.now_ns() == stalled_ns
