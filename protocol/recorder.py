@@ -45,13 +45,10 @@ class Recorder:
             self._ready.notify()
 
     def _drop_one(self) -> None:
-        for i, (key, payload, _, _) in enumerate(self._queue):
-            parsed = parse_key(key)
-            if parsed and parsed[0] is IMAGE:
-                del self._queue[i]
-                break
-        else:
-            _, payload, _, _ = self._queue.popleft()
+        pictures = (i for i, item in enumerate(self._queue) if (p := parse_key(item[0])) and p[0] is IMAGE)
+        oldest = next(pictures, 0)
+        payload = self._queue[oldest][1]
+        del self._queue[oldest]
         self._queued_bytes -= len(payload)
         self.dropped += 1
 

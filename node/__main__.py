@@ -1,0 +1,50 @@
+"""Run one node: `python -m node --config a.toml`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from protocol.errors import BuddylineError
+from protocol.service import start_logging
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("--config", required=True, metavar="FILE.toml", help="this node's configuration")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, tcp/host:7447, in place of the configured one")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the node until it is stopped; return the exit status."""
+    import msgspec
+
+    from node.config import load_node_config
+    from node.service import NodeService
+
+    config = load_node_config(args.config)
+    if args.connect:
+        config = msgspec.structs.replace(config, connect=args.connect)
+    service = NodeService(config)
+    service.handle_signals()
+    service.open()
+    service.start()
+    service.wait(args.seconds)
+    return service.close()
+
+
+def main() -> int:
+    """Run as a program of its own."""
+    parser = argparse.ArgumentParser(prog="node", description="One Buddyline node: capture, detect, publish, record.")
+    add_arguments(parser)
+    start_logging()
+    try:
+        return run(parser.parse_args())
+    except BuddylineError as error:
+        print(f"node: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

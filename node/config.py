@@ -1,0 +1,137 @@
+"""A node's configuration: one TOML file, strict, with defaults for all that can have one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta, field
+
+from protocol.config import Config, ConfigError, load_config
+from protocol.messages import CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
+
+Fraction = Annotated[float, Meta(ge=0, le=1)]
+
+
+class CameraConfig(Config, frozen=True, kw_only=True):
+    """[camera]: which one, and its fixed settings. path: pictures of the `stored` camera."""
+
+    name: str = "simulated"
+    path: str = ""
+    width_px: Annotated[int, Meta(ge=1, le=65535)] = 820
+    height_px: Annotated[int, Meta(ge=1, le=65535)] = 616
+    exposure_us: Annotated[int, Meta(ge=1)] = 4000
+    gain: Positive = 2.0
+    sync: Literal["off", "server", "client"] = "off"
+
+
+class DetectorConfig(Config, frozen=True, kw_only=True):
+    """[detector]: method, environment, and single values that override a preset."""
+
+    method: str = "source"
+    environment: str = "auto"
+    overrides: dict[str, float] = field(default_factory=dict)
+
+
+class SensorsConfig(Config, frozen=True, kw_only=True):
+    """[sensors]: source of attitude and depth, "simulated", "stored", "i2c" or "none"."""
+
+    name: str = "simulated"
+    imu: str = "auto"
+    depth: str = "auto"
+    i2c_bus: Annotated[int, Meta(ge=0)] = 1
+    mount_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    water_density_kgpm3: Positive = 997.0
+    magnetometer_offset_t: Vector3 = (0.0, 0.0, 0.0)
+    magnetometer_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class CalibrationConfig(Config, frozen=True, kw_only=True):
+    """[calibration]: what NodeInfo carries. Metres and the camera frame: x right, y down, z forward."""
+
+    camera: CameraModel
+    light_left_m: Vector3
+    light_right_m: Vector3
+    sigma_px: Positive = 0.7
+    q_body_camera_xyzw: Quaternion = (0.5, 0.5, 0.5, 0.5)
+    depth_port_m: Vector3 = (0.0, 0.0, 0.0)
+    declination_rad: float = 0.0
+
+
+class RecordConfig(Config, frozen=True, kw_only=True):
+    """[record]: the node's own log. Pictures: at most images_hz of them, JPEG of this quality."""
+
+    directory: str = "dives"
+    images_hz: Annotated[float, Meta(ge=0)] = 1.0
+    image_quality: Annotated[int, Meta(ge=1, le=100)] = 90
+    min_free_mb: Annotated[int, Meta(ge=0)] = 200
+
+
+class PreviewConfig(Config, frozen=True, kw_only=True):
+    """[preview]: small pictures on the bus for a viewer."""
+
+    rate_hz: Annotated[float, Meta(ge=0, le=10)] = 1.0
+    width_px: Annotated[int, Meta(ge=16, le=1640)] = 410
+    quality: Annotated[int, Meta(ge=1, le=100)] = 70
+
+
+class SimulationConfig(Config, frozen=True, kw_only=True):
+    """[simulation]: the world that the simulated camera and sensors are in; the same for both nodes."""
+
+    environment: str = "cavern"
+    seed: Annotated[int, Meta(ge=0)] = 1
+    start_ns: Annotated[int, Meta(ge=0)] = 1_764_000_000_000_000_000
+    node_a: NodeId = "a"
+    node_b: NodeId = "b"
+
+
+class NodeConfig(Config, frozen=True, kw_only=True):
+    """A whole node."""
+
+    node: NodeId
+    connect: str = "tcp/127.0.0.1:7447"
+    namespace: str = ""
+    rate_hz: Annotated[float, Meta(gt=0, le=200)] = 10.0
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    calibration: CalibrationConfig | None = None
+    record: RecordConfig = field(default_factory=RecordConfig)
+    preview: PreviewConfig = field(default_factory=PreviewConfig)
+    simulation: SimulationConfig = field(default_factory=SimulationConfig)
+
+    @property
+    def trigger_period_ns(self) -> int:
+        """Time between triggers."""
+        return round(1e9 / self.rate_hz)
+
+    def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
+        """Return NodeInfo out of [calibration]; raise ConfigError where there is none."""
+        calibration = self.calibration
+        if calibration is None:
+            raise ConfigError(
+                f"node {self.node}: camera {self.camera.name!r} needs a [calibration] table "
+                "(camera, light_left_m, light_right_m); see node/examples"
+            )
+        return NodeInfo(
+            node=self.node,
+            stamp_ns=stamp_ns,
+            width_px=self.camera.width_px,
+            height_px=self.camera.height_px,
+            camera=calibration.camera,
+            light_left_m=calibration.light_left_m,
+            light_right_m=calibration.light_right_m,
+            sigma_px=calibration.sigma_px,
+            trigger_period_ns=self.trigger_period_ns,
+            row_time_ns=row_time_ns,
+            q_body_camera_xyzw=calibration.q_body_camera_xyzw,
+            depth_port_m=calibration.depth_port_m,
+            declination_rad=calibration.declination_rad,
+            software=software,
+            config_sha256=sha256,
+        )
+
+
+def load_node_config(path: Path | str) -> NodeConfig:
+    """Read a node's TOML file; raise ConfigError naming file, field and value."""
+    return load_config(path, NodeConfig)

@@ -1,0 +1,100 @@
+"""Cameras and sensors by name: what they give, and which module serves which name."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.clock import Clock
+from protocol.errors import BuddylineError
+from protocol.messages import Message, NodeInfo
+
+if TYPE_CHECKING:
+    from node.config import NodeConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture: BGR (H, W, 3) or luminance (H, W), uint8.
+
+    stamp_ns: middle of exposure of the middle row, wall clock. row_time_ns: from one row to the next.
+    """
+
+    image: NDArray[np.uint8]
+    stamp_ns: int
+    row_time_ns: int = 0
+
+
+class Camera(Protocol):
+    """Gives one frame per trigger; used by one thread."""
+
+    def info(self) -> NodeInfo | None:
+        """Return the calibration that comes with the pictures; None: it stands in the configuration."""
+        ...
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next trigger's frame; None where there will be none, or stop is set."""
+        ...
+
+    def close(self) -> None:
+        """Free the device."""
+        ...
+
+
+class Source(Protocol):
+    """One sensor, or several that are read together; used by one thread."""
+
+    name: str
+
+    def next_messages(self, stop: threading.Event) -> list[Message] | None:
+        """Wait for the next samples (Imu, Attitude, Depth); None where there will be none, or stop is set."""
+        ...
+
+    def close(self) -> None:
+        """Free the device."""
+        ...
+
+
+CAMERAS: Final[Mapping[str, str]] = {
+    "simulated": "node.sim.devices:open_camera",
+    "stored": "node.drivers.stored:open_camera",
+    "picamera2": "node.drivers.camera_picamera2:open_camera",
+}
+
+SENSORS: Final[Mapping[str, str]] = {
+    "simulated": "node.sim.devices:open_sensors",
+    "stored": "node.drivers.stored:open_sensors",
+    "i2c": "node.drivers.devices:open_sensors",
+}
+
+
+def load(registry: Mapping[str, str], what: str, name: str) -> Callable[..., Any]:
+    """Import what serves a name; raise BuddylineError where there is none, or its package is missing."""
+    target = registry.get(name)
+    if target is None:
+        raise BuddylineError(f"{what} {name!r}: known are {', '.join(registry)}")
+    module, _, attribute = target.partition(":")
+    try:
+        return getattr(import_module(module), attribute)  # type: ignore[no-any-return]
+    except ModuleNotFoundError as error:
+        raise BuddylineError(f"{what} {name!r} needs the package {error.name}: pip install 'buddyline[pi]'") from error
+
+
+def open_camera(config: NodeConfig, clock: Clock) -> Camera:
+    """Open the configured camera."""
+    camera: Camera = load(CAMERAS, "camera", config.camera.name)(config, clock)
+    return camera
+
+
+def open_sensors(config: NodeConfig, clock: Clock) -> list[Source]:
+    """Open the configured sensors; none of them for "none"."""
+    if config.sensors.name == "none":
+        return []
+    sources: list[Source] = load(SENSORS, "sensors", config.sensors.name)(config, clock)
+    return sources

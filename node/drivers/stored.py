@@ -1,0 +1,206 @@
+"""Stored pictures as a camera: a folder of them, or a dive log with what its sensors said.
+
+A dive log keeps its own times; it is given out at the pace it was recorded at. Pictures of a folder come one
+a trigger.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.config import NodeConfig
+from node.devices import Frame
+from protocol.clock import Clock
+from protocol.config import ConfigError
+from protocol.divelog import DiveLogReader
+from protocol.errors import BuddylineError
+from protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, MessageError, NodeInfo
+from protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
+
+log = logging.getLogger(__name__)
+
+PICTURE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+
+
+class PictureError(BuddylineError):
+    """A picture that cannot be used."""
+
+
+def decode_picture(data: bytes, name: str) -> NDArray[np.uint8]:
+    """Return a stored picture, BGR (H, W, 3) or grey (H, W); name: what an error calls it."""
+    raw = np.frombuffer(data, np.uint8)
+    picture = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if raw.size else None
+    if picture is None:
+        raise PictureError(f"{name}: is not a picture, or is cut off")
+    if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-64:]:
+        raise PictureError(f"{name}: is cut off (a JPEG without its end)")
+    if picture.dtype == np.uint16:
+        raise PictureError(f"{name}: has 16 bits a channel; convert it to 8 first")
+    if picture.dtype != np.uint8:
+        raise PictureError(f"{name}: has values of type {picture.dtype}, not 8 bits")
+    if picture.ndim == 3 and picture.shape[2] == 4:
+        picture = picture[:, :, :3]
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[:, :, 0]
+    return np.ascontiguousarray(picture, np.uint8)
+
+
+def picture_files(path: Path) -> list[Path]:
+    """Return the pictures of a folder, or a single one, by name."""
+    if path.is_dir():
+        return sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+    return [path]
+
+
+class FolderCamera:
+    """One picture of a folder a trigger; broken ones are counted and skipped."""
+
+    def __init__(self, files: list[Path], trigger_period_ns: int, clock: Clock) -> None:
+        self.skipped = 0
+        self._files = iter(files)
+        self._period_ns = trigger_period_ns
+        self._clock = clock
+        self._next_ns = 0
+
+    def info(self) -> NodeInfo | None:
+        """Return None: pictures alone carry no calibration."""
+        return None
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next trigger instant and return the next sound picture."""
+        for file in self._files:
+            try:
+                picture = decode_picture(file.read_bytes(), str(file))
+            except (BuddylineError, OSError) as error:
+                self.skipped += 1
+                log.warning("skipped: %s", error)
+                continue
+            due_ns = (self._clock.now_ns() // self._period_ns + 1) * self._period_ns
+            self._next_ns = max(due_ns, self._next_ns + self._period_ns)
+            if self._clock.wait_until_ns(self._next_ns, stop):
+                return None
+            return Frame(picture, self._next_ns)
+        return None
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class _Paced:
+    """Messages of one node of a log, each when its time has come."""
+
+    def __init__(self, path: Path, node: str, kinds: frozenset[str], clock: Clock) -> None:
+        self._reader = DiveLogReader(path)
+        self._path = path
+        self._node = node
+        self._messages = self._decoded(kinds)
+        self._clock = clock
+        self._began_ns: int | None = None
+
+    def _decoded(self, kinds: frozenset[str]) -> Iterator[Message]:
+        for record in self._reader.records(lambda key: key in kinds):
+            try:
+                message = record.decode()
+            except MessageError as error:
+                log.warning("%s: skipped: %s", self._path, error)
+                continue
+            if message is not None:
+                yield message
+
+    def next_message(self, stop: threading.Event) -> Message | None:
+        message = next(self._messages, None)
+        if message is None:
+            return None
+        if self._began_ns is None:
+            self._began_ns = self._clock.now_ns()
+        stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
+        due_ns = self._began_ns + stamp_ns - (self._reader.start_ns or stamp_ns)
+        return None if self._clock.wait_until_ns(due_ns, stop) else message
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class DiveCamera:
+    """The pictures of one node in a dive log, with the log's own calibration and times."""
+
+    def __init__(self, path: Path, node: str, clock: Clock) -> None:
+        with DiveLogReader(path) as reader:
+            key = INFO.key(node)
+            found = next(iter(reader.records(lambda topic: topic == key)), None)
+            message = found.decode() if found else None
+            if IMAGE.key(node) not in reader.keys:
+                raise ConfigError(f"{path}: holds no pictures of node {node}; topics: {', '.join(reader.keys)}")
+        self._info = message if isinstance(message, NodeInfo) else None
+        self._paced = _Paced(path, node, frozenset({IMAGE.key(node)}), clock)
+        self.skipped = 0
+
+    def info(self) -> NodeInfo | None:
+        """Return the log's calibration of this node."""
+        return self._info
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next picture's time and return it."""
+        while (message := self._paced.next_message(stop)) is not None:
+            if not isinstance(message, CompressedImage):
+                continue
+            try:
+                picture = decode_picture(message.data, f"picture at {message.stamp_ns}")
+            except PictureError as error:
+                self.skipped += 1
+                log.warning("skipped: %s", error)
+                continue
+            return Frame(picture, message.stamp_ns, self._info.row_time_ns if self._info else 0)
+        return None
+
+    def close(self) -> None:
+        """Close the log."""
+        self._paced.close()
+
+
+class DiveSensors:
+    """Attitude, depth and inertial samples of one node in a dive log."""
+
+    name = "stored sensors"
+
+    def __init__(self, path: Path, node: str, clock: Clock) -> None:
+        kinds = frozenset({ATTITUDE.key(node), DEPTH.key(node), IMU.key(node)})
+        self._paced = _Paced(path, node, kinds, clock)
+
+    def next_messages(self, stop: threading.Event) -> list[Message] | None:
+        """Wait for the next sample's time and return it."""
+        message = self._paced.next_message(stop)
+        return [message] if isinstance(message, Attitude | Depth | Imu) else None
+
+    def close(self) -> None:
+        """Close the log."""
+        self._paced.close()
+
+
+def open_camera(config: NodeConfig, clock: Clock) -> FolderCamera | DiveCamera:
+    """Open `camera.path`: a folder, a picture, or a dive log."""
+    path = Path(config.camera.path)
+    if not config.camera.path or not path.exists():
+        raise ConfigError(f"camera.path = {config.camera.path!r}: no such folder, picture or dive log")
+    if path.suffix == ".mcap":
+        return DiveCamera(path, config.node, clock)
+    files = picture_files(path)
+    if not files:
+        raise ConfigError(f"camera.path = {config.camera.path!r}: holds no pictures")
+    return FolderCamera(files, config.trigger_period_ns, clock)
+
+
+def open_sensors(config: NodeConfig, clock: Clock) -> list[DiveSensors]:
+    """Open the sensors of the dive log in `camera.path`."""
+    path = Path(config.camera.path)
+    if path.suffix != ".mcap" or not path.exists():
+        raise ConfigError(f"sensors.name = 'stored' needs a dive log in camera.path, not {config.camera.path!r}")
+    return [DiveSensors(path, config.node, clock)]

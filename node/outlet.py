@@ -1,0 +1,67 @@
+"""Where a node's messages go: its own log, always, and the bus once there is one."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from protocol.clock import Clock
+from protocol.messages import Message, encode
+from protocol.topics import Topic, key_of, topic_of
+
+if TYPE_CHECKING:
+    from protocol.bus import Bus, Publisher
+
+    from protocol.recorder import Recorder
+
+
+class Outlet:
+    """Records and publishes; safe to use from several threads.
+
+    Messages from before the bus was there are in the log alone; info and status are sent again when it comes.
+    """
+
+    def __init__(self, node: str, recorder: Recorder, clock: Clock) -> None:
+        self.node = node
+        self.sent: Counter[str] = Counter()
+        self._recorder = recorder
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._bus: Bus | None = None
+        self._publishers: dict[str, Publisher] = {}
+        self._latest: dict[str, Message] = {}
+
+    def send(self, message: Message, *, record: bool = True, publish: bool = True) -> None:
+        """Record and publish one message."""
+        topic = topic_of(message)
+        payload = encode(message)
+        if record:
+            self._recorder.write(key_of(message), payload, self._clock.now_ns())
+        with self._lock:
+            self.sent[topic.name] += 1
+            if topic.latest_only:
+                self._latest[topic.name] = message
+            if publish and self._bus is not None:
+                self._publisher(topic).put_bytes(payload)
+
+    def connect(self, bus: Bus) -> None:
+        """Publish from now on."""
+        with self._lock:
+            self._bus = bus
+            for message in self._latest.values():
+                self._publisher(topic_of(message)).put_bytes(encode(message))
+
+    def disconnect(self) -> None:
+        """Publish no longer; the publishers are closed with their bus."""
+        with self._lock:
+            self._bus = None
+            self._publishers.clear()
+
+    def _publisher(self, topic: Topic) -> Publisher:
+        publisher = self._publishers.get(topic.name)
+        if publisher is None and self._bus is not None:
+            publisher = self._publishers[topic.name] = self._bus.publisher(topic, self.node)
+        if publisher is None:
+            raise RuntimeError("no bus")
+        return publisher

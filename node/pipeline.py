@@ -1,0 +1,72 @@
+"""From a frame to the message: the pure part of a node."""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+
+import msgspec
+
+from node.detect import Detection, Detector
+from node.devices import Frame
+from protocol.clock import trigger_index
+from protocol.messages import MAX_BLOBS, Blob, Candidates
+
+__all__ = ["Pipeline", "blobs_of"]
+
+
+def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int]:
+    """Return at most 64 blobs inside the picture, with their rows' times, and how many were left out."""
+    height, width = frame.image.shape[:2]
+    middle_row = (height - 1) / 2
+    blobs = [
+        msgspec.structs.replace(d.blob, dt_ns=round((d.blob.v_px - middle_row) * frame.row_time_ns))
+        for d in detections
+        if -0.5 <= d.blob.u_px <= width - 0.5 and -0.5 <= d.blob.v_px <= height - 0.5 and d.blob.sigma_px > 0
+    ]
+    return blobs[:MAX_BLOBS], max(len(blobs) - MAX_BLOBS, 0)
+
+
+class Pipeline:
+    """Detects, and numbers the result; one a camera."""
+
+    def __init__(self, node: str, boot: str, trigger_period_ns: int, detector: Detector) -> None:
+        self.node = node
+        self.boot = boot
+        self.trigger_period_ns = trigger_period_ns
+        self.residuals_s: deque[float] = deque(maxlen=100)
+        self.repeated = 0
+        self.detections: list[Detection] = []  # of the last frame, for whoever draws them
+        self._detector = detector
+        self._seq = 0
+        self._last_trigger = -1
+
+    def candidates(self, frame: Frame) -> Candidates | None:
+        """Return the frame's candidates; None where its trigger has had a frame already."""
+        trigger = trigger_index(frame.stamp_ns, self.trigger_period_ns)
+        if trigger == self._last_trigger:
+            self.repeated += 1
+            return None
+        self._last_trigger = trigger
+        self.residuals_s.append((frame.stamp_ns - trigger * self.trigger_period_ns) / 1e9)
+        self.detections = self._detector.detect(frame.image)
+        blobs, truncated = blobs_of(self.detections, frame)
+        height, width = frame.image.shape[:2]
+        message = Candidates(
+            node=self.node,
+            stamp_ns=frame.stamp_ns,
+            trigger=trigger,
+            seq=self._seq,
+            boot=self.boot,
+            width_px=width,
+            height_px=height,
+            blobs=blobs,
+            truncated=truncated,
+        )
+        self._seq += 1
+        return message
+
+    @property
+    def residual_s(self) -> float | None:
+        """Median distance of late exposures from their trigger instants."""
+        return statistics.median(self.residuals_s) if self.residuals_s else None

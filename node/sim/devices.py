@@ -1,0 +1,109 @@
+"""The simulated world as a node's camera and sensors, in real time."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import cast
+
+from node.config import NodeConfig, SimulationConfig
+from node.devices import Frame
+from node.sim.scenario import ENVIRONMENTS, Environment, Scenario
+from node.sim.world import World
+from protocol.clock import S_NS, Clock
+from protocol.config import ConfigError
+from protocol.messages import Message, NodeInfo
+
+ATTITUDE_HZ = 50
+IMU_HZ = 100
+DEPTH_HZ = 10
+
+
+def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> Scenario:
+    """Return the world that a configuration describes; raise ConfigError for an unknown environment."""
+    if simulation.environment not in ENVIRONMENTS:
+        raise ConfigError(f"simulation.environment = {simulation.environment!r}: known are {', '.join(ENVIRONMENTS)}")
+    return Scenario(
+        environment=cast(Environment, simulation.environment),
+        seed=simulation.seed,
+        start_ns=simulation.start_ns,
+        node_a=simulation.node_a,
+        node_b=simulation.node_b,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+def next_instant_ns(after_ns: int, period_ns: int) -> int:
+    """Return the first multiple of period_ns later than after_ns."""
+    return (after_ns // period_ns + 1) * period_ns
+
+
+class SimulatedCamera:
+    """Renders what the node sees at each trigger instant."""
+
+    def __init__(self, config: NodeConfig, clock: Clock) -> None:
+        camera = config.camera
+        self._world = World(scenario_of(config.simulation, camera.width_px, camera.height_px))
+        self._node = config.node
+        self._clock = clock
+        self._period_ns = config.trigger_period_ns
+        self._info = self._world.info(self._node, clock.now_ns(), self._period_ns)
+        self._last_ns = clock.now_ns()
+
+    def info(self) -> NodeInfo | None:
+        """Return the simulated rig."""
+        return self._info
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next trigger instant and render it; instants that went by meanwhile are skipped."""
+        instant_ns = next_instant_ns(max(self._clock.now_ns() - self._period_ns // 2, self._last_ns), self._period_ns)
+        if self._clock.wait_until_ns(instant_ns, stop):
+            return None
+        self._last_ns = instant_ns
+        return Frame(self._world.render(self._node, instant_ns), instant_ns)
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class SimulatedSensor:
+    """One sensor of the simulated node at a constant rate."""
+
+    def __init__(self, name: str, rate_hz: int, sample: Callable[[int], Message], clock: Clock) -> None:
+        self.name = name
+        self._period_ns = S_NS // rate_hz
+        self._sample = sample
+        self._clock = clock
+        self._last_ns = clock.now_ns()
+
+    def next_messages(self, stop: threading.Event) -> list[Message] | None:
+        """Wait for the next sample's instant."""
+        instant_ns = next_instant_ns(max(self._clock.now_ns() - S_NS, self._last_ns), self._period_ns)
+        if self._clock.wait_until_ns(instant_ns, stop):
+            return None
+        self._last_ns = instant_ns
+        return [self._sample(instant_ns)]
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+def open_camera(config: NodeConfig, clock: Clock) -> SimulatedCamera:
+    """Open the simulated camera."""
+    if config.node not in (config.simulation.node_a, config.simulation.node_b):
+        raise ConfigError(
+            f"node = {config.node!r}: simulation knows {config.simulation.node_a!r} and {config.simulation.node_b!r}"
+        )
+    return SimulatedCamera(config, clock)
+
+
+def open_sensors(config: NodeConfig, clock: Clock) -> list[SimulatedSensor]:
+    """Open the simulated attitude, depth gauge and inertial unit."""
+    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    node = config.node
+    return [
+        SimulatedSensor("attitude", ATTITUDE_HZ, lambda stamp_ns: world.attitude(node, stamp_ns), clock),
+        SimulatedSensor("depth", DEPTH_HZ, lambda stamp_ns: world.depth(node, stamp_ns), clock),
+        SimulatedSensor("imu", IMU_HZ, lambda stamp_ns: world.imu(node, stamp_ns), clock),
+    ]

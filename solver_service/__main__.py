@@ -1,0 +1,51 @@
+"""Run the solver: `python -m solver_service`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from protocol.errors import BuddylineError
+from protocol.service import start_logging
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("--config", metavar="FILE.toml", help="the solver's configuration (all of it has defaults)")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, tcp/host:7447, in place of the configured one")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the solver until it is stopped; return the exit status."""
+    import msgspec
+
+    from solver_service.config import load_solver_config
+    from solver_service.service import SolverService
+
+    config = load_solver_config(args.config)
+    if args.connect:
+        config = msgspec.structs.replace(config, connect=args.connect)
+    service = SolverService(config, args.config or "defaults")
+    service.handle_signals()
+    service.start()
+    service.wait(args.seconds)
+    return service.join()
+
+
+def main() -> int:
+    """Run as a program of its own."""
+    parser = argparse.ArgumentParser(
+        prog="solver_service", description="Buddyline's solver: candidates of two nodes in, relative poses out."
+    )
+    add_arguments(parser)
+    start_logging()
+    try:
+        return run(parser.parse_args())
+    except BuddylineError as error:
+        print(f"solver: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""The solver's configuration: one TOML file, strict; every key has a default."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta, field
+
+from protocol.config import Config, ConfigError, load_config
+from protocol.messages import NodeId
+from solver_service.geometry.trigger import METHODS, Settings
+
+CHECKS = ("range", "twist", "attitude", "depth")
+
+
+class SolveConfig(Config, frozen=True, kw_only=True):
+    """[solve]: method, the checks to use, and the ranges to believe."""
+
+    method: str = "refined"
+    checks: list[str] = field(default_factory=lambda: list(CHECKS))
+    range_min_m: Annotated[float, Meta(gt=0)] = 0.5
+    range_max_m: Annotated[float, Meta(gt=0)] = 30.0
+
+    def settings(self, source: str) -> Settings:
+        """Return what the geometry takes; source: the file, for errors."""
+        if self.method not in METHODS:
+            raise ConfigError(f"{source}: solve.method = {self.method!r}: known are {', '.join(METHODS)}")
+        unknown = [check for check in self.checks if check not in CHECKS]
+        if unknown:
+            raise ConfigError(f"{source}: solve.checks = {unknown[0]!r}: known are {', '.join(CHECKS)}")
+        if self.range_min_m >= self.range_max_m:
+            raise ConfigError(f"{source}: solve.range_min_m = {self.range_min_m}: not below range_max_m")
+        return Settings(
+            method=self.method,
+            checks=frozenset(self.checks),
+            range_min_m=self.range_min_m,
+            range_max_m=self.range_max_m,
+        )
+
+
+class SolverConfig(Config, frozen=True, kw_only=True):
+    """A whole solver. nodes: the pair [a, b]; empty: the first two that appear, in alphabetical order."""
+
+    nodes: list[NodeId] = field(default_factory=list)
+    connect: str = "tcp/127.0.0.1:7447"
+    namespace: str = ""
+    solve: SolveConfig = field(default_factory=SolveConfig)
+
+    def __post_init__(self) -> None:
+        """Check the pair."""
+        if len(self.nodes) not in (0, 2) or len(set(self.nodes)) != len(self.nodes):
+            raise ValueError(f"nodes: two different ids, or none, not {self.nodes}")
+
+
+def load_solver_config(path: Path | str | None) -> SolverConfig:
+    """Read the solver's TOML file, or take the defaults; raise ConfigError naming file, field and value."""
+    return SolverConfig() if path is None else load_config(path, SolverConfig)

@@ -1,0 +1,225 @@
+"""The solver's pure core: messages in, poses and rejections out; no clock, no bus, no files.
+
+The live service, the offline solver, replay and tests all call `SolverCore.handle`. Triggers are resolved in
+their own order and from their own data alone, so that the same messages give the same poses in whatever
+order they arrive within the matching window.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from typing import Final
+
+from protocol.clock import S_NS
+from protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    Message,
+    NodeInfo,
+    Reason,
+    Rejected,
+    RelativePose,
+)
+from solver_service.geometry.trigger import Fix, Settings, solve_trigger
+from solver_service.prior import PosePrior
+from solver_service.results import relative_pose, rig_of, sensed_of, view_of
+from solver_service.streams import Arrival, NodeStream
+
+# How long, in the dive's own time, a frame waits for the other node's frame that may still come.
+MATCH_WINDOW_NS: Final = 1 * S_NS
+# Where the other node is silent altogether.
+SILENCE_WINDOW_NS: Final = 2 * S_NS
+MAX_PENDING: Final = 512
+MAX_RESOLVED_MEMORY: Final = 8192
+
+
+class SolverCore:
+    """Matches the frames of nodes a and b, and solves each trigger once.
+
+    `counts` holds what became of the triggers ("solved" and the reasons), `late`, `duplicates`, `foreign`
+    what was not used.
+    """
+
+    def __init__(self, node_a: str, node_b: str, settings: Settings) -> None:
+        if node_a == node_b:
+            raise ValueError(f"the two nodes have the same id, {node_a!r}")
+        self.node_a = node_a
+        self.node_b = node_b
+        self.settings = settings
+        self.counts: Counter[str] = Counter()
+        self.matched = 0
+        self.late = 0
+        self.duplicates = 0
+        self.foreign = 0
+        self._a = NodeStream(node_a)
+        self._b = NodeStream(node_b)
+        self._conflicts: set[int] = set()
+        self._resolved: OrderedDict[int, None] = OrderedDict()
+        self._newest_resolved = -1
+        self._prior = PosePrior()
+
+    @property
+    def received(self) -> tuple[int, int]:
+        """Frames received from a and b."""
+        return self._a.received, self._b.received
+
+    @property
+    def newest_ns(self) -> tuple[int | None, int | None]:
+        """Stamps of the newest frames of a and b."""
+        return self._a.newest_ns, self._b.newest_ns
+
+    @property
+    def pending(self) -> int:
+        """Triggers that wait for something."""
+        return len(self._pending())
+
+    def handle(self, message: Message) -> list[RelativePose | Rejected]:
+        """Take one message of a node; return what is resolved by it, in the order of the triggers."""
+        stream = {self.node_a: self._a, self.node_b: self._b}.get(getattr(message, "node", ""))
+        if stream is None:
+            self.foreign += 1
+            return []
+        if isinstance(message, NodeInfo):
+            stream.add_info(message)
+        elif isinstance(message, Attitude):
+            stream.attitude.add(message)
+        elif isinstance(message, Depth):
+            stream.depth.add(message)
+        elif isinstance(message, Candidates):
+            early = self._take_frame(stream, message)
+            return early + self._resolve()
+        else:
+            return []
+        return self._resolve()
+
+    def flush(self) -> list[RelativePose | Rejected]:
+        """Resolve all that is pending with what there is: the dive has ended or has paused."""
+        return self._resolve(everything=True)
+
+    def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
+        arrival = stream.add_frame(frame)
+        if arrival is Arrival.DUPLICATE:
+            self.duplicates += 1
+            return []
+        if arrival is Arrival.CLOCK_SET:
+            self._resolved.clear()
+            self._newest_resolved = -1
+            self._prior.lose()
+            return []
+        if arrival is Arrival.FAR:
+            self.late += 1
+            seconds = (frame.stamp_ns - (stream.newest_ns or 0)) / S_NS
+            detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
+            return [] if frame.trigger in self._resolved else [self._reject(frame, "late", detail)]
+        if frame.trigger in self._resolved:
+            stream.frames.pop(frame.trigger, None)
+            self.late += 1
+            return []
+        if arrival is Arrival.CONFLICT:
+            self._conflicts.add(frame.trigger)
+            return []
+        if frame.trigger < self._newest_resolved:
+            stream.frames.pop(frame.trigger, None)
+            self.late += 1
+            return [self._reject(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
+        return []
+
+    def _pending(self) -> list[int]:
+        return sorted(self._a.frames.keys() | self._b.frames.keys())
+
+    def _resolve(self, *, everything: bool = False) -> list[RelativePose | Rejected]:
+        results: list[RelativePose | Rejected] = []
+        pending = self._pending()
+        for position, trigger in enumerate(pending):
+            crowded = len(pending) - position > MAX_PENDING
+            result = self._resolve_one(trigger, at_once=everything or crowded)
+            if result is None:
+                break
+            results.append(result)
+        return results
+
+    def _resolve_one(self, trigger: int, *, at_once: bool) -> RelativePose | Rejected | None:
+        """Resolve one trigger; None where it still waits for something that may come."""
+        frame_a, frame_b = self._a.frames.get(trigger), self._b.frames.get(trigger)
+        frame = frame_a or frame_b
+        if frame is None:
+            return None
+        if trigger in self._conflicts:
+            return self._reject(frame, "duplicate", "two different frames claim this trigger: two nodes of one id?")
+        if frame_a is None or frame_b is None:
+            other = self._b if frame_b is None else self._a
+            if not (at_once or other.has_passed(trigger) or self._expired(frame, other)):
+                return None
+            return self._reject(frame, "unmatched", f"no frame of {other.node} for this trigger")
+        expired = at_once or self._expired(frame_a, self._b) or self._expired(frame_b, self._a)
+        info_a, info_b = self._a.info_at(frame_a.stamp_ns), self._b.info_at(frame_b.stamp_ns)
+        if info_a is None or info_b is None:
+            if not expired:
+                return None
+            missing = " and ".join(n for n, info in ((self.node_a, info_a), (self.node_b, info_b)) if info is None)
+            return self._reject(frame_a, "no_info", f"no NodeInfo of {missing}")
+        covered = self._a.sensors_cover(frame_a.stamp_ns) and self._b.sensors_cover(frame_b.stamp_ns)
+        if not covered and not at_once:
+            return None
+        return self._solve(frame_a, frame_b, info_a, info_b)
+
+    def _expired(self, frame: Candidates, other: NodeStream) -> bool:
+        """Whether the other node's frame for the same trigger can be given up."""
+        own = self._a if other is self._b else self._b
+        other_ns = other.newest_ns if other.newest_ns is not None else 0
+        own_ns = own.newest_ns if own.newest_ns is not None else 0
+        return other_ns - frame.stamp_ns > MATCH_WINDOW_NS or own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
+
+    def _solve(
+        self, frame_a: Candidates, frame_b: Candidates, info_a: NodeInfo, info_b: NodeInfo
+    ) -> RelativePose | Rejected:
+        self.matched += 1
+        for frame, info in ((frame_a, info_a), (frame_b, info_b)):
+            if (frame.width_px, frame.height_px) != (info.width_px, info.height_px):
+                detail = (
+                    f"frame of {frame.node} is {frame.width_px}x{frame.height_px} px, "
+                    f"its calibration {info.width_px}x{info.height_px}"
+                )
+                return self._reject(frame, "no_info", detail)
+        stamp_ns = (frame_a.stamp_ns + frame_b.stamp_ns) // 2
+        sensed_a = sensed_of(self._a.attitude, self._a.depth, frame_a.stamp_ns)
+        sensed_b = sensed_of(self._b.attitude, self._b.depth, frame_b.stamp_ns)
+        outcome = solve_trigger(
+            view_of(frame_a),
+            view_of(frame_b),
+            rig_of(info_a),
+            rig_of(info_b),
+            sensed_a,
+            sensed_b,
+            self.settings,
+            self._prior.at(stamp_ns),
+        )
+        if not isinstance(outcome, Fix):
+            return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
+        self._prior.update(stamp_ns, outcome)
+        self._finish(frame_a.trigger)
+        self.counts["solved"] += 1
+        return relative_pose(frame_a, frame_b, rig_of(info_a), sensed_a, outcome)
+
+    def _reject(self, frame: Candidates, reason: Reason, detail: str, stamp_ns: int | None = None) -> Rejected:
+        self._finish(frame.trigger, newest=reason != "late")
+        self.counts[reason] += 1
+        return Rejected(
+            node_a=self.node_a,
+            node_b=self.node_b,
+            stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
+            trigger=frame.trigger,
+            reason=reason,
+            detail=detail,
+        )
+
+    def _finish(self, trigger: int, *, newest: bool = True) -> None:
+        self._a.frames.pop(trigger, None)
+        self._b.frames.pop(trigger, None)
+        self._conflicts.discard(trigger)
+        self._resolved[trigger] = None
+        if len(self._resolved) > MAX_RESOLVED_MEMORY:
+            self._resolved.popitem(last=False)
+        if newest:
+            self._newest_resolved = max(self._newest_resolved, trigger)

@@ -1,0 +1,193 @@
+"""The live solver: subscribes to both nodes, feeds the core, publishes what it resolves."""
+
+from __future__ import annotations
+
+import logging
+import math
+import statistics
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from msgspec import UNSET
+
+from protocol import __version__
+from protocol.clock import S_NS, Clock, SystemClock
+from protocol.messages import Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
+from protocol.service import Service
+from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, parse_key
+from solver_service.config import SolverConfig
+from solver_service.core import SolverCore
+
+if TYPE_CHECKING:
+    from protocol.bus import Bus, Publisher, Received
+
+log = logging.getLogger(__name__)
+
+# A dive that pauses this long is taken as ended: what waits is resolved with what there is.
+PAUSE_S: Final = 2.5
+STALE_S: Final = 2.0
+# Poses of live dives have latencies; those of stored ones do not.
+LIVE_WITHIN_NS: Final = 60 * S_NS
+BUFFERED_BEFORE_PAIR: Final = 4096
+
+
+class SolverService(Service):
+    """Solves the configured pair, or the first two nodes that appear."""
+
+    def __init__(self, config: SolverConfig, source: str = "defaults", clock: Clock | None = None) -> None:
+        super().__init__("solver")
+        self.config = config
+        self.clock = clock or SystemClock()
+        self.bad_messages = 0
+        self._settings = config.solve.settings(source)
+        self._core: SolverCore | None = None
+        self._before_pair: deque[Message] = deque(maxlen=BUFFERED_BEFORE_PAIR)
+        self._seen: list[str] = []
+        self._lock = threading.Lock()
+        self._bus: Bus | None = None
+        self._publishers: dict[str, Publisher] = {}
+        self._latencies_s: deque[float] = deque(maxlen=2000)
+        self._last_frame_s: dict[str, float] = {}
+        self._reported_bad = ""
+        if config.nodes:
+            self._pair(*config.nodes)
+
+    def start(self) -> None:
+        """Start all threads."""
+        self.spawn("bus", self._connect)
+
+    def _connect(self) -> None:
+        from protocol.zenoh_bus import connect
+
+        bus = connect(
+            self.config.connect,
+            namespace=self.config.namespace or None,
+            stop=self.stop,
+            on_wait=lambda text: log.info("solver: %s", text),
+        )
+        if bus is None:
+            return
+        with bus:
+            self.attach(bus)
+            bus.declare_alive(f"solver/{'_'.join(self.config.nodes) or 'any'}")
+            log.info("solver: connected to %s", self.config.connect)
+            while not self.stop.wait(1.0):
+                self._report()
+            self._publish(self._core.flush() if self._core else [])
+
+    def attach(self, bus: Bus) -> None:
+        """Subscribe to the nodes, and publish on this bus."""
+        self._bus = bus
+        if self._core is not None:
+            self._declare(self._core)
+        bus.subscribe(INFO.key_any(), self.receive, capacity=64)
+        bus.subscribe(ATTITUDE.key_any(), self.receive, capacity=8192)
+        bus.subscribe(DEPTH.key_any(), self.receive, capacity=4096)
+        bus.subscribe(CANDIDATES.key_any(), self.receive, capacity=4096)
+
+    def receive(self, received: Received) -> None:
+        """Take one message off the bus; a bad one is counted and reported, and stops nothing."""
+        parsed = parse_key(received.key)
+        if parsed is None:
+            return
+        topic, (node,) = parsed
+        try:
+            message = decode(received.payload, topic.schema)
+            if getattr(message, "node", None) != node:
+                raise MessageError(
+                    f"{topic.schema_name}: node {getattr(message, 'node', None)!r} on key {received.key}"
+                )
+        except MessageError as error:
+            self.bad_messages += 1
+            self._reported_bad = f"bad message on {received.key}: {error}"
+            if self.bad_messages.bit_count() == 1:  # the 1st, 2nd, 4th ...: said, and never a flood
+                log.warning("solver: %s (%d so far)", self._reported_bad, self.bad_messages)
+            return
+        with self._lock:
+            if topic is CANDIDATES:
+                self._last_frame_s[node] = time.monotonic()
+            self._publish(self._handle(message, node))
+
+    def _handle(self, message: Message, node: str) -> list[RelativePose | Rejected]:
+        if self._core is not None:
+            return self._core.handle(message)
+        self._before_pair.append(message)
+        if isinstance(message, NodeInfo) and node not in self._seen:
+            self._seen.append(node)
+        if len(self._seen) < 2:
+            return []
+        core = self._pair(*sorted(self._seen[:2]))
+        results = [result for waiting in self._before_pair for result in core.handle(waiting)]
+        self._before_pair.clear()
+        return results
+
+    def _pair(self, node_a: str, node_b: str) -> SolverCore:
+        self._core = SolverCore(node_a, node_b, self._settings)
+        log.info("solver: pair %s, %s", node_a, node_b)
+        if self._bus is not None:
+            self._declare(self._core)
+        return self._core
+
+    def _declare(self, core: SolverCore) -> None:
+        if self._bus is None:
+            return
+        for topic in (POSE, REJECTED, SOLVER_STATUS):
+            self._publishers[topic.name] = self._bus.publisher(topic, core.node_a, core.node_b)
+
+    def _publish(self, results: list[RelativePose | Rejected]) -> None:
+        now_ns = self.clock.now_ns()
+        for result in results:
+            topic = POSE if isinstance(result, RelativePose) else REJECTED
+            self._publishers[topic.name].put(result)
+            age_ns = now_ns - result.stamp_ns
+            if topic is POSE and 0 <= age_ns < LIVE_WITHIN_NS:
+                self._latencies_s.append(age_ns / S_NS)
+
+    def _report(self) -> None:
+        with self._lock:
+            core = self._core
+            if core is None:
+                return
+            newest_s = max(self._last_frame_s.values(), default=-math.inf)
+            if core.pending and time.monotonic() - newest_s > PAUSE_S:
+                self._publish(core.flush())
+            self._publishers[SOLVER_STATUS.name].put(self.status(core))
+
+    def status(self, core: SolverCore) -> SolverStatus:
+        """Return the solver's health."""
+        now_s = time.monotonic()
+        problems = []
+        for node in (core.node_a, core.node_b):
+            last_s = self._last_frame_s.get(node)
+            if last_s is None:
+                problems.append(f"no frame of node {node} yet")
+            elif now_s - last_s > STALE_S:
+                problems.append(f"no frame of node {node} for {now_s - last_s:.0f} s")
+        if self._reported_bad:
+            problems.append(self._reported_bad)
+            self._reported_bad = ""
+        latencies_s = sorted(self._latencies_s)
+        self._latencies_s.clear()
+        received_a, received_b = core.received
+        return SolverStatus(
+            node_a=core.node_a,
+            node_b=core.node_b,
+            stamp_ns=self.clock.now_ns(),
+            software=f"buddyline {__version__}",
+            received_a=received_a,
+            received_b=received_b,
+            matched=core.matched,
+            solved=core.counts["solved"],
+            rejected={reason: count for reason, count in sorted(core.counts.items()) if reason != "solved"},
+            late=core.late,
+            duplicates=core.duplicates,
+            bad_messages=self.bad_messages,
+            pending=core.pending,
+            latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
+            latency_p99_s=latencies_s[min(len(latencies_s) * 99 // 100, len(latencies_s) - 1)]
+            if latencies_s
+            else UNSET,
+            problem="; ".join(problems),
+        )

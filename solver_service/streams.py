@@ -1,0 +1,115 @@
+"""What one node has sent, in the order of its own time: frames, calibration, attitude, depth."""
+
+from __future__ import annotations
+
+import bisect
+from collections import OrderedDict
+from enum import Enum
+from typing import Final
+
+from protocol.clock import S_NS
+from protocol.messages import Attitude, Candidates, Depth, NodeInfo
+from solver_service.sensors import DEPTH_LAG_NS, SampleStream
+
+# A frame further than this from the node's others is not of the same time line ...
+FAR_NS: Final = 5 * S_NS
+# ... until so many in a row agree that the clock has been set.
+FRAMES_TO_BELIEVE: Final = 5
+MAX_INFOS: Final = 64
+MAX_SEQUENCE_MEMORY: Final = 512
+
+
+class Arrival(Enum):
+    """What a frame turned out to be."""
+
+    FRESH = "fresh"
+    DUPLICATE = "duplicate"
+    CONFLICT = "conflict"
+    FAR = "far"
+    CLOCK_SET = "clock_set"
+
+
+class NodeStream:
+    """One node's side of the match; bounded."""
+
+    def __init__(self, node: str) -> None:
+        self.node = node
+        self.frames: dict[int, Candidates] = {}
+        self.attitude: SampleStream[Attitude] = SampleStream(lag_ns=0)
+        self.depth: SampleStream[Depth] = SampleStream(lag_ns=DEPTH_LAG_NS)
+        self.received = 0
+        self.first_ns: int | None = None
+        self.newest_ns: int | None = None
+        self._infos: list[NodeInfo] = []
+        self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
+        self._far: list[int] = []
+
+    def add_info(self, info: NodeInfo) -> None:
+        """Take a calibration; it holds from its stamp on."""
+        at = bisect.bisect_left([known.stamp_ns for known in self._infos], info.stamp_ns)
+        if at < len(self._infos) and self._infos[at].stamp_ns == info.stamp_ns:
+            self._infos[at] = info
+        else:
+            self._infos.insert(at, info)
+            del self._infos[:-MAX_INFOS]
+
+    def info_at(self, stamp_ns: int) -> NodeInfo | None:
+        """Return the calibration in force at stamp_ns (before the first one: the first)."""
+        at = bisect.bisect_right([known.stamp_ns for known in self._infos], stamp_ns)
+        return self._infos[max(at - 1, 0)] if self._infos else None
+
+    def add_frame(self, frame: Candidates) -> Arrival:
+        """Take a frame, or say why not."""
+        self.received += 1
+        verdict = self._place_in_time(frame.stamp_ns)
+        if verdict is Arrival.FAR:
+            return verdict
+        seen = self._sequence.get(frame.trigger)
+        if seen is not None and verdict is not Arrival.CLOCK_SET:
+            if seen == (frame.boot, frame.seq, frame.stamp_ns):
+                return Arrival.DUPLICATE
+            return Arrival.CONFLICT
+        self._sequence[frame.trigger] = (frame.boot, frame.seq, frame.stamp_ns)
+        if len(self._sequence) > MAX_SEQUENCE_MEMORY:
+            self._sequence.popitem(last=False)
+        self.frames[frame.trigger] = frame
+        return verdict
+
+    def _place_in_time(self, stamp_ns: int) -> Arrival:
+        if self.newest_ns is None:
+            self.first_ns = self.newest_ns = stamp_ns
+            return Arrival.FRESH
+        if abs(stamp_ns - self.newest_ns) <= FAR_NS:
+            self._far.clear()
+            self.newest_ns = max(self.newest_ns, stamp_ns)
+            return Arrival.FRESH
+        if self._far and abs(stamp_ns - self._far[-1]) > FAR_NS:
+            self._far.clear()
+        self._far.append(stamp_ns)
+        if len(self._far) < FRAMES_TO_BELIEVE:
+            return Arrival.FAR
+        self._far.clear()
+        self.frames.clear()
+        self._sequence.clear()
+        self.first_ns = self.newest_ns = stamp_ns
+        return Arrival.CLOCK_SET
+
+    def has_passed(self, trigger: int) -> bool:
+        """Whether this node sent no frame for trigger: its neighbours are here, with nothing between them."""
+        if trigger in self._sequence:
+            return False
+        before = max((k for k in self._sequence if k < trigger), default=None)
+        after = min((k for k in self._sequence if k > trigger), default=None)
+        if before is None or after is None:
+            return False
+        boot_0, seq_0, _ = self._sequence[before]
+        boot_1, seq_1, _ = self._sequence[after]
+        return boot_0 == boot_1 and seq_1 == seq_0 + 1
+
+    def sensors_cover(self, stamp_ns: int) -> bool:
+        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come."""
+        if self.first_ns is None or self.newest_ns is None:
+            return True
+        return self.attitude.covers(stamp_ns, self.first_ns, self.newest_ns) and self.depth.covers(
+            stamp_ns, self.first_ns, self.newest_ns
+        )

@@ -1,0 +1,139 @@
+"""The `buddyline` program: one table of commands; each is imported when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import os
+import sys
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Final
+
+from protocol import __version__
+from protocol.errors import BuddylineError
+
+SUMMARY: Final = "Two underwater nodes see each other's lights; Buddyline says where they are."
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: the module with add_arguments(parser) and run(args), and what it does in a line."""
+
+    name: str
+    module: str
+    does: str
+    examples: tuple[str, ...] = ()
+
+
+COMMANDS: Final = (
+    Command(
+        "demo",
+        "tools.demo",
+        "run hub, two simulated nodes and solver on this machine, and watch the poses",
+        ("buddyline demo", "buddyline demo --environment lake --seconds 30"),
+    ),
+    Command("hub", "tools.hub", "run the hub that all others connect to", ("buddyline hub",)),
+    Command(
+        "node", "node.__main__", "run one node: camera, sensors, detector, log", ("buddyline node --config a.toml",)
+    ),
+    Command("solver", "solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)),
+    Command(
+        "play",
+        "tools.play",
+        "send stored dives over the bus, as if they happened now",
+        ("buddyline play a.mcap b.mcap", "buddyline play dive.mcap --speed 4 --start 10 --end 60"),
+    ),
+    Command("record", "tools.record", "record the bus into a dive log", ("buddyline record topside.mcap",)),
+    Command(
+        "detect",
+        "tools.detect",
+        "find light candidates in stored pictures or a dive's pictures",
+        (
+            "buddyline detect photos/ --draw marked/",
+            "buddyline detect dive.mcap -o candidates.mcap --environment lake",
+        ),
+    ),
+    Command(
+        "solve",
+        "tools.solve",
+        "solve stored dives offline",
+        ("buddyline solve a.mcap b.mcap -o poses.mcap", "buddyline solve dive.mcap -o p.mcap --checks range"),
+    ),
+    Command(
+        "simulate",
+        "tools.simulate",
+        "make a dive with known truth",
+        ("buddyline simulate dive.mcap --environment basin --seconds 60", "buddyline simulate dive.mcap --images"),
+    ),
+    Command(
+        "evaluate",
+        "tools.evaluate",
+        "measure poses and candidates against truth",
+        ("buddyline evaluate poses.mcap --truth dive.truth.mcap",),
+    ),
+    Command(
+        "export",
+        "tools.export",
+        "write poses for other programs",
+        ("buddyline export poses.mcap --format tum -o poses.tum",),
+    ),
+)
+
+
+def overview() -> str:
+    """Return what `buddyline --help` prints."""
+    width = max(len(command.name) for command in COMMANDS)
+    lines = [f"usage: buddyline COMMAND ... ({__version__})", "", SUMMARY, "", "commands:"]
+    lines += [f"  {command.name:<{width}}  {command.does}" for command in COMMANDS]
+    lines += ["", "`buddyline COMMAND --help` tells more, with examples. Start with `buddyline demo`."]
+    return "\n".join(lines)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the program; return its exit status: 0 done, 1 a check failed, 2 a known error, 130 interrupted."""
+    words = sys.argv[1:] if argv is None else argv
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    if words[0] == "--version":
+        print(f"buddyline {__version__}")
+        return 0
+    command = next((command for command in COMMANDS if command.name == words[0]), None)
+    if command is None:
+        near = difflib.get_close_matches(words[0], [command.name for command in COMMANDS], 1)
+        hint = f"did you mean `{near[0]}`?" if near else "see `buddyline --help`"
+        print(f"buddyline: no command {words[0]!r}; {hint}", file=sys.stderr)
+        return 2
+    try:
+        return _run(command, words[1:])
+    except BuddylineError as error:
+        print(f"buddyline {command.name}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has gone: nothing is left to say, and nothing to flush at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(command: Command, words: list[str]) -> int:
+    from protocol.service import start_logging
+
+    module = import_module(command.module)
+    parser = argparse.ArgumentParser(
+        prog=f"buddyline {command.name}",
+        description=f"{command.does[0].upper()}{command.does[1:]}.",
+        epilog="examples:\n" + "\n".join(f"  {example}" for example in command.examples) if command.examples else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(parser)
+    args = parser.parse_args(words)
+    start_logging()
+    status: int = module.run(args)
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,201 @@
+"""`buddyline detect`: candidates out of stored pictures, or out of a dive's pictures."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+
+from node.detect import ENVIRONMENTS, METHODS, Detection, draw, make_detector
+from node.devices import Frame
+from node.drivers.stored import PictureError, decode_picture, picture_files
+from node.pipeline import Pipeline
+from protocol.clock import trigger_index
+from protocol.divelog import DiveLogWriter, Record
+from protocol.errors import BuddylineError
+from protocol.messages import Candidates, CompressedImage, Message, MessageError, NodeInfo, encode
+from protocol.topics import parse_key
+from tools.dives import Dive
+from tools.progress import Progress
+
+log = logging.getLogger(__name__)
+
+DEFAULT_METHOD = METHODS[0]
+FOLDER_PERIOD_NS = 100_000_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap")
+    parser.add_argument("-o", "--output", metavar="OUT.mcap", help="write a dive log in place of JSON lines")
+    parser.add_argument("--draw", metavar="DIR", help="write the pictures with their candidates marked")
+    parser.add_argument("--environment", default="auto", choices=ENVIRONMENTS, help="default: auto")
+    parser.add_argument(
+        "--method", default=DEFAULT_METHOD, choices=METHODS, help=f"default: {DEFAULT_METHOD}; paper: the paper's"
+    )
+    parser.add_argument("--json", action="store_true", help="JSON lines on stdout (the default without -o)")
+
+
+@dataclass
+class DiveDetector:
+    """Candidates for the pictures of a dive: one detector a node, each with its own memory."""
+
+    method: str
+    environment: str
+    infos: dict[str, NodeInfo]
+    skipped: int = 0
+    pictures: int = 0
+    _pipelines: dict[str, Pipeline] = field(default_factory=dict)
+    last: tuple[Frame, list[Detection]] | None = None
+
+    def candidates(self, image: CompressedImage) -> Candidates | None:
+        """Detect in one picture; None where it cannot be used, with a warning that says why."""
+        node = image.frame_id.removesuffix("_camera")
+        info = self.infos.get(node)
+        try:
+            picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
+            height, width = picture.shape[:2]
+            if info is not None and (width, height) != (info.width_px, info.height_px):
+                raise PictureError(
+                    f"picture of node {node} at {image.stamp_ns}: {width}x{height} px, "
+                    f"its NodeInfo says {info.width_px}x{info.height_px}"
+                )
+        except PictureError as error:
+            self.skipped += 1
+            log.warning("skipped: %s", error)
+            return None
+        pipeline = self._pipelines.get(node)
+        if pipeline is None:
+            period_ns = info.trigger_period_ns if info else FOLDER_PERIOD_NS
+            detector = make_detector(self.method, self.environment)
+            pipeline = self._pipelines[node] = Pipeline(node, f"detect-{self.method}", period_ns, detector)
+        self.pictures += 1
+        frame = Frame(picture, image.stamp_ns, info.row_time_ns if info else 0)
+        candidates = pipeline.candidates(frame)
+        self.last = (frame, pipeline.detections)
+        return candidates
+
+
+def run(args: argparse.Namespace) -> int:
+    """Detect in pictures or in a dive."""
+    cv2.setNumThreads(1)
+    if args.draw:
+        Path(args.draw).mkdir(parents=True, exist_ok=True)
+    dives = [path for path in args.inputs if Path(path).suffix == ".mcap"]
+    if dives and len(dives) != len(args.inputs):
+        raise BuddylineError("give either pictures or dive logs, not both at once")
+    return _detect_dive(args, dives) if dives else _detect_pictures(args)
+
+
+def _detect_pictures(args: argparse.Namespace) -> int:
+    if args.output:
+        raise BuddylineError(
+            "-o writes a dive log, which needs a dive's times and calibration; pictures give JSON lines"
+        )
+    files: list[Path] = []
+    for name in args.inputs:
+        path = Path(name)
+        if not path.exists():
+            raise BuddylineError(f"{name}: no such picture, folder or dive log")
+        found = picture_files(path)
+        if not found:
+            raise BuddylineError(f"{name}: holds no pictures")
+        files += found
+    detector = make_detector(args.method, args.environment)
+    skipped = 0
+    with Progress("detect", len(files)) as progress:
+        for i, file in enumerate(files):
+            progress.show(i, file.name)
+            try:
+                picture = decode_picture(file.read_bytes(), str(file))
+                detections = detector.detect(picture)
+            except (PictureError, OSError) as error:
+                skipped += 1
+                log.warning("skipped: %s", error)
+                continue
+            height, width = picture.shape[:2]
+            stamp_ns = i * FOLDER_PERIOD_NS
+            print(
+                _line(
+                    Candidates(
+                        node="picture",
+                        stamp_ns=stamp_ns,
+                        trigger=trigger_index(stamp_ns, FOLDER_PERIOD_NS),
+                        seq=i,
+                        boot=f"detect-{args.method}",
+                        width_px=width,
+                        height_px=height,
+                        blobs=[d.blob for d in detections[:64]],
+                        truncated=max(len(detections) - 64, 0),
+                    ),
+                    str(file),
+                )
+            )
+            if args.draw:
+                cv2.imwrite(str(Path(args.draw) / f"{file.stem}.png"), draw(picture, detections))
+    if skipped:
+        log.warning("%d of %d pictures skipped", skipped, len(files))
+    return 1 if skipped == len(files) else 0
+
+
+def _line(message: Candidates, file: str = "") -> str:
+    text = encode(message).decode()
+    if not file:
+        return text
+    import json
+
+    return f'{{"file":{json.dumps(file)},{text[1:]}'
+
+
+def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
+    with Dive(paths) as dive:
+        infos = dive.infos()
+        if not dive.nodes("image"):
+            raise BuddylineError(f"{dive.name}: holds no pictures; topics: {', '.join(dive.keys) or 'none'}")
+        detector = DiveDetector(args.method, args.environment, infos)
+        writer = DiveLogWriter(args.output) if args.output else None
+        try:
+            with Progress("detect", (dive.end_ns - dive.start_ns) / 1e9) as progress:
+                for record in dive.records():
+                    progress.show((record.log_time_ns - dive.start_ns) / 1e9)
+                    for key, message, payload in _derived(record, detector):
+                        if writer is not None:
+                            writer.write(key, payload, record.log_time_ns)
+                        elif isinstance(message, Candidates):
+                            print(payload.decode())
+                        if isinstance(message, Candidates) and args.draw and detector.last:
+                            frame, detections = detector.last
+                            name = f"{message.node}_{message.trigger}.png"
+                            cv2.imwrite(str(Path(args.draw) / name), draw(frame.image, detections))
+        finally:
+            if writer is not None:
+                writer.close()
+        for text in dive.damage:
+            log.warning("%s", text)
+    print(f"{detector.pictures} pictures, {detector.skipped} skipped", file=sys.stderr)
+    return 0
+
+
+def _derived(record: Record, detector: DiveDetector) -> Iterator[tuple[str, Message | None, bytes]]:
+    """Give what a record becomes: pictures turn into candidates, what was solved or detected before is left out."""
+    parsed = parse_key(record.key)
+    if parsed is None or parsed[0].name in ("candidates", "pose", "rejected", "solver_status"):
+        return
+    if parsed[0].name != "image":
+        yield record.key, None, record.payload
+        return
+    try:
+        image = record.decode()
+    except MessageError as error:
+        detector.skipped += 1
+        log.warning("skipped: %s", error)
+        return
+    if isinstance(image, CompressedImage):
+        candidates = detector.candidates(image)
+        if candidates is not None:
+            yield f"buddyline/node/{candidates.node}/candidates", candidates, encode(candidates)

@@ -1,0 +1,149 @@
+"""Where the other node's lights truly are in a picture, and whether a pose took the right ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.messages import CameraModel, Candidates, LightTruth, NodeInfo, RelativePose
+from tools.evaluation.rotation import Floats, conjugate, rotate
+from tools.evaluation.truth import TruthTrack
+
+NAMES: Final = ("left", "right")
+
+
+def tolerance_px(width_px: int) -> float:
+    """Return how far a candidate may stand from a light and still be taken for it: 3 px, or 1 % of the width."""
+    return max(3.0, 0.01 * width_px)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueLights:
+    """The other node's left and right light in one picture.
+
+    pixels: (2, 2), NaN where a light has no place in it. visible: (2,). marked: from LightTruth; else projected
+    from the true pose, which knows nothing of what stands in between.
+    """
+
+    pixels: Floats
+    visible: NDArray[np.bool_]
+    marked: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Blobs:
+    """One picture's candidates: pixels (N, 2) and their sigma_px (N,)."""
+
+    pixels: Floats
+    sigma_px: Floats
+    tolerance_px: float
+
+    @classmethod
+    def of(cls, frame: Candidates) -> Blobs:
+        """Return a frame's candidates as arrays."""
+        pixels = np.array([(blob.u_px, blob.v_px) for blob in frame.blobs]).reshape(-1, 2)
+        sigma_px = np.array([blob.sigma_px for blob in frame.blobs])
+        return cls(pixels, sigma_px, tolerance_px(frame.width_px))
+
+    def distances_px(self, lights: TrueLights) -> Floats:
+        """Return how far each candidate is from the left and the right light, (N, 2), infinite where unknown."""
+        away = np.linalg.norm(self.pixels[:, None, :] - lights.pixels[None, :, :], axis=-1)
+        return np.nan_to_num(away, nan=np.inf)
+
+
+def project(points_c_m: Floats, camera: CameraModel) -> Floats:
+    """Project points (N, 3) of the camera frame to distorted pixels (N, 2) by OpenCV's model.
+
+    NaN behind the camera, and beyond the fold where a lens polynomial leads back into the picture.
+    """
+    matrix = np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
+    distortion = np.array(camera.distortion)
+    ahead = points_c_m[:, 2] > 1e-6
+    normalized = points_c_m[:, :2] / np.where(ahead, points_c_m[:, 2], 1.0)[:, None]
+    # The way from the centre out to each point: an honest image moves outward all along it.
+    steps = np.linspace(0.0, 1.0, 33)[1:]
+    way = np.ones((len(points_c_m), len(steps), 3))
+    way[:, :, :2] = normalized[:, None, :] * steps[:, None]
+    flat, zero = way.reshape(-1, 1, 3), np.zeros(3)
+    if not len(flat):
+        return np.empty((0, 2))
+    if camera.model == "fisheye":
+        imaged, _ = cv2.fisheye.projectPoints(flat, zero, zero, matrix, distortion)
+    else:
+        imaged, _ = cv2.projectPoints(flat, zero, zero, matrix, distortion)
+    imaged = np.asarray(imaged, dtype=np.float64).reshape(way.shape[:2] + (2,))
+    radius = np.linalg.norm((imaged - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), axis=-1)
+    outward = (np.diff(radius, axis=1) >= -1e-9).all(axis=1)
+    pixels: Floats = imaged[:, -1].copy()
+    pixels[~(ahead & outward)] = np.nan
+    return pixels
+
+
+def _projected(frame: Candidates, track: TruthTrack, own: NodeInfo, other: NodeInfo, is_a: bool) -> TrueLights | None:
+    known = track.at(frame.stamp_ns, frame.trigger)
+    if known is None:
+        return None
+    t, q = known
+    if not is_a:
+        q = conjugate(q)
+        t = -rotate(q, t)
+    points_c_m = rotate(q, np.array([other.light_left_m, other.light_right_m])) + t
+    pixels = project(points_c_m, own.camera)
+    with np.errstate(invalid="ignore"):
+        inside = (pixels >= -0.5) & (pixels <= (own.width_px - 0.5, own.height_px - 0.5))
+    return TrueLights(pixels, inside.all(axis=1), marked=False)
+
+
+def _marked(truth: LightTruth) -> TrueLights:
+    pixels = np.full((2, 2), np.nan)
+    visible = np.zeros(2, dtype=bool)
+    for light in truth.lights:
+        side = NAMES.index(light.name)
+        pixels[side] = light.u_px, light.v_px
+        visible[side] = light.visible
+    return TrueLights(pixels, visible, marked=True)
+
+
+def true_lights(
+    nodes: tuple[str, str],
+    frames: Iterable[Candidates],
+    light_truths: Iterable[LightTruth],
+    infos: Mapping[str, NodeInfo],
+    track: TruthTrack,
+) -> dict[tuple[str, int], TrueLights]:
+    """Return the true lights by node and trigger, from LightTruth; for a node without any, projected."""
+    lights = {(truth.node, truth.trigger): _marked(truth) for truth in light_truths if truth.node in nodes}
+    marked = {node for node, _ in lights}
+    if not all(node in infos for node in nodes):
+        return lights
+    for frame in frames:
+        if frame.node in marked or frame.node not in nodes:
+            continue
+        is_a = frame.node == nodes[0]
+        seen = _projected(frame, track, infos[frame.node], infos[nodes[1] if is_a else nodes[0]], is_a)
+        if seen is not None:
+            lights[frame.node, frame.trigger] = seen
+    return lights
+
+
+def is_right_pair(
+    pose: RelativePose, blobs: Mapping[tuple[str, int], Blobs], lights: Mapping[tuple[str, int], TrueLights]
+) -> bool | None:
+    """Whether a pose took the other node's lights in both pictures, left as left and right as right.
+
+    None where the candidates or the true lights of a picture are not known.
+    """
+    for node, taken in ((pose.node_a, pose.blobs_a), (pose.node_b, pose.blobs_b)):
+        seen, true = blobs.get((node, pose.trigger)), lights.get((node, pose.trigger))
+        if seen is None or true is None:
+            return None
+        away = seen.distances_px(true)
+        for side, index in enumerate(taken):
+            if not 0 <= index < len(away) or away[index, side] > seen.tolerance_px:
+                return False
+    return True

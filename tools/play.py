@@ -1,0 +1,207 @@
+"""`buddyline play`: stored dives onto the bus, as if they happened now."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import threading
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Final
+
+from msgspec import UNSET
+from msgspec.structs import replace
+
+from protocol.clock import S_NS, Clock, SystemClock
+from protocol.divelog import Record
+from protocol.errors import BuddylineError
+from protocol.messages import CompressedImage, FoxgloveTime, Message, MessageError, encode
+from protocol.service import Service
+from protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
+from tools.dives import Dive
+from tools.hub import DEFAULT_ENDPOINT
+from tools.progress import Progress
+
+if TYPE_CHECKING:
+    from protocol.bus import Bus, Publisher, Received
+
+log = logging.getLogger(__name__)
+
+# Poses and what else a solver made are not sent: a solver on the bus makes them anew.
+NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status"})
+# Pictures go out as previews: the bus is for what the solver needs.
+IMAGES_HZ: Final = 2.0
+# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time.
+AHEAD_NS: Final = S_NS // 2
+SOLVER_SILENT_S: Final = 1.0
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
+    parser.add_argument("--speed", type=float, default=1.0, help="1: as it was (default); 0: as fast as it goes")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
+    parser.add_argument("--end", type=float, metavar="S", help="seconds from the dive's start")
+    parser.add_argument("--loop", action="store_true", help="again and again, with the times carried on")
+    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+
+
+class SolverFollower:
+    """Knows how far a solver on the bus has come, so that a fast playback does not outrun it."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._changed = threading.Condition()
+        self._resolved_ns = -1
+        self._heard_s = -math.inf
+        for topic in (POSE, REJECTED):
+            bus.subscribe(topic.key_any(), self._hear, capacity=4096, history=False)
+
+    def _hear(self, received: Received) -> None:
+        from protocol.divelog import payload_stamp_ns
+
+        with self._changed:
+            self._resolved_ns = max(self._resolved_ns, payload_stamp_ns(received.payload) or -1)
+            self._heard_s = time.monotonic()
+            self._changed.notify_all()
+
+    def wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
+        """Wait until the solver is close behind stamp_ns; not at all where none answers."""
+        with self._changed:
+            while (
+                self._resolved_ns < stamp_ns - AHEAD_NS
+                and time.monotonic() - self._heard_s < SOLVER_SILENT_S
+                and not stop.is_set()
+            ):
+                self._changed.wait(0.1)
+
+
+class Player:
+    """Sends a dive's records in order, each when its time has come."""
+
+    def __init__(self, bus: Bus, speed: float, clock: Clock, stop: threading.Event) -> None:
+        self.sent = 0
+        self.bad = 0
+        self._bus = bus
+        self._speed = speed
+        self._clock = clock
+        self._stop = stop
+        self._publishers: dict[str, Publisher] = {}
+        self._follower = SolverFollower(bus) if speed == 0 else None
+        self._image_due_ns: dict[str, int] = {}
+        self._first_ns: int | None = None
+        self._began_ns = 0
+
+    def declare(self, keys: list[str]) -> None:
+        """Declare the publishers of a dive, so that subscribers find them before the first message."""
+        for key in keys:
+            parsed = parse_key(key)
+            if parsed and parsed[0].name not in NOT_SENT and key not in self._publishers:
+                self._publishers[key] = self._bus.publisher(parsed[0], *parsed[1])
+
+    def send(self, record: Record, shift_triggers: int = 0, period_ns: int = S_NS) -> None:
+        """Wait for a record's time, and send it, so many triggers later than it was recorded."""
+        time_ns = record.log_time_ns + shift_triggers * period_ns
+        if self._first_ns is None:
+            self._first_ns, self._began_ns = time_ns, self._clock.now_ns()
+        if self._speed > 0:
+            self._clock.wait_until_ns(self._began_ns + round((time_ns - self._first_ns) / self._speed), self._stop)
+        if self._stop.is_set():
+            return
+        parsed = parse_key(record.key)
+        if parsed is None or (parsed[0] is IMAGE and not self._image_is_due(record, time_ns)):
+            return
+        try:
+            message = record.decode()
+            payload = record.payload
+            if message is not None and shift_triggers:
+                payload = encode(_shifted(message, shift_triggers, period_ns))
+        except MessageError as error:
+            self.bad += 1
+            if self.bad.bit_count() == 1:
+                log.warning("play: %s: %s (%d so far)", record.key, error, self.bad)
+            return
+        if self._follower is not None and parsed[0] is CANDIDATES:
+            self._follower.wait_for(time_ns, self._stop)
+        self._publishers[record.key].put_bytes(payload)
+        self.sent += 1
+
+    def _image_is_due(self, record: Record, time_ns: int) -> bool:
+        if self._clock.now_ns() < self._image_due_ns.get(record.key, 0):
+            return False
+        self._image_due_ns[record.key] = self._clock.now_ns() + round(S_NS / IMAGES_HZ)
+        return True
+
+
+def _shifted(message: Message, triggers: int, period_ns: int) -> Message:
+    """Return a message as it would be so many triggers later."""
+    shift_ns = triggers * period_ns
+    if isinstance(message, CompressedImage):
+        stamp_ns = message.stamp_ns + shift_ns
+        return replace(message, timestamp=FoxgloveTime(sec=stamp_ns // S_NS, nsec=stamp_ns % S_NS))
+    changes = {"stamp_ns": getattr(message, "stamp_ns") + shift_ns}  # noqa: B009
+    trigger = getattr(message, "trigger", UNSET)
+    if trigger is not UNSET:
+        changes["trigger"] = trigger + triggers
+    return replace(message, **changes)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play until the dive's end, or until stopped."""
+    if not (math.isfinite(args.speed) and args.speed >= 0):
+        raise BuddylineError(f"--speed {args.speed}: 0 or more")
+    from protocol.zenoh_bus import connect
+
+    service = Service("play")
+    service.handle_signals()
+    with Dive(args.dives) as dive:
+        start_ns, stop_ns = _span(dive, args.start, args.end)
+        if not dive.nodes("candidates"):
+            log.warning("play: %s holds no candidates: a solver finds nothing; run `buddyline detect` first", dive.name)
+        bus = connect(args.connect, stop=service.stop, on_wait=lambda text: log.info("play: %s", text))
+        if bus is None:
+            return service.join()
+        with bus:
+            bus.declare_alive("player")
+            player = Player(bus, args.speed, SystemClock(), service.stop)
+            player.declare(dive.keys)
+            period_ns = max((info.trigger_period_ns for info in dive.infos().values()), default=S_NS)
+            laps_triggers = (stop_ns - start_ns) // period_ns + 2
+            lap = 0
+            while not service.stop.is_set() and (lap == 0 or args.loop):
+                with Progress("play", (stop_ns - start_ns) / S_NS) as progress:
+                    for record in _selected(dive, start_ns, stop_ns):
+                        if service.stop.is_set():
+                            break
+                        player.send(record, lap * laps_triggers, period_ns)
+                        progress.show((record.log_time_ns - start_ns) / S_NS)
+                lap += 1
+            # What was just sent is on its way: leave the recovery of lost samples its time.
+            service.stop.wait(1.0)
+        for text in dive.damage:
+            log.warning("%s", text)
+    log.info("play: %d messages sent, %d bad", player.sent, player.bad)
+    return service.join()
+
+
+def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
+    first_ns, last_ns = dive.start_ns, dive.end_ns
+    start_ns = first_ns + round(start_s * S_NS)
+    stop_ns = last_ns + 1 if end_s is None else first_ns + round(end_s * S_NS)
+    if not first_ns <= start_ns <= last_ns or stop_ns <= start_ns:
+        raise BuddylineError(
+            f"--start {start_s} --end {end_s}: the dive goes from 0 to {(last_ns - first_ns) / S_NS:.1f} s"
+        )
+    return start_ns, stop_ns
+
+
+def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Record]:
+    """Yield what is sent of a dive; calibration from before the start comes too."""
+    for record in dive.records():
+        parsed = parse_key(record.key)
+        if parsed is None or parsed[0].name in NOT_SENT:
+            continue
+        if record.log_time_ns >= stop_ns:
+            return
+        if record.log_time_ns >= start_ns or parsed[0] is INFO:
+            yield record

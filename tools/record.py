@@ -1,0 +1,83 @@
+"""`buddyline record`: the bus into a dive log."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from protocol.messages import MessageError, decode
+from protocol.recorder import Recorder
+from protocol.service import Service
+from protocol.topics import EVERYTHING, parse_key
+from tools.hub import DEFAULT_ENDPOINT
+
+if TYPE_CHECKING:
+    from protocol.bus import Received
+
+log = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("output", metavar="OUT.mcap")
+    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
+
+
+class BusRecorder:
+    """Writes every sound message of ours that it is handed; counts them by topic."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.counts: Counter[str] = Counter()
+        self.bad = 0
+        self._recorder = recorder
+
+    def receive(self, received: Received) -> None:
+        """Record one message; one that is not sound is counted, and said."""
+        parsed = parse_key(received.key)
+        if parsed is None:
+            self.bad += 1
+            return
+        try:
+            decode(received.payload, parsed[0].schema)
+        except MessageError as error:
+            self.bad += 1
+            if self.bad.bit_count() == 1:
+                log.warning("record: bad message on %s: %s (%d so far)", received.key, error, self.bad)
+            return
+        self.counts[parsed[0].name] += 1
+        self._recorder.write(received.key, received.payload, received.receive_ns)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record until stopped."""
+    from protocol.zenoh_bus import connect
+
+    service = Service("record")
+    service.handle_signals()
+    with Recorder(args.output, metadata={"command": "record"}) as recorder:
+        sink = BusRecorder(recorder)
+        bus = connect(args.connect, stop=service.stop, on_wait=lambda text: log.info("record: %s", text))
+        if bus is None:
+            return service.join()
+        with bus:
+            subscriber = bus.subscribe(EVERYTHING, sink.receive, capacity=16384)
+            log.info("record: %s into %s; Ctrl-C ends", args.connect, args.output)
+            began_s = time.monotonic()
+            while not service.stop.wait(0.5):
+                if args.seconds is not None and time.monotonic() - began_s >= args.seconds:
+                    break
+                if recorder.error is not None:
+                    service.fail("recorder", recorder.error)
+                if sys.stderr.isatty():
+                    print(f"\r{sum(sink.counts.values())} messages", end="\x1b[K", file=sys.stderr, flush=True)
+        lost = subscriber.dropped + recorder.dropped
+    total = sum(sink.counts.values())
+    print(f"{args.output}: {total} messages, {lost} dropped, {sink.bad} bad", file=sys.stderr)
+    for name, count in sorted(sink.counts.items()):
+        print(f"  {count:8d} {name}", file=sys.stderr)
+    return service.join()

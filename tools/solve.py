@@ -1,0 +1,193 @@
+"""`buddyline solve`: the whole pipeline on stored dives, offline and deterministic."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from solver_service.geometry.trigger import METHODS
+
+from protocol.config import ConfigError
+from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.messages import (
+    CompressedImage,
+    Message,
+    MessageError,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    encode,
+)
+from protocol.topics import CANDIDATES, check_node_id, parse_key
+from solver_service.config import CHECKS, SolveConfig
+from solver_service.core import SolverCore
+from tools.dives import Dive, load_info
+from tools.progress import Progress
+
+log = logging.getLogger(__name__)
+
+# What the output carries beside the poses, so that it can be evaluated and solved again on its own.
+COPIED = ("info", "candidates", "attitude", "depth", "truth", "light_truth")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.mcap", help="poses, rejections, and their inputs")
+    parser.add_argument("--method", choices=METHODS, default="refined", help="default: refined")
+    parser.add_argument(
+        "--checks", default=",".join(CHECKS), help=f"comma-separated, of {', '.join(CHECKS)} (default: all)"
+    )
+    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
+    parser.add_argument(
+        "--info",
+        action="append",
+        default=[],
+        metavar="NODE=FILE",
+        help="calibration in place of the log's: JSON or log",
+    )
+    parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
+    parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve a dive; return 0, or 1 where not one trigger was resolved."""
+    settings = SolveConfig(method=args.method, checks=[check for check in args.checks.split(",") if check]).settings(
+        "--checks"
+    )
+    replaced = _replacements(args.info)
+    with Dive(args.dives) as dive:
+        node_a, node_b = _pair(dive, args.nodes)
+        infos = dive.infos() | replaced
+        for node in (node_a, node_b):
+            if node not in infos:
+                raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; give one with --info {node}=FILE")
+        core = SolverCore(node_a, node_b, settings)
+        bad = 0
+        began_s = time.monotonic()
+        with DiveLogWriter(args.output, metadata={"command": "solve", "method": args.method}) as writer:
+            for info in replaced.values():
+                core.handle(info)
+                writer.write_message(info, dive.start_ns)
+            with Progress("solve", (dive.end_ns - dive.start_ns) / 1e9) as progress:
+                for key, message, log_time_ns in _messages(dive, args, infos, node_a, node_b):
+                    progress.show((log_time_ns - dive.start_ns) / 1e9)
+                    if isinstance(message, MessageError):
+                        bad += 1
+                        if bad.bit_count() == 1:
+                            log.warning("%s: %s (%d so far)", key, message, bad)
+                        continue
+                    if isinstance(message, NodeInfo) and message.node in replaced:
+                        continue
+                    writer.write(key, encode(message), log_time_ns)
+                    _write(writer, core.handle(message))
+            _write(writer, core.flush())
+        for text in dive.damage:
+            log.warning("%s", text)
+    _summarize(args, core, bad, time.monotonic() - began_s)
+    resolved = sum(core.counts.values())
+    if resolved == 0:
+        log.error("no trigger was resolved: the dive holds no candidates of %s or %s", node_a, node_b)
+    elif core.matched == 0:
+        log.error("nodes %s and %s have no trigger in common: are the logs of the same dive?", node_a, node_b)
+    return 0 if core.matched else 1
+
+
+def _replacements(given: list[str]) -> dict[str, NodeInfo]:
+    replaced = {}
+    for text in given:
+        node, equals, path = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--info {text}: give NODE=FILE")
+        info = load_info(path)
+        if info.node != check_node_id(node):
+            raise ConfigError(f"--info {text}: the file describes node {info.node}")
+        replaced[node] = info
+    return replaced
+
+
+def _pair(dive: Dive, given: list[str] | None) -> tuple[str, str]:
+    present = dive.nodes("candidates", "image")
+    if given:
+        missing = [node for node in given if node not in present]
+        if missing:
+            raise BuddylineError(
+                f"{dive.name}: holds nothing of node {missing[0]}; it has {', '.join(present) or 'none'}"
+            )
+        return given[0], given[1]
+    if len(present) < 2:
+        have = f"only of node {present[0]}" if present else "of no node"
+        raise BuddylineError(f"{dive.name}: candidates or pictures {have}; give the logs of both nodes")
+    if len(present) > 2:
+        raise BuddylineError(f"{dive.name}: nodes {', '.join(present)}; choose a pair with --nodes A B")
+    return present[0], present[1]
+
+
+def _messages(
+    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str
+) -> Iterator[tuple[str, Message | MessageError, int]]:
+    """Yield what the solver and the output need, decoded; pictures of a node without candidates are detected."""
+    raw = [node for node in pair if node not in dive.nodes("candidates")]
+    detector = None
+    if raw:
+        from tools.detect import DiveDetector
+
+        detector = DiveDetector(args.detector, args.environment, infos)
+    topics = (*COPIED, "image") if raw else COPIED
+    for record in dive.records(*topics):
+        parsed = parse_key(record.key)
+        if parsed is None or (len(parsed[1]) == 1 and parsed[1][0] not in pair):
+            continue
+        try:
+            message = record.decode()
+            if message is not None and getattr(message, "node", parsed[1][0]) != parsed[1][0]:
+                raise MessageError(f"node {getattr(message, 'node', None)!r} on key {record.key}")
+        except MessageError as error:
+            yield record.key, error, record.log_time_ns
+            continue
+        if isinstance(message, CompressedImage):
+            if detector is not None and parsed[1][0] in raw:
+                found = detector.candidates(message)
+                if found is not None:
+                    yield CANDIDATES.key(found.node), found, record.log_time_ns
+        elif message is not None:
+            yield record.key, message, record.log_time_ns
+
+
+def _write(writer: DiveLogWriter, results: list[RelativePose | Rejected]) -> None:
+    for result in results:
+        writer.write_message(result)
+
+
+def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: float) -> None:
+    resolved = sum(core.counts.values())
+    rejected = {reason: count for reason, count in sorted(core.counts.items()) if reason != "solved"}
+    if args.json:
+        print(
+            json.dumps(
+                {
+                    "node_a": core.node_a,
+                    "node_b": core.node_b,
+                    "triggers": resolved,
+                    "matched": core.matched,
+                    "solved": core.counts["solved"],
+                    "rejected": rejected,
+                    "bad_messages": bad,
+                    "seconds": took_s,
+                    "output": str(Path(args.output)),
+                }
+            )
+        )
+        return
+    print(f"{args.output}: {core.counts['solved']} poses of {resolved} triggers, nodes {core.node_a} and {core.node_b}")
+    for reason, count in rejected.items():
+        print(f"  {count:6d} {reason}")
+    if bad:
+        print(f"  {bad:6d} messages that could not be used")
+    print(f"  {took_s:.1f} s, {resolved / max(took_s, 1e-9):.0f} triggers/s")
