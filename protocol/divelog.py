@@ -17,6 +17,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
 
 from protocol import topics
 from protocol.errors import BuddylineError
@@ -26,7 +27,7 @@ from protocol.schemas import json_schema
 CHUNK_BYTES: Final = 1024 * 1024
 MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
 _CHANNEL_METADATA: Final = "buddyline.channel"
-_DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError)
+_DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError, ZstdError)
 
 
 class _Stamp(msgspec.Struct):

@@ -1,0 +1,37 @@
+"""Configuration: strict, and errors name file, field and value."""
+
+import pytest
+
+from node.config import NodeConfig
+from protocol.config import ConfigError, config_sha256, load_config, parse_config
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('node = "a"\n[camera]\nwidht_px = 3\n', ["camera", "widht_px", "width_px"]),
+        ('node = "a"\nnmae = 1\n', ["nmae", "node"]),
+        ('node = "a/b"\n', ["node", "'a/b'"]),
+        ('node = "a"\nrate_hz = "ten"\n', ["rate_hz", "'ten'"]),
+        ('node = "a"\nrate_hz = -1.0\n', ["rate_hz", "-1.0"]),
+        ("rate_hz = 1.0\n", ["node"]),
+        ('node = "a\n', ["not TOML"]),
+    ],
+)
+def test_errors_name_field_and_value(text, says):
+    with pytest.raises(ConfigError) as refused:
+        parse_config(text, NodeConfig, "a.toml")
+    for word in ["a.toml", *says]:
+        assert word in str(refused.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.toml"):
+        load_config(tmp_path / "none.toml", NodeConfig)
+
+
+def test_defaults_and_hash():
+    config = parse_config('node = "a"', NodeConfig, "a.toml")
+    assert config.camera.name == "simulated"
+    assert config_sha256(config) == config_sha256(NodeConfig(node="a"))
+    assert config_sha256(config) != config_sha256(NodeConfig(node="b"))

@@ -1,0 +1,176 @@
+"""Dive logs: what is written comes back, whole or damaged, in order of time."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+from mcap.reader import make_reader
+
+from protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
+from protocol.errors import BuddylineError
+from protocol.messages import CompressedImage, Depth, FoxgloveTime
+from protocol.recorder import Recorder
+from protocol.topics import parse_key
+
+S_NS = 1_000_000_000
+
+
+def depth(second: int, node: str = "a") -> Depth:
+    return Depth(node=node, stamp_ns=second * S_NS, depth_m=float(second), sigma_m=0.02)
+
+
+def write(path, seconds, flush_every=10, node="a"):
+    with DiveLogWriter(path, metadata={"software": "test"}) as writer:
+        for i, second in enumerate(seconds):
+            writer.write_message(depth(second, node))
+            if i % flush_every == flush_every - 1:
+                writer.flush()
+
+
+def seconds_of(reader):
+    return [record.decode().stamp_ns // S_NS for record in reader.records()]
+
+
+def test_round_trip_and_independent_reader(tmp_path):
+    write(tmp_path / "a.mcap", range(100))
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        assert seconds_of(reader) == list(range(100))
+        assert (reader.start_ns, reader.end_ns, reader.damage) == (0, 99 * S_NS, [])
+        assert reader.metadata() == {"software": "test"}
+        assert reader.keys == ["buddyline/node/a/depth"]
+    with open(tmp_path / "a.mcap", "rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
+            assert (schema.name, schema.encoding) == ("buddyline.Depth", "jsonschema")
+            assert (channel.message_encoding, message.publish_time) == ("json", message.log_time)
+
+
+def test_never_overwrites(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    with pytest.raises(BuddylineError, match="exists"):
+        DiveLogWriter(tmp_path / "a.mcap")
+    assert (tmp_path / "a.mcap").read_bytes() == b"precious"
+
+
+def test_out_of_order_messages_come_in_order(tmp_path):
+    seconds = list(range(200))
+    random.Random(1).shuffle(seconds)
+    write(tmp_path / "a.mcap", seconds)
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        assert seconds_of(reader) == list(range(200))
+
+
+def test_several_logs_read_as_one(tmp_path):
+    write(tmp_path / "a.mcap", range(0, 100, 2))
+    write(tmp_path / "b.mcap", range(1, 100, 2), node="b")
+    with DiveLogReader(tmp_path / "a.mcap") as a, DiveLogReader(tmp_path / "b.mcap") as b:
+        assert [r.log_time_ns // S_NS for r in read_logs([a, b])] == list(range(100))
+        assert [r.key for r in read_logs([a, b], lambda key: "/b/" in key)] == ["buddyline/node/b/depth"] * 50
+
+
+def test_cut_at_any_byte_loses_only_the_chunk_in_progress(tmp_path):
+    write(tmp_path / "a.mcap", range(50), flush_every=5)
+    whole = (tmp_path / "a.mcap").read_bytes()
+    kept = 0
+    for cut in range(1, len(whole), 7):
+        (tmp_path / "cut.mcap").write_bytes(whole[:cut])
+        try:
+            with DiveLogReader(tmp_path / "cut.mcap") as reader:
+                found = seconds_of(reader)
+                assert reader.damage or cut == len(whole)
+        except BuddylineError:
+            assert cut < 8
+            continue
+        assert found == list(range(len(found)))
+        assert len(found) % 5 == 0
+        assert len(found) >= kept
+        kept = len(found)
+    assert kept == 50
+
+
+def test_damaged_chunk_is_left_out_and_said(tmp_path):
+    write(tmp_path / "a.mcap", range(50), flush_every=10)
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        offset = sorted(reader._contents.chunks)[1][2]
+    data[offset + 60 : offset + 80] = bytes(20)
+    (tmp_path / "a.mcap").write_bytes(data)
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        assert seconds_of(reader) == [*range(10), *range(20, 50)]
+        assert len(reader.damage) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "says"), [(b"", "is empty"), (b"just some text\n", "not a dive log"), (None, "cannot be read")]
+)
+def test_what_is_no_log_is_said_so(tmp_path, content, says):
+    if content is not None:
+        (tmp_path / "x.mcap").write_bytes(content)
+    with pytest.raises(BuddylineError, match=says) as refused:
+        DiveLogReader(tmp_path / "x.mcap")
+    assert "x.mcap" in str(refused.value)
+
+
+def test_kill_loses_at_most_two_seconds(tmp_path):
+    program = textwrap.dedent(
+        """
+        import sys, time
+        from protocol.recorder import Recorder
+        recorder = Recorder(sys.argv[1])
+        for i in range(10_000):
+            stamp = time.time_ns()
+            payload = b'{"node":"a","stamp_ns":%d,"depth_m":1.0,"sigma_m":0.02}' % stamp
+            recorder.write("buddyline/node/a/depth", payload, stamp)
+            print(stamp, flush=True)
+            time.sleep(0.02)
+        """
+    )
+    path = tmp_path / "killed.mcap"
+    child = subprocess.Popen([sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True)
+    stamps = [int(child.stdout.readline()) for _ in range(150)]
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+    with DiveLogReader(path) as reader:
+        found = [record.publish_time_ns for record in reader.records()]
+    assert found == stamps[: len(found)]
+    assert stamps[-1] - found[-1] <= 2 * S_NS
+
+
+def test_recorder_writes_everything_and_says_where_it_failed(tmp_path):
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for second in range(1000):
+            message = depth(second)
+            recorder.write("buddyline/node/a/depth", b'{"stamp_ns":%d}' % message.stamp_ns, message.stamp_ns)
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        assert len(list(reader.records())) == 1000
+    assert (recorder.written, recorder.dropped) == (1000, 0)
+
+
+def test_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
+    monkeypatch.setattr("protocol.recorder.MAX_QUEUED_BYTES", 1000)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        with recorder._ready:  # the writing thread cannot take anything meanwhile
+            for i in range(8):
+                recorder._queue.append(("buddyline/node/a/image", bytes(200), i, ""))
+                recorder._queue.append(("buddyline/node/a/depth", b'{"stamp_ns":%d}' % i, i, ""))
+                recorder._queued_bytes += 200 + len(recorder._queue[-1][1])
+            while recorder._queued_bytes > 1000:
+                recorder._drop_one()
+            kinds = [parse_key(item[0])[0].name for item in recorder._queue]
+        assert kinds.count("depth") == 8
+        assert kinds.count("image") == 4
+    assert recorder.dropped == 4
+
+
+def test_image_stamp_is_its_publish_time(tmp_path):
+    image = CompressedImage(timestamp=FoxgloveTime(sec=3, nsec=4), frame_id="a_camera", data=b"x", format="jpeg")
+    with DiveLogWriter(tmp_path / "a.mcap") as writer:
+        writer.write_message(image)
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        (record,) = reader.records()
+        assert record.publish_time_ns == 3_000_000_004
+        assert record.decode() == image

@@ -1,0 +1,126 @@
+"""The contract's messages: what decodes is sound, and nothing unsound goes out."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol.messages import Attitude, Blob, Candidates, Depth, MessageError, NodeInfo, decode, encode
+
+ATTITUDE = {
+    "node": "a",
+    "stamp_ns": 1_764_000_000_000_000_001,
+    "q_ned_body_xyzw": [0.0, 0.0, 0.0, 1.0],
+    "sigma_rad": [0.02, 0.02, 0.08],
+}
+CANDIDATES = {
+    "node": "a",
+    "stamp_ns": 5,
+    "trigger": 0,
+    "seq": 0,
+    "boot": "x",
+    "width_px": 820,
+    "height_px": 616,
+    "blobs": [
+        {"u_px": 1.0, "v_px": 2.0, "sigma_px": 0.5, "area_px": 9.0, "peak": 255.0, "elongation": 1.0, "dt_ns": 0}
+    ],
+}
+CAMERA = {"model": "pinhole", "fx_px": 900.0, "fy_px": 900.0, "cx_px": 409.5, "cy_px": 307.5, "distortion": [0.0] * 5}
+INFO = {
+    "node": "a",
+    "stamp_ns": 0,
+    "width_px": 820,
+    "height_px": 616,
+    "camera": CAMERA,
+    "light_left_m": [-0.44, 0.0, 0.0],
+    "light_right_m": [0.44, 0.0, 0.0],
+    "sigma_px": 0.7,
+    "trigger_period_ns": 100_000_000,
+}
+
+
+def dumps(message: object) -> bytes:
+    return json.dumps(message).encode()
+
+
+@pytest.mark.parametrize(
+    ("schema", "sound", "change", "named"),
+    [
+        (Attitude, ATTITUDE, {"node": "a/b"}, "node"),
+        (Attitude, ATTITUDE, {"node": "a\n"}, "node"),
+        (Attitude, ATTITUDE, {"stamp_ns": -1}, "stamp_ns"),
+        (Attitude, ATTITUDE, {"stamp_ns": 1.5}, "stamp_ns"),
+        (Attitude, ATTITUDE, {"stamp_ns": True}, "stamp_ns"),
+        (Attitude, ATTITUDE, {"q_ned_body_xyzw": [0.0, 0.0, 0.0, 1.01]}, "q_ned_body_xyzw"),
+        (Attitude, ATTITUDE, {"q_ned_body_xyzw": [0.0, 0.0, 1.0]}, "q_ned_body_xyzw"),
+        (Attitude, ATTITUDE, {"sigma_rad": [math.nan, 0.1, 0.1]}, "sigma_rad"),
+        (Attitude, ATTITUDE, {"sigma_rad": [0.1, math.inf, 0.1]}, "sigma_rad"),
+        (Attitude, ATTITUDE, {"sigma_rad": [0.1, "0.1", 0.1]}, "sigma_rad"),
+        (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], u_px=820.0)]}, "blobs[0].u_px"),
+        (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], v_px=-0.6)]}, "blobs[0].v_px"),
+        (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], sigma_px=0.0)]}, "sigma_px"),
+        (Candidates, CANDIDATES, {"blobs": CANDIDATES["blobs"] * 65}, "blobs"),
+        (NodeInfo, INFO, {"camera": dict(CAMERA, distortion=[0.0] * 4)}, "distortion"),
+        (NodeInfo, INFO, {"light_left_m": [0.44, 0.0, 0.0]}, "light_left_m"),
+        (NodeInfo, INFO, {"trigger_period_ns": 0}, "trigger_period_ns"),
+    ],
+)
+def test_unsound_is_refused_and_named(schema, sound, change, named):
+    decode(dumps(sound), schema)
+    with pytest.raises(MessageError) as refused:
+        decode(dumps(sound | change), schema)
+    assert named in str(refused.value)
+
+
+@pytest.mark.parametrize("field", sorted(ATTITUDE))
+def test_missing_field_is_named(field):
+    with pytest.raises(MessageError, match=field):
+        decode(dumps({name: value for name, value in ATTITUDE.items() if name != field}), Attitude)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"null", b"[" * 100_000, b"{" * 50, b"{}", b'{"node":'])
+def test_garbage_is_refused(payload):
+    with pytest.raises(MessageError):
+        decode(payload, Attitude)
+
+
+def test_unknown_fields_are_ignored():
+    assert decode(dumps(ATTITUDE | {"mood": "calm"}), Attitude).node == "a"
+
+
+def test_nothing_unsound_goes_out():
+    with pytest.raises(MessageError, match="depth_m"):
+        encode(Depth(node="a", stamp_ns=0, depth_m=math.nan, sigma_m=0.02))
+    with pytest.raises(MessageError, match="node"):
+        encode(Depth(node="A", stamp_ns=0, depth_m=1.0, sigma_m=0.02))
+
+
+def test_numbers_go_out_as_floats_and_unknown_is_left_out():
+    out = encode(Depth(node="a", stamp_ns=7, depth_m=np.float64(3), sigma_m=1))
+    assert out == b'{"node":"a","stamp_ns":7,"depth_m":3.0,"sigma_m":1.0}'
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-0.5, 819.5), st.floats(-0.5, 615.5), st.floats(1e-3, 50.0), st.floats(0.0, 255.0)),
+        max_size=64,
+    )
+)
+def test_round_trip(values):
+    blobs = [
+        Blob(u_px=u, v_px=v, sigma_px=s, area_px=1.0, peak=p, elongation=1.0, score=p / 255.0) for u, v, s, p in values
+    ]
+    message = Candidates(node="b", stamp_ns=9, trigger=1, seq=3, boot="y", width_px=820, height_px=616, blobs=blobs)
+    assert decode(encode(message), Candidates) == message
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_decode_or_are_refused(payload):
+    for schema in (Attitude, Candidates, NodeInfo):
+        try:
+            decode(payload, schema)
+        except MessageError as error:
+            assert schema.__name__ in str(error)
