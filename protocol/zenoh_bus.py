@@ -19,13 +19,13 @@ import zenoh.ext
 
 from protocol.bus import (
     CACHE_S,
-    ThreadDiedError,
     Delivery,
     FailureLatch,
     Publisher,
     RateCap,
     Received,
     Subscription,
+    ThreadDiedError,
     cache_depth,
     check_alive_name,
 )
