@@ -53,7 +53,8 @@ class Blobs:
     def distances_px(self, lights: TrueLights) -> Floats:
         """Return how far each candidate is from the left and the right light, (N, 2), infinite where unknown."""
         away = np.linalg.norm(self.pixels[:, None, :] - lights.pixels[None, :, :], axis=-1)
-        return np.nan_to_num(away, nan=np.inf)
+        known: Floats = np.where(np.isnan(away), np.inf, away)
+        return known
 
 
 def project(points_c_m: Floats, camera: CameraModel) -> Floats:
@@ -72,11 +73,9 @@ def project(points_c_m: Floats, camera: CameraModel) -> Floats:
     flat, zero = way.reshape(-1, 1, 3), np.zeros(3)
     if not len(flat):
         return np.empty((0, 2))
-    if camera.model == "fisheye":
-        imaged, _ = cv2.fisheye.projectPoints(flat, zero, zero, matrix, distortion)
-    else:
-        imaged, _ = cv2.projectPoints(flat, zero, zero, matrix, distortion)
-    imaged = np.asarray(imaged, dtype=np.float64).reshape(way.shape[:2] + (2,))
+    model = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    imaged: Floats = np.asarray(model(flat, zero, zero, matrix, distortion)[0], dtype=np.float64)
+    imaged = imaged.reshape((*way.shape[:2], 2))
     radius = np.linalg.norm((imaged - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px), axis=-1)
     outward = (np.diff(radius, axis=1) >= -1e-9).all(axis=1)
     pixels: Floats = imaged[:, -1].copy()
@@ -94,9 +93,10 @@ def _projected(frame: Candidates, track: TruthTrack, own: NodeInfo, other: NodeI
         t = -rotate(q, t)
     points_c_m = rotate(q, np.array([other.light_left_m, other.light_right_m])) + t
     pixels = project(points_c_m, own.camera)
+    half = np.array([own.width_px, own.height_px]) / 2.0
     with np.errstate(invalid="ignore"):
-        inside = (pixels >= -0.5) & (pixels <= (own.width_px - 0.5, own.height_px - 0.5))
-    return TrueLights(pixels, inside.all(axis=1), marked=False)
+        inside = (np.abs(pixels - half + 0.5) <= half).all(axis=1)
+    return TrueLights(pixels, np.asarray(inside, dtype=bool), marked=False)
 
 
 def _marked(truth: LightTruth) -> TrueLights:

@@ -1,0 +1,54 @@
+"""`buddyline evaluate`: poses, pairs and candidates against truth."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from pathlib import Path
+
+from protocol.errors import BuddylineError
+from tools.evaluation.logs import load_for_evaluation, parse_pair
+from tools.evaluation.report import as_dict, as_text
+from tools.evaluation.result import evaluate
+
+log = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "logs", nargs="+", metavar="OUT.mcap", help="the solved log; further logs, where it lacks candidates or truth"
+    )
+    parser.add_argument("--truth", action="append", default=[], metavar="T.mcap", help="the log with the truth")
+    parser.add_argument("--pair", type=parse_pair, metavar="A/B", help="where the logs hold more than one pair")
+    parser.add_argument("--json", action="store_true", help="print one JSON object: metres, radians, seconds")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots (PNG); needs the extra `plots`")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print, and draw where asked for; return 0."""
+    if args.plots is not None:
+        from tools.evaluation import plots
+
+        plots.check(args.plots)
+    recorded = load_for_evaluation(args.logs, args.truth, args.pair)
+    for problem in recorded.problems:
+        log.warning("%s", problem)
+    result = evaluate(
+        recorded.poses,
+        recorded.rejected,
+        recorded.truths,
+        recorded.candidates,
+        recorded.light_truths,
+        recorded.infos,
+        recorded.attitudes_a,
+        nodes=recorded.nodes,
+    )
+    if result.poses and result.without_truth == result.poses:
+        raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")
+    print(json.dumps(as_dict(result), allow_nan=False) if args.json else as_text(result))
+    if args.plots is not None:
+        for path in plots.write(result, args.plots):
+            log.info("%s", path)
+    return 0

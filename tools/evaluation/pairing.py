@@ -1,0 +1,106 @@
+"""Whether the triggers that show all four lights end as a pose with the right pair."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from protocol.messages import Rejected, RelativePose
+from tools.evaluation.lights import Blobs, TrueLights, is_right_pair
+from tools.evaluation.statistics import share
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Triggers at which both pictures show both lights of the other node.
+
+    marked: visible by LightTruth; else: the projected lights fall inside both pictures, whatever stands in between.
+    right: of them, those that ended as a pose with the right pair; other_pair: as a pose with another; ended: how the
+    rest ended, by reason ("no result" among them). detected: of them, with a candidate near all four lights, and of
+    these right_detected. None where candidates or results are not known.
+    """
+
+    marked: bool
+    visible: int
+    right: int | None
+    other_pair: int | None
+    ended: dict[str, int]
+    detected: int | None
+    right_detected: int | None
+
+    @property
+    def right_share(self) -> float | None:
+        """The share of visible triggers that ended as a pose with the right pair."""
+        return None if self.right is None else share(self.right, self.visible)
+
+    @property
+    def right_detected_share(self) -> float | None:
+        """The same, of the triggers at which all four lights were detected."""
+        return (
+            None if self.right_detected is None or self.detected is None else share(self.right_detected, self.detected)
+        )
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One trigger at which both pictures show both lights; ended: "pose", a rejection's reason, or "no result"."""
+
+    range_m: float
+    marked: bool
+    detected: bool | None
+    right: bool | None
+    ended: str
+
+
+def sightings_of(
+    nodes: tuple[str, str],
+    poses: Sequence[RelativePose],
+    rejected: Sequence[Rejected],
+    lights: Mapping[tuple[str, int], TrueLights],
+    blobs: Mapping[tuple[str, int], Blobs],
+    ranges_m: Mapping[int, float],
+) -> list[Sighting]:
+    """Return the triggers at which both pictures show both lights; ranges_m: the true range by trigger."""
+    pose_at = {pose.trigger: pose for pose in poses}
+    reason_at = {rejection.trigger: rejection.reason for rejection in rejected}
+    answered = bool(blobs and (poses or rejected))
+    sightings = []
+    for trigger in sorted({trigger for _, trigger in lights}):
+        views = [(lights.get((node, trigger)), blobs.get((node, trigger))) for node in nodes]
+        if not all(true is not None and true.visible.all() for true, _ in views):
+            continue
+        pose = pose_at.get(trigger)
+        near = [
+            seen is not None and true is not None and bool((seen.distances_px(true) <= seen.tolerance_px).any(0).all())
+            for true, seen in views
+        ]
+        sightings.append(
+            Sighting(
+                range_m=ranges_m.get(trigger, float("nan")),
+                marked=all(true is not None and true.marked for true, _ in views),
+                detected=all(near) if blobs else None,
+                right=(pose is not None and is_right_pair(pose, blobs, lights) is True) if answered else None,
+                ended="pose" if pose is not None else reason_at.get(trigger, "no result"),
+            )
+        )
+    return sightings
+
+
+def pairing_figures(sightings: Sequence[Sighting]) -> Pairing | None:
+    """Return the figures of these triggers, None where there are none."""
+    if not sightings:
+        return None
+    judged = all(sighting.right is not None for sighting in sightings)
+    searched = all(sighting.detected is not None for sighting in sightings)
+    posed = sum(sighting.ended == "pose" for sighting in sightings)
+    right = sum(bool(sighting.right) for sighting in sightings)
+    return Pairing(
+        marked=all(sighting.marked for sighting in sightings),
+        visible=len(sightings),
+        right=right if judged else None,
+        other_pair=posed - right if judged else None,
+        ended=dict(Counter(sighting.ended for sighting in sightings if sighting.ended != "pose").most_common()),
+        detected=sum(bool(sighting.detected) for sighting in sightings) if searched else None,
+        right_detected=sum(bool(sighting.detected and sighting.right) for sighting in sightings) if judged else None,
+    )

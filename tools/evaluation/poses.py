@@ -1,0 +1,144 @@
+"""Errors of poses against truth, a value a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from protocol.messages import NodeInfo, RelativePose
+from tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
+from tools.evaluation.truth import Track, TruthTrack
+
+# A pose is wrong where its position is off by more than this share of the true range.
+WRONG_SHARE: Final = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Poses that have truth, in order of time; N values each, NaN where one cannot be known.
+
+    t_m, true_t_m: (N, 3), in A's camera frame. range_m, azimuth_rad, inclination_rad: published minus true.
+    bearing_rad: angle between the published and the true direction to B. azimuth and inclination: the truth is
+    turned to NED by A's attitude as it was measured, so the compass's own error is in neither.
+    nees6, nees3: squared error in units of the published covariance, of all six and of the position;
+    an honest covariance makes their means 6 and 3. right_pair: 1, 0 or NaN.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    trigger: NDArray[np.int64]
+    t_m: Floats
+    true_t_m: Floats
+    true_range_m: Floats
+    translation_m: Floats
+    rotation_rad: Floats
+    range_m: Floats
+    bearing_rad: Floats
+    azimuth_rad: Floats
+    inclination_rad: Floats
+    nees6: Floats
+    nees3: Floats
+    wrong: NDArray[np.bool_]
+    right_pair: Floats
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def select(self, chosen: NDArray[np.bool_]) -> PoseErrors:
+        """Return the poses for which chosen (N,) holds."""
+        return PoseErrors(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+
+
+def nees(errors: Floats, covariances: Floats) -> Floats:
+    """Return e^T P^-1 e for errors (N, k) and covariances (N, k, k); NaN where P is not positive definite."""
+    result = np.full(len(errors), np.nan)
+    if not len(errors):
+        return result
+    symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    # Metres and radians share the matrix: scaled to a unit diagonal, definiteness does not hang on the units.
+    diagonal = np.diagonal(symmetric, axis1=1, axis2=2)
+    positive = np.asarray((diagonal > 0.0).all(axis=1))
+    scale = 1.0 / np.sqrt(np.where(positive[:, None], diagonal, 1.0))
+    scaled = symmetric * scale[:, :, None] * scale[:, None, :]
+    sound = positive & (np.linalg.eigvalsh(scaled)[:, 0] > 1e-12)
+    whitened = (errors * scale)[sound]
+    solved = np.linalg.solve(scaled[sound], whitened[:, :, None])[:, :, 0]
+    result[sound] = (whitened * solved).sum(axis=1)
+    return result
+
+
+def _angle_between(one: Floats, other: Floats) -> Floats:
+    angle: Floats = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(axis=1))
+    return angle
+
+
+def _wrapped(angle_rad: Floats) -> Floats:
+    wrapped: Floats = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+    return wrapped
+
+
+def _published(values: Sequence[object]) -> Floats:
+    return np.array([np.nan if value is UNSET else value for value in values], dtype=float)
+
+
+def _ned_of_a(poses: Sequence[RelativePose], attitude_a: Track, info_a: NodeInfo | None) -> Floats:
+    """Return q_ned_camera (N, 4) of node a at each pose, NaN where unknown."""
+    q_ned_camera = np.full((len(poses), 4), np.nan)
+    if info_a is None:
+        return q_ned_camera
+    q_body_camera = normalized(np.array(info_a.q_body_camera_xyzw))
+    for i, pose in enumerate(poses):
+        measured = attitude_a.at(pose.stamp_ns + pose.skew_ns // 2)
+        if measured is not None:
+            q_ned_camera[i] = multiply(measured[1], q_body_camera)
+    return q_ned_camera
+
+
+def pose_errors(
+    poses: Sequence[RelativePose],
+    track: TruthTrack,
+    is_right: Callable[[RelativePose], bool | None],
+    attitude_a: Track,
+    infos: Mapping[str, NodeInfo],
+) -> PoseErrors:
+    """Compare the poses of one pair with truth; poses without truth are left out."""
+    found = [(pose, known) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
+    found.sort(key=lambda pair: pair[0].stamp_ns)
+    known_poses = [pose for pose, _ in found]
+    t_m = np.array([pose.t_a_b_m for pose in known_poses]).reshape(-1, 3)
+    q = normalized(np.array([pose.q_a_b_xyzw for pose in known_poses]).reshape(-1, 4))
+    true_t_m = np.array([known[0] for _, known in found]).reshape(-1, 3)
+    true_q = np.array([known[1] for _, known in found]).reshape(-1, 4)
+    true_range_m = np.linalg.norm(true_t_m, axis=1)
+
+    offset_m = true_t_m - t_m
+    w_rad = rotation_vector(multiply(true_q, conjugate(q)))
+    translation_m = np.linalg.norm(offset_m, axis=1)
+    covariances = np.array([pose.covariance for pose in known_poses]).reshape(-1, 6, 6)
+
+    info_a = infos.get(known_poses[0].node_a) if known_poses else None
+    true_ned_m = rotate(_ned_of_a(known_poses, attitude_a, info_a), true_t_m)
+    north, east, down = true_ned_m.T
+    right = (is_right(pose) for pose in known_poses)
+    return PoseErrors(
+        stamp_ns=np.array([pose.stamp_ns for pose in known_poses], dtype=np.int64),
+        trigger=np.array([pose.trigger for pose in known_poses], dtype=np.int64),
+        t_m=t_m,
+        true_t_m=true_t_m,
+        true_range_m=true_range_m,
+        translation_m=translation_m,
+        rotation_rad=np.linalg.norm(w_rad, axis=1),
+        range_m=np.array([pose.range_m for pose in known_poses]) - true_range_m,
+        bearing_rad=_angle_between(t_m, true_t_m),
+        azimuth_rad=_wrapped(_published([pose.azimuth_rad for pose in known_poses]) - np.arctan2(east, north)),
+        inclination_rad=_published([pose.inclination_rad for pose in known_poses])
+        - np.arctan2(-down, np.hypot(north, east)),
+        nees6=nees(np.concatenate([offset_m, w_rad], axis=1), covariances),
+        nees3=nees(offset_m, covariances[:, :3, :3]),
+        wrong=translation_m > WRONG_SHARE * true_range_m,
+        right_pair=np.array([np.nan if verdict is None else float(verdict) for verdict in right]),
+    )

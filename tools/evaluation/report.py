@@ -1,0 +1,182 @@
+"""A result as text for a person and as plain values for a program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from tools.evaluation.detection import Detection
+from tools.evaluation.pairing import Pairing
+from tools.evaluation.poses import WRONG_SHARE
+from tools.evaluation.result import Accuracy, RangeBin, Result
+from tools.evaluation.statistics import Stats
+
+_DEGREES = 180.0 / math.pi
+
+
+def as_dict(result: Result) -> dict[str, Any]:
+    """Return the figures as JSON takes them: no NaN, no infinity, null for what is not known."""
+    return {key: value for key, value in _plain(result).items() if key != "errors"}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        plain = {field.name: _plain(getattr(value, field.name)) for field in fields(value) if field.name != "errors"}
+        if isinstance(value, Pairing):
+            plain |= {"right_share": value.right_share, "right_detected_share": value.right_detected_share}
+        return plain
+    if isinstance(value, dict):
+        return {"all" if key == 0 else str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def as_text(result: Result) -> str:
+    """Return the figures as aligned tables."""
+    parts = [_triggers_text(result)]
+    if result.pairing is not None:
+        parts.append(_pairing_text(result.pairing))
+    if result.accuracy.poses:
+        parts += [_accuracy_text(result.accuracy), _bins_text(result.bins)]
+    if result.detection is not None:
+        parts.append(_detection_text(result.detection))
+    return "\n\n".join(parts)
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f} %"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    """Align: the first column left, the others right."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return "\n".join(
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
+        ).rstrip()
+        for row in rows
+    )
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
+
+
+def _triggers_text(result: Result) -> str:
+    triggers, skew = result.triggers, result.skew
+    lines = [
+        f"pair {result.node_a}/{result.node_b}: {result.poses} poses of {triggers.total} triggers"
+        f" in {triggers.span_s:.1f} s ({_number(triggers.poses_hz, 2)} of {_number(triggers.triggers_hz, 2)} Hz,"
+        f" longest time without a pose {_number(triggers.gap_s, 2)} s)",
+        f"rejected: {_counts(triggers.rejected)}",
+        f"triggers without a result: {'not known' if triggers.unanswered is None else triggers.unanswered}"
+        f", with more than one: {triggers.doubled}",
+    ]
+    if result.without_truth:
+        lines.append(f"poses without truth, not compared: {result.without_truth}")
+    if skew is not None:
+        drift = "" if skew.drift_ppm is None else f", drift {skew.drift_ppm:.1f} +- {skew.drift_sd_ppm:.1f} ppm"
+        lines.append(
+            f"stamps a - b: median {1e3 * skew.median_s:.2f} ms, 95 % within {1e3 * skew.p95_s:.2f} ms,"
+            f" at most {1e3 * skew.largest_s:.2f} ms{drift}"
+        )
+    return "\n".join(lines)
+
+
+def _pairing_text(pairing: Pairing) -> str:
+    how = "all four lights in view" if pairing.marked else "all four lights inside the pictures (by projection)"
+    lines = [f"triggers with {how}: {pairing.visible}"]
+    if pairing.right is not None:
+        lines.append(f"  right pair   {_percent(pairing.right_share):>7}  {pairing.right} poses")
+        lines.append(f"  another pair          {pairing.other_pair} poses")
+        lines.append(f"  no pose               {_counts(pairing.ended)}")
+    if pairing.detected is not None:
+        lines.append(f"  with a candidate near all four: {pairing.detected}")
+    if pairing.right_detected is not None:
+        lines.append(f"    right pair {_percent(pairing.right_detected_share):>7}  {pairing.right_detected} poses")
+    return "\n".join(lines)
+
+
+def _stats_row(name: str, stats: Stats, digits: int, scale: float = 1.0, note: str = "") -> list[str]:
+    figures = (stats.median, stats.p95, stats.rmse, stats.mean)
+    scaled = [_number(None if figure is None else figure * scale, digits) for figure in figures]
+    return [name, str(stats.count), *scaled, note]
+
+
+def _accuracy_text(accuracy: Accuracy) -> str:
+    rows = [
+        ["error", "poses", "median", "p95", "RMSE", "mean", ""],
+        _stats_row("position, m", accuracy.translation_m, 4),
+        _stats_row("rotation, deg", accuracy.rotation_rad, 3, _DEGREES),
+        _stats_row("range, m", accuracy.range_m, 4),
+        _stats_row("bearing, deg", accuracy.bearing_rad, 3, _DEGREES),
+    ]
+    if accuracy.azimuth_rad.count:
+        rows.append(_stats_row("azimuth, deg", accuracy.azimuth_rad, 3, _DEGREES))
+        rows.append(_stats_row("inclination, deg", accuracy.inclination_rad, 3, _DEGREES))
+    rows += [
+        _stats_row(
+            "NEES, pose", accuracy.nees6, 2, note=f"honest: 5.35 12.59, mean 6; {_percent(accuracy.honest6)} in 95 %"
+        ),
+        _stats_row(
+            "NEES, position", accuracy.nees3, 2, note=f"honest: 2.37 7.81, mean 3; {_percent(accuracy.honest3)} in 95 %"
+        ),
+    ]
+    wrong = (
+        f"wrong poses (position off by more than {WRONG_SHARE:.0%} of the range): {accuracy.wrong} of {accuracy.poses}"
+    )
+    return f"{wrong}, {_percent(accuracy.wrong_share)}\n{_table(rows)}"
+
+
+def _bins_text(bins: Sequence[RangeBin]) -> str:
+    rows = [
+        ["range, m", "in view", "right pair", "poses", "wrong", "position", "p95, m", "rotation", "p95, deg", "NEES"]
+    ]
+    for part in bins:
+        accuracy = part.accuracy
+        rotation = (accuracy.rotation_rad.median, accuracy.rotation_rad.p95)
+        rows.append(
+            [
+                f"{part.from_m:g} - {part.to_m:g}" if math.isfinite(part.to_m) else f"{part.from_m:g} -",
+                str(part.pairing.visible if part.pairing else 0),
+                _percent(part.pairing.right_share if part.pairing else None),
+                str(accuracy.poses),
+                _percent(accuracy.wrong_share),
+                _number(accuracy.translation_m.median, 4),
+                _number(accuracy.translation_m.p95, 4),
+                *(_number(None if angle is None else angle * _DEGREES) for angle in rotation),
+                _number(accuracy.nees6.median, 2),
+            ]
+        )
+    return f"by range (medians beside p95)\n{_table(rows)}"
+
+
+def _detection_text(detection: Detection) -> str:
+    first = {n: share for n, share in detection.both_first.items() if n}
+    rows = [
+        ["recall within 2 px", _percent(detection.recall_close)],
+        ["recall within 1 % of the width", _percent(detection.recall_near)],
+        *([f"both lights among the first {n}", _percent(share)] for n, share in first.items()),
+        ["both lights among all", _percent(detection.both_first[0])],
+        ["candidates per picture", _number(detection.candidates_per_picture, 1)],
+        ["false candidates per picture", _number(detection.false_per_picture, 2)],
+        ["error of the nearest, median, px", _number(detection.error_median_px, 2)],
+        ["error of the nearest, p90, px", _number(detection.error_p90_px, 2)],
+        ["error over sigma, per axis, RMS (honest: 1)", _number(detection.normalized_rms, 2)],
+        ["the same from the median", _number(detection.normalized_robust, 2)],
+    ]
+    lost = f", {detection.lost_pictures} of them without candidates" if detection.lost_pictures else ""
+    head = (
+        f"detection: {detection.pictures} pictures{lost}; {detection.visible_lights} lights in view,"
+        f" {detection.both_visible} pictures with both"
+    )
+    return f"{head}\n{_table(rows)}"

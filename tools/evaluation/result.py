@@ -1,0 +1,154 @@
+"""Poses, rejections and candidates of one pair of nodes, measured against truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from protocol.messages import Attitude, Candidates, LightTruth, NodeInfo, Rejected, RelativePose, Truth
+from tools.evaluation.detection import Detection, detection_figures
+from tools.evaluation.lights import Blobs, is_right_pair, true_lights
+from tools.evaluation.pairing import Pairing, Sighting, pairing_figures, sightings_of
+from tools.evaluation.poses import PoseErrors, pose_errors
+from tools.evaluation.statistics import Stats, share
+from tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
+from tools.evaluation.truth import Track, TruthTrack
+
+RANGE_EDGES_M: Final = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, float("inf"))
+# The 95 % points of chi-square with 6 and 3 degrees of freedom.
+NEES6_GATE: Final = 12.592
+NEES3_GATE: Final = 7.815
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of some poses; see PoseErrors. honest6, honest3: the share inside the 95 % gate of the covariance."""
+
+    poses: int
+    wrong: int
+    wrong_share: float | None
+    translation_m: Stats
+    rotation_rad: Stats
+    range_m: Stats
+    bearing_rad: Stats
+    azimuth_rad: Stats
+    inclination_rad: Stats
+    nees6: Stats
+    nees3: Stats
+    honest6: float | None
+    honest3: float | None
+
+    @classmethod
+    def of(cls, errors: PoseErrors) -> Accuracy:
+        """Return the figures of these poses."""
+        known6, known3 = errors.nees6[np.isfinite(errors.nees6)], errors.nees3[np.isfinite(errors.nees3)]
+        return cls(
+            poses=len(errors),
+            wrong=int(errors.wrong.sum()),
+            wrong_share=share(int(errors.wrong.sum()), len(errors)),
+            translation_m=Stats.of(errors.translation_m),
+            rotation_rad=Stats.of(errors.rotation_rad),
+            range_m=Stats.of(errors.range_m),
+            bearing_rad=Stats.of(errors.bearing_rad),
+            azimuth_rad=Stats.of(errors.azimuth_rad),
+            inclination_rad=Stats.of(errors.inclination_rad),
+            nees6=Stats.of(errors.nees6),
+            nees3=Stats.of(errors.nees3),
+            honest6=share(int((known6 <= NEES6_GATE).sum()), len(known6)),
+            honest3=share(int((known3 <= NEES3_GATE).sum()), len(known3)),
+        )
+
+
+@dataclass(frozen=True)
+class RangeBin:
+    """The same by true range, from_m <= range < to_m; pairing is None where no trigger showed all lights."""
+
+    from_m: float
+    to_m: float
+    accuracy: Accuracy
+    pairing: Pairing | None
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """All that is measured of one pair. without_truth: poses that could not be compared."""
+
+    node_a: str
+    node_b: str
+    poses: int
+    without_truth: int
+    triggers: Triggers
+    skew: Skew | None
+    accuracy: Accuracy
+    bins: list[RangeBin]
+    pairing: Pairing | None
+    detection: Detection | None
+    errors: PoseErrors
+
+
+def _bins(errors: PoseErrors, sightings: Sequence[Sighting]) -> list[RangeBin]:
+    bins = []
+    for start_m, end_m in pairwise(RANGE_EDGES_M):
+        chosen = errors.select((errors.true_range_m >= start_m) & (errors.true_range_m < end_m))
+        seen = [sighting for sighting in sightings if start_m <= sighting.range_m < end_m]
+        if len(chosen) or seen:
+            bins.append(RangeBin(start_m, end_m, Accuracy.of(chosen), pairing_figures(seen)))
+    return bins
+
+
+def evaluate(
+    poses: Sequence[RelativePose],
+    rejected: Sequence[Rejected],
+    truths: Sequence[Truth],
+    candidates: Sequence[Candidates],
+    light_truths: Sequence[LightTruth],
+    infos: Mapping[str, NodeInfo],
+    attitudes_a: Iterable[Attitude] = (),
+    *,
+    nodes: tuple[str, str],
+) -> Result:
+    """Measure one pair's poses, rejections and candidates.
+
+    nodes: a and b; all poses, rejections and truths are of T_a_b; messages of other nodes are left out. Of several
+    Candidates of one node and trigger the first counts. attitudes_a: node a's, for azimuth and inclination.
+    """
+    track = TruthTrack(truths)
+    frames: dict[tuple[str, int], Candidates] = {}
+    for frame in candidates:
+        if frame.node in nodes:
+            frames.setdefault((frame.node, frame.trigger), frame)
+    blobs = {key: Blobs.of(frame) for key, frame in frames.items()}
+    lights = true_lights(nodes, frames.values(), light_truths, infos, track)
+    errors = pose_errors(
+        poses, track, lambda pose: is_right_pair(pose, blobs, lights), Track.of_attitudes(attitudes_a), infos
+    )
+    ranges_m: dict[int, float] = {}
+    for (_, trigger), stamp_ns in _stamps_ns(frames, light_truths).items():
+        known = track.at(stamp_ns, trigger)
+        if known is not None:
+            ranges_m[trigger] = float(np.linalg.norm(known[0]))
+    sightings = sightings_of(nodes, poses, rejected, lights, blobs, ranges_m)
+    return Result(
+        node_a=nodes[0],
+        node_b=nodes[1],
+        poses=len(poses),
+        without_truth=len(poses) - len(errors),
+        triggers=trigger_figures(poses, rejected, list(frames.values())),
+        skew=skew_figures(poses),
+        accuracy=Accuracy.of(errors),
+        bins=_bins(errors, sightings),
+        pairing=pairing_figures(sightings),
+        detection=detection_figures(lights, blobs),
+        errors=errors,
+    )
+
+
+def _stamps_ns(
+    frames: Mapping[tuple[str, int], Candidates], light_truths: Iterable[LightTruth]
+) -> dict[tuple[str, int], int]:
+    stamps_ns = {(truth.node, truth.trigger): truth.stamp_ns for truth in light_truths}
+    return stamps_ns | {key: frame.stamp_ns for key, frame in frames.items()}

@@ -1,0 +1,40 @@
+"""Figures of a sample of errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tools.evaluation.rotation import Floats
+
+
+@dataclass(frozen=True)
+class Stats:
+    """count: finite values; median and p95: of their absolute values; rmse; mean: signed (the bias)."""
+
+    count: int
+    median: float | None = None
+    p95: float | None = None
+    rmse: float | None = None
+    mean: float | None = None
+
+    @classmethod
+    def of(cls, errors: Floats) -> Stats:
+        """Return the figures of errors (N,); NaN stands for one that is not known."""
+        known = errors[np.isfinite(errors)]
+        if not len(known):
+            return cls(0)
+        size = np.abs(known)
+        return cls(
+            count=len(known),
+            median=float(np.median(size)),
+            p95=float(np.percentile(size, 95)),
+            rmse=float(np.sqrt(np.mean(known**2))),
+            mean=float(np.mean(known)),
+        )
+
+
+def share(part: int | float, whole: int | float) -> float | None:
+    """Return part / whole, None where there is no whole."""
+    return part / whole if whole else None

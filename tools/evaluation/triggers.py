@@ -1,0 +1,82 @@
+"""What became of the triggers, how often they came, and how the nodes' clocks stood."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from protocol.messages import Candidates, Rejected, RelativePose
+from tools.evaluation.statistics import share
+
+
+@dataclass(frozen=True)
+class Triggers:
+    """What became of the triggers: each is to end as one pose or one rejection.
+
+    unanswered: with Candidates, without a result; None where the logs hold no Candidates. doubled: with more than
+    one result. gap_s: the longest time between two poses.
+    """
+
+    total: int
+    unanswered: int | None
+    doubled: int
+    rejected: dict[str, int]
+    span_s: float
+    triggers_hz: float | None
+    poses_hz: float | None
+    gap_s: float | None
+
+
+@dataclass(frozen=True)
+class Skew:
+    """stamp_a - stamp_b over the poses; drift: its slope, 1e-6, with one standard deviation."""
+
+    median_s: float
+    p95_s: float
+    largest_s: float
+    drift_ppm: float | None
+    drift_sd_ppm: float | None
+
+
+def trigger_figures(
+    poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Sequence[Candidates]
+) -> Triggers:
+    """Return what became of all triggers, those of frames without a result among them."""
+    stamps_ns = {frame.trigger: frame.stamp_ns for frame in frames}
+    stamps_ns |= {rejection.trigger: rejection.stamp_ns for rejection in rejected}
+    stamps_ns |= {pose.trigger: pose.stamp_ns for pose in poses}
+    results = Counter([pose.trigger for pose in poses]) + Counter([rejection.trigger for rejection in rejected])
+    asked = {frame.trigger for frame in frames}
+    span_s = (max(stamps_ns.values()) - min(stamps_ns.values())) / 1e9 if stamps_ns else 0.0
+    solved = sorted(pose.stamp_ns for pose in poses)
+    return Triggers(
+        total=len(asked | results.keys()),
+        unanswered=len(asked - results.keys()) if frames else None,
+        doubled=sum(count > 1 for count in results.values()),
+        rejected=dict(Counter(rejection.reason for rejection in rejected).most_common()),
+        span_s=span_s,
+        triggers_hz=share(len(stamps_ns) - 1, span_s),
+        poses_hz=share(len(poses), span_s),
+        gap_s=max(((end - start) / 1e9 for start, end in pairwise(solved)), default=None),
+    )
+
+
+def skew_figures(poses: Sequence[RelativePose]) -> Skew | None:
+    """Return how the stamps of matched frames differ, None where there is no pose."""
+    if not poses:
+        return None
+    skew_s = np.array([pose.skew_ns for pose in poses]) / 1e9
+    size_s = np.abs(skew_s)
+    first_ns = min(pose.stamp_ns for pose in poses)
+    t_s = np.array([pose.stamp_ns - first_ns for pose in poses]) / 1e9
+    drift = drift_sd = None
+    spread = float(((t_s - t_s.mean()) ** 2).sum())
+    if len(poses) > 2 and spread > 0.0:
+        slope = float(((t_s - t_s.mean()) * (skew_s - skew_s.mean())).sum()) / spread
+        rest = skew_s - skew_s.mean() - slope * (t_s - t_s.mean())
+        drift, drift_sd = slope * 1e6, float(np.sqrt((rest**2).sum() / (len(poses) - 2) / spread)) * 1e6
+    return Skew(float(np.median(skew_s)), float(np.percentile(size_s, 95)), float(size_s.max()), drift, drift_sd)
