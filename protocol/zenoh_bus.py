@@ -17,21 +17,11 @@ from typing import Any, Final, Literal, Self
 import zenoh
 import zenoh.ext
 
-from protocol.bus import (
-    CACHE_S,
-    Delivery,
-    FailureLatch,
-    Publisher,
-    RateCap,
-    Received,
-    Subscription,
-    ThreadDiedError,
-    cache_depth,
-    check_alive_name,
-)
+from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
 from protocol.clock import Clock, SystemClock
+from protocol.delivery import Delivery, FailureLatch, RateCap
 from protocol.errors import BuddylineError
-from protocol.messages import MAX_MESSAGE_BYTES, Message, encode
+from protocol.messages import MAX_MESSAGE_BYTES
 from protocol.topics import Topic, parse_key
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
@@ -183,25 +173,20 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
     return opened[0] if opened else None
 
 
-class ZenohPublisher:
+class ZenohPublisher(Publisher):
     """A Publisher over Zenoh."""
 
-    def __init__(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, topic: Topic, cap: RateCap) -> None:
-        self.topic = topic
+    def __init__(
+        self,
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        topic: Topic,
+        key: str,
+        cap: RateCap,
+    ) -> None:
+        super().__init__(topic, key, cap)
         self._publisher = publisher
-        self._cap = cap
-        self._closed = False
 
-    def put(self, message: Message) -> bool:
-        """Encode and send; False where the rate cap or a closed bus held it back."""
-        if not isinstance(message, self.topic.schema):
-            raise TypeError(f"topic {self.topic.name} carries {self.topic.schema.__name__}")
-        return self.put_bytes(encode(message))
-
-    def put_bytes(self, payload: bytes) -> bool:
-        """Send what is encoded already; False where the rate cap or a closed bus held it back."""
-        if self._closed or not self._cap.passes():
-            return False
+    def _send(self, payload: bytes) -> bool:
         try:
             self._publisher.put(payload)
         except zenoh.ZError:
@@ -212,7 +197,7 @@ class ZenohPublisher:
         return True
 
     def close(self) -> None:
-        """Publish no longer."""
+        """Publish no longer; what the cache held is gone."""
         if not self._closed:
             self._closed = True
             self._publisher.undeclare()  # type: ignore[no-untyped-call]
@@ -405,34 +390,20 @@ class ZenohWatch:
             self._delivery.offer((name, bool(processes)))
 
 
-class ZenohBus:
+class ZenohBus(Bus):
     """A Bus over Zenoh; get one from connect()."""
 
     def __init__(self, session: zenoh.Session, config: zenoh.Config, clock: Clock, cache_s: float) -> None:
+        super().__init__(clock)
         self._session = session
         self._config = config
-        self._clock = clock
         self._cache_s = cache_s
-        self._failures = FailureLatch()
-        self._lock = threading.Lock()
         self._bulk_session: zenoh.Session | None = None
-        self._publishers: list[ZenohPublisher] = []
-        self._subscriptions: list[ZenohSubscription | ZenohWatch] = []
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._closed = False
-
-    @property
-    def failure(self) -> ThreadDiedError | None:
-        """The first thread that died, for the service to raise; None while all is well."""
-        return self._failures.failure
-
-    def on_failure(self, handle: Callable[[ThreadDiedError], None]) -> None:
-        """Call handle, from the dying thread, when a thread of the bus dies."""
-        self._failures.on_failure(handle)
 
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
         """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
-        key = topic.key(*ids)
+        key, depth = topic.key(*ids), cache_depth(topic, self._cache_s)
         publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         settings: dict[str, Any] = {
             "encoding": topic.encoding,
@@ -440,18 +411,18 @@ class ZenohBus:
             "priority": _PRIORITIES[topic.priority],
             "express": topic.express,
         }
-        if topic.priority == "background":
-            # A big message holds up what is queued behind it in the same connection; nor is it worth recovering.
-            publisher = self._bulk().declare_publisher(key, **settings)
-        else:
+        if depth:
             publisher = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
-                cache=zenoh.ext.CacheConfig(cache_depth(topic, self._cache_s)),
+                cache=zenoh.ext.CacheConfig(depth),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 **settings,
             )
-        wrapped = ZenohPublisher(publisher, topic, RateCap(max_rate_hz, self._clock))
+        else:
+            # A big message holds up whatever is queued behind it in the same connection.
+            publisher = self._bulk().declare_publisher(key, **settings)
+        wrapped = ZenohPublisher(publisher, topic, key, RateCap(max_rate_hz, self.clock))
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped
@@ -462,7 +433,7 @@ class ZenohBus:
         """Hand every message on key_expr to handle, one at a time (protocol.bus.Bus has the contract)."""
         delivery = Delivery(f"bus {key_expr}", handle, capacity, self._failures)
         subscription = ZenohSubscription(
-            self._session, key_expr, delivery, history=history, clock=self._clock, failures=self._failures
+            self._session, key_expr, delivery, history=history, clock=self.clock, failures=self._failures
         )
         with self._lock:
             self._subscriptions.append(subscription)
@@ -490,30 +461,10 @@ class ZenohBus:
         keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         return any(not key.endswith(f"/{own}") for key in keys)
 
-    def close(self) -> None:
-        """Close publishers and subscriptions and leave the bus; twice does no harm."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            bulk_session = self._bulk_session
-        for publisher in self._publishers:
-            publisher.close()
-        for subscription in self._subscriptions:
-            subscription.close()
+    def _leave(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
-        if bulk_session is not None:
-            bulk_session.close()  # type: ignore[no-untyped-call]
-
-    def __enter__(self) -> Self:
-        """Return the bus."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close."""
-        self.close()
+        if self._bulk_session is not None:
+            self._bulk_session.close()  # type: ignore[no-untyped-call]
 
     def _bulk(self) -> zenoh.Session:
         with self._lock:

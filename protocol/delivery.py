@@ -1,0 +1,142 @@
+"""What both buses are made of: a bounded queue with its own thread, a rate cap, the news of a thread's death."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Generic, TypeVar
+
+from protocol.clock import S_NS, Clock
+
+MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
+CLOSE_S: Final = 1.0
+
+log = logging.getLogger(__name__)
+
+
+class ThreadDiedError(RuntimeError):
+    """A thread of the bus died; the text names it, __cause__ is what killed it."""
+
+
+class FailureLatch:
+    """Keeps the first thread that died and tells whom it concerns."""
+
+    def __init__(self) -> None:
+        self.failure: ThreadDiedError | None = None
+        self._lock = threading.Lock()
+        self._handlers: list[Callable[[ThreadDiedError], None]] = []
+
+    def on_failure(self, handle: Callable[[ThreadDiedError], None]) -> None:
+        """Call handle at the first failure, or now where it was."""
+        with self._lock:
+            self._handlers.append(handle)
+            failure = self.failure
+        if failure is not None:
+            handle(failure)
+
+    def report(self, thread_name: str, error: Exception) -> None:
+        """Record that a thread died."""
+        failure = ThreadDiedError(f"thread {thread_name!r} died: {type(error).__name__}: {error}")
+        failure.__cause__ = error
+        with self._lock:
+            if self.failure is not None:
+                return
+            self.failure = failure
+            handlers = list(self._handlers)
+        log.error("%s", failure)
+        for handle in handlers:
+            handle(failure)
+
+
+T = TypeVar("T")
+
+
+class Delivery(Generic[T]):
+    """A bounded queue that drops its oldest, and the thread that hands its items to one handler in order.
+
+    capacity: how many items; MAX_QUEUED_BYTES bounds what they hold together. dropped counts both.
+    """
+
+    def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity {capacity}: at least 1")
+        self.dropped = 0
+        self._handle = handle
+        self._capacity = capacity
+        self._failures = failures
+        self._items: deque[tuple[T, int]] = deque()
+        self._bytes = 0
+        self._closing = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def offer(self, item: T, size_bytes: int = 0) -> None:
+        """Queue an item; never waits."""
+        with self._changed:
+            if self._closing:
+                return
+            self._items.append((item, size_bytes))
+            self._bytes += size_bytes
+            while len(self._items) > self._capacity or (self._bytes > MAX_QUEUED_BYTES and len(self._items) > 1):
+                self._bytes -= self._items.popleft()[1]
+                self.dropped += 1
+            self._changed.notify()
+
+    def close(self, timeout_s: float = CLOSE_S) -> None:
+        """Take no more, hand over what is queued within timeout_s, end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread is threading.current_thread():
+            return
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            with self._changed:
+                self._items.clear()
+            log.warning("thread %r is still busy after %g s", self._thread.name, timeout_s)
+
+    def _run(self) -> None:
+        try:
+            while True:
+                with self._changed:
+                    while not self._items and not self._closing:
+                        self._changed.wait()
+                    if not self._items:
+                        return
+                    item, size_bytes = self._items.popleft()
+                    self._bytes -= size_bytes
+                self._handle(item)
+        except Exception as error:
+            with self._changed:
+                self._closing = True
+                self._items.clear()
+            self._failures.report(self._thread.name, error)
+
+
+class RateCap:
+    """Lets at most max_rate_hz through, on average; None lets all through."""
+
+    def __init__(self, max_rate_hz: float | None, clock: Clock) -> None:
+        if max_rate_hz is not None and not max_rate_hz > 0:
+            raise ValueError(f"max_rate_hz {max_rate_hz}: must be positive")
+        self._period_ns = None if max_rate_hz is None else round(S_NS / max_rate_hz)
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._due_ns: int | None = None
+
+    def passes(self) -> bool:
+        """Return whether one may go out now, and count it as gone."""
+        if self._period_ns is None:
+            return True
+        now_ns = self._clock.now_ns()
+        with self._lock:
+            late_ns = 0 if self._due_ns is None else now_ns - self._due_ns
+            # A clock that was set back by more than a period must not silence the topic for as long.
+            if -self._period_ns <= late_ns < 0:
+                return False
+            # On time, the next is due a period after this one was; after a pause, a period from now.
+            self._due_ns = now_ns + self._period_ns - (late_ns if 0 <= late_ns < self._period_ns else 0)
+            return True

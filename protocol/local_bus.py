@@ -1,0 +1,199 @@
+"""The bus within one process: for tests, and wherever a whole system runs in one program."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
+from protocol.clock import Clock, SystemClock
+from protocol.delivery import Delivery, RateCap
+from protocol.topics import Topic
+
+
+def key_matches(key_expr: str, key: str) -> bool:
+    """Return whether key is one of key_expr's: `*` stands for one chunk, `**` for any number of them.
+
+    Neither matches a chunk that begins with @.
+    """
+    return _chunks_match(key_expr.split("/"), key.split("/"))
+
+
+def _chunks_match(pattern: list[str], chunks: list[str]) -> bool:
+    if not pattern:
+        return not chunks
+    head, rest = pattern[0], pattern[1:]
+    if head == "**":
+        if _chunks_match(rest, chunks):
+            return True
+        return bool(chunks) and not chunks[0].startswith("@") and _chunks_match(pattern, chunks[1:])
+    if not chunks or not (head == chunks[0] or (head == "*" and not chunks[0].startswith("@"))):
+        return False
+    return _chunks_match(rest, chunks[1:])
+
+
+class LocalNetwork:
+    """What several LocalBus clients have in common, as the hub is for several processes."""
+
+    def __init__(self, clock: Clock | None = None, cache_s: float = CACHE_S) -> None:
+        self.clock = clock or SystemClock()
+        self.cache_s = cache_s
+        # Held while a sample is handed round, so that all subscribers see one order.
+        self.lock = threading.RLock()
+        self.publishers: list[LocalPublisher] = []
+        self.subscriptions: list[LocalSubscription] = []
+        self.watches: list[LocalWatch] = []
+        self.alive: list[tuple[str, LocalBus]] = []
+
+    def connect(self) -> LocalBus:
+        """Return one more client."""
+        return LocalBus(self)
+
+    def tell(self, name: str, alive: bool) -> None:
+        """Tell all watches of a change."""
+        for watch in self.watches:
+            watch.offer(name, alive)
+
+
+class LocalPublisher(Publisher):
+    """A Publisher within one process."""
+
+    def __init__(self, network: LocalNetwork, topic: Topic, key: str, cap: RateCap) -> None:
+        super().__init__(topic, key, cap)
+        self.cache: deque[bytes] = deque(maxlen=cache_depth(topic, network.cache_s))
+        self._network = network
+
+    def _send(self, payload: bytes) -> bool:
+        with self._network.lock:
+            self.cache.append(payload)
+            for subscription in self._network.subscriptions:
+                if key_matches(subscription.key_expr, self.key):
+                    subscription.offer(self, payload)
+        return True
+
+    def close(self) -> None:
+        """Publish no longer; what the cache held is gone."""
+        with self._network.lock:
+            if not self._closed:
+                self._closed = True
+                self._network.publishers.remove(self)
+
+
+class LocalSubscription:
+    """A Subscription within one process, where nothing is ever missed."""
+
+    missed = 0
+
+    def __init__(self, network: LocalNetwork, key_expr: str, delivery: Delivery[Received]) -> None:
+        self.key_expr = key_expr
+        self._network = network
+        self._delivery = delivery
+
+    @property
+    def dropped(self) -> int:
+        """How many were dropped because the handler was too slow."""
+        return self._delivery.dropped
+
+    def offer(self, publisher: LocalPublisher, payload: bytes) -> None:
+        """Queue one of publisher's messages."""
+        received = Received(publisher.key, payload, self._network.clock.now_ns(), publisher.topic.encoding)
+        self._delivery.offer(received, len(payload))
+
+    def close(self) -> None:
+        """Let the handler finish what is queued, one second at most, and end its thread."""
+        with self._network.lock:
+            if self in self._network.subscriptions:
+                self._network.subscriptions.remove(self)
+        self._delivery.close()
+
+
+class LocalWatch:
+    """Who is alive, told to one handler."""
+
+    missed = 0
+
+    def __init__(self, network: LocalNetwork, delivery: Delivery[tuple[str, bool]]) -> None:
+        self._network = network
+        self._delivery = delivery
+
+    @property
+    def dropped(self) -> int:
+        """How many changes were dropped because the handler was too slow."""
+        return self._delivery.dropped
+
+    def offer(self, name: str, alive: bool) -> None:
+        """Queue one change."""
+        self._delivery.offer((name, alive))
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._network.lock:
+            if self in self._network.watches:
+                self._network.watches.remove(self)
+        self._delivery.close()
+
+
+class LocalBus(Bus):
+    """A Bus within one process; get one from LocalNetwork.connect()."""
+
+    def __init__(self, network: LocalNetwork) -> None:
+        super().__init__(network.clock)
+        self._network = network
+
+    def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
+        """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
+        publisher = LocalPublisher(self._network, topic, topic.key(*ids), RateCap(max_rate_hz, self.clock))
+        with self._network.lock:
+            self._network.publishers.append(publisher)
+            self._publishers.append(publisher)
+        return publisher
+
+    def subscribe(
+        self, key_expr: str, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+    ) -> Subscription:
+        """Hand every message on key_expr to handle, one at a time (protocol.bus.Bus has the contract)."""
+        delivery = Delivery(f"bus {key_expr}", handle, capacity, self._failures)
+        subscription = LocalSubscription(self._network, key_expr, delivery)
+        with self._network.lock:
+            if history:
+                held = [p for p in self._network.publishers if key_matches(key_expr, p.key)]
+                for publisher in sorted(held, key=lambda p: (not p.topic.latest_only, p.key)):
+                    for payload in publisher.cache:
+                        subscription.offer(publisher, payload)
+            self._network.subscriptions.append(subscription)
+            self._subscriptions.append(subscription)
+        return subscription
+
+    def declare_alive(self, name: str) -> None:
+        """Let others see that this process lives, until it closes the bus."""
+        check_alive_name(name)
+        with self._network.lock:
+            known = any(name == other for other, _ in self._network.alive)
+            self._network.alive.append((name, self))
+            if not known:
+                self._network.tell(name, True)
+
+    def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
+        """Call handle(name, alive) for everyone who is alive now, and at every change."""
+        delivery = Delivery[tuple[str, bool]]("bus alive", lambda item: handle(*item), 1024, self._failures)
+        watch = LocalWatch(self._network, delivery)
+        with self._network.lock:
+            for name in sorted({name for name, _ in self._network.alive}):
+                watch.offer(name, True)
+            self._network.watches.append(watch)
+            self._subscriptions.append(watch)
+        return watch
+
+    def is_alive(self, name: str) -> bool:
+        """Return whether another client of this network has declared name."""
+        check_alive_name(name)
+        with self._network.lock:
+            return any(name == other and bus is not self for other, bus in self._network.alive)
+
+    def _leave(self) -> None:
+        with self._network.lock:
+            own = {name for name, bus in self._network.alive if bus is self}
+            self._network.alive = [entry for entry in self._network.alive if entry[1] is not self]
+            for name in own - {name for name, _ in self._network.alive}:
+                self._network.tell(name, False)
