@@ -104,8 +104,9 @@ class NodeService(Service):
     def close(self) -> int:
         """Stop all threads, write the log's end; return the exit status."""
         status = self.join()
-        for device in (self.camera, *self.sources):
-            device.close()
+        self.camera.close()
+        for source in self.sources:
+            source.close()
         self.recorder.close()
         log.info("%s: log %s", self.name, self.recorder.path)
         return status
@@ -193,6 +194,7 @@ class NodeService(Service):
         if bus is None:
             return
         with bus:
+            bus.on_failure(lambda error: self.fail("bus", error))
             if bus.is_alive(f"node/{self.config.node}"):
                 raise ConfigError(
                     f"another node with the id {self.config.node!r} is on the bus at {self.config.connect}; "

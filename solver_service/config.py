@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast, get_args
 
 from msgspec import Meta, field
 
 from protocol.config import Config, ConfigError, load_config
 from protocol.messages import NodeId
-from solver_service.geometry.trigger import METHODS, Settings
+from solver_service.geometry.observation import Method, Settings
 
 CHECKS = ("range", "twist", "attitude", "depth")
+METHODS = get_args(Method)
 
 
 class SolveConfig(Config, frozen=True, kw_only=True):
@@ -32,7 +33,7 @@ class SolveConfig(Config, frozen=True, kw_only=True):
         if self.range_min_m >= self.range_max_m:
             raise ConfigError(f"{source}: solve.range_min_m = {self.range_min_m}: not below range_max_m")
         return Settings(
-            method=self.method,
+            method=cast(Method, self.method),
             checks=frozenset(self.checks),
             range_min_m=self.range_min_m,
             range_max_m=self.range_max_m,

@@ -7,7 +7,7 @@ order they arrive within the matching window.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from typing import Final
 
 from protocol.clock import S_NS
@@ -24,7 +24,7 @@ from protocol.messages import (
 from solver_service.geometry.trigger import Fix, Settings, solve_trigger
 from solver_service.prior import PosePrior
 from solver_service.results import relative_pose, rig_of, sensed_of, view_of
-from solver_service.streams import Arrival, NodeStream
+from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
 
 # How long, in the dive's own time, a frame waits for the other node's frame that may still come.
 MATCH_WINDOW_NS: Final = 1 * S_NS
@@ -56,6 +56,7 @@ class SolverCore:
         self._b = NodeStream(node_b)
         self._conflicts: set[int] = set()
         self._resolved: OrderedDict[int, None] = OrderedDict()
+        self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
         self._prior = PosePrior()
 
@@ -98,12 +99,14 @@ class SolverCore:
         return self._resolve(everything=True)
 
     def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
-        arrival = stream.add_frame(frame)
+        other = self._b if stream is self._a else self._a
+        arrival = stream.add_frame(frame, other.newest_ns)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
         if arrival is Arrival.CLOCK_SET:
-            self._resolved.clear()
+            # The same triggers may come again, as in a dive played twice; those that told of the new time are done.
+            self._resolved = OrderedDict.fromkeys(self._far)
             self._newest_resolved = -1
             self._prior.lose()
             return []
@@ -111,6 +114,7 @@ class SolverCore:
             self.late += 1
             seconds = (frame.stamp_ns - (stream.newest_ns or 0)) / S_NS
             detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
+            self._far.append(frame.trigger)
             return [] if frame.trigger in self._resolved else [self._reject(frame, "late", detail)]
         if frame.trigger in self._resolved:
             stream.frames.pop(frame.trigger, None)
@@ -169,7 +173,8 @@ class SolverCore:
         own = self._a if other is self._b else self._b
         other_ns = other.newest_ns if other.newest_ns is not None else 0
         own_ns = own.newest_ns if own.newest_ns is not None else 0
-        return other_ns - frame.stamp_ns > MATCH_WINDOW_NS or own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
+        # A node whose clock is far from this frame says nothing about what of it may still come.
+        return MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS or own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
 
     def _solve(
         self, frame_a: Candidates, frame_b: Candidates, info_a: NodeInfo, info_b: NodeInfo

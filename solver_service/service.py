@@ -70,6 +70,7 @@ class SolverService(Service):
         if bus is None:
             return
         with bus:
+            bus.on_failure(lambda error: self.fail("bus", error))
             self.attach(bus)
             bus.declare_alive(f"solver/{'_'.join(self.config.nodes) or 'any'}")
             log.info("solver: connected to %s", self.config.connect)

@@ -58,10 +58,10 @@ class NodeStream:
         at = bisect.bisect_right([known.stamp_ns for known in self._infos], stamp_ns)
         return self._infos[max(at - 1, 0)] if self._infos else None
 
-    def add_frame(self, frame: Candidates) -> Arrival:
-        """Take a frame, or say why not."""
+    def add_frame(self, frame: Candidates, other_newest_ns: int | None) -> Arrival:
+        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap."""
         self.received += 1
-        verdict = self._place_in_time(frame.stamp_ns)
+        verdict = self._place_in_time(frame.stamp_ns, other_newest_ns)
         if verdict is Arrival.FAR:
             return verdict
         seen = self._sequence.get(frame.trigger)
@@ -75,11 +75,14 @@ class NodeStream:
         self.frames[frame.trigger] = frame
         return verdict
 
-    def _place_in_time(self, stamp_ns: int) -> Arrival:
+    def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
             self.first_ns = self.newest_ns = stamp_ns
             return Arrival.FRESH
-        if abs(stamp_ns - self.newest_ns) <= FAR_NS:
+        resumed = (
+            stamp_ns > self.newest_ns and other_newest_ns is not None and abs(stamp_ns - other_newest_ns) <= FAR_NS
+        )
+        if resumed or abs(stamp_ns - self.newest_ns) <= FAR_NS:
             self._far.clear()
             self.newest_ns = max(self.newest_ns, stamp_ns)
             return Arrival.FRESH

@@ -147,6 +147,7 @@ def run(args: argparse.Namespace) -> int:
         if bus is None:
             return service.join()
         with bus:
+            bus.on_failure(lambda error: service.fail("bus", error))
             dashboard = Dashboard(args.environment, args.seed, start_ns, args.rate)
             dashboard.subscribe(bus)
             _watch(service, processes, dashboard, args.seconds)

@@ -162,6 +162,7 @@ def run(args: argparse.Namespace) -> int:
         if bus is None:
             return service.join()
         with bus:
+            bus.on_failure(lambda error: service.fail("bus", error))
             bus.declare_alive("player")
             player = Player(bus, args.speed, SystemClock(), service.stop)
             player.declare(dive.keys)

@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
         if bus is None:
             return service.join()
         with bus:
+            bus.on_failure(lambda error: service.fail("bus", error))
             subscriber = bus.subscribe(EVERYTHING, sink.receive, capacity=16384)
             log.info("record: %s into %s; Ctrl-C ends", args.connect, args.output)
             began_s = time.monotonic()

@@ -9,8 +9,6 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from solver_service.geometry.trigger import METHODS
-
 from protocol.config import ConfigError
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
@@ -24,7 +22,7 @@ from protocol.messages import (
     encode,
 )
 from protocol.topics import CANDIDATES, check_node_id, parse_key
-from solver_service.config import CHECKS, SolveConfig
+from solver_service.config import CHECKS, METHODS, SolveConfig
 from solver_service.core import SolverCore
 from tools.dives import Dive, load_info
 from tools.progress import Progress

@@ -1,0 +1,247 @@
+"""The pure core: every trigger ends once, in any order of arrival, with the same result."""
+
+import random
+from collections import Counter
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
+from solver_service.core import MAX_PENDING, SolverCore
+from solver_service.geometry.trigger import Settings
+from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
+
+
+def solve(messages, node_a="a", node_b="b"):
+    core = SolverCore(node_a, node_b, Settings())
+    results = [result for message in messages for result in core.handle(message)]
+    return results + core.flush(), core
+
+
+def triggers_of(messages):
+    return {message.trigger for message in messages if isinstance(message, Candidates)}
+
+
+def assert_each_ends_once(results, messages):
+    assert Counter(result.trigger for result in results) == dict.fromkeys(triggers_of(messages), 1)
+
+
+def test_poses_are_right_and_in_order(dive):
+    messages, world = dive
+    results, core = solve(messages)
+    assert_each_ends_once(results, messages)
+    assert [r.trigger for r in results] == sorted(r.trigger for r in results)
+    poses = [r for r in results if isinstance(r, RelativePose)]
+    assert len(poses) > 0.8 * len(results)
+    assert core.counts["solved"] == len(poses)
+    for pose in poses:
+        truth = world.truth(pose.stamp_ns, pose.trigger)
+        assert np.linalg.norm(np.subtract(pose.t_a_b_m, truth.t_a_b_m)) < 0.1 * pose.range_m
+        assert {"attitude", "depth"} <= set(pose.checks)
+
+
+def test_azimuth_and_inclination_point_at_b(dive):
+    messages, world = dive
+    poses = [r for r in solve(messages)[0] if isinstance(r, RelativePose)]
+    for pose in poses[::7]:
+        (_, t_a), (_, t_b) = (world.T_ned_camera(node, pose.stamp_ns) for node in ("a", "b"))
+        north_m, east_m, down_m = t_b - t_a
+        assert abs(np.angle(np.exp(1j * (pose.azimuth_rad - np.arctan2(east_m, north_m))))) < 0.35
+        assert abs(pose.inclination_rad - np.arctan2(-down_m, np.hypot(north_m, east_m))) < 0.08
+
+
+def test_same_result_in_any_order_within_the_window(dive):
+    messages, _ = dive
+    expected, _ = solve(messages)
+    for seed in range(3):
+        rng = random.Random(seed)
+        # Each message is late by up to 150 ms of the dive, each stream in itself stays in order.
+        delays = {}
+        order = []
+        for i, message in enumerate(messages):
+            stream = (message.node, type(message))
+            delays[stream] = max(delays.get(stream, 0), message.stamp_ns + rng.randrange(150_000_000))
+            order.append((delays[stream], i))
+        shuffled = [messages[i] for _, i in sorted(order)]
+        assert shuffled != messages
+        assert solve(shuffled)[0] == expected
+
+
+def test_frames_out_of_order_are_matched(dive):
+    messages, _ = dive
+    expected, _ = solve(messages)
+    swapped = list(messages)
+    places = [i for i, m in enumerate(swapped) if isinstance(m, Candidates) and m.node == "b"]
+    for one, other in zip(places[4::6], places[5::6], strict=False):
+        swapped[one], swapped[other] = swapped[other], swapped[one]
+    results, core = solve(swapped)
+    assert_each_ends_once(results, messages)
+    assert core.late == 0
+    assert results == expected
+
+
+def test_duplicates_change_nothing(dive):
+    messages, _ = dive
+    expected, _ = solve(messages)
+    doubled = [copy for message in messages for copy in (message, message)]
+    results, core = solve(doubled)
+    assert results == expected
+    assert core.duplicates + core.late == len(triggers_of(messages)) * 2
+
+
+def test_lost_frames_are_unmatched_without_waiting(dive):
+    messages, _ = dive
+    lost = {m.trigger for m in messages if isinstance(m, Candidates)}
+    lost = set(sorted(lost)[5::10])
+    kept = [m for m in messages if not (isinstance(m, Candidates) and m.node == "b" and m.trigger in lost)]
+    results, _ = solve(kept)
+    assert_each_ends_once(results, messages)
+    unmatched = {r.trigger for r in results if isinstance(r, Rejected) and r.reason == "unmatched"}
+    assert unmatched == lost
+
+
+def test_camera_that_skipped_a_trigger_is_known_at_once(dive):
+    messages, _ = dive
+    frames = [m for m in messages if isinstance(m, Candidates)]
+    gone = sorted(triggers_of(frames))[10]
+    core = SolverCore("a", "b", Settings())
+    seq = 0
+    for message in messages:
+        if isinstance(message, Candidates) and message.node == "b":
+            if message.trigger == gone:
+                continue
+            message = msgspec.structs.replace(message, seq=seq)
+            seq += 1
+        results = core.handle(message)
+        if any(isinstance(r, Rejected) and r.trigger == gone for r in results):
+            assert message.stamp_ns <= START_NS + (gone - START_NS // PERIOD_NS + 2) * PERIOD_NS
+            return
+    pytest.fail("the skipped trigger was never resolved")
+
+
+def test_late_frame_ends_once_and_is_counted(dive):
+    messages, _ = dive
+    late = next(m for m in messages if isinstance(m, Candidates) and m.node == "b" and m.seq == 10)
+    rest = [m for m in messages if m is not late]
+    results, core = solve([*rest[: len(rest) // 2 + 300], late, *rest[len(rest) // 2 + 300 :]])
+    assert_each_ends_once(results, messages)
+    assert core.late == 1
+
+
+def test_one_node_alone_expires_and_memory_is_bounded(dive):
+    messages, _ = dive
+    alone = [m for m in messages if m.node == "a"]
+    core = SolverCore("a", "b", Settings())
+    results = []
+    for message in alone:
+        results += core.handle(message)
+        assert core.pending <= 2 * 10 + 2
+    results += core.flush()
+    assert_each_ends_once(results, alone)
+    assert {r.reason for r in results} == {"unmatched"}
+
+
+def test_without_calibration_every_trigger_says_so(dive):
+    messages, _ = dive
+    results, _ = solve([m for m in messages if not (isinstance(m, NodeInfo) and m.node == "b")])
+    assert_each_ends_once(results, messages)
+    assert {r.reason for r in results} == {"no_info"}
+    assert "b" in results[0].detail
+
+
+def test_calibration_of_another_size_is_refused(dive):
+    messages, _ = dive
+    wrong = [msgspec.structs.replace(m, width_px=1640) if isinstance(m, NodeInfo) else m for m in messages]
+    results, _ = solve(wrong)
+    assert {r.reason for r in results} == {"no_info"}
+    assert "820x616" in results[0].detail
+
+
+def test_two_nodes_of_one_id_are_a_duplicate(dive):
+    messages, _ = dive
+    frames = [m for m in messages if isinstance(m, Candidates) and m.node == "a"]
+    imposters = [msgspec.structs.replace(m, boot="other", blobs=[]) for m in frames]
+    mixed = []
+    for message in messages:
+        mixed.append(message)
+        if isinstance(message, Candidates) and message.node == "a":
+            mixed.append(imposters[frames.index(message)])
+    results, _ = solve(mixed)
+    assert_each_ends_once(results, messages)
+    assert {r.reason for r in results} == {"duplicate"}
+
+
+def test_sensors_that_stop_do_not_stop_the_poses(dive):
+    messages, _ = dive
+    half = START_NS + 3_000_000_000
+    cut = [m for m in messages if not (isinstance(m, Attitude | Depth) and m.stamp_ns > half)]
+    results, _ = solve(cut)
+    assert_each_ends_once(results, messages)
+    late = [r for r in results if isinstance(r, RelativePose) and r.stamp_ns > half + 500_000_000]
+    assert late
+    assert not any("attitude" in r.checks for r in late)
+
+
+def test_clock_set_back_an_hour_is_followed(dive):
+    messages, _ = dive
+    hour = 36_000
+    back = [
+        msgspec.structs.replace(
+            m,
+            stamp_ns=m.stamp_ns - hour * PERIOD_NS,
+            **({"trigger": m.trigger - hour, "seq": m.seq + 1000} if isinstance(m, Candidates) else {}),
+        )
+        for m in messages
+        if not isinstance(m, NodeInfo)
+    ]
+    results, _ = solve([*messages, *back])
+    assert_each_ends_once(results, [*messages, *back])
+    after = [r for r in results if r.trigger < START_NS // PERIOD_NS]
+    assert sum(isinstance(r, RelativePose) for r in after) > 0.7 * len(after)
+
+
+def test_frame_an_hour_ahead_ends_alone(dive):
+    messages, _ = dive
+    frame = next(m for m in messages if isinstance(m, Candidates) and m.seq == 20)
+    ahead = msgspec.structs.replace(frame, stamp_ns=frame.stamp_ns + 3600 * 10**9, trigger=frame.trigger + 36_000)
+    at = messages.index(frame)
+    results, _ = solve([*messages[:at], ahead, *messages[at:]])
+    assert_each_ends_once(results, [*messages, ahead])
+    assert [r.reason for r in results if r.trigger == ahead.trigger] == ["late"]
+    assert sum(isinstance(r, RelativePose) for r in results) > 0.8 * len(results)
+
+
+def test_other_nodes_are_not_used(dive):
+    messages, _ = dive
+    stranger = [msgspec.structs.replace(m, node="c") for m in messages if isinstance(m, Candidates)][:10]
+    expected, _ = solve(messages)
+    results, core = solve([*messages[:100], *stranger, *messages[100:]])
+    assert results == expected
+    assert core.foreign == 10
+
+
+def test_pending_is_bounded_against_a_flood(dive):
+    messages, _ = dive
+    frame = next(m for m in messages if isinstance(m, Candidates))
+    core = SolverCore("a", "b", Settings())
+    for k in range(2 * MAX_PENDING):
+        core.handle(msgspec.structs.replace(frame, trigger=frame.trigger + k, seq=2 * k, blobs=[]))
+    assert core.pending <= MAX_PENDING
+
+
+def test_same_id_twice_is_refused():
+    with pytest.raises(ValueError, match="same id"):
+        SolverCore("a", "a", Settings())
+
+
+def test_without_sensors_it_still_solves():
+    messages, world = dive_messages(sensors=False, seed=5)
+    results, _ = solve(messages)
+    assert_each_ends_once(results, messages)
+    poses = [r for r in results if isinstance(r, RelativePose)]
+    assert len(poses) > 0.5 * len(results)
+    for pose in poses:
+        assert "upright_assumed" in pose.checks
+        truth = world.truth(pose.stamp_ns, pose.trigger)
+        assert np.linalg.norm(np.subtract(pose.t_a_b_m, truth.t_a_b_m)) < 0.1 * pose.range_m
