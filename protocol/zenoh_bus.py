@@ -7,33 +7,29 @@ Streams are recovered by their publishers' caches, never blocked for: one frozen
 from __future__ import annotations
 
 import json
-import logging
-import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Self, TypeAlias
 
 import zenoh
 import zenoh.ext
 
 from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
 from protocol.clock import Clock, SystemClock
-from protocol.delivery import Delivery, FailureLatch, RateCap
+from protocol.delivery import CLOSE_S, Delivery, FailureLatch, RateCap
+from protocol.endpoint import DEFAULT_ENDPOINT, client_settings, hub_settings
 from protocol.errors import BuddylineError
-from protocol.messages import MAX_MESSAGE_BYTES
 from protocol.topics import Topic, parse_key
-
-DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
 # `**` does not match chunks that begin with @: nobody takes a token for a message.
 ALIVE: Final = "buddyline/@alive"
 
 HEARTBEAT_S: Final = 0.25
-LEASE_MS: Final = 3000
 RETRY_S: Final = 0.25
 QUERY_S: Final = 2.0
 INTAKE: Final = 8192
+MAX_PUBLISHERS: Final = 4096
 
 _PRIORITIES: Final = {
     "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
@@ -43,38 +39,14 @@ _PRIORITIES: Final = {
     "background": zenoh.Priority.BACKGROUND,
 }
 
-_ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]{1,5})\Z")
-
-log = logging.getLogger(__name__)
-
-
-def check_endpoint(endpoint: str) -> str:
-    """Return endpoint; raise BuddylineError where it is not `tcp/<host>:<port>`."""
-    match = _ENDPOINT.match(endpoint)
-    if match is None or not 0 < int(match.group(3)) < 65536:
-        raise BuddylineError(f"endpoint {endpoint!r}: write it as tcp/<host>:<port>, like {DEFAULT_ENDPOINT}")
-    return endpoint
+AnySubscriber: TypeAlias = (
+    zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]
+)
 
 
-def _config(mode: Literal["router", "client"], endpoint: str, namespace: str | None = None) -> zenoh.Config:
-    """Return a configuration that opens no socket but the one asked for."""
-    entries: dict[str, object] = {
-        "mode": mode,
-        "listen/endpoints": [endpoint] if mode == "router" else [],
-        "connect/endpoints": [] if mode == "router" else [endpoint],
-        "connect/timeout_ms": 0,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES + 65536,
-        "transport/shared_memory/enabled": False,
-    }
-    if namespace is not None:
-        entries["namespace"] = namespace
+def _config(settings: Mapping[str, object]) -> zenoh.Config:
     config = zenoh.Config()
-    for key, value in entries.items():
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
@@ -103,9 +75,9 @@ class Hub:
 
 def open_hub(endpoint: str = DEFAULT_ENDPOINT) -> Hub:
     """Listen on endpoint; raise BuddylineError where the port is taken or the address is not this machine's."""
-    check_endpoint(endpoint)
+    config = _config(hub_settings(endpoint))
     try:
-        return Hub(zenoh.open(_config("router", endpoint)), endpoint)
+        return Hub(zenoh.open(config), endpoint)
     except zenoh.ZError as error:
         if "Address already in use" in str(error):
             raise BuddylineError(
@@ -127,22 +99,31 @@ def connect(
 
     on_wait is called once, with what is being waited for. cache_s: how long an outage may last without loss.
     """
-    check_endpoint(endpoint)
-    config = _config("client", endpoint, namespace)
+    config = _config(client_settings(endpoint, namespace))
+    session = _open_when_there(
+        config,
+        stop,
+        lambda: on_wait(f"no hub at {endpoint} yet, waiting for it (start one with `buddyline hub`)"),
+    )
+    return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
+
+
+def _open_when_there(config: zenoh.Config, stop: threading.Event, on_wait: Callable[[], None]) -> zenoh.Session | None:
+    """Open a session, trying again until stop is set; on_wait is called once, after the first failure."""
     waiting = False
     while not stop.is_set():
         session = _try_open(config, stop)
         if session is not None:
-            return ZenohBus(session, config, clock or SystemClock(), cache_s)
+            return session
         if not waiting and not stop.is_set():
-            on_wait(f"no hub at {endpoint} yet, waiting for it (start one with `buddyline hub`)")
+            on_wait()
             waiting = True
         stop.wait(RETRY_S)
     return None
 
 
 def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | None:
-    """Open a session within a thread of its own: a listener that does not answer holds it for 10 s."""
+    """Open a session within a thread of its own: a listener that does not answer holds it for seconds."""
     opened: list[zenoh.Session] = []
     errors: list[Exception] = []
     ended = threading.Event()
@@ -173,20 +154,60 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
     return opened[0] if opened else None
 
 
+class BulkLink:
+    """A session for big messages alone, opened at the first that asks for it.
+
+    In a session with others, a big message holds up what is queued behind it in the same connection.
+    """
+
+    def __init__(self, config: zenoh.Config) -> None:
+        self.session: zenoh.Session | None = None
+        self._config = config
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def open(self) -> None:
+        """See to it that session is set once the hub is there; does not wait for that."""
+        with self._lock:
+            if self._thread is None and not self._stop.is_set():
+                self._thread = threading.Thread(target=self._run, name="bus bulk", daemon=True)
+                self._thread.start()
+
+    def close(self) -> None:
+        """Close the session."""
+        with self._lock:
+            self._stop.set()
+        if self._thread is not None:
+            self._thread.join(1.0)
+        if self.session is not None:
+            self.session.close()  # type: ignore[no-untyped-call]
+
+    def _run(self) -> None:
+        self.session = _open_when_there(self._config, self._stop, lambda: None)
+
+
 class ZenohPublisher(Publisher):
-    """A Publisher over Zenoh."""
+    """A Publisher over Zenoh. declare: returns None while its session is not there yet."""
 
     def __init__(
         self,
-        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        declare: Callable[[], zenoh.Publisher | zenoh.ext.AdvancedPublisher | None],
         topic: Topic,
         key: str,
         cap: RateCap,
     ) -> None:
         super().__init__(topic, key, cap)
-        self._publisher = publisher
+        self._declare = declare
+        self._declare_lock = threading.Lock()
+        self._publisher = declare()
 
     def _send(self, payload: bytes) -> bool:
+        if self._publisher is None:
+            with self._declare_lock:
+                self._publisher = self._publisher or self._declare()
+        if self._publisher is None:
+            return False
         try:
             self._publisher.put(payload)
         except zenoh.ZError:
@@ -200,11 +221,50 @@ class ZenohPublisher(Publisher):
         """Publish no longer; what the cache held is gone."""
         if not self._closed:
             self._closed = True
-            self._publisher.undeclare()  # type: ignore[no-untyped-call]
+            if self._publisher is not None:
+                self._publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+class Intake:
+    """A thread that takes samples out of Zenoh as they come, so that its own ring never overflows.
+
+    name tells the thread from others; accept gets each sample, and must not wait for its consumer.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        subscriber: AnySubscriber,
+        accept: Callable[[zenoh.Sample], None],
+        failures: FailureLatch,
+    ) -> None:
+        self._subscriber = subscriber
+        # The subscriber's own recv cannot be undeclared while another thread waits in it; its handler's can.
+        self._samples = subscriber.handler
+        self._accept = accept
+        self._failures = failures
+        self._thread = threading.Thread(target=self._run, name=f"bus intake {name}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Undeclare the subscriber, take in what has come, end the thread."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        try:
+            while True:
+                try:
+                    sample = self._samples.recv()
+                except zenoh.ZError:
+                    return
+                self._accept(sample)
+        except Exception as error:
+            self._failures.report(self._thread.name, error)
 
 
 class ZenohSubscription:
-    """A Subscription over Zenoh: an intake thread puts samples in order, fetches gaps, and never waits.
+    """A Subscription over Zenoh: samples in order, each once, with what can be fetched of those that are missing.
 
     Zenoh's own recovery does most of it. What it leaves: a publisher first heard of in the middle of its
     numbers, and a gap whose query was lost with the link.
@@ -222,30 +282,21 @@ class ZenohSubscription:
     ) -> None:
         self.missed = 0
         self._session = session
-        self._key_expr = key_expr
         self._delivery = delivery
         self._history = history
         self._clock = clock
-        self._failures = failures
+        # The newest number of each publisher, the one longest silent first.
         self._last: dict[tuple[str, int], int] = {}
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
-        self._subscriber = (
-            zenoh.ext.declare_advanced_subscriber(
-                session,
-                key_expr,
-                ring,
-                recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-            )
-            if history
-            else session.declare_subscriber(key_expr, ring)
-        )
-        # The subscriber's own recv cannot be undeclared while another thread waits in it; its handler's can.
-        self._samples = self._subscriber.handler
+        subscriber: AnySubscriber
         if history:
-            for sample in self._held():
+            recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, recovery=recovery)
+            for sample in sorted(self._query(f"{key_expr}/@adv/pub/**"), key=_state_first):
                 self._accept(sample)
-        self._thread = threading.Thread(target=self._run, name=f"bus intake {key_expr}", daemon=True)
-        self._thread.start()
+        else:
+            subscriber = session.declare_subscriber(key_expr, ring)
+        self._intake = Intake(key_expr, subscriber, self._accept, failures)
 
     @property
     def dropped(self) -> int:
@@ -254,20 +305,8 @@ class ZenohSubscription:
 
     def close(self) -> None:
         """Let the handler finish what is queued, one second at most, and end the threads."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._intake.close()
         self._delivery.close()
-        self._thread.join(1.0)
-
-    def _run(self) -> None:
-        try:
-            while True:
-                try:
-                    sample = self._samples.recv()
-                except zenoh.ZError:
-                    return
-                self._accept(sample)
-        except Exception as error:
-            self._failures.report(self._thread.name, error)
 
     def _accept(self, sample: zenoh.Sample) -> None:
         """Deliver a sample, after those of its publisher that should have come before it."""
@@ -278,11 +317,13 @@ class ZenohSubscription:
             self._deliver(sample)
             return
         source = (str(info.source_id.zid), info.source_id.eid)
-        sn, last = info.source_sn, self._last.get(source)
+        sn, last = info.source_sn, self._last.pop(source, None)
+        self._last[source] = sn if last is None else max(sn, last)
+        if len(self._last) > MAX_PUBLISHERS:
+            del self._last[next(iter(self._last))]
         if last is not None and sn <= last:
             return
         first_due = 0 if last is None else last + 1
-        self._last[source] = sn
         if sn > first_due:
             self._fill(sample, source, range(first_due, sn), known=last is not None)
         self._deliver(sample)
@@ -303,15 +344,6 @@ class ZenohSubscription:
                     found += 1
         if known:
             self.missed += len(gap) - found
-
-    def _held(self) -> list[zenoh.Sample]:
-        """Return what publishers hold, in order, topics with only a latest message first."""
-
-        def order(sample: zenoh.Sample) -> tuple[bool, str, int]:
-            parsed = parse_key(str(sample.key_expr))
-            return parsed is None or not parsed[0].latest_only, str(sample.key_expr), _number(sample)
-
-        return sorted(self._query(f"{self._key_expr}/@adv/pub/**"), key=order)
 
     def _query(self, selector: str) -> Iterator[zenoh.Sample]:
         for reply in self._session.get(
@@ -339,6 +371,13 @@ def _number(sample: zenoh.Sample) -> int:
     return -1 if info is None else info.source_sn
 
 
+def _state_first(sample: zenoh.Sample) -> tuple[bool, str, int]:
+    """Order what publishers hold: topics with only a latest message first, then by key and number."""
+    key = str(sample.key_expr)
+    parsed = parse_key(key)
+    return parsed is None or not parsed[0].latest_only, key, _number(sample)
+
+
 class ZenohWatch:
     """Who is alive, told to one handler. A process counts once, however often its token is reported."""
 
@@ -346,13 +385,10 @@ class ZenohWatch:
 
     def __init__(self, session: zenoh.Session, delivery: Delivery[tuple[str, bool]], failures: FailureLatch) -> None:
         self._delivery = delivery
-        self._failures = failures
-        self._tokens: dict[str, set[str]] = {}
+        self._processes: dict[str, set[str]] = {}
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
-        self._subscriber = session.liveliness().declare_subscriber(f"{ALIVE}/**", ring, history=True)
-        self._samples = self._subscriber.handler
-        self._thread = threading.Thread(target=self._run, name="bus intake alive", daemon=True)
-        self._thread.start()
+        subscriber = session.liveliness().declare_subscriber(f"{ALIVE}/**", ring, history=True)
+        self._intake = Intake("alive", subscriber, self._accept, failures)
 
     @property
     def dropped(self) -> int:
@@ -361,31 +397,20 @@ class ZenohWatch:
 
     def close(self) -> None:
         """End the threads."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        self._intake.close()
         self._delivery.close()
-        self._thread.join(1.0)
 
-    def _run(self) -> None:
-        try:
-            while True:
-                try:
-                    sample = self._samples.recv()
-                except zenoh.ZError:
-                    return
-                self._accept(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-        except Exception as error:
-            self._failures.report(self._thread.name, error)
-
-    def _accept(self, key: str, alive: bool) -> None:
-        name, _, process = key.removeprefix(f"{ALIVE}/").rpartition("/")
-        processes = self._tokens.setdefault(name, set())
+    def _accept(self, sample: zenoh.Sample) -> None:
+        token = str(sample.key_expr).removeprefix(f"{ALIVE}/")
+        name, _, process = token.rpartition("/")
+        processes = self._processes.setdefault(name, set())
         before = bool(processes)
-        if alive:
+        if sample.kind == zenoh.SampleKind.PUT:
             processes.add(process)
         else:
             processes.discard(process)
         if not processes:
-            del self._tokens[name]
+            del self._processes[name]
         if before != bool(processes):
             self._delivery.offer((name, bool(processes)))
 
@@ -396,33 +421,35 @@ class ZenohBus(Bus):
     def __init__(self, session: zenoh.Session, config: zenoh.Config, clock: Clock, cache_s: float) -> None:
         super().__init__(clock)
         self._session = session
-        self._config = config
+        self._bulk = BulkLink(config)
         self._cache_s = cache_s
-        self._bulk_session: zenoh.Session | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
 
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
         """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
         key, depth = topic.key(*ids), cache_depth(topic, self._cache_s)
-        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
         settings: dict[str, Any] = {
             "encoding": topic.encoding,
             "congestion_control": zenoh.CongestionControl.DROP,
             "priority": _PRIORITIES[topic.priority],
             "express": topic.express,
         }
-        if depth:
-            publisher = zenoh.ext.declare_advanced_publisher(
+        if not depth:
+            self._bulk.open()
+
+        def declare() -> zenoh.Publisher | zenoh.ext.AdvancedPublisher | None:
+            if not depth:
+                bulk = self._bulk.session
+                return None if bulk is None else bulk.declare_publisher(key, **settings)
+            return zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
                 cache=zenoh.ext.CacheConfig(depth),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 **settings,
             )
-        else:
-            # A big message holds up whatever is queued behind it in the same connection.
-            publisher = self._bulk().declare_publisher(key, **settings)
-        wrapped = ZenohPublisher(publisher, topic, key, RateCap(max_rate_hz, self.clock))
+
+        wrapped = ZenohPublisher(declare, topic, key, RateCap(max_rate_hz, self.clock))
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped
@@ -463,11 +490,4 @@ class ZenohBus(Bus):
 
     def _leave(self) -> None:
         self._session.close()  # type: ignore[no-untyped-call]
-        if self._bulk_session is not None:
-            self._bulk_session.close()  # type: ignore[no-untyped-call]
-
-    def _bulk(self) -> zenoh.Session:
-        with self._lock:
-            if self._bulk_session is None:
-                self._bulk_session = zenoh.open(self._config)
-            return self._bulk_session
+        self._bulk.close()
