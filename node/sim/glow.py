@@ -21,16 +21,16 @@ from node.sim.scene import LAMP_RADIUS_M, Lamp
 Image = NDArray[np.float32]
 
 COARSE: Final = 4
-NEAR_PX: Final = 48.0
-FAR_PX: Final = 96.0
+NEAR_PX: Final = 32.0
+FAR_PX: Final = 64.0
 BLUR_PX: Final = 0.8
-AZIMUTHS: Final = 32
-STEPS: Final = 36
-NODES: Final = 10
+AZIMUTHS: Final = 24
+STEPS: Final = 30
+NODES: Final = 8
 RHO_MIN_PX: Final = 0.5
 FORWARD_SHARE: Final = 0.7
 """Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
-GLARE: Final = 0.004
+GLARE: Final = 0.04
 """Share of a lamp's light that the lens spreads widely."""
 
 
@@ -104,14 +104,22 @@ class GlowRenderer:
         """Return the radius within which a lamp clips the green channel."""
         bright = table[..., 1].max(axis=1) > self._rho
         glow_px = float(self._rho[bright].max()) if bright.any() else 0.0
-        return max(glow_px, LAMP_RADIUS_M * self._f_px / lamp.range_m)
+        return max(glow_px, LAMP_RADIUS_M * self._f_px / lamp.range_m + BLUR_PX)
 
     def add_wide(self, coarse: Image, lamp: Lamp, table: Image) -> None:
         """Add a lamp's light beyond NEAR_PX to the coarse picture."""
         du = np.broadcast_to(self._coarse_u - np.float32(lamp.pixel[0]), self.coarse_shape)
         dv = np.broadcast_to(self._coarse_v[:, None] - np.float32(lamp.pixel[1]), self.coarse_shape)
         radiance, rho = self._look_up(table, du, dv)
-        coarse += radiance * (1.0 - self._window(rho))[..., None]
+        # Only a small box of the picture is near.
+        reach = math.ceil(FAR_PX * self._scale / COARSE) + 1
+        row, column = round(float(lamp.pixel[1]) / COARSE), round(float(lamp.pixel[0]) / COARSE)
+        box = (
+            slice(max(row - reach, 0), max(row + reach + 1, 0)),
+            slice(max(column - reach, 0), max(column + reach + 1, 0)),
+        )
+        radiance[box] *= (1.0 - self._window(rho[box]))[..., None]
+        coarse += radiance
 
     def add_near(self, full: Image, lamp: Lamp, table: Image) -> None:
         """Add a lamp's disc and its light within FAR_PX to the full picture."""

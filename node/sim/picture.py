@@ -26,7 +26,7 @@ class Painter:
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
         water, camera = scenario.water, scene.rigs[index].camera
-        self._seed, self._index = scenario.seed, index
+        self._seed, self._index, self._rig = scenario.seed, index, scene.rigs[index]
         self._size_px = scenario.width_px, scenario.height_px
         self._glow = GlowRenderer(water, scenario.width_px, scenario.height_px, camera.fx_px)
         self._scenery = Scenery(scenario, camera)
@@ -40,11 +40,11 @@ class Painter:
         lamps = [lamp for lamp in (*view.lights, *view.others) if self._matters(lamp)]
         tables = [self._glow.table(lamp) for lamp in lamps]
         full = self._full
-        coarse = self._scenery.coarse(view, self._glow.coarse_shape)
+        coarse = np.zeros((*self._glow.coarse_shape, 3), np.float32)
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_wide(coarse, lamp, table)
-        cv2.resize(coarse, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
-        self._scenery.add(full, view, t_s)
+        self._scenery.paint(view, t_s, coarse, full)
+        self._scenery.add_body(full, view, self._rig)
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_near(full, lamp, table)
         for passer in view.passers:

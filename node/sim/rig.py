@@ -42,8 +42,8 @@ def build(scenario: Scenario, index: int) -> Rig:
     return Rig(scenario.camera(index), lights_m, aims, port_m)
 
 
-BEAM_RAD: Final = math.radians(17)
-SPILL: Final = 0.02
+BEAM_RAD: Final = math.radians(10.5)
+SPILL: Final = 0.015
 
 
 def beam(cos_off_axis: Vector) -> Vector:

@@ -12,6 +12,10 @@ from protocol.messages import CameraModel
 
 Image = NDArray[np.float32]
 BOX_M = 2.4
+NEAREST_M = 0.15
+SHINE = 0.05
+FAINTEST = 0.002
+"""Radiance below which noise hides a particle."""
 
 
 class Snow:
@@ -19,7 +23,7 @@ class Snow:
 
     def __init__(self, scenario: Scenario, camera: CameraModel, index: int) -> None:
         rng = generator(scenario.seed, "snow")
-        count = scenario.water.snow * 6
+        count = scenario.water.snow * 5
         self._home_m = rng.uniform(0, BOX_M, (count, 3))
         self._drift_mps = rng.normal(0, 0.03, (count, 3)) + rng.normal(0, 0.06, 3)
         self._shine = rng.lognormal(-1.0, 0.8, count)
@@ -27,21 +31,20 @@ class Snow:
 
     def add(self, full: Image, view: View, t_s: float) -> None:
         """Add the particles in view to the full picture."""
+        camera = self._camera
         position_m = view.placement.position_ned_m
         centre_m = position_m + view.R_ned_camera[:, 2] * BOX_M / 2
         relative_m = self._home_m + self._drift_mps * t_s - centre_m
         relative_m -= BOX_M * np.floor(relative_m / BOX_M + 0.5)
         points = (relative_m + centre_m - position_m) @ view.R_ned_camera
-        ahead = points[:, 2] > 0.15
-        height_px, width_px = full.shape[:2]
-        camera = self._camera
-        for (x, y, z), shine in zip(points[ahead], self._shine[ahead], strict=True):
-            u, v = camera.cx_px + camera.fx_px * x / z, camera.cy_px + camera.fy_px * y / z
-            if not (2 < u < width_px - 3 and 2 < v < height_px - 3):
-                continue
-            focus_px = camera.fx_px / 900.0 * (0.7 + 1.2 * max(0.6 / z - 1.0, 0.0))
-            light = 0.05 * shine / (z * z * focus_px * focus_px) * min(1.0, (z / 0.5) ** 2)
-            _add_spot(full, u, v, focus_px, light)
+        z = np.maximum(points[:, 2], NEAREST_M)
+        pixels = points[:, :2] / z[:, None] * (camera.fx_px, camera.fy_px) + (camera.cx_px, camera.cy_px)
+        sharp_px = camera.fx_px / 900.0 * (0.7 + 1.2 * np.maximum(0.6 / z - 1.0, 0.0))
+        light = SHINE * self._shine * np.minimum(1.0, (z / 0.5) ** 2) / (z * sharp_px) ** 2
+        inside = ((pixels > 2) & (pixels < np.array([full.shape[1], full.shape[0]]) - 3)).all(axis=1)
+        shown = inside & (points[:, 2] > NEAREST_M) & (light > FAINTEST)
+        for (u, v), sd_px, shine in zip(pixels[shown], sharp_px[shown], light[shown], strict=True):
+            _add_spot(full, float(u), float(v), float(sd_px), float(shine))
 
 
 def _add_spot(full: Image, u_px: float, v_px: float, sd_px: float, light: float) -> None:

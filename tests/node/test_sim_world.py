@@ -165,7 +165,7 @@ def test_the_dive_stays_in_the_water_and_within_its_ranges(environment):
 def test_lights_are_mostly_in_view_but_not_always():
     world = World(Scenario(seed=5))
     all_four = []
-    for stamp_ns in range(0, 200 * S_NS, S_NS):
+    for stamp_ns in range(0, 200 * S_NS, 2 * S_NS):
         lights = [x for node in "ab" for x in world.light_truth(node, stamp_ns, 0).lights]
         all_four.append(sum(light.visible for light in lights) == 4)
     assert 0.5 < np.mean(all_four) < 0.95
@@ -236,16 +236,16 @@ def test_candidates_are_as_noisy_as_they_say():
     scenario = Scenario(seed=8, gross_share=0.0, miss_share=0.0, false_lights=0, other_lamps=0, sigma_px=0.5)
     world = World(scenario)
     errors = []
-    for k in range(300):
-        stamp_ns = k * S_NS // 5
+    for k in range(150):
+        stamp_ns = k * S_NS // 2
         lights = [light for light in world.light_truth("a", stamp_ns, 0).lights if light.visible]
         blobs = decode(encode(world.candidates("a", stamp_ns, k, k, "x")), Candidates).blobs
         assert len(blobs) <= len(lights)
         for blob in blobs:
             assert blob.sigma_px == 0.5
             errors.append(min(((blob.u_px - x.u_px, blob.v_px - x.v_px) for x in lights), key=lambda e: np.hypot(*e)))
-    assert len(errors) > 300
-    np.testing.assert_allclose(np.std(errors, axis=0), 0.5, rtol=0.1)
+    assert len(errors) > 150
+    np.testing.assert_allclose(np.std(errors, axis=0), 0.5, rtol=0.15)
 
 
 def test_false_lights_and_misses_are_as_many_as_asked_for():
