@@ -313,6 +313,20 @@ class LightTruth(Message, frozen=True, kw_only=True):
     lights: list[TrueLight]
 
 
+class Mark(Message, frozen=True, kw_only=True):
+    """A word on the survey: what a person, or a check, says of a node at an instant.
+
+    station: the node stands at the station `name` from the rest nearest to this instant until it leaves. point: the
+    node is at a point of interest. note: `note` alone. alarm: a check of the survey failed; `name` says which.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    kind: Literal["station", "point", "note", "alarm"] = "station"
+    name: Annotated[str, Meta(max_length=64)] = ""
+    note: Annotated[str, Meta(max_length=1024)] = ""
+
+
 class SolverStatus(Message, frozen=True, kw_only=True):
     """Health of the solver, 1 Hz; counts since its start.
 

@@ -117,6 +117,7 @@ LIGHT_TRUTH: Final = Topic(
     10.0,
     "data_low",
 )
+MARK: Final = Topic("mark", "buddyline/node/{node}/mark", messages.Mark, "buddyline.Mark", 0.0, "data")
 POSE: Final = Topic(
     "pose",
     "buddyline/pair/{a}/{b}/pose",
@@ -157,6 +158,7 @@ TOPICS: Final = (
     IMAGE,
     NODE_STATUS,
     LIGHT_TRUTH,
+    MARK,
     POSE,
     REJECTED,
     TRUTH,
