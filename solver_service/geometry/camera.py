@@ -1,0 +1,127 @@
+"""The inverse camera model: pixels to bearings, and pixel noise to bearing noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from solver_service.geometry.rotation import Floats
+
+_MAX_STEPS = 30
+_TOLERANCE = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Intrinsics of one camera, pixel centres at integers.
+
+    distortion: OpenCV's k1 k2 p1 p2 k3 (pinhole) or k1..k4 (fisheye: equidistant).
+    """
+
+    model: Literal["pinhole", "fisheye"]
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] | Floats = ()
+
+    def rays(self, pixels: Floats) -> tuple[Floats, Floats]:
+        """Give the bearings (N, 3) of distorted pixels (N, 2) and their tangents (N, 2, 3), px per rad.
+
+        For a direction q near the bearing b, tangent @ q / (b @ q) is how far q's image stands off the
+        pixel, in px, to first order. Both are NaN where the model does not reach the pixel.
+        """
+        xd = (pixels[:, 0] - self.cx_px) / self.fx_px
+        yd = (pixels[:, 1] - self.cy_px) / self.fy_px
+        if self.model == "fisheye":
+            return self._fisheye_rays(xd, yd)
+        return self._pinhole_rays(xd, yd)
+
+    def bearings(self, pixels: Floats) -> Floats:
+        """Give the unit bearings (N, 3) of distorted pixels (N, 2)."""
+        return self.rays(pixels)[0]
+
+    @cached_property
+    def solid_angle_sr(self) -> float:
+        """The solid angle that the picture covers."""
+        columns, rows = 32, 24
+        u = (np.arange(columns) + 0.5) * self.width_px / columns - 0.5
+        v = (np.arange(rows) + 0.5) * self.height_px / rows - 0.5
+        grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        with np.errstate(all="ignore"):
+            _, tangents = self.rays(grid)
+            gram = tangents @ tangents.transpose(0, 2, 1)
+            px2_per_sr = np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2)
+            angle = float(np.nansum(self.width_px * self.height_px / (columns * rows) / px2_per_sr))
+        return angle if 0.0 < angle < 13.0 else 1.0
+
+    def _pinhole_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
+        x, y = xd, yd
+        a00, a01, a10, a11 = np.ones_like(x), np.zeros_like(x), np.zeros_like(x), np.ones_like(x)
+        if any(self.distortion):
+            k1, k2, p1, p2, k3 = self.distortion
+            for _ in range(_MAX_STEPS):
+                r2 = x * x + y * y
+                radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+                slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+                a00 = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+                a01 = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+                a10 = a01
+                a11 = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+                ex = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - xd
+                ey = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - yd
+                det = a00 * a11 - a01 * a10
+                dx = (a11 * ex - a01 * ey) / det
+                dy = (a00 * ey - a10 * ex) / det
+                x, y = x - dx, y - dy
+                step = np.abs(dx) + np.abs(dy)
+                if not (step > _TOLERANCE).any():
+                    break
+            # Past the fold of the distortion a solution is none: no scene point images there.
+            bad = ~((step < 1e-9) & (det > 0.0) & (a00 + a11 > 0.0))
+            x = np.where(bad, np.nan, x)
+        norm = np.sqrt(x * x + y * y + 1.0)
+        bearings = np.stack((x / norm, y / norm, 1.0 / norm), axis=-1)
+        tangents = np.empty((*x.shape, 2, 3))
+        fx, fy = self.fx_px * norm, self.fy_px * norm
+        tangents[:, 0, 0] = fx * a00
+        tangents[:, 0, 1] = fx * a01
+        tangents[:, 0, 2] = -fx * (a00 * x + a01 * y)
+        tangents[:, 1, 0] = fy * a10
+        tangents[:, 1, 1] = fy * a11
+        tangents[:, 1, 2] = -fy * (a10 * x + a11 * y)
+        return bearings, tangents
+
+    def _fisheye_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
+        k1, k2, k3, k4 = self.distortion if any(self.distortion) else (0.0, 0.0, 0.0, 0.0)
+        rd = np.sqrt(xd * xd + yd * yd)
+        theta, slope, step = rd, np.ones_like(rd), np.zeros_like(rd)
+        if any(self.distortion):
+            for _ in range(_MAX_STEPS):
+                t2 = theta * theta
+                value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+                slope = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * 9.0 * k4)))
+                step = (value - rd) / slope
+                theta = theta - step
+                if not (np.abs(step) > _TOLERANCE).any():
+                    break
+        bad = ~((np.abs(step) < 1e-9) & (slope > 0.0) & (theta >= 0.0) & (theta < np.pi))
+        theta = np.where(bad, np.nan, theta)
+        centre = rd < 1e-12
+        safe = np.where(centre, 1.0, rd)
+        cos_phi, sin_phi = np.where(centre, 1.0, xd / safe), yd / safe
+        sin_theta, cos_theta = np.sin(theta), np.cos(theta)
+        across = np.where(centre, 1.0, rd / np.where(centre, 1.0, sin_theta))
+        bearings = np.stack((sin_theta * cos_phi, sin_theta * sin_phi, cos_theta), axis=-1)
+        outward = np.stack((cos_theta * cos_phi, cos_theta * sin_phi, -sin_theta), axis=-1)
+        around = np.stack((-sin_phi, cos_phi, np.zeros_like(rd)), axis=-1)
+        tangents = np.empty((*rd.shape, 2, 3))
+        along, across = slope[:, None] * outward, across[:, None] * around
+        tangents[:, 0] = self.fx_px * (cos_phi[:, None] * along - sin_phi[:, None] * across)
+        tangents[:, 1] = self.fy_px * (sin_phi[:, None] * along + cos_phi[:, None] * across)
+        return bearings, tangents

@@ -1,0 +1,84 @@
+"""What goes into one trigger: what two nodes saw and sensed, what is expected, and how to decide."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+from solver_service.geometry.rotation import Floats
+
+Method: TypeAlias = Literal["refined", "exact", "paper", "paper_midpoint", "paper_literal"]
+CHECKS: Final = frozenset({"range", "twist", "attitude", "depth"})
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one node saw at one trigger: N candidates.
+
+    pixels: (N, 2), distorted. sigma_px, score (0-1, NaN unknown), area_px, peak: (N,). dt_s: (N,) exposure of
+    the candidate's row after stamp_ns.
+    """
+
+    pixels: Floats
+    sigma_px: Floats
+    score: Floats
+    area_px: Floats
+    peak: Floats
+    dt_s: Floats
+    stamp_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """Attitude (body to NED; sigma: roll, pitch, yaw) and depth of the port at a trigger, None where unknown."""
+
+    q_ned_body_xyzw: Floats | None = None
+    sigma_rad: Floats | None = None
+    depth_m: float | None = None
+    depth_sigma_m: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A prediction from earlier fixes for this instant, its covariance (6, 6) widened for the time since.
+
+    rates: (6,) velocity (m/s) and turn (rad/s) of B in A's camera frame, with covariance (6, 6); None: unknown.
+    """
+
+    t_a_b_m: Floats
+    q_a_b_xyzw: Floats
+    covariance: Floats
+    rates: Floats | None = None
+    rates_covariance: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How triggers are solved.
+
+    checks: what may speak for or against a hypothesis. min_probability: of the published pose, against chance and
+    every other. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the
+    prior knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
+    """
+
+    method: Method = "refined"
+    checks: frozenset[str] = CHECKS
+    range_min_m: float = 0.8
+    range_max_m: float = 30.0
+    min_probability: float = 0.9
+    gate_sigma: float = 4.5
+    speed_mps: float = 0.2
+    turn_radps: float = 0.2
+    skew_sigma_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work."""
+        if not self.checks <= CHECKS:
+            raise ValueError(f"checks: {sorted(self.checks - CHECKS)} unknown, there are {sorted(CHECKS)}")
+        if not 0.0 < self.range_min_m < self.range_max_m < math.inf:
+            raise ValueError(f"range_min_m: {self.range_min_m:g}, range_max_m: {self.range_max_m:g}: not 0 < min < max")
+        if not 0.0 <= self.min_probability < 1.0:
+            raise ValueError(f"min_probability: {self.min_probability:g} is not in [0, 1)")
+        if not 0.0 < self.gate_sigma < math.inf:
+            raise ValueError(f"gate_sigma: {self.gate_sigma:g} is not positive")

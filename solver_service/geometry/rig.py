@@ -1,0 +1,51 @@
+"""One node's calibration, and what follows from it for a pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from solver_service.geometry.camera import Camera
+from solver_service.geometry.rotation import Floats
+
+# Camera to body for the nominal mount: x forward is z, y right is x, z down is y.
+NOMINAL_R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """One node's calibration.
+
+    lights_m: (2, 3), left and right, in the camera frame. R_body_camera: camera to body. depth_port_m: in the
+    camera frame. declination_rad: what its headings have been corrected by; 0: they are magnetic.
+    """
+
+    camera: Camera
+    lights_m: Floats
+    R_body_camera: Floats = field(default_factory=NOMINAL_R_BODY_CAMERA.copy)
+    depth_port_m: Floats = field(default_factory=lambda: np.zeros(3))
+    declination_rad: float = 0.0
+
+    @cached_property
+    def middle_m(self) -> Floats:
+        """The bar's middle (3,), camera frame."""
+        middle: Floats = (self.lights_m[0] + self.lights_m[1]) / 2.0
+        return middle
+
+    @cached_property
+    def length_m(self) -> float:
+        """The distance between the lights."""
+        return float(np.linalg.norm(self.lights_m[1] - self.lights_m[0]))
+
+    @cached_property
+    def axis(self) -> Floats:
+        """The unit vector (3,) from the left to the right light, camera frame."""
+        axis: Floats = (self.lights_m[1] - self.lights_m[0]) / self.length_m
+        return axis
+
+    @property
+    def usable(self) -> bool:
+        """Whether the lights are finite and apart."""
+        return bool(np.isfinite(self.lights_m).all()) and self.length_m >= 1e-3

@@ -1,0 +1,76 @@
+"""Rotations: unit quaternions (x, y, z, w), matrices, rotation vectors."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+
+# v @ CROSS, reshaped to (3, 3), is the matrix of the cross product v x .
+CROSS: Final[Floats] = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    CROSS[_i, _k, _j] = 1.0
+    CROSS[_i, _j, _k] = -1.0
+
+
+def skew(v: Floats) -> Floats:
+    """Give the (..., 3, 3) matrices of the cross products with v (..., 3)."""
+    return (v @ CROSS.reshape(3, 9)).reshape(*v.shape, 3)
+
+
+def matrix_of(q_xyzw: Floats) -> Floats:
+    """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
+    q = np.asarray(q_xyzw, dtype=np.float64)
+    q = q / np.sqrt((q * q).sum(-1, keepdims=True))
+    v, w = q[..., :3], q[..., 3]
+    R: Floats = 2.0 * v[..., :, None] * v[..., None, :] + 2.0 * w[..., None, None] * skew(v)
+    R[..., (0, 1, 2), (0, 1, 2)] += (2.0 * w * w - 1.0)[..., None]
+    return R
+
+
+def quaternion_of(R: Floats) -> Floats:
+    """Turn one rotation matrix (3, 3) into its quaternion (4,), the largest component positive.
+
+    Which component is divided by follows from the matrix (Shepperd 1978), so that no rotation is near a
+    singularity.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
+    # Four times the outer product of the quaternion with itself, row by row.
+    rows = (
+        (1.0 + a - e - i, b + d, c + g, h - f),
+        (b + d, 1.0 - a + e - i, f + h, c - g),
+        (c + g, f + h, 1.0 - a - e + i, d - b),
+        (h - f, c - g, d - b, 1.0 + a + e + i),
+    )
+    row = max(range(4), key=lambda k: rows[k][k])
+    norm = math.sqrt(sum(x * x for x in rows[row]))
+    return np.array([x / norm for x in rows[row]])
+
+
+def rotation_exp(w_rad: Floats) -> Floats:
+    """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
+    square = (w_rad * w_rad).sum(-1)
+    angle = np.sqrt(square)
+    # sin(x)/x and (1 - cos x)/x^2, without a division by zero.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    K = skew(w_rad)
+    R: Floats = first[..., None, None] * K + second[..., None, None] * (K @ K)
+    R[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    return R
+
+
+def rotation_log(R: Floats) -> Floats:
+    """Turn one rotation matrix (3, 3) into its rotation vector (3,), at most pi long."""
+    q = quaternion_of(R)
+    if q[3] < 0.0:
+        q = -q
+    sine = math.sqrt(float(q[:3] @ q[:3]))
+    if sine < 1e-12:
+        return 2.0 * q[:3]
+    vector: Floats = q[:3] * (2.0 * math.atan2(sine, float(q[3])) / sine)
+    return vector
