@@ -15,7 +15,7 @@ from protocol.messages import Attitude, Depth
 
 HORIZON_NS: Final = 20 * S_NS
 MAX_SAMPLES: Final = 8192
-SENSOR_WAIT_NS: Final = 2 * S_NS
+SENSOR_WAIT_NS: Final = 3 * S_NS
 
 # An attitude is interpolated between neighbours at most this far apart, or held at most this long.
 ATTITUDE_GAP_NS: Final = 300 * MS_NS
@@ -70,7 +70,7 @@ class SampleStream(Generic[S]):
     def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int) -> bool:
         """Whether what matters for a frame at stamp_ns is here, or is not going to come.
 
-        first_frame_ns, newest_frame_ns: the node's frames so far; a sensor that stays behind them for two
+        first_frame_ns, newest_frame_ns: the node's frames so far; a sensor that stays behind them for three
         seconds of the dive is not waited for any longer.
         """
         newest_ns = self._stamps[-1] if self._stamps else first_frame_ns

@@ -32,9 +32,12 @@ log = logging.getLogger(__name__)
 NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status"})
 # Pictures go out as previews: the bus is for what the solver needs.
 IMAGES_HZ: Final = 2.0
-# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time.
-AHEAD_NS: Final = S_NS // 2
+# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time:
+# more than a solver waits for a frame that is lost.
+AHEAD_NS: Final = 2_200_000_000
 SOLVER_SILENT_S: Final = 1.0
+# Calibration goes ahead of the frames, which have a higher priority on the bus.
+INFO_AHEAD_S: Final = 0.3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +56,7 @@ class SolverFollower:
     def __init__(self, bus: Bus) -> None:
         self._changed = threading.Condition()
         self._resolved_ns = -1
-        self._heard_s = -math.inf
+        self._heard_s: float | None = None
         for topic in (POSE, REJECTED):
             bus.subscribe(topic.key_any(), self._hear, capacity=4096, history=False)
 
@@ -68,6 +71,8 @@ class SolverFollower:
     def wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
         """Wait until the solver is close behind stamp_ns; not at all where none answers."""
         with self._changed:
+            if self._heard_s is None:
+                self._heard_s = time.monotonic()
             while (
                 self._resolved_ns < stamp_ns - AHEAD_NS
                 and time.monotonic() - self._heard_s < SOLVER_SILENT_S
@@ -98,6 +103,15 @@ class Player:
             parsed = parse_key(key)
             if parsed and parsed[0].name not in NOT_SENT and key not in self._publishers:
                 self._publishers[key] = self._bus.publisher(parsed[0], *parsed[1])
+
+    def send_infos(self, records: Iterator[Record]) -> None:
+        """Send the first calibration of each node, ahead of everything else."""
+        sent: set[str] = set()
+        for record in records:
+            if record.key not in sent:
+                sent.add(record.key)
+                self._publishers[record.key].put_bytes(record.payload)
+        self._stop.wait(INFO_AHEAD_S)
 
     def send(self, record: Record, shift_triggers: int = 0, period_ns: int = S_NS) -> None:
         """Wait for a record's time, and send it, so many triggers later than it was recorded."""
@@ -166,6 +180,7 @@ def run(args: argparse.Namespace) -> int:
             bus.declare_alive("player")
             player = Player(bus, args.speed, SystemClock(), service.stop)
             player.declare(dive.keys)
+            player.send_infos(dive.records(INFO.name))
             period_ns = max((info.trigger_period_ns for info in dive.infos().values()), default=S_NS)
             laps_triggers = (stop_ns - start_ns) // period_ns + 2
             lap = 0

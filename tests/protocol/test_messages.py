@@ -1,5 +1,6 @@
 """The contract's messages: what decodes is sound, and nothing unsound goes out."""
 
+import contextlib
 import json
 import math
 
@@ -120,7 +121,5 @@ def test_round_trip(values):
 @given(st.binary(max_size=200))
 def test_any_bytes_decode_or_are_refused(payload):
     for schema in (Attitude, Candidates, NodeInfo):
-        try:
-            decode(payload, schema)
-        except MessageError as error:
-            assert schema.__name__ in str(error)
+        with contextlib.suppress(MessageError):
+            assert isinstance(decode(payload, schema), schema)

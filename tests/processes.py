@@ -1,0 +1,103 @@
+"""Real processes of the project for tests: started, waited for, and ended by their own ids."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+END_S = 5.0
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def buddyline(*words: str, timeout: float = 60.0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run one command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "tools", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+    )
+
+
+class Process:
+    """A running command; its stderr is read as it comes, so that a test can wait for a line."""
+
+    def __init__(self, *words: str, cwd: Path | None = None) -> None:
+        self.lines: list[str] = []
+        self._changed = threading.Condition()
+        self._child = subprocess.Popen(
+            [sys.executable, "-m", "tools", *map(str, words)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=cwd,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    def _read(self) -> None:
+        for line in self._child.stderr:
+            with self._changed:
+                self.lines.append(line.rstrip())
+                self._changed.notify_all()
+        with self._changed:
+            self._changed.notify_all()
+
+    def wait_for(self, text: str, timeout: float = 20.0) -> str:
+        """Wait for a line of stderr with text in it."""
+        with self._changed:
+            found = self._changed.wait_for(lambda: next((line for line in self.lines if text in line), None), timeout)
+        assert found, f"{text!r} did not come; stderr: {self.lines}"
+        return found
+
+    def wait(self, timeout: float = 30.0) -> int:
+        """Wait for its end; return the exit status."""
+        status = self._child.wait(timeout)
+        self._reader.join(timeout)
+        return status
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._child.send_signal(number)
+
+    def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = END_S) -> int:
+        """Ask it to end; kill it where it does not; return the exit status."""
+        if self._child.poll() is None:
+            self._child.send_signal(number)
+        try:
+            status = self._child.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+            raise
+        finally:
+            self._reader.join(END_S)
+            self._child.stderr.close()
+        return status
+
+    def __enter__(self) -> Process:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()

@@ -1,0 +1,180 @@
+"""Real processes over a real hub on loopback."""
+
+import json
+import os
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from protocol.divelog import DiveLogReader, DiveLogWriter
+from protocol.messages import Rejected, RelativePose
+from tests.processes import Process, buddyline, free_endpoint
+from tests.solver_service.conftest import dive_messages
+
+END_WITHIN_S = 2.0
+
+
+def results_of(path):
+    with DiveLogReader(path) as reader:
+        found = [record.decode() for record in reader.records(lambda key: key.startswith("buddyline/pair/"))]
+    return {m.trigger: m for m in found if isinstance(m, RelativePose | Rejected)}, Counter(
+        m.trigger for m in found if isinstance(m, RelativePose | Rejected)
+    )
+
+
+def children_of(pid):
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[1]) == pid:
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.fixture
+def two_logs(tmp_path):
+    messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05)
+    for node in ("a", "b"):
+        with DiveLogWriter(tmp_path / f"{node}.mcap") as writer:
+            for message in messages:
+                if message.node == node:
+                    writer.write_message(message)
+    return [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+
+
+@pytest.mark.parametrize("speed", ["1", "0"])
+def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
+    offline = buddyline("solve", *two_logs, "-o", tmp_path / "offline.mcap", "--json")
+    assert offline.returncode == 0, offline.stderr
+    endpoint = free_endpoint()
+    with (
+        Process("hub", "--listen", endpoint) as hub,
+        Process("solver", "--connect", endpoint) as solver,
+        Process("record", tmp_path / "live.mcap", "--connect", endpoint) as record,
+    ):
+        hub.wait_for("listens")
+        solver.wait_for("connected")
+        record.wait_for("into")
+        played = buddyline("play", *two_logs, "--connect", endpoint, "--speed", speed)
+        assert played.returncode == 0, played.stderr
+        expected, _ = results_of(tmp_path / "offline.mcap")
+        last = max(expected)
+        deadline = time.monotonic() + 15
+        while time.monotonic() < deadline:
+            # The recorder syncs every second: the end of the dive has come when its last trigger has.
+            if last in results_of(tmp_path / "live.mcap")[0]:
+                break
+            solver.wait_for("connected")
+            time.sleep(0.2)
+        assert record.end(signal.SIGINT) == 130
+    live, counts = results_of(tmp_path / "live.mcap")
+    assert live == expected
+    assert set(counts.values()) == {1}
+    with DiveLogReader(tmp_path / "live.mcap") as reader:
+        assert reader.damage == []
+
+
+def test_demo_shows_poses_and_leaves_nothing_running(tmp_path):
+    demo = Process("demo", "--environment", "basin", "--rate", "4", "--record", tmp_path)
+    try:
+        demo.wait_for("range", timeout=40.0)
+        children = children_of(demo.pid)
+        assert len(children) == 4
+        began_s = time.monotonic()
+        demo.send(signal.SIGINT)
+        assert demo.wait(timeout=10.0) == 130
+        assert time.monotonic() - began_s < END_WITHIN_S
+        assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+    finally:
+        demo.end()
+    logs = sorted(tmp_path.glob("*.mcap"))
+    assert [log.name[0] for log in logs] == ["a", "b"]
+    for log in logs:
+        with DiveLogReader(log) as reader:
+            names = {key.rpartition("/")[2] for key in reader.keys}
+            assert {"info", "candidates", "attitude", "depth", "imu", "image"} <= names
+            assert reader.damage == []
+
+
+def test_demo_summary_as_json():
+    done = buddyline("demo", "--environment", "basin", "--rate", "4", "--seconds", "8", "--json")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["poses"] > 0
+    assert summary["wrong_poses"] == 0
+
+
+def node_toml(path, node, endpoint, **tables):
+    text = f'node = "{node}"\nconnect = "{endpoint}"\nrate_hz = 5.0\n[record]\ndirectory = "{path.parent}"\n'
+    for table, values in tables.items():
+        text += f"[{table}]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in values.items())
+    path.write_text(text)
+    return path
+
+
+def test_node_and_solver_wait_for_the_hub_and_a_second_node_is_refused(tmp_path):
+    endpoint = free_endpoint()
+    config = node_toml(tmp_path / "a.toml", "a", endpoint)
+    with (
+        Process("node", "--config", config) as node,
+        Process("solver", "--connect", endpoint) as solver,
+    ):
+        node.wait_for("no hub")
+        solver.wait_for("no hub")
+        with Process("hub", "--listen", endpoint) as hub:
+            hub.wait_for("listens")
+            node.wait_for("connected")
+            solver.wait_for("connected")
+            taken = buddyline("hub", "--listen", endpoint)
+            assert taken.returncode == 2
+            assert endpoint.rpartition(":")[2] in taken.stderr
+            twin = Process("node", "--config", config)
+            assert twin.wait(20.0) == 2
+            assert any("another node" in line for line in twin.lines)
+            assert twin.end() == 2
+            for process in (node, solver):
+                began_s = time.monotonic()
+                assert process.end(signal.SIGTERM) == 0
+                assert time.monotonic() - began_s < END_WITHIN_S
+    # From the start, hub or not, the node has recorded.
+    first = min(tmp_path.glob("a-*.mcap"), key=os.path.getmtime)
+    with DiveLogReader(first) as reader:
+        assert reader.damage == []
+        assert "buddyline/node/a/candidates" in reader.keys
+
+
+def test_stored_dive_through_a_node(tmp_path):
+    import cv2
+    import numpy as np
+
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for i in range(6):
+        picture = np.zeros((120, 160, 3), np.uint8)
+        cv2.circle(picture, (40 + i, 60), 4, (255, 255, 255), -1)
+        cv2.imwrite(str(folder / f"{i}.png"), picture)
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:60])
+    camera = {"name": "stored", "path": str(folder), "width_px": 160, "height_px": 120}
+    config = node_toml(tmp_path / "c.toml", "c", free_endpoint(), camera=camera, sensors={"name": "none"})
+    config.write_text(
+        config.read_text()
+        + "[calibration]\nlight_left_m = [-0.44, 0.0, 0.0]\nlight_right_m = [0.44, 0.0, 0.0]\n"
+        + '[calibration.camera]\nmodel = "pinhole"\nfx_px = 200.0\nfy_px = 200.0\ncx_px = 79.5\ncy_px = 59.5\n'
+        + "distortion = [0.0, 0.0, 0.0, 0.0, 0.0]\n"
+    )
+    with Process("node", "--config", config) as node:
+        node.wait_for("2.png")
+        node.wait_for("no more pictures")
+        assert node.end() == 0
+    (log,) = tmp_path.glob("c-*.mcap")
+    with DiveLogReader(log) as reader:
+        frames = [r.decode() for r in reader.records(lambda key: key.endswith("candidates"))]
+    assert len(frames) == 5
+    assert all(abs(frame.blobs[0].u_px - (40 + i)) < 1 for i, frame in zip((0, 1, 3, 4, 5), frames, strict=True))

@@ -1,0 +1,192 @@
+"""The program as a person meets it: help, exit status, and errors of one line that say what to do."""
+
+import json
+
+import pytest
+
+from protocol.divelog import DiveLogWriter
+from tests.processes import buddyline
+from tests.solver_service.conftest import dive_messages
+from tools.cli import COMMANDS, main
+
+
+@pytest.fixture(scope="module")
+def dive_log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dive") / "dive.mcap"
+    messages, world = dive_messages(seconds=3.0)
+    with DiveLogWriter(path) as writer:
+        for message in messages:
+            writer.write_message(message)
+        for stamp_ns in sorted({m.stamp_ns for m in messages if hasattr(m, "trigger")}):
+            truth = world.truth(stamp_ns, stamp_ns // 100_000_000)
+            writer.write_message(truth, key="buddyline/pair/a/b/truth")
+    return path
+
+
+def run(capsys, *words):
+    status = main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_help_names_every_command(capsys):
+    status, out, _ = run(capsys, "--help")
+    assert status == 0
+    for command in COMMANDS:
+        assert command.name in out
+
+
+@pytest.mark.parametrize("name", [command.name for command in COMMANDS])
+def test_each_command_helps_with_examples(capsys, name):
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0
+    assert "examples:" in capsys.readouterr().out
+
+
+def test_unknown_command_is_guessed(capsys):
+    status, _, err = run(capsys, "slove")
+    assert status == 2
+    assert "solve" in err
+
+
+def test_solve_and_its_summary(capsys, dive_log, tmp_path):
+    status, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", "--json")
+    assert status == 0
+    summary = json.loads(out)
+    assert summary["triggers"] == summary["solved"] + sum(summary["rejected"].values()) == 28
+    assert summary["solved"] > 14
+    status, out, _ = run(capsys, "evaluate", tmp_path / "out.mcap", "--json")
+    assert status == 0
+    json.loads(out)
+
+
+def test_solve_is_deterministic(capsys, dive_log, tmp_path):
+    for name in ("one.mcap", "two.mcap"):
+        assert run(capsys, "solve", dive_log, "-o", tmp_path / name)[0] == 0
+    assert (tmp_path / "one.mcap").read_bytes() == (tmp_path / "two.mcap").read_bytes()
+
+
+def test_output_that_exists_is_kept(capsys, dive_log, tmp_path):
+    (tmp_path / "out.mcap").write_text("precious")
+    status, _, err = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap")
+    assert status == 2
+    assert "exists" in err
+    assert (tmp_path / "out.mcap").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [(None, "cannot be read"), (b"", "empty"), (b"dear diary", "not a dive log")],
+    ids=["missing", "empty", "text"],
+)
+@pytest.mark.parametrize("command", ["solve", "play", "detect", "evaluate", "export"])
+def test_bad_logs_are_one_line_and_exit_2(capsys, tmp_path, command, content, says):
+    path = tmp_path / "bad.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    words = {"solve": ["-o", tmp_path / "out.mcap"], "export": ["--format", "csv"]}.get(command, [])
+    status, out, err = run(capsys, command, path, *words)
+    assert status == 2
+    assert out == ""
+    assert says in err
+    assert "bad.mcap" in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_dive_without_calibration(capsys, tmp_path):
+    messages, _ = dive_messages(seconds=1.0)
+    with DiveLogWriter(tmp_path / "dive.mcap") as writer:
+        for message in messages:
+            if not hasattr(message, "camera"):
+                writer.write_message(message)
+    status, _, err = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out.mcap")
+    assert status == 2
+    assert "--info a=FILE" in err
+    info = next(m for m in messages if hasattr(m, "camera"))
+    from protocol.messages import encode
+
+    for node in ("a", "b"):
+        import msgspec
+
+        (tmp_path / f"{node}.json").write_bytes(encode(msgspec.structs.replace(info, node=node)))
+    given = [word for node in ("a", "b") for word in ("--info", f"{node}={tmp_path / node}.json")]
+    status, _, _ = run(capsys, "solve", tmp_path / "dive.mcap", "-o", tmp_path / "out2.mcap", *given)
+    assert status == 0
+
+
+def test_two_logs_of_different_rigs(capsys, tmp_path):
+    for name, seed in (("one", 3), ("two", 4)):
+        messages, _ = dive_messages(seconds=1.0, seed=seed)
+        with DiveLogWriter(tmp_path / f"{name}.mcap") as writer:
+            for message in messages:
+                writer.write_message(message)
+    status, _, err = run(capsys, "solve", tmp_path / "one.mcap", tmp_path / "two.mcap", "-o", tmp_path / "out.mcap")
+    assert status == 2
+    for word in ("one.mcap", "two.mcap", "node a"):
+        assert word in err
+
+
+def test_one_node_alone(capsys, tmp_path):
+    messages, _ = dive_messages(seconds=1.0)
+    with DiveLogWriter(tmp_path / "a.mcap") as writer:
+        for message in messages:
+            if message.node == "a":
+                writer.write_message(message)
+    status, _, err = run(capsys, "solve", tmp_path / "a.mcap", "-o", tmp_path / "out.mcap")
+    assert status == 2
+    assert "both nodes" in err
+
+
+def test_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path):
+    data = dive_log.read_bytes()
+    with DiveLogWriter(tmp_path / "chunked.mcap") as writer:
+        for i, message in enumerate(dive_messages(seconds=3.0)[0]):
+            writer.write_message(message)
+            if i % 50 == 0:
+                writer.flush()
+    data = (tmp_path / "chunked.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 6 // 10])
+    status, out, _ = run(capsys, "solve", tmp_path / "cut.mcap", "-o", tmp_path / "out.mcap", "--json")
+    assert status == 0
+    assert 5 < json.loads(out)["solved"] < 28
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--checks", "range,magic"], "magic"),
+        (["--info", "a"], "NODE=FILE"),
+        (["--info", "a=nothing.json"], "nothing.json"),
+        (["--nodes", "a", "c"], "node c"),
+    ],
+)
+def test_bad_arguments_name_the_value(capsys, dive_log, tmp_path, words, says):
+    status, _, err = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap", *words)
+    assert status == 2
+    assert says in err
+
+
+def test_configuration_typo_is_named(capsys, tmp_path):
+    (tmp_path / "a.toml").write_text('node = "a"\n[camera]\nnmae = "stored"\n')
+    status, _, err = run(capsys, "node", "--config", tmp_path / "a.toml")
+    assert status == 2
+    for word in ("a.toml", "nmae", "name"):
+        assert word in err
+
+
+def test_help_is_quick_because_heavy_imports_stay_where_they_are_used():
+    # What is imported tells more than a clock on a shared machine.
+    import subprocess
+    import sys
+
+    code = "import sys; from tools.cli import main; main(['--help']); print(sorted(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    for heavy in ("numpy", "cv2", "zenoh", "mcap", "msgspec", "matplotlib"):
+        assert f"'{heavy}'" not in out
+
+
+def test_exit_status_of_the_real_program(tmp_path):
+    assert buddyline("--version").returncode == 0
+    assert buddyline("solve", "none.mcap", "-o", tmp_path / "x.mcap").returncode == 2
