@@ -62,7 +62,7 @@ class GlowRenderer:
         source = lamp.position_m / r
         centre = lamp.position_m[:2] / lamp.position_m[2]
         offsets = self._rho[:, None, None] / self._f_px * self._ring
-        rays = np.empty((STEPS, AZIMUTHS, 3))
+        rays = np.empty((STEPS, AZIMUTHS, 3), np.float64)
         rays[..., :2] = centre + offsets
         rays[..., 2] = 1.0
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)

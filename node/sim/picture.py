@@ -26,7 +26,7 @@ class Painter:
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
         water, camera = scenario.water, scene.rigs[index].camera
-        self._seed, self._index, self._rig = scenario.seed, index, scene.rigs[index]
+        self._seed, self._index = scenario.seed, index
         self._size_px = scenario.width_px, scenario.height_px
         self._glow = GlowRenderer(water, scenario.width_px, scenario.height_px, camera.fx_px)
         self._scenery = Scenery(scenario, camera)
@@ -44,25 +44,26 @@ class Painter:
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_wide(coarse, lamp, table)
         self._scenery.paint(view, t_s, coarse, full)
-        self._scenery.add_body(full, view, self._rig)
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_near(full, lamp, table)
         for passer in view.passers:
             _darken(full, passer, self._scenery.passer_radiance)
         self._snow.add(full, view, t_s)
-        np.multiply(full, np.float32(255.0**2), out=full)
         cv2.sqrt(full, dst=full)
         left, top = rng.integers(0, NOISE_MARGIN_PX, 2)
         width_px, height_px = self._size_px
         noise = self._noise[top : top + height_px, left : left + width_px]
-        return np.asarray(cv2.add(full, noise, dtype=cv2.CV_8U), np.uint8)
+        return np.asarray(cv2.addWeighted(full, 255.0, noise, 1.0, 0.0, dtype=cv2.CV_8U), np.uint8)
 
     def merged(self, left: Lamp, right: Lamp) -> bool:
         """Tell whether the clipped cores of two lights are one."""
         if not (self._matters(left) and self._matters(right)):
             return False
+        apart_px = float(np.linalg.norm(left.pixel - right.pixel))
+        if apart_px > self._size_px[0] / 4:  # no core is that large: not worth a table
+            return False
         cores_px = sum(self._glow.core_px(lamp, self._glow.table(lamp)) for lamp in (left, right))
-        return bool(np.linalg.norm(left.pixel - right.pixel) < cores_px)
+        return apart_px < cores_px
 
     def _matters(self, lamp: Lamp) -> bool:
         """Tell whether a lamp stands near enough to the picture to be seen or to light the water in it."""

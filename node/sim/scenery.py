@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.sim.randomness import generator
-from node.sim.rig import Rig
 from node.sim.scenario import Scenario
 from node.sim.scene import View
 from protocol.messages import CameraModel
@@ -41,6 +40,7 @@ class Scenery:
     def __init__(self, scenario: Scenario, camera: CameraModel) -> None:
         self._water = water = scenario.water
         self._size_px = scenario.width_px, scenario.height_px
+        self._f_px = camera.fx_px
         self._grid = -(-scenario.height_px // GRID_PX), -(-scenario.width_px // GRID_PX)
         middle = -(-scenario.height_px // TEXTURED_PX), -(-scenario.width_px // TEXTURED_PX), 3
         self._middle: Image = np.empty(middle, np.float32)
@@ -84,31 +84,30 @@ class Scenery:
         position_m = view.placement.position_ned_m[:2]
         for plane, tile, tile_m, colour in textured:
             self._add_texture(plane, position_m, tile, tile_m, colour)
+        self._add_body(view)
         cv2.resize(middle, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
 
-    def add_body(self, full: Image, view: View, rig: Rig) -> None:
-        """Add the other node's bar and housing, dark before sunlit water."""
+    def _add_body(self, view: View) -> None:
+        """Add the other node's bar and housing to the middle picture, before sunlit water."""
         left, right = view.lights
-        near_m = min(left.position_m[2], right.position_m[2])
-        if not self._sunlit or near_m < 0.3 or np.isnan([left.pixel, right.pixel]).any():
+        if min(left.position_m[2], right.position_m[2]) < 0.3 or np.isnan([left.pixel, right.pixel]).any():
             return
         range_m = (left.range_m + right.range_m) / 2
-        scale = rig.camera.fx_px / range_m
-        reach = 0.16 * scale
-        ends = np.array([left.pixel, right.pixel])
-        width_px, height_px = self._size_px
-        u0, v0 = np.clip((ends.min(axis=0) - reach).astype(int), 0, (width_px, height_px))
-        u1, v1 = np.clip((ends.max(axis=0) + reach).astype(int) + 1, 0, (width_px, height_px))
-        if u0 >= u1 or v0 >= v1 or max(u1 - u0, v1 - v0) > 4000:
+        scale = self._f_px / TEXTURED_PX / range_m
+        ends = np.array([left.pixel, right.pixel]) / TEXTURED_PX
+        height_px, width_px = self._middle.shape[:2]
+        u0, v0 = np.clip((ends.min(axis=0) - 0.16 * scale).astype(int), 0, (width_px, height_px))
+        u1, v1 = np.clip((ends.max(axis=0) + 0.16 * scale).astype(int) + 1, 0, (width_px, height_px))
+        if u0 >= u1 or v0 >= v1 or np.abs(ends).max() > 4 * width_px:
             return
-        through = np.exp(-self._k * range_m)
+        through = np.exp(-self._k * range_m) / 255.0
         for radiance, draw in ((1.7, self._bar), (0.12, self._housing)):
             mask = np.zeros((v1 - v0, u1 - u0), np.uint8)
             draw(mask, ends - (u0, v0), scale)
             rows, columns = np.nonzero(mask)
-            cover = mask[rows, columns, None] * (through / 255.0).astype(np.float32)
-            patch = full[v0:v1, u0:u1]
+            patch = self._middle[v0:v1, u0:u1]
             behind = patch[rows, columns]
+            cover = mask[rows, columns, None] * through
             patch[rows, columns] = behind + cover * (radiance * self._ambient - behind)
 
     @staticmethod
