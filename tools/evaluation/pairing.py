@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from protocol.messages import Rejected, RelativePose
@@ -16,15 +16,18 @@ class Pairing:
     """Triggers at which both pictures show both lights of the other node.
 
     marked: visible by LightTruth; else: the projected lights fall inside both pictures, whatever stands in between.
-    right: of them, those that ended as a pose with the right pair; other_pair: as a pose with another; ended: how the
-    rest ended, by reason ("no result" among them). detected: of them, with a candidate near all four lights, and of
-    these right_detected. None where candidates or results are not known.
+    right: of them, those that ended as a pose with the right pair; other_pair: as a pose with another; partial: as a
+    pose from fewer than four lights; wrong: as a wrong pose, whatever its pair; ended: how the rest ended, by reason
+    ("no result" among them). detected: of them, with a candidate near all four lights, and of these right_detected.
+    None where candidates or results are not known.
     """
 
     marked: bool
     visible: int
     right: int | None
     other_pair: int | None
+    partial: int | None
+    wrong: int
     ended: dict[str, int]
     detected: int | None
     right_detected: int | None
@@ -50,6 +53,8 @@ class Sighting:
     marked: bool
     detected: bool | None
     right: bool | None
+    partial: bool
+    wrong: bool
     ended: str
 
 
@@ -60,8 +65,12 @@ def sightings_of(
     lights: Mapping[tuple[str, int], TrueLights],
     blobs: Mapping[tuple[str, int], Blobs],
     ranges_m: Mapping[int, float],
+    wrong: Collection[int],
 ) -> list[Sighting]:
-    """Return the triggers at which both pictures show both lights; ranges_m: the true range by trigger."""
+    """Return the triggers at which both pictures show both lights; ranges_m: the true range by trigger.
+
+    wrong: the triggers of wrong poses.
+    """
     pose_at = {pose.trigger: pose for pose in poses}
     reason_at = {rejection.trigger: rejection.reason for rejection in rejected}
     answered = bool(blobs and (poses or rejected))
@@ -81,6 +90,8 @@ def sightings_of(
                 marked=all(true is not None and true.marked for true, _ in views),
                 detected=all(near) if blobs else None,
                 right=(pose is not None and is_right_pair(pose, blobs, lights) is True) if answered else None,
+                partial=pose is not None and min(*pose.blobs_a, *pose.blobs_b) < 0,
+                wrong=trigger in wrong,
                 ended="pose" if pose is not None else reason_at.get(trigger, "no result"),
             )
         )
@@ -95,11 +106,14 @@ def pairing_figures(sightings: Sequence[Sighting]) -> Pairing | None:
     searched = all(sighting.detected is not None for sighting in sightings)
     posed = sum(sighting.ended == "pose" for sighting in sightings)
     right = sum(bool(sighting.right) for sighting in sightings)
+    partial = sum(sighting.partial for sighting in sightings)
     return Pairing(
         marked=all(sighting.marked for sighting in sightings),
         visible=len(sightings),
         right=right if judged else None,
-        other_pair=posed - right if judged else None,
+        other_pair=posed - right - partial if judged else None,
+        partial=partial if judged else None,
+        wrong=sum(sighting.wrong for sighting in sightings),
         ended=dict(Counter(sighting.ended for sighting in sightings if sighting.ended != "pose").most_common()),
         detected=sum(bool(sighting.detected) for sighting in sightings) if searched else None,
         right_detected=sum(bool(sighting.detected and sighting.right) for sighting in sightings) if judged else None,

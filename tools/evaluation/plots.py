@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from protocol.errors import BuddylineError
 from tools.evaluation.result import Result
+from tools.evaluation.rotation import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FILES: Final = ("trajectory.png", "errors_over_time.png", "errors_over_range.png", "normalized_error.png")
-_DPI: Final = 120
+_DPI: Final = 100
 
 
 def check(directory: Path) -> None:
@@ -63,20 +64,28 @@ def _split(result: Result) -> list[tuple[str, str, NDArray[np.bool_]]]:
     )
 
 
+def _logarithmic(errors: Floats) -> Floats:
+    """Lift exact zeros, which a logarithmic axis cannot show."""
+    return np.maximum(errors, 1e-6)
+
+
 def _trajectory(result: Result) -> Figure:
     """Node b in a's camera frame, from above and from the side, on a 1 m grid."""
+    from matplotlib.ticker import MultipleLocator
+
     errors = result.errors
     figure, axes = _figure(2, 1, 8.0, 8.0)
-    furthest_m = 1.1 * float(np.abs(errors.true_t_m).max()) + 0.5
+    true_m, ahead_m = errors.true_t_m, errors.true_t_m[:, 2]
+    grid_m = max(1.0, float(np.ceil(np.abs(true_m).max() / 20)))
     for axis, across, name in ((axes[0], 0, "right"), (axes[1], 1, "down")):
-        axis.plot(errors.true_t_m[:, 2], errors.true_t_m[:, across], "-", color="0.6", label="truth")
+        axis.plot(ahead_m, true_m[:, across], ".", color="0.6", markersize=5, label="truth")
         for label, colour, chosen in _split(result):
             axis.plot(errors.t_m[chosen, 2], errors.t_m[chosen, across], ".", color=colour, markersize=3, label=label)
-        centre_m = float(np.median(errors.true_t_m[:, across]))
-        spread_m = float(np.ptp(errors.true_t_m[:, across])) / 2 + 1.0
-        axis.set(xlabel="forward of a, m", ylabel=f"{name}, m", xlim=(0.0, furthest_m), aspect="equal")
-        axis.set_ylim(centre_m + spread_m, centre_m - spread_m)
-        axis.set_xticks(np.arange(0.0, furthest_m, max(1.0, np.ceil(furthest_m / 30))))
+        axis.set(xlabel=f"forward of {result.node_a}, m", ylabel=f"{name}, m", aspect="equal")
+        axis.set_xlim(min(0.0, float(ahead_m.min())) - 0.5, float(ahead_m.max()) + 1.0)
+        axis.set_ylim(float(true_m[:, across].max()) + 1.0, float(true_m[:, across].min()) - 1.0)
+        axis.xaxis.set_major_locator(MultipleLocator(grid_m))
+        axis.yaxis.set_major_locator(MultipleLocator(grid_m))
         axis.grid(visible=True, linewidth=0.4)
     axes[0].legend()
     axes[0].set_title(f"{result.node_b} as {result.node_a} sees it: from above, from the side")
@@ -88,8 +97,12 @@ def _over_time(result: Result) -> Figure:
     t_s = (errors.stamp_ns - errors.stamp_ns[0]) / 1e9
     figure, axes = _figure(3, 1, 9.0, 8.0)
     for label, colour, chosen in _split(result):
-        axes[0].plot(t_s[chosen], errors.translation_m[chosen], ".", color=colour, markersize=3, label=label)
-        axes[1].plot(t_s[chosen], np.degrees(errors.rotation_rad[chosen]), ".", color=colour, markersize=3)
+        axes[0].plot(
+            t_s[chosen], _logarithmic(errors.translation_m[chosen]), ".", color=colour, markersize=3, label=label
+        )
+        axes[1].plot(
+            t_s[chosen], _logarithmic(np.degrees(errors.rotation_rad[chosen])), ".", color=colour, markersize=3
+        )
     axes[2].plot(t_s, errors.true_range_m, ".", color="0.5", markersize=3)
     for axis, label in zip(axes, ("position error, m", "rotation error, deg", "true range, m"), strict=True):
         axis.set_ylabel(label)
@@ -106,9 +119,9 @@ def _over_range(result: Result) -> Figure:
     figure, axes = _figure(3, 1, 9.0, 9.0)
     for label, colour, chosen in _split(result):
         range_m = errors.true_range_m[chosen]
-        axes[0].plot(range_m, errors.translation_m[chosen], ".", color=colour, markersize=3, label=label)
+        axes[0].plot(range_m, _logarithmic(errors.translation_m[chosen]), ".", color=colour, markersize=3, label=label)
         axes[1].plot(range_m, errors.range_m[chosen], ".", color=colour, markersize=3)
-        axes[2].plot(range_m, np.degrees(errors.rotation_rad[chosen]), ".", color=colour, markersize=3)
+        axes[2].plot(range_m, _logarithmic(np.degrees(errors.rotation_rad[chosen])), ".", color=colour, markersize=3)
     labels = ("position error, m", "range error, m", "rotation error, deg")
     for axis, label in zip(axes, labels, strict=True):
         axis.set_ylabel(label)
@@ -125,13 +138,13 @@ def _normalized(result: Result) -> Figure:
     errors = result.errors
     figure, axes = _figure(1, 2, 9.0, 4.0)
     for axis, values, name, median, gate in (
-        (axes[0], errors.nees6, "pose, 6 degrees of freedom", 5.348, 12.592),
-        (axes[1], errors.nees3, "position, 3 degrees of freedom", 2.366, 7.815),
+        (axes[0], errors.nees6, "pose", 5.348, 12.592),
+        (axes[1], errors.nees3, "position", 2.366, 7.815),
     ):
         known = np.sort(values[np.isfinite(values)])
-        axis.plot(np.maximum(known, 1e-3), np.arange(1, len(known) + 1) / max(len(known), 1))
+        axis.plot(_logarithmic(known), np.arange(1, len(known) + 1) / max(len(known), 1))
         axis.plot([median, gate], [0.5, 0.95], "o", color="tab:orange", label="an honest covariance")
-        axis.set(xscale="log", xlabel=f"normalized error squared, {name}", ylabel="share of poses below")
+        axis.set(xscale="log", xlabel=f"normalized error (NEES), {name}", ylabel="share of poses below")
         axis.grid(visible=True, linewidth=0.4)
         axis.legend()
     return figure

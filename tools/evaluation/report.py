@@ -98,6 +98,8 @@ def _pairing_text(pairing: Pairing) -> str:
     if pairing.right is not None:
         lines.append(f"  right pair   {_percent(pairing.right_share):>7}  {pairing.right} poses")
         lines.append(f"  another pair          {pairing.other_pair} poses")
+        lines.append(f"  three lights          {pairing.partial} poses")
+        lines.append(f"  wrong poses           {pairing.wrong}")
         lines.append(f"  no pose               {_counts(pairing.ended)}")
     if pairing.detected is not None:
         lines.append(f"  with a candidate near all four: {pairing.detected}")
@@ -106,15 +108,15 @@ def _pairing_text(pairing: Pairing) -> str:
     return "\n".join(lines)
 
 
-def _stats_row(name: str, stats: Stats, digits: int, scale: float = 1.0, note: str = "") -> list[str]:
+def _stats_row(name: str, stats: Stats, digits: int, scale: float = 1.0) -> list[str]:
     figures = (stats.median, stats.p95, stats.rmse, stats.mean)
     scaled = [_number(None if figure is None else figure * scale, digits) for figure in figures]
-    return [name, str(stats.count), *scaled, note]
+    return [name, str(stats.count), *scaled]
 
 
 def _accuracy_text(accuracy: Accuracy) -> str:
     rows = [
-        ["error", "poses", "median", "p95", "RMSE", "mean", ""],
+        ["error", "poses", "median", "p95", "RMSE", "mean"],
         _stats_row("position, m", accuracy.translation_m, 4),
         _stats_row("rotation, deg", accuracy.rotation_rad, 3, _DEGREES),
         _stats_row("range, m", accuracy.range_m, 4),
@@ -124,17 +126,19 @@ def _accuracy_text(accuracy: Accuracy) -> str:
         rows.append(_stats_row("azimuth, deg", accuracy.azimuth_rad, 3, _DEGREES))
         rows.append(_stats_row("inclination, deg", accuracy.inclination_rad, 3, _DEGREES))
     rows += [
-        _stats_row(
-            "NEES, pose", accuracy.nees6, 2, note=f"honest: 5.35 12.59, mean 6; {_percent(accuracy.honest6)} in 95 %"
-        ),
-        _stats_row(
-            "NEES, position", accuracy.nees3, 2, note=f"honest: 2.37 7.81, mean 3; {_percent(accuracy.honest3)} in 95 %"
-        ),
+        _stats_row("NEES, pose", accuracy.nees6, 2),
+        ["  were it honest", "", "5.35", "12.59", "6.93", "6.00"],
+        _stats_row("NEES, position", accuracy.nees3, 2),
+        ["  were it honest", "", "2.37", "7.81", "3.87", "3.00"],
     ]
+    inside = (
+        f"inside the 95 % bound of the covariance: pose {_percent(accuracy.honest6)},"
+        f" position {_percent(accuracy.honest3)}"
+    )
     wrong = (
         f"wrong poses (position off by more than {WRONG_SHARE:.0%} of the range): {accuracy.wrong} of {accuracy.poses}"
     )
-    return f"{wrong}, {_percent(accuracy.wrong_share)}\n{_table(rows)}"
+    return f"{wrong}, {_percent(accuracy.wrong_share)}\n{_table(rows)}\n{inside}"
 
 
 def _bins_text(bins: Sequence[RangeBin]) -> str:

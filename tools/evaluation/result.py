@@ -131,7 +131,9 @@ def evaluate(
         known = track.at(stamp_ns, trigger)
         if known is not None:
             ranges_m[trigger] = float(np.linalg.norm(known[0]))
-    sightings = sightings_of(nodes, poses, rejected, lights, blobs, ranges_m)
+    sightings = sightings_of(
+        nodes, poses, rejected, lights, blobs, ranges_m, set(errors.trigger[errors.wrong].tolist())
+    )
     return Result(
         node_a=nodes[0],
         node_b=nodes[1],
