@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -83,20 +83,22 @@ def project(points_c_m: Floats, camera: CameraModel) -> Floats:
     return pixels
 
 
-def _projected(frame: Candidates, track: TruthTrack, own: NodeInfo, other: NodeInfo, is_a: bool) -> TrueLights | None:
-    known = track.at(frame.stamp_ns, frame.trigger)
-    if known is None:
-        return None
-    t, q = known
+def _projected(
+    frames: Sequence[Candidates], track: TruthTrack, own: NodeInfo, other: NodeInfo, *, is_a: bool
+) -> Iterator[tuple[Candidates, TrueLights]]:
+    """Yield the frames of one node at which the true pose is known, with the other node's lights."""
+    known = [(frame, pose) for frame in frames if (pose := track.at(frame.stamp_ns, frame.trigger)) is not None]
+    t = np.array([pose[0] for _, pose in known]).reshape(-1, 1, 3)
+    q = np.array([pose[1] for _, pose in known]).reshape(-1, 1, 4)
     if not is_a:
         q = conjugate(q)
         t = -rotate(q, t)
-    points_c_m = rotate(q, np.array([other.light_left_m, other.light_right_m])) + t
-    pixels = project(points_c_m, own.camera)
+    points_c_m = rotate(q, np.array([[other.light_left_m, other.light_right_m]])) + t
+    pixels = project(points_c_m.reshape(-1, 3), own.camera).reshape(-1, 2, 2)
     half = np.array([own.width_px, own.height_px]) / 2.0
-    with np.errstate(invalid="ignore"):
-        inside = (np.abs(pixels - half + 0.5) <= half).all(axis=1)
-    return TrueLights(pixels, np.asarray(inside, dtype=bool), marked=False)
+    inside = np.asarray((np.abs(pixels - half + 0.5) <= half).all(axis=-1))
+    for i, (frame, _) in enumerate(known):
+        yield frame, TrueLights(pixels[i], inside[i], marked=False)
 
 
 def _marked(truth: LightTruth) -> TrueLights:
@@ -111,7 +113,7 @@ def _marked(truth: LightTruth) -> TrueLights:
 
 def true_lights(
     nodes: tuple[str, str],
-    frames: Iterable[Candidates],
+    frames: Collection[Candidates],
     light_truths: Iterable[LightTruth],
     infos: Mapping[str, NodeInfo],
     track: TruthTrack,
@@ -121,13 +123,11 @@ def true_lights(
     marked = {node for node, _ in lights}
     if not all(node in infos for node in nodes):
         return lights
-    for frame in frames:
-        if frame.node in marked or frame.node not in nodes:
-            continue
-        is_a = frame.node == nodes[0]
-        seen = _projected(frame, track, infos[frame.node], infos[nodes[1] if is_a else nodes[0]], is_a)
-        if seen is not None:
-            lights[frame.node, frame.trigger] = seen
+    for node, other in (nodes, nodes[::-1]):
+        if node not in marked:
+            own = [frame for frame in frames if frame.node == node]
+            for frame, seen in _projected(own, track, infos[node], infos[other], is_a=node == nodes[0]):
+                lights[node, frame.trigger] = seen
     return lights
 
 
