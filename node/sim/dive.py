@@ -1,0 +1,125 @@
+"""A simulated dive as a stream of messages in order of time, as two nodes would log it, and its truth."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import cv2
+
+from node.sim.randomness import generator
+from node.sim.world import World
+from protocol import topics
+from protocol.clock import MS_NS, S_NS, trigger_index
+from protocol.errors import BuddylineError
+from protocol.messages import CompressedImage, FoxgloveTime, Message
+
+BOOT: Final = "simulated"
+ATTITUDE_NS: Final = S_NS // 50
+DEPTH_NS: Final = S_NS // 10
+IMU_NS: Final = S_NS // 100
+JPEG_QUALITY: Final = 92
+
+Entry: TypeAlias = tuple[int, str, Message]
+"""Stamp, key, message."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What of a dive is logged. images: pictures in place of synthetic candidates.
+
+    exposure_sigma_ns: how far exposures stray from their trigger, 1 sd. lost_share: of the frames.
+    """
+
+    seconds: float = 60.0
+    rate_hz: float = 10.0
+    images: bool = False
+    imu: bool = False
+    exposure_sigma_ns: int = MS_NS
+    lost_share: float = 0.03
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be logged, naming the field."""
+        if not 0 < self.seconds < 1e6:
+            raise BuddylineError(f"seconds: {self.seconds} is not above 0 and below 1e6")
+        if not 0 < self.rate_hz <= 200:
+            raise BuddylineError(f"rate_hz: {self.rate_hz} is not above 0 and at most 200")
+        if not 0 <= self.lost_share <= 1:
+            raise BuddylineError(f"lost_share: {self.lost_share} is not between 0 and 1")
+
+    @property
+    def period_ns(self) -> int:
+        """Time between triggers."""
+        return round(S_NS / self.rate_hz)
+
+
+def messages(world: World, plan: Plan) -> Iterator[Entry]:
+    """Yield all messages of a dive in order of time; the same world and plan give the same dive."""
+    start_ns = world.scenario.start_ns
+    end_ns = start_ns + math.ceil(plan.seconds * S_NS)
+    nodes = (world.scenario.node_a, world.scenario.node_b)
+    for node in nodes:
+        yield start_ns, topics.INFO.key(node), world.info(node, start_ns, plan.period_ns)
+    streams: list[Iterator[Entry]] = [_truth(world, plan, end_ns)]
+    for node in nodes:
+        attitude, depth, imu = (topic.key(node) for topic in (topics.ATTITUDE, topics.DEPTH, topics.IMU))
+        streams.append(_samples(world.attitude, node, attitude, range(start_ns, end_ns, ATTITUDE_NS)))
+        streams.append(_samples(world.depth, node, depth, range(start_ns + 7 * MS_NS, end_ns, DEPTH_NS)))
+        if plan.imu:
+            streams.append(_samples(world.imu, node, imu, range(start_ns + 3 * MS_NS, end_ns, IMU_NS)))
+        streams.append(_frames(world, plan, node, end_ns))
+    yield from heapq.merge(*streams, key=lambda entry: entry[0])
+
+
+def _samples(sample: Callable[[str, int], Message], node: str, key: str, stamps_ns: range) -> Iterator[Entry]:
+    for stamp_ns in stamps_ns:
+        yield stamp_ns, key, sample(node, stamp_ns)
+
+
+def _triggers(world: World, plan: Plan, end_ns: int) -> Iterator[int]:
+    """Yield the indices of the triggers of a dive; none so early that its exposure might precede the start."""
+    lead_ns = 5 * plan.exposure_sigma_ns + MS_NS
+    yield from range(-(-(world.scenario.start_ns + lead_ns) // plan.period_ns), -(-end_ns // plan.period_ns))
+
+
+def _truth(world: World, plan: Plan, end_ns: int) -> Iterator[Entry]:
+    """Yield the truth at the nominal instant of every trigger, whether or not its frames were lost."""
+    key = topics.TRUTH.key(world.scenario.node_a, world.scenario.node_b)
+    for trigger in _triggers(world, plan, end_ns):
+        stamp_ns = trigger * plan.period_ns
+        yield stamp_ns, key, world.truth(stamp_ns, trigger)
+
+
+def _frames(world: World, plan: Plan, node: str, end_ns: int) -> Iterator[Entry]:
+    """Yield each frame that was not lost, as picture or candidates, and where its lights truly are."""
+    index, seq = world.scenario.index(node), 0
+    light_truth = topics.LIGHT_TRUTH.key(node)
+    for instant in _triggers(world, plan, end_ns):
+        rng = generator(world.scenario.seed, "exposures", index, instant)
+        stray = max(-5.0, min(5.0, float(rng.standard_normal())))
+        lost = float(rng.random()) < plan.lost_share
+        seq += 1
+        if lost:
+            continue
+        stamp_ns = instant * plan.period_ns + round(stray * plan.exposure_sigma_ns)
+        trigger = trigger_index(stamp_ns, plan.period_ns)
+        if plan.images:
+            yield stamp_ns, topics.IMAGE.key(node), _picture(world, node, stamp_ns)
+        else:
+            yield stamp_ns, topics.CANDIDATES.key(node), world.candidates(node, stamp_ns, trigger, seq - 1, BOOT)
+        yield stamp_ns, light_truth, world.light_truth(node, stamp_ns, trigger)
+
+
+def _picture(world: World, node: str, stamp_ns: int) -> CompressedImage:
+    """Return the picture as JPEG."""
+    _, data = cv2.imencode(".jpg", world.render(node, stamp_ns), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    seconds, rest_ns = divmod(stamp_ns, S_NS)
+    return CompressedImage(
+        timestamp=FoxgloveTime(sec=seconds, nsec=rest_ns),
+        frame_id=f"{node}_camera",
+        data=data.tobytes(),
+        format="jpeg",
+    )

@@ -1,0 +1,100 @@
+"""`buddyline simulate`: a dive log of two simulated nodes, with the truth in it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from dataclasses import asdict, fields
+
+import cv2
+
+from node.sim.dive import Plan, messages
+from node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
+from node.sim.world import World
+from protocol.clock import MS_NS, S_NS
+from protocol.divelog import DiveLogWriter
+from tools.progress import Progress
+
+START_NS = 1_764_000_000 * S_NS
+ASPECT = 616 / 820
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    scenario, plan = Scenario(), Plan()
+    parser.add_argument("output", metavar="OUT.mcap", help="the dive log to write; must not exist")
+    parser.add_argument("--environment", choices=ENVIRONMENTS, default=scenario.environment, help="default: cavern")
+    parser.add_argument("--seconds", type=float, default=plan.seconds, help="default: %(default)s")
+    parser.add_argument("--rate", type=float, default=plan.rate_hz, metavar="HZ", help="triggers; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=1, help="another seed is another dive; default: %(default)s")
+    parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
+    parser.add_argument("--imu", action="store_true", help="raw inertial samples, too")
+    parser.add_argument("--width", type=int, default=scenario.width_px, metavar="PX", help="default: %(default)s")
+    world = parser.add_argument_group("the dive")
+    world.add_argument("--trajectory", choices=TRAJECTORIES, default=scenario.trajectory, help="default: circles")
+    world.add_argument(
+        "--range-min", type=float, default=scenario.range_min_m, metavar="M", help="default: %(default)s"
+    )
+    world.add_argument("--range-max", type=float, default=0.0, metavar="M", help="default: what the water lets be seen")
+    world.add_argument(
+        "--baseline", type=float, default=scenario.baseline_a_m, metavar="M", help="default: %(default)s"
+    )
+    world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
+    world.add_argument("--undisturbed", action="store_true", help="nobody looks away, nothing passes before a light")
+    faults = parser.add_argument_group("noise and faults")
+    faults.add_argument("--sigma-px", type=float, default=scenario.sigma_px, metavar="PX", help="noise of candidates")
+    faults.add_argument("--gross", type=float, default=scenario.gross_share, metavar="SHARE", help="off by pixels")
+    faults.add_argument("--misses", type=float, default=scenario.miss_share, metavar="SHARE", help="lights not found")
+    faults.add_argument("--false", type=int, default=scenario.false_lights, metavar="N", help="false ones a picture")
+    faults.add_argument("--lost", type=float, default=plan.lost_share, metavar="SHARE", help="frames lost")
+    faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
+    faults.add_argument("--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong")
+    faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the dive; return 0."""
+    cv2.setNumThreads(1)
+    scenario = Scenario(
+        environment=args.environment,
+        seed=args.seed,
+        start_ns=START_NS,
+        width_px=args.width,
+        height_px=round(args.width * ASPECT),
+        row_time_ns=round(args.row_time_us * 1000),
+        baseline_a_m=args.baseline,
+        baseline_b_m=args.baseline,
+        trajectory=args.trajectory,
+        range_min_m=args.range_min,
+        range_max_m=args.range_max,
+        sigma_px=args.sigma_px,
+        gross_share=args.gross,
+        miss_share=args.misses,
+        false_lights=args.false,
+        other_lamps=args.others,
+        interruptions=not args.undisturbed,
+        clock_offset_ns=round(args.clock_offset_ms * MS_NS),
+        magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
+    )
+    plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
+    metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
+    with (
+        DiveLogWriter(args.output, metadata=metadata) as writer,
+        Progress("simulate", plan.seconds) as progress,
+    ):
+        for stamp_ns, key, message in messages(World(scenario), plan):
+            writer.write_message(message, key=key)
+            progress.show((stamp_ns - START_NS) / S_NS)
+        count = writer.count
+    print(f"{args.output}: {plan.seconds:g} s of {scenario.environment}, {count} messages", file=sys.stderr)
+    return 0
+
+
+def _differing(scenario: Scenario) -> dict[str, object]:
+    """Return the fields of a scenario that are not at their default, and what always tells."""
+    return {
+        field.name: getattr(scenario, field.name)
+        for field in fields(scenario)
+        if getattr(scenario, field.name) != field.default or field.name in ("environment", "seed")
+    }
