@@ -6,6 +6,7 @@ Streams are recovered by their publishers' caches, never blocked for: one frozen
 
 from __future__ import annotations
 
+import atexit
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -243,13 +244,17 @@ class Intake:
         self._samples = subscriber.handler
         self._accept = accept
         self._failures = failures
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name=f"bus intake {name}", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Undeclare the subscriber, take in what has come, end the thread."""
-        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
-        self._thread.join(CLOSE_S)
+        if not self._closed:
+            self._closed = True
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        if self._thread is not threading.current_thread():
+            self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
         try:
@@ -424,6 +429,8 @@ class ZenohBus(Bus):
         self._bulk = BulkLink(config)
         self._cache_s = cache_s
         self._tokens: list[zenoh.LivelinessToken] = []
+        # A thread that is still inside Zenoh when the interpreter ends aborts the process.
+        atexit.register(self.close)
 
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
         """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
@@ -489,5 +496,6 @@ class ZenohBus(Bus):
         return any(not key.endswith(f"/{own}") for key in keys)
 
     def _leave(self) -> None:
+        atexit.unregister(self.close)
         self._session.close()  # type: ignore[no-untyped-call]
         self._bulk.close()

@@ -1,0 +1,399 @@
+"""The contract that every bus keeps: within one process, and over Zenoh with a real hub on loopback."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from protocol import topics
+from protocol.bus import Bus, Received
+from protocol.clock import ManualClock
+from protocol.local_bus import LocalNetwork, key_matches
+from protocol.messages import (
+    Candidates,
+    CompressedImage,
+    Depth,
+    FoxgloveTime,
+    MessageError,
+    NodeStatus,
+    Rejected,
+    decode,
+)
+from protocol.zenoh_bus import connect, open_hub
+
+WAIT_S = 10.0
+NOW_NS = 1_700_000_000_000_000_000
+
+Connect = Callable[[], Bus]
+
+
+class Inbox:
+    """A handler that keeps what it gets; wait_for blocks until enough has come."""
+
+    def __init__(self) -> None:
+        self.received: list[Received] = []
+        self._changed = threading.Condition()
+
+    def __call__(self, received: Received) -> None:
+        with self._changed:
+            self.received.append(received)
+            self._changed.notify_all()
+
+    def wait_for(self, count: int) -> list[Received]:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.received) >= count, WAIT_S), self.received
+            return list(self.received)
+
+    @property
+    def triggers(self) -> list[int]:
+        return [decode(received.payload, Rejected).trigger for received in self.received]
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for what no event announces."""
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.002)
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module")
+def endpoint() -> Iterator[str]:
+    with open_hub(free_endpoint()) as hub:
+        yield hub.endpoint
+
+
+@pytest.fixture(params=["local", "zenoh"])
+def client(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """A function that connects one more client to the same bus; all are closed at the end."""
+    buses: list[Bus] = []
+    clock = ManualClock(NOW_NS)
+    network = LocalNetwork(clock)
+
+    def local() -> Bus:
+        return network.connect()
+
+    def zenoh() -> Bus:
+        endpoint = request.getfixturevalue("endpoint")
+        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, clock=clock)
+        assert bus is not None
+        return bus
+
+    def make() -> Bus:
+        buses.append(local() if request.param == "local" else zenoh())
+        return buses[-1]
+
+    yield make
+    for bus in buses:
+        bus.close()
+
+
+def rejected(trigger: int) -> Rejected:
+    return Rejected(node_a="a", node_b="b", stamp_ns=trigger, trigger=trigger, reason="late")
+
+
+def status(node: str, uptime_s: float) -> NodeStatus:
+    return NodeStatus(
+        node=node,
+        stamp_ns=0,
+        boot="x",
+        software="",
+        uptime_s=uptime_s,
+        rates_hz={},
+        drops={},
+        ages_s={},
+    )
+
+
+def depth(stamp_ns: int) -> Depth:
+    return Depth(node="a", stamp_ns=stamp_ns, depth_m=1.0, sigma_m=0.1)
+
+
+def test_a_message_arrives_as_it_was_sent(client: Connect) -> None:
+    inbox = Inbox()
+    client().subscribe("buddyline/pair/*/*/rejected", inbox)
+    client().publisher(topics.REJECTED, "a", "b").put(rejected(7))
+    (received,) = inbox.wait_for(1)
+    assert received.key == "buddyline/pair/a/b/rejected"
+    assert received.encoding == "application/json;buddyline.Rejected"
+    assert received.receive_ns == NOW_NS
+    assert decode(received.payload, Rejected) == rejected(7)
+
+
+def test_bytes_go_out_as_they_are(client: Connect) -> None:
+    inbox = Inbox()
+    client().subscribe(topics.EVERYTHING, inbox)
+    client().publisher(topics.IMU, "a").put_bytes(b'{"from": "a log"}')
+    assert inbox.wait_for(1)[0].payload == b'{"from": "a log"}'
+
+
+def test_a_publishers_messages_come_in_order_and_once(client: Connect) -> None:
+    inbox = Inbox()
+    client().subscribe("buddyline/pair/a/b/rejected", inbox)
+    publisher = client().publisher(topics.REJECTED, "a", "b")
+    for trigger in range(500):
+        publisher.put(rejected(trigger))
+    inbox.wait_for(500)
+    assert inbox.triggers == list(range(500))
+
+
+def test_a_late_joiner_gets_what_came_before_then_what_comes_then(client: Connect) -> None:
+    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
+    for trigger in range(100):
+        publisher.put(rejected(trigger))
+    subscription = client().subscribe("buddyline/pair/*/*/rejected", inbox)
+    for trigger in range(100, 150):
+        publisher.put(rejected(trigger))
+    inbox.wait_for(150)
+    assert inbox.triggers == list(range(150))
+    assert subscription.missed == 0
+
+
+def test_a_late_joiner_gets_the_latest_state_before_any_stream(client: Connect) -> None:
+    node, inbox = client(), Inbox()
+    depths = node.publisher(topics.DEPTH, "a")
+    states = node.publisher(topics.NODE_STATUS, "a")
+    for i in range(3):
+        depths.put(depth(i))
+        states.put(status("a", float(i)))
+    client().subscribe(topics.EVERYTHING, inbox)
+    received = inbox.wait_for(4)
+    assert [topics.parse_key(r.key) for r in received] == [
+        (topics.NODE_STATUS, ("a",)),
+        *[(topics.DEPTH, ("a",))] * 3,
+    ]
+    assert decode(received[0].payload, NodeStatus).uptime_s == 2.0
+
+
+def test_without_history_only_what_comes_from_now_on(client: Connect) -> None:
+    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
+    for trigger in range(10):
+        publisher.put(rejected(trigger))
+    before = Inbox()
+    client().subscribe("buddyline/pair/a/b/rejected", before)
+    before.wait_for(10)
+    subscription = client().subscribe("buddyline/pair/a/b/rejected", inbox, history=False)
+    trigger = 10
+    while not inbox.received:
+        publisher.put(rejected(trigger))
+        trigger += 1
+        time.sleep(0.002)
+    assert min(inbox.triggers) >= 10
+    assert subscription.missed == 0
+
+
+def test_only_the_keys_asked_for_come(client: Connect) -> None:
+    node, asked, all_of_b = client(), Inbox(), Inbox()
+    bus = client()
+    bus.subscribe("buddyline/node/*/depth", asked)
+    bus.subscribe("buddyline/node/b/**", all_of_b)
+    node.publisher(topics.NODE_STATUS, "a").put(status("a", 1.0))
+    node.publisher(topics.NODE_STATUS, "b").put(status("b", 1.0))
+    node.publisher(topics.DEPTH, "a").put(depth(1))
+    assert [r.key for r in asked.wait_for(1)] == ["buddyline/node/a/depth"]
+    assert [r.key for r in all_of_b.wait_for(1)] == ["buddyline/node/b/status"]
+
+
+def test_an_unsound_message_is_refused_and_a_foreign_one_too(client: Connect) -> None:
+    publisher = client().publisher(topics.DEPTH, "a")
+    with pytest.raises(MessageError, match="depth_m"):
+        publisher.put(Depth(node="a", stamp_ns=1, depth_m=math.nan, sigma_m=0.1))
+    with pytest.raises(TypeError, match="Depth"):
+        publisher.put(rejected(1))
+
+
+def test_a_node_id_that_is_none_is_refused(client: Connect) -> None:
+    with pytest.raises(topics.BuddylineError, match="a/b"):
+        client().publisher(topics.DEPTH, "a/b")
+
+
+def test_a_slow_handler_loses_the_oldest_and_is_told_how_many(client: Connect) -> None:
+    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
+    begun, go_on = threading.Event(), threading.Event()
+
+    def slow(received: Received) -> None:
+        begun.set()
+        assert go_on.wait(WAIT_S)
+        inbox(received)
+
+    subscription = client().subscribe("buddyline/pair/a/b/rejected", slow, capacity=5)
+    publisher.put(rejected(0))
+    assert begun.wait(WAIT_S)
+    for trigger in range(1, 31):
+        publisher.put(rejected(trigger))
+    until(lambda: subscription.dropped >= 25)
+    go_on.set()
+    inbox.wait_for(6)
+    assert inbox.triggers == [0, 26, 27, 28, 29, 30]
+    assert (subscription.dropped, subscription.missed) == (25, 0)
+
+
+def test_a_handler_that_stands_still_does_not_starve_another(client: Connect) -> None:
+    bus, node, inbox = client(), client(), Inbox()
+    go_on = threading.Event()
+    bus.subscribe("buddyline/pair/*/*/rejected", lambda _: go_on.wait(WAIT_S) and None, capacity=2)
+    bus.subscribe("buddyline/node/*/depth", inbox)
+    stuck, depths = node.publisher(topics.REJECTED, "a", "b"), node.publisher(topics.DEPTH, "a")
+    for i in range(200):
+        stuck.put(rejected(i))
+        depths.put(depth(i))
+    assert [decode(r.payload, Depth).stamp_ns for r in inbox.wait_for(200)] == list(range(200))
+    go_on.set()
+
+
+def test_an_exception_in_a_handler_is_the_buss_failure(client: Connect) -> None:
+    bus, node, inbox = client(), client(), Inbox()
+    failed = threading.Event()
+
+    def broken(received: Received) -> None:
+        raise ZeroDivisionError("a bug")
+
+    bus.on_failure(lambda _: failed.set())
+    bus.subscribe("buddyline/node/*/depth", broken)
+    bus.subscribe("buddyline/pair/*/*/rejected", inbox)
+    assert bus.failure is None
+    node.publisher(topics.DEPTH, "a").put(depth(1))
+    assert failed.wait(WAIT_S)
+    assert isinstance(bus.failure.__cause__, ZeroDivisionError)
+    assert "buddyline/node/*/depth" in str(bus.failure)
+    node.publisher(topics.REJECTED, "a", "b").put(rejected(1))
+    inbox.wait_for(1)
+    late: list[Exception] = []
+    bus.on_failure(late.append)
+    assert late == [bus.failure]
+
+
+def test_the_living_are_known_and_the_gone_too(client: Connect) -> None:
+    first, second, watcher, messages = client(), client(), client(), Inbox()
+    changes: list[tuple[str, bool]] = []
+    watcher.subscribe(topics.EVERYTHING, messages)
+    first.declare_alive("node/a")
+    until(lambda: watcher.is_alive("node/a"))
+    watcher.watch_alive(lambda name, alive: changes.append((name, alive)))
+    until(lambda: len(changes) == 1)
+    second.declare_alive("solver")
+    until(lambda: len(changes) == 2)
+    first.close()
+    until(lambda: len(changes) == 3)
+    assert changes == [("node/a", True), ("solver", True), ("node/a", False)]
+    assert not watcher.is_alive("node/a")
+    assert messages.received == []
+
+
+def test_a_second_of_the_same_name_is_noticed(client: Connect) -> None:
+    first, second = client(), client()
+    changes: list[tuple[str, bool]] = []
+    assert not first.is_alive("node/a")
+    first.declare_alive("node/a")
+    assert not first.is_alive("node/a")
+    until(lambda: second.is_alive("node/a"))
+    assert not second.is_alive("node/b")
+    second.declare_alive("node/a")
+    until(lambda: first.is_alive("node/a"))
+    first.watch_alive(lambda name, alive: changes.append((name, alive)))
+    until(lambda: len(changes) == 1)
+    second.close()
+    until(lambda: not first.is_alive("node/a"))
+    assert changes == [("node/a", True)]
+
+
+@pytest.mark.parametrize("name", ["", "node/*", "node//a", "a/", "@x"])
+def test_a_name_that_is_no_key_is_refused(client: Connect, name: str) -> None:
+    with pytest.raises(ValueError, match="alive name"):
+        client().declare_alive(name)
+
+
+def test_previews_are_capped_and_never_kept(client: Connect) -> None:
+    node, inbox, late = client(), Inbox(), Inbox()
+    image = CompressedImage(timestamp=FoxgloveTime(sec=1, nsec=0), frame_id="a_camera", data=b"jpeg", format="jpeg")
+    client().subscribe("buddyline/node/*/image", inbox)
+    publisher = node.publisher(topics.IMAGE, "a", max_rate_hz=10.0)
+    clock = node.clock
+    assert isinstance(clock, ManualClock)
+
+    def sent() -> bool:
+        clock.set_ns(clock.now_ns() + 100_000_000)
+        return publisher.put(image)
+
+    # Over Zenoh they have a session of their own, which comes up meanwhile.
+    until(sent)
+    clock.set_ns(clock.now_ns() + 99_000_000)
+    assert not publisher.put(image)
+    assert len(inbox.wait_for(1)) == 1
+    bus = client()
+    bus.subscribe(topics.EVERYTHING, late)
+    node.publisher(topics.DEPTH, "a").put(depth(1))
+    assert [r.key for r in late.wait_for(1)] == ["buddyline/node/a/depth"]
+
+
+def test_what_is_closed_sends_nothing_and_leaves_no_thread(client: Connect) -> None:
+    before = set(threading.enumerate())
+    bus = client()
+    publisher = bus.publisher(topics.DEPTH, "a")
+    bus.publisher(topics.IMAGE, "a")
+    bus.subscribe(topics.EVERYTHING, Inbox())
+    bus.watch_alive(lambda name, alive: None)
+    assert publisher.put(depth(1))
+    bus.close()
+    bus.close()
+    assert not publisher.put(depth(2))
+    assert set(threading.enumerate()) - before == set()
+
+
+def test_closing_lets_the_handler_finish_what_has_come(client: Connect) -> None:
+    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
+    for trigger in range(200):
+        publisher.put(rejected(trigger))
+    client().subscribe("buddyline/pair/a/b/rejected", inbox).close()
+    assert inbox.triggers == list(range(200))
+
+
+def test_a_handler_may_publish(client: Connect) -> None:
+    """As the solver does."""
+    solver, node, inbox = client(), client(), Inbox()
+    answers = solver.publisher(topics.REJECTED, "a", "b")
+
+    def answer(received: Received) -> None:
+        answers.put(rejected(decode(received.payload, Candidates).trigger))
+
+    solver.subscribe("buddyline/node/*/candidates", answer)
+    client().subscribe("buddyline/pair/*/*/rejected", inbox)
+    node.publisher(topics.CANDIDATES, "a").put(
+        Candidates(node="a", stamp_ns=1, trigger=3, seq=0, boot="x", width_px=640, height_px=480, blobs=[])
+    )
+    inbox.wait_for(1)
+    assert inbox.triggers == [3]
+
+
+@pytest.mark.parametrize(
+    ("key_expr", "key", "matches"),
+    [
+        ("a/b", "a/b", True),
+        ("a/b", "a", False),
+        ("a", "a/b", False),
+        ("a/*", "a/b", True),
+        ("a/*", "a", False),
+        ("a/*", "a/b/c", False),
+        ("a/**", "a", True),
+        ("a/**", "a/b/c", True),
+        ("**/c", "a/b/c", True),
+        ("a/**/c", "a/c", True),
+        ("a/**/c", "a/b/d", False),
+        ("a/**", "a/@alive/b", False),
+        ("a/*/b", "a/@alive/b", False),
+        ("a/@alive/**", "a/@alive/b", True),
+    ],
+)
+def test_key_expressions(key_expr: str, key: str, matches: bool) -> None:
+    assert key_matches(key_expr, key) is matches

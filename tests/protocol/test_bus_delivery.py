@@ -1,0 +1,108 @@
+"""The parts that both buses are made of."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from protocol import delivery, topics
+from protocol.bus import cache_depth
+from protocol.clock import S_NS, ManualClock
+from protocol.delivery import Delivery, FailureLatch, RateCap
+
+WAIT_S = 10.0
+
+
+def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(delivery, "MAX_QUEUED_BYTES", 100)
+    begun, go_on, handled = threading.Event(), threading.Event(), []
+
+    def handle(item: str) -> None:
+        begun.set()
+        assert go_on.wait(WAIT_S)
+        handled.append(item)
+
+    queue = Delivery("test", handle, capacity=1000, failures=FailureLatch())
+    queue.offer("first", 60)
+    assert begun.wait(WAIT_S)
+    for item in ("a", "b", "c"):
+        queue.offer(item, 60)
+    # One alone may be bigger than the bound, or it could never be had.
+    queue.offer("huge", 1000)
+    assert queue.dropped == 3
+    go_on.set()
+    queue.close()
+    assert handled == ["first", "huge"]
+
+
+def test_a_handler_that_never_ends_does_not_hold_up_closing(caplog: pytest.LogCaptureFixture) -> None:
+    go_on, handled = threading.Event(), []
+
+    def handle(item: int) -> None:
+        handled.append(item)
+        go_on.wait(WAIT_S)
+
+    queue = Delivery("stuck", handle, capacity=10, failures=FailureLatch())
+    for item in range(5):
+        queue.offer(item)
+    queue.close(timeout_s=0.05)
+    assert "stuck" in caplog.text
+    go_on.set()
+    queue.close()
+    assert handled == [0]
+
+
+def test_a_handler_may_close_its_own_queue() -> None:
+    closed = threading.Event()
+
+    def handle(item: int) -> None:
+        queue.close()
+        closed.set()
+
+    queue = Delivery("own", handle, capacity=10, failures=FailureLatch())
+    queue.offer(1)
+    assert closed.wait(WAIT_S)
+
+
+def test_the_first_death_is_kept() -> None:
+    failures = FailureLatch()
+    failures.report("one", KeyError("x"))
+    failures.report("two", KeyError("y"))
+    assert str(failures.failure) == "thread 'one' died: KeyError: 'x'"
+
+
+@pytest.mark.parametrize("rate_hz", [7.0, 10.0, 29.0, 30.0])
+def test_a_rate_cap_lets_its_rate_through(rate_hz: float) -> None:
+    clock = ManualClock()
+    cap = RateCap(rate_hz, clock)
+    passed = 0
+    for i in range(300):
+        clock.set_ns(i * S_NS // 30)
+        passed += cap.passes()
+    assert passed == pytest.approx(10 * rate_hz, abs=1)
+
+
+def test_a_rate_cap_outlives_pauses_and_a_clock_set_back() -> None:
+    clock = ManualClock(1000 * S_NS)
+    cap = RateCap(1.0, clock)
+    assert cap.passes()
+    assert not cap.passes()
+    clock.set_ns(1100 * S_NS)
+    assert [cap.passes(), cap.passes()] == [True, False]
+    clock.set_ns(0)
+    assert [cap.passes(), cap.passes()] == [True, False]
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan")])
+def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
+    with pytest.raises(ValueError, match="max_rate_hz"):
+        RateCap(rate_hz, ManualClock())
+
+
+def test_caches_hold_a_minute_of_streams_and_one_of_states() -> None:
+    assert cache_depth(topics.INFO, 60.0) == 1
+    assert cache_depth(topics.IMAGE, 60.0) == 0
+    assert cache_depth(topics.ATTITUDE, 60.0) == 6000
+    assert cache_depth(topics.CANDIDATES, 60.0) == 1800
+    assert cache_depth(topics.CANDIDATES, 0.001) == 1

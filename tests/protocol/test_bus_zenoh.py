@@ -1,0 +1,308 @@
+"""What only the bus between processes can do wrong: a hub that is absent, taken, killed; sockets; stdout."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from protocol import topics
+from protocol.bus import Bus, Received
+from protocol.errors import BuddylineError
+from protocol.zenoh_bus import connect, open_hub
+
+WAIT_S = 10.0
+
+HUB = """
+import sys
+from protocol.zenoh_bus import open_hub
+with open_hub(sys.argv[1]):
+    print("listening", flush=True)
+    sys.stdin.readline()
+"""
+
+# What a process has open, told by itself: sockets that listen, sockets that are not TCP.
+SOCKETS = """
+import json, os, sys, threading
+from protocol import topics
+from protocol.zenoh_bus import connect, open_hub
+
+def sockets():
+    links = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]
+    own = {os.readlink(link) for link in links if os.path.lexists(link)}
+    found = []
+    for protocol in ("tcp", "tcp6", "udp", "udp6"):
+        with open(f"/proc/self/net/{protocol}") as table:
+            for line in list(table)[1:]:
+                fields = line.split()
+                if f"socket:[{fields[9]}]" in own and (protocol[:3] == "udp" or fields[3] == "0A"):
+                    address, port = fields[1].split(":")
+                    found.append([protocol, address, int(port, 16)])
+    return found
+
+role, endpoint = sys.argv[1:]
+if role == "hub":
+    with open_hub(endpoint):
+        result = sockets()
+else:
+    with connect(endpoint, stop=threading.Event(), on_wait=print) as bus:
+        bus.publisher(topics.DEPTH, "a").put_bytes(b"{}")
+        bus.subscribe(topics.EVERYTHING, lambda _: None)
+        bus.declare_alive("node/a")
+        previews = bus.publisher(topics.IMAGE, "a")
+        while not previews.put_bytes(b"{}"):
+            pass
+        result = sockets()
+print(json.dumps(result))
+"""
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def run_client(endpoint: str, **more: object) -> Bus:
+    bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, **more)  # type: ignore[arg-type]
+    assert bus is not None
+    return bus
+
+
+def numbers(received: list[Received]) -> list[int]:
+    return [int(r.payload) for r in received]
+
+
+class Inbox:
+    def __init__(self) -> None:
+        self.received: list[Received] = []
+        self._changed = threading.Condition()
+
+    def __call__(self, received: Received) -> None:
+        with self._changed:
+            self.received.append(received)
+            self._changed.notify_all()
+
+    def wait_for(self, count: int) -> list[int]:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.received) >= count, WAIT_S), numbers(self.received)
+            return numbers(self.received)
+
+
+@contextmanager
+def hub_process(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, "-c", HUB, endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "listening\n"
+            yield process
+        finally:
+            process.kill()
+
+
+def test_a_hub_that_is_not_there_yet_is_waited_for_and_said_once() -> None:
+    endpoint, said, waiting = free_endpoint(), [], threading.Event()
+    connected: list[Bus | None] = []
+
+    def on_wait(text: str) -> None:
+        said.append(text)
+        waiting.set()
+
+    thread = threading.Thread(
+        target=lambda: connected.append(connect(endpoint, stop=threading.Event(), on_wait=on_wait))
+    )
+    thread.start()
+    assert waiting.wait(WAIT_S)
+    time.sleep(0.3)
+    with open_hub(endpoint):
+        thread.join(WAIT_S)
+        (bus,) = connected
+        assert bus is not None
+        bus.close()
+    assert len(said) == 1
+    assert endpoint in said[0]
+
+
+@pytest.mark.parametrize("listener", ["nobody", "someone who does not answer"])
+def test_waiting_for_a_hub_ends_with_stop(listener: str) -> None:
+    stop = threading.Event()
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        if listener != "nobody":
+            mute.listen()
+        timer = threading.Timer(0.2, stop.set)
+        timer.start()
+        endpoint = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        assert connect(endpoint, stop=stop, on_wait=lambda _: None) is None
+        timer.join()
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["", "localhost:7447", "tcp/7447", "udp/127.0.0.1:7447", "tcp/127.0.0.1:99999", "tcp/a b:1"]
+)
+def test_an_endpoint_that_is_none_is_refused(endpoint: str) -> None:
+    with pytest.raises(BuddylineError, match="tcp/<host>:<port>"):
+        connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
+    with pytest.raises(BuddylineError, match="tcp/<host>:<port>"):
+        open_hub(endpoint)
+
+
+def test_a_port_in_use_is_said() -> None:
+    endpoint = free_endpoint()
+    with open_hub(endpoint), pytest.raises(BuddylineError, match=f"{endpoint} is in use"):
+        open_hub(endpoint)
+    with pytest.raises(BuddylineError, match=r"192\.0\.2\.1"):
+        open_hub("tcp/192.0.2.1:7447")
+
+
+def test_namespaces_keep_two_systems_apart() -> None:
+    one, two = Inbox(), Inbox()
+    with (
+        open_hub(free_endpoint()) as hub,
+        run_client(hub.endpoint, namespace="dive_1") as first,
+        run_client(hub.endpoint, namespace="dive_2") as second,
+    ):
+        first.subscribe(topics.EVERYTHING, one)
+        second.subscribe(topics.EVERYTHING, two)
+        first.declare_alive("node/a")
+        second.publisher(topics.DEPTH, "a").put_bytes(b"2")
+        first.publisher(topics.DEPTH, "a").put_bytes(b"1")
+        assert (one.wait_for(1), two.wait_for(1)) == ([1], [2])
+        assert one.received[0].key == "buddyline/node/a/depth"
+        assert not second.is_alive("node/a")
+
+
+def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
+    """What is published meanwhile too, and what a publisher sends that nobody has heard of yet."""
+    endpoint, known, unheard = free_endpoint(), Inbox(), Inbox()
+    changes: list[tuple[str, bool]] = []
+    with hub_process(endpoint) as hub:
+        node, solver = run_client(endpoint), run_client(endpoint)
+        publisher = node.publisher(topics.CANDIDATES, "a")
+        candidates = solver.subscribe("buddyline/node/*/candidates", known)
+        depths = solver.subscribe("buddyline/node/*/depth", unheard)
+        for number in range(50):
+            publisher.put_bytes(b"%d" % number)
+        known.wait_for(50)
+        node.declare_alive("node/a")
+        there, gone, back = threading.Event(), threading.Event(), threading.Event()
+
+        def on_change(name: str, alive: bool) -> None:
+            changes.append((name, alive))
+            (gone if not alive else back if gone.is_set() else there).set()
+
+        solver.watch_alive(on_change)
+        assert there.wait(WAIT_S)
+        hub.kill()
+        assert gone.wait(WAIT_S)
+        late = node.publisher(topics.DEPTH, "a")
+        for number in range(50, 300):
+            publisher.put_bytes(b"%d" % number)
+            late.put_bytes(b"%d" % (number - 50))
+    with hub_process(endpoint):
+        assert known.wait_for(300) == list(range(300))
+        assert unheard.wait_for(250) == list(range(250))
+        assert back.wait(WAIT_S)
+        publisher.put_bytes(b"300")
+        assert known.wait_for(301)[-1] == 300
+        assert (candidates.missed, candidates.dropped, depths.missed) == (0, 0, 0)
+        assert changes == [("node/a", True), ("node/a", False), ("node/a", True)]
+        node.close()
+        solver.close()
+
+
+def test_an_outage_longer_than_the_cache_is_counted() -> None:
+    endpoint, inbox = free_endpoint(), Inbox()
+    with hub_process(endpoint) as hub:
+        node, solver = run_client(endpoint, cache_s=1.0), run_client(endpoint)
+        publisher = node.publisher(topics.REJECTED, "a", "b")
+        subscription = solver.subscribe("buddyline/pair/*/*/rejected", inbox)
+        publisher.put_bytes(b"0")
+        inbox.wait_for(1)
+        hub.kill()
+        hub.wait(WAIT_S)
+        for number in range(1, 101):
+            publisher.put_bytes(b"%d" % number)
+    with hub_process(endpoint):
+        assert inbox.wait_for(31) == [0, *range(71, 101)]
+        assert subscription.missed == 70
+        node.close()
+        solver.close()
+
+
+def test_closing_does_not_wait_for_a_hub_that_is_gone_or_frozen() -> None:
+    endpoint = free_endpoint()
+    for fault in (signal.SIGKILL, signal.SIGSTOP):
+        with hub_process(endpoint) as hub:
+            bus = run_client(endpoint)
+            publisher = bus.publisher(topics.CANDIDATES, "a")
+            bus.subscribe(topics.EVERYTHING, Inbox())
+            bus.declare_alive("node/a")
+            hub.send_signal(fault)
+            for _ in range(200):
+                publisher.put_bytes(b"0" * 3000)
+            closer = threading.Thread(target=bus.close, daemon=True)
+            closer.start()
+            closer.join(2.0)
+            assert not closer.is_alive(), fault
+            hub.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs /proc")
+def test_nothing_listens_but_the_hub_and_stdout_is_ours() -> None:
+    endpoint = free_endpoint()
+    port = int(endpoint.rpartition(":")[2])
+
+    def sockets(role: str) -> object:
+        done = subprocess.run(
+            [sys.executable, "-c", SOCKETS, role, endpoint],
+            check=True,
+            stdout=subprocess.PIPE,
+            timeout=WAIT_S,
+            env={**os.environ, "RUST_LOG": "debug"},
+        )
+        return json.loads(done.stdout)
+
+    assert sockets("hub") == [["tcp", "0100007F", port]]
+    with open_hub(endpoint):
+        assert sockets("client") == []
+
+
+def test_samples_that_never_came_are_counted() -> None:
+    """A foreign publisher whose numbers jump, and who cannot be asked for what is missing."""
+    inbox = Inbox()
+    with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
+        subscription = bus.subscribe("buddyline/node/*/depth", inbox)
+        config = zenoh.Config()
+        for key, value in {
+            "mode": "client",
+            "connect/endpoints": [hub.endpoint],
+            "scouting/multicast/enabled": False,
+        }.items():
+            config.insert_json5(key, json.dumps(value))
+        with zenoh.open(config) as foreign:
+            publisher = foreign.declare_publisher("buddyline/node/a/depth")
+
+            def send(number: int) -> None:
+                info = zenoh.SourceInfo(publisher.id, number)
+                foreign.put("buddyline/node/a/depth", str(number), source_info=info)
+
+            for number in (0, 1, 5, 6, 6, 7):
+                send(number)
+            assert inbox.wait_for(5) == [0, 1, 5, 6, 7]
+            send(3)
+            foreign.put("buddyline/node/a/depth", "8")
+            assert inbox.wait_for(6)[-1] == 8
+        assert subscription.missed == 3
