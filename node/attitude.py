@@ -1,0 +1,214 @@
+"""Attitude to NED out of inertial samples: a start at rest, VQF for the tilt, a gated compass for the heading.
+
+Laidig and Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation and magnetic disturbance
+rejection", Information Fusion 91 (2023). Its own disturbance rejection goes by the field's strength and dip
+alone; the heading is therefore ours (node.heading).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.drivers.samples import ImuSample, Vector
+from node.geomagnetism import EarthField, MagnetometerCalibration
+from node.heading import HeadingFilter, wrap
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+
+SAMPLE_S: Final = 0.01
+# Swell averages out over more than its period, where the bias is known well enough to wait for it.
+RESTED_TILT_TAU_S: Final = 6.0
+MOVING_TILT_TAU_S: Final = 3.0
+
+REST_S: Final = 3.0
+REST_GYRO_RADPS: Final = math.radians(0.6)
+REST_ACCEL_MPS2: Final = 0.15
+GIVE_UP_REST_S: Final = 20.0
+REST_BIAS_SIGMA_DPS: Final = 0.03
+MOVING_BIAS_SIGMA_DPS: Final = 1.0
+MAX_BIAS_DPS: Final = 5.0
+GAP_S: Final = 0.2
+LONG_GAP_S: Final = 5.0
+GAP_TURN_RADPS: Final = math.radians(10.0)
+
+# An accelerometer's offset of 20 mg tilts the horizon by this much, and so does its mount.
+TILT_SIGMA_RAD: Final = math.radians(1.4)
+SWELL_SIGMA_RAD: Final = math.radians(0.5)
+RESTED_TILT_SIGMA_RAD: Final = math.radians(1.0)
+MOVING_TILT_SIGMA_RAD: Final = math.radians(6.0)
+
+R_NED_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeEstimate:
+    """Body to NED, true north. sigma_rad: roll, pitch, yaw. problem: why the heading is not trusted, or ""."""
+
+    stamp_ns: int
+    q_ned_body_xyzw: tuple[float, float, float, float]
+    sigma_rad: tuple[float, float, float]
+    problem: str = ""
+
+
+class AttitudeEstimator(Protocol):
+    """Turns samples into attitudes, in order of time."""
+
+    def update(self, sample: ImuSample) -> AttitudeEstimate | None:
+        """Take a sample; None while it starts up, at rest if it can be."""
+        ...
+
+
+def quaternion_to_matrix(q_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrix, (3, 3), of a unit quaternion in VQF's order w, x, y, z."""
+    w, x, y, z = (float(v) for v in q_wxyz)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[float, float, float, float]:
+    """Return q_ned_body as x, y, z, w of q_enu_body as w, x, y, z, turned about down by turn_rad.
+
+    q_ned_enu is half a turn about the line between x and y: (x, y, z, w) = (1, 1, 0, 0) / sqrt(2).
+    """
+    w, x, y, z = (float(v) for v in q_enu_body_wxyz)
+    h = math.sqrt(0.5)
+    nx, ny, nz, nw = h * (w + z), h * (w - z), h * (y - x), -h * (x + y)
+    c, s = math.cos(turn_rad / 2), math.sin(turn_rad / 2)
+    return c * nx - s * ny, c * ny + s * nx, c * nz + s * nw, c * nw - s * nz
+
+
+class _Rest:
+    """Watches for a time at rest, which tells the gyroscope's bias."""
+
+    def __init__(self) -> None:
+        self._window: deque[ImuSample] = deque()
+        self._began_ns: int | None = None
+        self._count = 0
+
+    def update(self, sample: ImuSample) -> tuple[Vector, float] | None:
+        """Return the bias in rad/s, (3,), and its sigma in deg/s, once they are known or waiting is no use."""
+        self._window.append(sample)
+        self._count += 1
+        if self._began_ns is None:
+            self._began_ns = sample.stamp_ns
+        while sample.stamp_ns - self._window[0].stamp_ns > REST_S * S_NS:
+            self._window.popleft()
+        waited_s = (sample.stamp_ns - self._began_ns) / S_NS
+        # Ten times a second is often enough to look at three seconds.
+        if waited_s < REST_S or self._count % 10:
+            return None
+        gyro = np.array([s.gyro_radps for s in self._window])
+        accel = np.array([s.accel_mps2 for s in self._window])
+        still = gyro.std(axis=0).max() < REST_GYRO_RADPS and accel.std(axis=0).max() < REST_ACCEL_MPS2
+        if still:
+            bias: Vector = gyro.mean(axis=0)
+            return bias, REST_BIAS_SIGMA_DPS
+        return (np.zeros(3), MOVING_BIAS_SIGMA_DPS) if waited_s > GIVE_UP_REST_S else None
+
+
+class VqfAttitude:
+    """Tilt and gyroscope bias by VQF, heading by the gated compass.
+
+    calibration: of the magnetometer. field: of the place, with its declination; None: headings are magnetic and
+    the field's strength is learned. declination_rad: used where no field is given. A gap in the samples widens
+    the standard deviations; a long one starts the tilt anew, with the bias that was known.
+    """
+
+    def __init__(
+        self,
+        calibration: MagnetometerCalibration,
+        field: EarthField | None = None,
+        declination_rad: float = 0.0,
+    ) -> None:
+        try:
+            from vqf import VQF
+        except ModuleNotFoundError as error:
+            raise BuddylineError("attitude needs the package vqf: pip install 'buddyline[pi]'") from error
+        self._new_filter: Any = VQF
+        self._calibration = calibration
+        self._declination_rad = field.declination_rad if field else declination_rad
+        self._heading = HeadingFilter(field, not calibration.is_none)
+        self._rest: _Rest | None = _Rest()
+        self._vqf: Any = None
+        self._bias_radps = np.zeros(3)
+        self._last_ns = 0
+        self._tilt_tau_s = MOVING_TILT_TAU_S
+        self._transient_rad = 0.0
+        self._yaw_rad = 0.0
+
+    def update(self, sample: ImuSample) -> AttitudeEstimate | None:
+        """Take a sample; None while it starts up."""
+        if self._rest is not None:
+            found = self._rest.update(sample)
+            if found is None:
+                return None
+            self._rest = None
+            self._begin(sample, *found)
+        dt_s = (sample.stamp_ns - self._last_ns) / S_NS
+        if dt_s == 0:
+            return None
+        if not 0 < dt_s <= GAP_S:
+            self._bridge(sample, abs(dt_s))
+            dt_s = SAMPLE_S
+        self._last_ns = sample.stamp_ns
+        return self._advance(sample, dt_s)
+
+    def _begin(self, sample: ImuSample, bias_radps: Vector, bias_sigma_dps: float) -> None:
+        rested = bias_sigma_dps <= REST_BIAS_SIGMA_DPS
+        self._bias_radps = bias_radps
+        self._tilt_tau_s = RESTED_TILT_TAU_S if rested else MOVING_TILT_TAU_S
+        self._transient_rad = RESTED_TILT_SIGMA_RAD if rested else MOVING_TILT_SIGMA_RAD
+        self._vqf = self._new_filter(
+            SAMPLE_S,
+            tauAcc=self._tilt_tau_s,
+            biasSigmaInit=bias_sigma_dps,
+            biasClip=MAX_BIAS_DPS,
+            magDistRejectionEnabled=False,
+        )
+        self._last_ns = sample.stamp_ns - round(SAMPLE_S * S_NS)
+
+    def _bridge(self, sample: ImuSample, gap_s: float) -> None:
+        """Go on over samples that are missing, or a clock that was set: the turn meanwhile is not known."""
+        turned_rad = gap_s * GAP_TURN_RADPS
+        if gap_s < LONG_GAP_S:
+            self._transient_rad = math.hypot(self._transient_rad, turned_rad)
+        else:
+            bias_radps, sigma_radps = self._vqf.getBiasEstimate()
+            self._begin(sample, self._bias_radps + np.asarray(bias_radps), math.degrees(sigma_radps))
+            self._transient_rad = MOVING_TILT_SIGMA_RAD
+        self._heading.widen(turned_rad)
+
+    def _advance(self, sample: ImuSample, dt_s: float) -> AttitudeEstimate | None:
+        vqf = self._vqf
+        # VQF counts in samples; the turn between two of them is what matters.
+        vqf.update((sample.gyro_radps - self._bias_radps) * (dt_s / SAMPLE_S), np.asarray(sample.accel_mps2))
+        q_level_body = vqf.getQuat6D()
+        R_level_body = quaternion_to_matrix(q_level_body)
+        _, bias_sigma_radps = vqf.getBiasEstimate()
+        self._transient_rad *= math.exp(-dt_s / self._tilt_tau_s)
+        tilt_sigma_rad = math.sqrt(
+            TILT_SIGMA_RAD**2 + SWELL_SIGMA_RAD**2 + (bias_sigma_radps * self._tilt_tau_s) ** 2 + self._transient_rad**2
+        )
+        self._heading.predict(dt_s, float(bias_sigma_radps))
+        yaw_rad = math.atan2(R_level_body[1, 0], R_level_body[0, 0])
+        if sample.mag_t is not None:
+            field_t = R_level_body @ self._calibration.apply(sample.mag_t)
+            self._heading.update(dt_s, field_t, wrap(yaw_rad - self._yaw_rad))
+        self._yaw_rad = yaw_rad
+        return AttitudeEstimate(
+            sample.stamp_ns,
+            ned_of_enu(q_level_body, self._declination_rad - self._heading.delta_rad),
+            (tilt_sigma_rad, tilt_sigma_rad, self._heading.sigma_rad(tilt_sigma_rad)),
+            self._heading.problem,
+        )

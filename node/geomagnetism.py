@@ -1,0 +1,77 @@
+"""The Earth's field where one dives, and the rig's own field taken off what the magnetometer reads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class EarthField:
+    """declination_rad: of magnetic north, east of true north positive. dip_rad: below the horizon positive."""
+
+    declination_rad: float
+    dip_rad: float
+    norm_t: float
+
+
+def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> EarthField:
+    """Return the World Magnetic Model's field at sea level.
+
+    Past its last model's five years the newest one is carried on: declination then errs by tenths of a degree
+    a year. Raises BuddylineError where pygeomag is missing or the position is none.
+    """
+    if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180):
+        raise BuddylineError(f"position {latitude_deg:g}, {longitude_deg:g}: latitude and longitude in degrees")
+    try:
+        from pygeomag import GeoMag
+    except ModuleNotFoundError as error:
+        raise BuddylineError("declination from a position needs pygeomag: pip install 'buddyline[pi]'") from error
+    model = GeoMag()
+    moment = datetime.fromtimestamp(stamp_ns // S_NS, UTC)
+    start = datetime(moment.year, 1, 1, tzinfo=UTC)
+    length = datetime(moment.year + 1, 1, 1, tzinfo=UTC) - start
+    field = model.calculate(
+        glat=latitude_deg,
+        glon=longitude_deg,
+        alt=0.0,
+        time=moment.year + (moment - start) / length,
+        allow_date_outside_lifespan=True,
+    )
+    return EarthField(math.radians(field.d), math.radians(field.i), field.f * 1e-9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MagnetometerCalibration:
+    """What the rig adds and distorts: field = matrix @ (reading - offset_t), body frame.
+
+    offset_t: (3,), hard iron. matrix: (3, 3), soft iron, scale and misalignment.
+    """
+
+    offset_t: Vector
+    matrix: Matrix
+
+    @classmethod
+    def none(cls) -> MagnetometerCalibration:
+        """Return the one that changes nothing."""
+        return cls(np.zeros(3), np.eye(3))
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it changes nothing, so that nobody has calibrated."""
+        return not self.offset_t.any() and np.array_equal(self.matrix, np.eye(3))
+
+    def apply(self, mag_t: Vector) -> Vector:
+        """Return the Earth's field, (3,) or (n, 3), of a reading."""
+        field_t: Vector = (mag_t - self.offset_t) @ self.matrix.T
+        return field_t

@@ -1,0 +1,239 @@
+"""Attitude in simulated swell, with truth: tilt, heading, their sigmas, and what throws them off."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from node.attitude import VqfAttitude, ned_of_enu, quaternion_to_matrix
+from node.drivers.samples import ImuSample
+from node.geomagnetism import EarthField, MagnetometerCalibration
+from protocol.errors import BuddylineError
+from tests.node import swell
+
+pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
+
+HERE = EarthField(0.0, float(swell.DIP_RAD), swell.FIELD_T)
+SOUND = MagnetometerCalibration(np.full(3, 1e-12), np.eye(3))  # calibrated, and nothing to correct
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came out against truth; errors in NED, rad, (n, 3); sigmas (n, 3)."""
+
+    times_s: np.ndarray
+    errors_rad: np.ndarray
+    sigmas_rad: np.ndarray
+    problems: list[str]
+    disturbed: np.ndarray
+
+    def tilt_rms_deg(self, since_s: float = 10.0) -> float:
+        errors = self.errors_rad[self.times_s > since_s, :2]
+        return float(np.degrees(np.sqrt((errors**2).sum(axis=1).mean())))
+
+    def heading_rms_deg(self, which: np.ndarray) -> float:
+        return float(np.degrees(np.sqrt((self.errors_rad[which, 2] ** 2).mean())))
+
+
+def matrix(q_xyzw: tuple[float, float, float, float]) -> np.ndarray:
+    x, y, z, w = q_xyzw
+    return quaternion_to_matrix(np.array([w, x, y, z]))
+
+
+def estimate(dive: swell.Dive, estimator: VqfAttitude) -> Run:
+    found = [(i, out) for i, s in enumerate(dive.samples) if (out := estimator.update(s)) is not None]
+    index = [i for i, _ in found]
+    R = np.array([matrix(out.q_ned_body_xyzw) for _, out in found])
+    return Run(
+        dive.times_s[index],
+        swell.matrix_to_vector(np.einsum("nij,nkj->nik", R, dive.R_ned_body[index])),
+        np.array([out.sigma_rad for _, out in found]),
+        [out.problem for _, out in found],
+        dive.disturbed[index],
+    )
+
+
+@lru_cache
+def calm_run(seed: int = 1) -> Run:
+    return estimate(swell.simulate(40.0, seed=seed), VqfAttitude(SOUND, HERE))
+
+
+@lru_cache
+def disturbed_run(seed: int = 1) -> Run:
+    dive = swell.simulate(58.0, seed=seed, disturbances=((34.0, 46.0, 15e-6),))
+    return estimate(dive, VqfAttitude(SOUND, HERE))
+
+
+def test_ned_of_enu_maps_axes():
+    """Level and facing north: the body's x is north. Facing east: it is east, in both frames."""
+    level_north = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])  # body x forward, z down, in ENU
+    assert quaternion_to_matrix(level_north) @ [1, 0, 0] == pytest.approx([0, 1, 0], abs=1e-12)
+    assert matrix(ned_of_enu(level_north, 0.0)) == pytest.approx(np.eye(3), abs=1e-12)
+    turned = matrix(ned_of_enu(level_north, np.pi / 2))
+    assert turned @ [1, 0, 0] == pytest.approx([0, 1, 0], abs=1e-12)
+
+
+def test_ned_of_enu_is_the_change_of_axes_for_any_attitude():
+    rng = np.random.default_rng(3)
+    R_ned_enu = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    for _ in range(50):
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        assert matrix(ned_of_enu(q, 0.0)) == pytest.approx(R_ned_enu @ quaternion_to_matrix(q), abs=1e-12)
+
+
+def test_it_starts_at_rest_within_five_seconds():
+    assert 3.0 <= calm_run().times_s[0] <= 5.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_tilt_and_heading_in_swell(seed):
+    """Half a metre of swell: tilt 0.2 deg, heading 0.3 deg; the bounds leave twice that."""
+    run = calm_run(seed)
+    assert run.tilt_rms_deg() < 0.4
+    assert run.heading_rms_deg(run.times_s > 10) < 0.7
+    assert not any(run.problems)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_disturbance_is_flagged_and_hardly_felt(seed):
+    """15 uT fixed to the rig, a third of a horizontal field of 22 uT, turns a bare compass by up to 40 deg."""
+    run = disturbed_run(seed)
+    flagged = np.array([bool(problem) for problem in run.problems])
+    assert flagged[run.disturbed].mean() > 0.85
+    assert not flagged[run.times_s < 34].any()
+    assert not flagged[run.times_s > 57].any()
+    assert run.heading_rms_deg(run.disturbed) < 1.5
+    assert any("differ" in p or "uT" in p for p in run.problems)
+
+
+@pytest.mark.parametrize("which", [calm_run, disturbed_run])
+def test_sigmas_cover_the_errors(which):
+    """Sensor offsets are part of the sigmas and not of this simulation: errors are to be well inside."""
+    run = which()
+    assert (np.abs(run.errors_rad) < 3 * run.sigmas_rad).all()
+    assert np.degrees(run.sigmas_rad[-1]) == pytest.approx([1.5, 1.5, 4.0], abs=1.0)
+
+
+def test_heading_sigma_shrinks_once_a_turn_has_confirmed_the_field():
+    run = calm_run()
+    assert np.degrees(run.sigmas_rad[0, 2]) > 10
+    assert np.degrees(run.sigmas_rad[-1, 2]) < 5
+
+
+def test_without_a_magnetometer_the_heading_is_anything():
+    dive = swell.simulate(12.0)
+    estimator = VqfAttitude(SOUND, HERE)
+    out = None
+    for s in dive.samples:
+        out = estimator.update(ImuSample(s.stamp_ns, s.accel_mps2, s.gyro_radps))
+    assert out is not None
+    assert out.sigma_rad[2] > 1.8
+    assert out.sigma_rad[0] < 0.05
+
+
+def test_an_uncalibrated_magnetometer_is_hardly_trusted():
+    dive = swell.simulate(6.0)
+    estimator = VqfAttitude(MagnetometerCalibration.none(), HERE)
+    outs = [estimator.update(s) for s in dive.samples]
+    assert np.degrees(outs[-1].sigma_rad[2]) > 30
+
+
+def test_calibration_is_applied():
+    """The same dive through a distorting rig and its calibration; without it the heading is off."""
+    dive = swell.simulate(8.0, calibrated=False)
+    A = np.array([[1.1, 0.03, 0.0], [0.03, 0.95, -0.02], [0.0, -0.02, 1.04]])
+    sound = MagnetometerCalibration(np.array([8e-6, -12e-6, 5e-6]), np.linalg.inv(A))
+    right = estimate(dive, VqfAttitude(sound, HERE))
+    assert np.degrees(np.abs(right.errors_rad[:, 2]).max()) < 3
+    bare = estimate(dive, VqfAttitude(MagnetometerCalibration.none()))
+    assert np.degrees(np.abs(bare.errors_rad[:, 2]).min()) > 4
+
+
+@pytest.mark.parametrize("declination_deg", [-20.0, 15.0])
+def test_declination_turns_to_true_north(declination_deg):
+    """Declination east: true heading = magnetic heading + declination."""
+    dive = swell.simulate(4.0)
+    field = EarthField(np.radians(declination_deg), HERE.dip_rad, HERE.norm_t)
+    for estimator in (VqfAttitude(SOUND, field), VqfAttitude(SOUND, declination_rad=field.declination_rad)):
+        run = estimate(dive, estimator)
+        assert np.degrees(run.errors_rad[-1, 2]) == pytest.approx(declination_deg, abs=1.5)
+
+
+def test_a_gyroscope_bias_of_five_degrees_a_second_is_taken_off():
+    run = estimate(swell.simulate(20.0, gyro_bias_radps=np.radians(5.0)), VqfAttitude(SOUND, HERE))
+    assert run.times_s[0] < 5
+    assert run.tilt_rms_deg() < 0.5
+
+
+def test_without_rest_it_starts_late_and_says_how_bad_it_is():
+    run = estimate(swell.simulate(30.0, rest_s=0.0), VqfAttitude(SOUND, HERE))
+    assert 20 < run.times_s[0] < 21
+    assert np.degrees(run.sigmas_rad[0, 0]) > 4
+    assert (np.abs(run.errors_rad) < 3 * run.sigmas_rad).all()
+
+
+@pytest.mark.parametrize("step_s", [-1.0, 1.0, -0.5, 3.0])
+def test_a_clock_that_steps_widens_sigma_and_keeps_the_attitude(step_s):
+    dive = swell.simulate(16.0)
+    estimator = VqfAttitude(SOUND, HERE)
+    before = after = None
+    for i, s in enumerate(dive.samples):
+        shift_ns = int(step_s * 1e9) if i >= 1200 else 0
+        out = estimator.update(ImuSample(s.stamp_ns + shift_ns, s.accel_mps2, s.gyro_radps, s.mag_t))
+        if i == 1199:
+            before = out
+        if i == 1200:
+            after = out
+        if i > 1200:
+            error = swell.matrix_to_vector((matrix(out.q_ned_body_xyzw) @ dive.R_ned_body[i].T)[None])[0]
+            assert np.degrees(np.abs(error).max()) < 3
+    assert after.sigma_rad[0] > before.sigma_rad[0]
+    assert after.sigma_rad[2] > before.sigma_rad[2]
+
+
+def test_samples_missing_for_ten_seconds_are_survived():
+    dive = swell.simulate(34.0)
+    kept = [s for i, s in enumerate(dive.samples) if not 1500 < i < 2500]
+    where = [i for i in range(len(dive.samples)) if not 1500 < i < 2500]
+    estimator = VqfAttitude(SOUND, HERE)
+    for i, s in zip(where, kept, strict=True):
+        out = estimator.update(s)
+        if out is not None:
+            error = swell.matrix_to_vector((matrix(out.q_ned_body_xyzw) @ dive.R_ned_body[i].T)[None])[0]
+            assert (np.abs(error) < 3 * np.array(out.sigma_rad)).all(), i
+    assert np.degrees(out.sigma_rad[0]) < 4
+
+
+def test_uneven_and_missing_samples_do_not_lose_the_turn():
+    """Every fifth sample missing and the rest up to 3 ms late, as on a busy Pi."""
+    dive = swell.simulate(24.0)
+    rng = np.random.default_rng(5)
+    estimator = VqfAttitude(SOUND, HERE)
+    errors = []
+    for i, s in enumerate(dive.samples):
+        if i % 5 == 3:
+            continue
+        late_ns = int(rng.uniform(0, 3e6))
+        out = estimator.update(ImuSample(s.stamp_ns + late_ns, s.accel_mps2, s.gyro_radps, s.mag_t))
+        if out is not None and i > 1000:
+            errors.append(swell.matrix_to_vector((matrix(out.q_ned_body_xyzw) @ dive.R_ned_body[i].T)[None])[0])
+    assert np.degrees(np.abs(errors).max()) < 2.5
+
+
+def test_the_same_stamp_twice_is_passed_over():
+    dive = swell.simulate(4.0)
+    estimator = VqfAttitude(SOUND, HERE)
+    for s in dive.samples:
+        estimator.update(s)
+    assert estimator.update(dive.samples[-1]) is None
+
+
+def test_without_vqf_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "vqf", None)
+    with pytest.raises(BuddylineError, match=r"buddyline\[pi\]"):
+        VqfAttitude(SOUND)
