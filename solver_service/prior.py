@@ -1,40 +1,90 @@
-"""What earlier fixes say of the present one: a prediction that fades, is lost, and is found again."""
+"""What earlier fixes say of the present one: a prediction that fades, is lost, and is found again.
+
+A constant-velocity filter on T_a_b, twelve error states: position (m), small rotation (rad), velocity (m/s) and
+turn rate (rad/s), all in A's camera frame. A fix that does not fit starts it anew: it never argues with the light.
+"""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from protocol.clock import S_NS
+from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
 from solver_service.geometry.trigger import Fix, Prior
 
 LIFETIME_NS: Final = 2 * S_NS
-# How fast two divers may part, drift and turn (1 sd).
-SPEED_MPS: Final = 0.7
-TURN_RADPS: Final = 0.7
+# How divers and the cameras they hold speed up and turn: spectral densities of white acceleration,
+# (m/s^2)^2/Hz and (rad/s^2)^2/Hz. A knows no better of the camera's own shaking, which is in T_a_b too.
+ACCELERATION_DENSITY: Final = 0.3**2
+TURN_DENSITY: Final = 0.6**2
+# At first: 1 sd of what a pair may be doing.
+SPEED_MPS: Final = 0.5
+TURN_RADPS: Final = 0.5
+# Innovations beyond this (six degrees of freedom, 1 in 10^6) mean that something else was seen.
+GATE_CHI2: Final = 38.0
 
 
 class PosePrior:
-    """Holds the last fix and widens it with time; no velocity, so that one bad fix cannot run away."""
+    """Follows the fixes and predicts the next."""
 
     def __init__(self) -> None:
-        self._stamp_ns = 0
-        self._fix: Fix | None = None
-
-    def update(self, stamp_ns: int, fix: Fix) -> None:
-        """Take a new fix."""
-        self._stamp_ns, self._fix = stamp_ns, fix
+        self._stamp_ns: int | None = None
+        self._t = np.zeros(3)
+        self._R = np.eye(3)
+        self._rates = np.zeros(6)
+        self._P: NDArray[np.float64] = np.zeros((12, 12))
 
     def lose(self) -> None:
         """Forget it."""
-        self._fix = None
+        self._stamp_ns = None
 
     def at(self, stamp_ns: int) -> Prior | None:
-        """Return the prediction for stamp_ns, None where the last fix is too old."""
-        age_ns = stamp_ns - self._stamp_ns
-        if self._fix is None or not 0 <= age_ns <= LIFETIME_NS:
+        """Return the prediction for stamp_ns, None where the last fix is too old, or later."""
+        if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None
-        age_s = age_ns / S_NS
-        walk = np.array([SPEED_MPS * age_s] * 3 + [TURN_RADPS * age_s] * 3) ** 2
-        return Prior(self._fix.t_a_b_m, self._fix.q_a_b_xyzw, self._fix.covariance + np.diag(walk))
+        t, R, P = self._predict((stamp_ns - self._stamp_ns) / S_NS)
+        return Prior(t, quaternion_of(R), P[:6, :6], self._rates.copy(), P[6:, 6:])
+
+    def update(self, stamp_ns: int, fix: Fix) -> None:
+        """Take a new fix."""
+        R_fix = matrix_of(fix.q_a_b_xyzw)
+        if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
+            self._start(stamp_ns, fix, R_fix)
+            return
+        t, R, P = self._predict((stamp_ns - self._stamp_ns) / S_NS)
+        innovation = np.concatenate((fix.t_a_b_m - t, rotation_log(R_fix @ R.T)))
+        S = P[:6, :6] + fix.covariance
+        gain = np.linalg.solve(S, P[:6]).T
+        if innovation @ np.linalg.solve(S, innovation) > GATE_CHI2:
+            self._start(stamp_ns, fix, R_fix)
+            return
+        step = gain @ innovation
+        P = P - gain @ P[:6]
+        self._stamp_ns = stamp_ns
+        self._t, self._R = t + step[:3], rotation_exp(step[3:6]) @ R
+        self._rates = self._rates + step[6:]
+        self._P = (P + P.T) / 2
+
+    def _start(self, stamp_ns: int, fix: Fix, R_fix: NDArray[np.float64]) -> None:
+        self._stamp_ns = stamp_ns
+        self._t, self._R, self._rates = fix.t_a_b_m.copy(), R_fix, np.zeros(6)
+        self._P = np.zeros((12, 12))
+        self._P[:6, :6] = fix.covariance
+        self._P[6:9, 6:9] = SPEED_MPS**2 * np.eye(3)
+        self._P[9:, 9:] = TURN_RADPS**2 * np.eye(3)
+
+    def _predict(self, dt_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        t = self._t + dt_s * self._rates[:3]
+        R = rotation_exp(dt_s * self._rates[3:]) @ self._R
+        F = np.eye(12)
+        F[:6, 6:] = dt_s * np.eye(6)
+        density = np.diag([ACCELERATION_DENSITY] * 3 + [TURN_DENSITY] * 3)
+        P = F @ self._P @ F.T
+        P[:6, :6] += density * dt_s**3 / 3
+        P[:6, 6:] += density * dt_s**2 / 2
+        P[6:, :6] += density * dt_s**2 / 2
+        P[6:, 6:] += density * dt_s
+        return t, R, P
