@@ -101,7 +101,6 @@ def _frames(world: World, plan: Plan, node: str, end_ns: int) -> Iterator[Entry]
         rng = generator(world.scenario.seed, "exposures", index, instant)
         stray = max(-5.0, min(5.0, float(rng.standard_normal())))
         lost = float(rng.random()) < plan.lost_share
-        seq += 1
         if lost:
             continue
         stamp_ns = instant * plan.period_ns + round(stray * plan.exposure_sigma_ns)
@@ -109,7 +108,8 @@ def _frames(world: World, plan: Plan, node: str, end_ns: int) -> Iterator[Entry]
         if plan.images:
             yield stamp_ns, topics.IMAGE.key(node), _picture(world, node, stamp_ns)
         else:
-            yield stamp_ns, topics.CANDIDATES.key(node), world.candidates(node, stamp_ns, trigger, seq - 1, BOOT)
+            yield stamp_ns, topics.CANDIDATES.key(node), world.candidates(node, stamp_ns, trigger, seq, BOOT)
+        seq += 1
         yield stamp_ns, light_truth, world.light_truth(node, stamp_ns, trigger)
 
 

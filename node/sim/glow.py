@@ -30,8 +30,29 @@ NODES: Final = 8
 RHO_MIN_PX: Final = 0.5
 FORWARD_SHARE: Final = 0.7
 """Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
+SCALE_PX: Final = 900.0
+"""Focal length that the lengths here in pixels belong to; they grow with it."""
 GLARE: Final = 0.04
 """Share of a lamp's light that the lens spreads widely."""
+
+
+def through_water(water: Water) -> NDArray[np.float64]:
+    """Return the attenuation of direct light, (3,), 1/m: what is scattered straight on still arrives."""
+    return np.array(water.absorption_per_m) + (1 - FORWARD_SHARE) * np.array(water.scattering_per_m)
+
+
+def flux_px(lamp: Lamp, water: Water, f_px: float) -> NDArray[np.float64]:
+    """Return the light that reaches the picture directly, (3,): full scales times square pixels."""
+    direct = np.exp(-through_water(water) * lamp.range_m) * lamp.towards_camera / lamp.range_m**2
+    return np.asarray(water.lamp_gain * direct * f_px**2)
+
+
+def core_px(lamp: Lamp, water: Water, f_px: float) -> float:
+    """Return about the radius within which a lamp clips the green channel: its disc's or its glare's."""
+    scale = f_px / SCALE_PX
+    flux = float(flux_px(lamp, water, f_px)[1]) / scale**2
+    glare_px: float = scale * (GLARE / (2 * math.pi) * flux) ** 0.4
+    return max(glare_px, LAMP_RADIUS_M * f_px / lamp.range_m + BLUR_PX)
 
 
 class GlowRenderer:
@@ -41,13 +62,13 @@ class GlowRenderer:
         self._water = water
         self._f_px = f_px
         self._size_px = width_px, height_px
-        self._k = np.array(water.absorption_per_m) + (1 - FORWARD_SHARE) * np.array(water.scattering_per_m)
+        self._k = through_water(water)
         self._b = np.array(water.scattering_per_m)
         shape = -(-height_px // COARSE), -(-width_px // COARSE)
         self.coarse_shape = shape
         self._coarse_u = (np.arange(shape[1], dtype=np.float32) + 0.5) * COARSE - 0.5
         self._coarse_v = (np.arange(shape[0], dtype=np.float32) + 0.5) * COARSE - 0.5
-        self._scale = f_px / 900.0
+        self._scale = f_px / SCALE_PX
         reach = 1.6 * math.hypot(width_px, height_px)
         self._log_step = math.log(reach / RHO_MIN_PX) / (STEPS - 1)
         self._rho = (RHO_MIN_PX * np.exp(self._log_step * np.arange(STEPS))).astype(np.float32)
@@ -91,20 +112,9 @@ class GlowRenderer:
             table[..., channel] = scattered * front * self._b[channel]
         table *= self._water.lamp_gain * lamp.intensity
         rho = self._rho / self._scale
-        glare = GLARE / (2 * np.pi) / (rho * rho + 9.0) ** 1.25 * self._rho
-        table += (glare[:, None] * self._flux_px(lamp)).astype(np.float32)[:, None, :]
+        glare = GLARE / (2 * np.pi * self._scale**2) / (rho * rho + 9.0) ** 1.25 * self._rho
+        table += (glare[:, None] * flux_px(lamp, self._water, self._f_px)).astype(np.float32)[:, None, :]
         return table
-
-    def _flux_px(self, lamp: Lamp) -> NDArray[np.float64]:
-        """Return the light that reaches the picture directly, (3,): full scales times square pixels."""
-        direct = np.exp(-self._k * lamp.range_m) * lamp.towards_camera / lamp.range_m**2
-        return np.asarray(self._water.lamp_gain * direct * self._f_px**2)
-
-    def core_px(self, lamp: Lamp, table: Image) -> float:
-        """Return the radius within which a lamp clips the green channel."""
-        bright = table[..., 1].max(axis=1) > self._rho
-        glow_px = float(self._rho[bright].max()) if bright.any() else 0.0
-        return max(glow_px, LAMP_RADIUS_M * self._f_px / lamp.range_m + BLUR_PX)
 
     def add_wide(self, coarse: Image, lamp: Lamp, table: Image) -> None:
         """Add a lamp's light beyond NEAR_PX to the coarse picture."""
@@ -141,7 +151,7 @@ class GlowRenderer:
         area_px = math.pi * (size_px**2 + (math.pi * edge_px) ** 2 / 3)
         near = rho < size_px + 14 * edge_px
         disc = 1.0 / (1.0 + np.exp((rho[near] - size_px) / edge_px))
-        radiance[near] += disc[:, None] * (self._flux_px(lamp) / area_px).astype(np.float32)
+        radiance[near] += disc[:, None] * (flux_px(lamp, self._water, self._f_px) / area_px).astype(np.float32)
         full[v0:v1, u0:u1] += radiance
 
     def _look_up(self, table: Image, du: Image, dv: Image) -> tuple[Image, Image]:

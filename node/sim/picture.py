@@ -55,16 +55,6 @@ class Painter:
         noise = self._noise[top : top + height_px, left : left + width_px]
         return np.asarray(cv2.addWeighted(full, 255.0, noise, 1.0, 0.0, dtype=cv2.CV_8U), np.uint8)
 
-    def merged(self, left: Lamp, right: Lamp) -> bool:
-        """Tell whether the clipped cores of two lights are one."""
-        if not (self._matters(left) and self._matters(right)):
-            return False
-        apart_px = float(np.linalg.norm(left.pixel - right.pixel))
-        if apart_px > self._size_px[0] / 4:  # no core is that large: not worth a table
-            return False
-        cores_px = sum(self._glow.core_px(lamp, self._glow.table(lamp)) for lamp in (left, right))
-        return apart_px < cores_px
-
     def _matters(self, lamp: Lamp) -> bool:
         """Tell whether a lamp stands near enough to the picture to be seen or to light the water in it."""
         if np.isnan(lamp.pixel).any() or lamp.position_m[2] < 0.1:

@@ -87,9 +87,11 @@ class Scene:
         self.rigs: tuple[Rig, Rig] = (build(scenario, 0), build(scenario, 1))
         rng = generator(scenario.seed, "divers")
         self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
+        # Pictures, candidates and truth of a frame all ask for the same view.
+        self.view = lru_cache(maxsize=4)(self._view)
         self._ripple = [[Sway(rng, 0.4, 3.0) for _ in range(2)] for _ in range(2)]
 
-    def view(self, index: int, t_s: float) -> View:
+    def _view(self, index: int, t_s: float) -> View:
         """Return what A (0) or B (1) sees at t_s, with every lamp where its row of the picture has it."""
         placement = self.motion.placement(index, t_s)
         lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))

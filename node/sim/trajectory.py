@@ -37,6 +37,8 @@ class Motion:
 
     def __init__(self, scenario: Scenario) -> None:
         rng = generator(scenario.seed, "motion")
+        # All that is asked about one instant needs the same two placements.
+        self.placement = lru_cache(maxsize=16)(self._placement)
         self._scenario = scenario
         self._heading_rad = float(rng.uniform(-math.pi, math.pi))
         self._phases = [float(p) for p in rng.uniform(0, 2 * math.pi, 3)]
@@ -51,7 +53,7 @@ class Motion:
         self._half_v_rad = min(math.atan(scenario.height_px / 2 / c.fy_px) for c in cameras)
         self._half_bar_m = 0.55 * max(scenario.baseline_a_m, scenario.baseline_b_m)
 
-    def placement(self, index: int, t_s: float) -> Placement:
+    def _placement(self, index: int, t_s: float) -> Placement:
         """Return where A (0) or B (1) is at t_s."""
         if self._scenario.trajectory == "rest":
             t_s = 0.0

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.sim import candidates, rotation
+from node.sim.glow import core_px
 from node.sim.picture import Painter
 from node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
 from node.sim.rotation import Matrix, Vector
@@ -88,7 +89,7 @@ class World:
         """
         index = self.scenario.index(node)
         view = self._scene.view(index, self._seconds(index, stamp_ns))
-        merged = self._painter(index).merged(*view.lights)
+        merged = self._merged(index, *view.lights)
         names: tuple[Literal["left", "right"], Literal["left", "right"]] = ("left", "right")
         lights = [
             TrueLight(
@@ -148,6 +149,12 @@ class World:
 
     def _visible(self, view: View, lamp: Lamp) -> bool:
         return candidates.in_picture(lamp, self.scenario) and not view.hidden(lamp.pixel)
+
+    def _merged(self, index: int, left: Lamp, right: Lamp) -> bool:
+        """Tell whether the clipped cores of two lights are one."""
+        f_px = self._scene.rigs[index].camera.fx_px
+        cores_px = [core_px(lamp, self.scenario.water, f_px) for lamp in (left, right)]
+        return bool(np.linalg.norm(left.pixel - right.pixel) < sum(cores_px))
 
     def _painter(self, index: int) -> Painter:
         if index not in self._painters:

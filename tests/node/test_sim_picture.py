@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from node.sim.glow import FAR_PX, GLARE, NEAR_PX, GlowRenderer
+from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer
 from node.sim.rig import BEAM_RAD, SPILL
 from node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
 from node.sim.scene import Lamp
@@ -35,7 +35,7 @@ def test_a_near_light_is_a_clipped_core_at_its_true_place(environment):
 
 
 def test_without_scattering_the_centroid_is_the_source_to_a_fraction_of_a_pixel():
-    """Against the clear sunlit reef: the disc, its edge and the sub-pixel place are unbiased."""
+    """In the clear basin: the disc, its edge and the sub-pixel place are unbiased."""
     errors = []
     for seed in range(3):
         world = World(Scenario(environment="basin", seed=seed, **QUIET))
@@ -122,8 +122,8 @@ def test_the_table_follows_the_integral():
     flux_px = (
         904.0**2 * np.exp(-k * 3.0) / 9.0 * (SPILL + (1 - SPILL) * np.exp(-(1 - np.cos(np.radians(6))) / BEAM_RAD**2))
     )
-    rho = np.hypot(ray[0], ray[1]) / ray[2] * 904.0 / (904.0 / 900.0)
-    glare = GLARE / (2 * np.pi) / (rho**2 + 9) ** 1.25 * flux_px
+    rho = np.hypot(ray[0], ray[1]) / ray[2] * SCALE_PX
+    glare = GLARE * (SCALE_PX / 904.0) ** 2 / (2 * np.pi) / (rho**2 + 9) ** 1.25 * flux_px
     assert found == pytest.approx(water.lamp_gain * (scattered + glare), rel=0.05)
 
 

@@ -1,0 +1,77 @@
+"""A simulated dive as a stream of messages."""
+
+from collections import Counter
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from node.sim.dive import Plan, messages
+from node.sim.scenario import Scenario
+from node.sim.world import World
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth, encode
+
+START_NS = 1_764_000_000 * S_NS
+
+
+def _dive(plan, **scenario):
+    return list(messages(World(Scenario(seed=3, start_ns=START_NS, **scenario)), plan))
+
+
+def test_a_dive_holds_every_topic_at_its_rate_in_order_of_time():
+    entries = _dive(Plan(seconds=4, rate_hz=5, imu=True, lost_share=0.0))
+    counts = Counter(key for _, key, _ in entries)
+    assert counts.pop("buddyline/pair/a/b/truth") == 19
+    for node in "ab":
+        of_node = {key.rsplit("/", 1)[1]: counts.pop(key) for key in list(counts) if f"/{node}/" in key}
+        assert of_node == {
+            "info": 1, "attitude": 200, "depth": 40, "imu": 400, "candidates": 19, "light_truth": 19,
+        }  # fmt: skip
+    assert not counts
+    stamps = [stamp_ns for stamp_ns, _, _ in entries]
+    assert stamps == sorted(stamps)
+    assert stamps[0] == START_NS
+    assert isinstance(entries[0][2], NodeInfo)
+    assert all(encode(message) for _, _, message in entries)
+
+
+def test_triggers_are_those_of_the_contract_and_exposures_stray():
+    period_ns = Plan(rate_hz=8).period_ns
+    entries = _dive(Plan(seconds=10, rate_hz=8, lost_share=0.1))
+    frames = [m for _, _, m in entries if isinstance(m, Candidates) and m.node == "a"]
+    truths = {m.trigger: m for _, _, m in entries if isinstance(m, Truth)}
+    lights = [m for _, _, m in entries if isinstance(m, LightTruth) and m.node == "a"]
+    strays_ns = np.array([m.stamp_ns - m.trigger * period_ns for m in frames])
+    assert 0.6e6 < strays_ns.std() < 1.5e6
+    assert 55 < len(frames) < len(truths) == 79
+    assert [m.seq for m in frames] == list(range(len(frames)))
+    assert all(truths[m.trigger].stamp_ns == m.trigger * period_ns for m in frames)
+    assert [(m.stamp_ns, m.trigger) for m in frames] == [(m.stamp_ns, m.trigger) for m in lights]
+    assert any(later.trigger - earlier.trigger > 1 for earlier, later in pairwise(frames))
+
+
+def test_the_same_seed_is_the_same_dive_to_the_last_bit():
+    one, two = (_dive(Plan(seconds=2)) for _ in range(2))
+    assert [encode(m) for _, _, m in one] == [encode(m) for _, _, m in two]
+
+
+def test_a_dive_with_images_holds_what_the_camera_saw():
+    scenario = {"environment": "lake", "width_px": 410, "height_px": 308}
+    pictures = [m for _, _, m in _dive(Plan(seconds=0.5, images=True), **scenario) if isinstance(m, CompressedImage)]
+    assert {m.frame_id for m in pictures} == {"a_camera", "b_camera"}
+    world = World(Scenario(seed=3, start_ns=START_NS, **scenario))
+    image = cv2.imdecode(np.frombuffer(pictures[0].data, np.uint8), cv2.IMREAD_COLOR)
+    seen = world.render(pictures[0].frame_id[0], pictures[0].stamp_ns)
+    assert image.shape == seen.shape
+    assert np.abs(image.astype(float) - seen).mean() < 2.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"), [({"seconds": 0.0}, "seconds"), ({"rate_hz": -1.0}, "rate_hz"), ({"lost_share": 2.0}, "lost")]
+)
+def test_what_cannot_be_logged_is_refused_by_name(wrong, named):
+    with pytest.raises(BuddylineError, match=named):
+        Plan(**wrong)

@@ -1,0 +1,69 @@
+"""`buddyline simulate`: dive logs with truth."""
+
+import pytest
+
+from protocol.divelog import DiveLogReader
+from protocol.messages import Candidates, CompressedImage, NodeInfo, Truth
+from tools.cli import main
+
+
+def _simulated(path, *words):
+    assert main(["simulate", str(path), "--seconds", "1.5", *words]) == 0
+    with DiveLogReader(path) as reader:
+        return reader.metadata(), [record.decode() for record in reader.records()]
+
+
+def test_a_dive_is_written_with_its_truth_and_says_how_it_was_made(tmp_path, capsys):
+    metadata, found = _simulated(tmp_path / "d.mcap", "--environment", "basin", "--baseline", "0.6", "--false", "9")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "d.mcap" in err
+    kinds = [type(message) for message in found]
+    assert kinds.count(NodeInfo) == 2
+    assert kinds.count(Truth) == 14
+    assert 20 <= kinds.count(Candidates) <= 28
+    assert min(len(m.blobs) for m in found if isinstance(m, Candidates)) >= 9
+    assert (metadata["environment"], metadata["baseline_a_m"], metadata["rate_hz"]) == ("basin", "0.6", "10.0")
+
+
+def test_the_same_words_give_the_same_file_and_another_seed_another(tmp_path):
+    files = []
+    for name, seed in (("one", "5"), ("two", "5"), ("three", "6")):
+        _simulated(tmp_path / name, "--seed", seed)
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1] != files[2]
+
+
+def test_pictures_are_as_wide_as_asked_for(tmp_path):
+    _, found = _simulated(tmp_path / "d.mcap", "--images", "--width", "200", "--rate", "4")
+    infos = [message for message in found if isinstance(message, NodeInfo)]
+    assert {(info.width_px, info.height_px) for info in infos} == {(200, 150)}
+    assert any(isinstance(message, CompressedImage) for message in found)
+    assert not any(isinstance(message, Candidates) for message in found)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--range-min", "9", "--range-max", "3"], "range_max_m"),
+        (["--seconds", "0"], "seconds"),
+        (["--rate", "0"], "rate_hz"),
+        (["--baseline", "-1"], "baseline"),
+        (["--width", "1"], "width_px"),
+    ],
+)
+def test_what_cannot_be_simulated_is_one_line_and_leaves_no_file(words, named, tmp_path, capsys):
+    path = tmp_path / "d.mcap"
+    assert main(["simulate", str(path), *words]) == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1
+    assert not path.exists()
+
+
+def test_a_log_is_never_overwritten(tmp_path, capsys):
+    path = tmp_path / "d.mcap"
+    path.write_bytes(b"precious")
+    assert main(["simulate", str(path), "--seconds", "1"]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert path.read_bytes() == b"precious"
