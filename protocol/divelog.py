@@ -149,7 +149,8 @@ class DiveLogWriter:
 class _Contents:
     """Where the chunks of a log stand, by log time, and what of it is readable."""
 
-    chunks: list[tuple[int, int, int]] = field(default_factory=list)  # start, end (ns), offset in the file
+    # start, end (ns), offset in the file, and the channels in it (None: not known before it is read)
+    chunks: list[tuple[int, int, int, frozenset[int] | None]] = field(default_factory=list)
     channels: dict[int, tuple[str, str]] = field(default_factory=dict)  # id: topic, schema name
     loose: list[McapMessage] = field(default_factory=list)
 
@@ -183,13 +184,13 @@ class DiveLogReader:
     @property
     def start_ns(self) -> int | None:
         """Log time of the first message, None for a log without messages."""
-        starts = [start for start, _, _ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
+        starts = [start for start, *_ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
         return min(starts, default=None)
 
     @property
     def end_ns(self) -> int | None:
         """Log time of the last message, None for a log without messages."""
-        ends = [end for _, end, _ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
+        ends = [end for _, end, *_ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
         return max(ends, default=None)
 
     def metadata(self) -> dict[str, str]:
@@ -205,31 +206,44 @@ class DiveLogReader:
             pass
         return {}
 
-    def records(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
+    def records(self, wanted: Callable[[str], bool] | None = None, since_ns: int | None = None) -> Iterator[Record]:
         """Yield the records by log time (ties: as in the file); memory holds only chunks that overlap.
 
-        wanted: whether a topic is to be read.
+        wanted: whether a topic is to be read; since_ns: the least log time. Chunks without any such record are
+        passed over unread, where the log's index tells.
         """
         heap: list[tuple[int, int, Record]] = []
         order = 0
         for message in self._contents.loose:
-            record = self._record(message, wanted)
+            record = self._record(message, wanted, since_ns)
             if record is not None:
                 heap.append((record.log_time_ns, order, record))
                 order += 1
         heapq.heapify(heap)
-        for start_ns, _, offset in sorted(self._contents.chunks):
+        for start_ns, end_ns, offset, channels in sorted(self._contents.chunks, key=lambda chunk: chunk[:3]):
+            if (since_ns is not None and end_ns < since_ns) or not self._holds_any(channels, wanted):
+                continue
             while heap and heap[0][0] < start_ns:
                 yield heapq.heappop(heap)[2]
             for message in self._chunk_messages(offset):
-                record = self._record(message, wanted)
+                record = self._record(message, wanted, since_ns)
                 if record is not None:
                     heapq.heappush(heap, (record.log_time_ns, order, record))
                     order += 1
         while heap:
             yield heapq.heappop(heap)[2]
 
-    def _record(self, message: McapMessage, wanted: Callable[[str], bool] | None) -> Record | None:
+    def _holds_any(self, channels: frozenset[int] | None, wanted: Callable[[str], bool] | None) -> bool:
+        if channels is None or wanted is None:
+            return True
+        declared = self._contents.channels
+        return any(channel not in declared or wanted(declared[channel][0]) for channel in channels)
+
+    def _record(
+        self, message: McapMessage, wanted: Callable[[str], bool] | None, since_ns: int | None
+    ) -> Record | None:
+        if since_ns is not None and message.log_time < since_ns:
+            return None
         channel = self._contents.channels.get(message.channel_id)
         if channel is None:
             self._note(f"channel {message.channel_id} is not declared: its messages are left out")
@@ -276,7 +290,11 @@ class DiveLogReader:
             return None
         contents = _Contents()
         for index in summary.chunk_indexes:
-            contents.chunks.append((index.message_start_time, index.message_end_time, index.chunk_start_offset))
+            # A chunk whose writer made no index of its messages may hold any.
+            channels = frozenset(index.message_index_offsets) or None
+            contents.chunks.append(
+                (index.message_start_time, index.message_end_time, index.chunk_start_offset, channels)
+            )
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
             contents.channels[channel.id] = (channel.topic, schema.name if schema else "")
@@ -293,7 +311,7 @@ class DiveLogReader:
             offset = 8
             for record in stream.records:
                 if isinstance(record, Chunk):
-                    contents.chunks.append((record.message_start_time, record.message_end_time, offset))
+                    contents.chunks.append((record.message_start_time, record.message_end_time, offset, None))
                     record.data = b""
                 elif isinstance(record, McapMessage):
                     contents.loose.append(record)
@@ -310,7 +328,7 @@ class DiveLogReader:
         if not closed and not self.damage:
             self._note("was not closed")
         if not contents.channels:
-            for _, _, offset in contents.chunks:
+            for _, _, offset, _ in contents.chunks:
                 self._chunk_messages(offset)
         return contents
 
@@ -325,9 +343,11 @@ class DiveLogReader:
         self.close()
 
 
-def read_logs(readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
-    """Yield the records of several logs as one, by log time."""
-    return heapq.merge(*(reader.records(wanted) for reader in readers), key=lambda record: record.log_time_ns)
+def read_logs(
+    readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None, since_ns: int | None = None
+) -> Iterator[Record]:
+    """Yield the records of several logs as one, by log time, from since_ns on."""
+    return heapq.merge(*(reader.records(wanted, since_ns) for reader in readers), key=lambda record: record.log_time_ns)
 
 
 __all__ = ["DiveLogReader", "DiveLogWriter", "MessageError", "Record", "payload_stamp_ns", "read_logs"]
