@@ -16,8 +16,8 @@ from typing import Final, Protocol, Self
 
 from protocol.clock import Clock
 from protocol.delivery import FailureLatch, RateCap, ThreadDiedError
-from protocol.messages import Message, encode
-from protocol.topics import Topic
+from protocol.messages import Message, encode, payload_stamp_ns
+from protocol.topics import Topic, parse_key
 
 CACHE_S: Final = 60.0
 MAX_TRIGGER_HZ: Final = 30.0
@@ -110,10 +110,11 @@ class Bus(ABC):
     ) -> Subscription:
         """Hand every message on key_expr (`*`: one chunk, `**`: any number) to handle, one at a time.
 
-        With history, nothing that publishers still hold is missed: what they sent before (the newest of a topic
-        with latest_only, else the last minute) is queued before this returns, the newest-only topics first,
-        and what a fault of the link took is fetched when it is back. Each publisher's samples come in order
-        and once. Without: only what comes from now on, as it comes. Images are never kept.
+        With history, nothing that publishers still hold is missed: what they sent before is queued before this
+        returns, first the newest of each topic with latest_only, then the last minute of the others, all
+        publishers' in order of their stamps; and what a fault of the link took is fetched when it is back.
+        Each publisher's samples come in order and once. Images are never kept.
+        Without history: only what comes from now on, as it comes.
         Past capacity the oldest is dropped and counted. An exception in handle ends the subscription's
         thread and is the bus's failure.
         """
@@ -170,6 +171,15 @@ def cache_depth(topic: Topic, cache_s: float) -> int:
     if topic.latest_only:
         return 1
     return max(math.ceil(max(topic.rate_hz, MAX_TRIGGER_HZ) * cache_s), 1)
+
+
+def held_order(key: str, payload: bytes) -> tuple[bool, int]:
+    """Order what publishers hold for a late joiner: the topics with only a latest message, then by time.
+
+    By time, because whoever matches two nodes' frames would otherwise wait for one through all of the other's.
+    """
+    parsed = parse_key(key)
+    return parsed is None or not parsed[0].latest_only, payload_stamp_ns(payload) or 0
 
 
 def check_alive_name(name: str) -> str:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final
 
-import msgspec
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Metadata, Schema
@@ -21,34 +20,13 @@ from zstandard import ZstdError
 
 from protocol import topics
 from protocol.errors import BuddylineError
-from protocol.messages import FoxgloveTime, Message, MessageError, decode, encode
+from protocol.messages import Message, MessageError, decode, encode, payload_stamp_ns
 from protocol.schemas import json_schema
 
 CHUNK_BYTES: Final = 1024 * 1024
 MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
 _CHANNEL_METADATA: Final = "buddyline.channel"
 _DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError, ZstdError)
-
-
-class _Stamp(msgspec.Struct):
-    """The measurement time of any message of ours."""
-
-    stamp_ns: int | None = None
-    timestamp: FoxgloveTime | None = None
-
-
-_STAMP_DECODER = msgspec.json.Decoder(_Stamp)
-
-
-def payload_stamp_ns(payload: bytes) -> int | None:
-    """Return the measurement time that a payload carries, or None."""
-    try:
-        stamp = _STAMP_DECODER.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return None
-    if stamp.timestamp is not None:
-        return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
-    return stamp.stamp_ns
 
 
 @dataclass(frozen=True, slots=True)

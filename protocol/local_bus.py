@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
+from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name, held_order
 from protocol.clock import Clock, SystemClock
 from protocol.delivery import Delivery, RateCap
 from protocol.topics import Topic
@@ -157,10 +157,10 @@ class LocalBus(Bus):
         subscription = LocalSubscription(self._network, key_expr, delivery)
         with self._network.lock:
             if history:
-                held = [p for p in self._network.publishers if key_matches(key_expr, p.key)]
-                for publisher in sorted(held, key=lambda p: (not p.topic.latest_only, p.key)):
-                    for payload in publisher.cache:
-                        subscription.offer(publisher, payload)
+                publishers = [p for p in self._network.publishers if key_matches(key_expr, p.key)]
+                held = [(publisher, payload) for publisher in publishers for payload in publisher.cache]
+                for publisher, payload in sorted(held, key=lambda item: held_order(item[0].key, item[1])):
+                    subscription.offer(publisher, payload)
             self._network.subscriptions.append(subscription)
             self._subscriptions.append(subscription)
         return subscription

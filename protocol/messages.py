@@ -331,6 +331,7 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     """Health of the solver, 1 Hz; counts since its start.
 
     latency: from the middle of exposure to the pose, over the last second's poses (live dives only).
+    clock_skew_s: B's clock minus A's as the dive itself tells it, left out until it does.
     """
 
     node_a: NodeId
@@ -400,6 +401,27 @@ def _non_finite_field(payload: bytes) -> str | None:
         elif isinstance(value, list):
             stack.extend((f"{path}[{i}]", item) for i, item in enumerate(value))
     return None
+
+
+class _Stamp(Struct):
+    """The measurement time of any message of ours."""
+
+    stamp_ns: int | None = None
+    timestamp: FoxgloveTime | None = None
+
+
+_STAMP_DECODER = msgspec.json.Decoder(_Stamp)
+
+
+def payload_stamp_ns(payload: bytes) -> int | None:
+    """Return the measurement time that a payload carries, or None."""
+    try:
+        stamp = _STAMP_DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    if stamp.timestamp is not None:
+        return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
+    return stamp.stamp_ns
 
 
 def encode(message: Message) -> bytes:

@@ -16,7 +16,7 @@ from typing import Any, Final, Self, TypeAlias
 import zenoh
 import zenoh.ext
 
-from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
+from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name, held_order
 from protocol.clock import Clock, SystemClock
 from protocol.delivery import CLOSE_S, Delivery, FailureLatch, RateCap
 from protocol.endpoint import DEFAULT_ENDPOINT, client_settings, hub_settings
@@ -297,7 +297,7 @@ class ZenohSubscription:
         if history:
             recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
             subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, recovery=recovery)
-            for sample in sorted(self._query(f"{key_expr}/@adv/pub/**"), key=_state_first):
+            for sample in sorted(self._query(f"{key_expr}/@adv/pub/**"), key=_held_order):
                 self._accept(sample)
         else:
             subscriber = session.declare_subscriber(key_expr, ring)
@@ -376,11 +376,8 @@ def _number(sample: zenoh.Sample) -> int:
     return -1 if info is None else info.source_sn
 
 
-def _state_first(sample: zenoh.Sample) -> tuple[bool, str, int]:
-    """Order what publishers hold: topics with only a latest message first, then by key and number."""
-    key = str(sample.key_expr)
-    parsed = parse_key(key)
-    return parsed is None or not parsed[0].latest_only, key, _number(sample)
+def _held_order(sample: zenoh.Sample) -> tuple[bool, int, int]:
+    return (*held_order(str(sample.key_expr), bytes(sample.payload)), _number(sample))
 
 
 class ZenohWatch:

@@ -116,8 +116,8 @@ def status(node: str, uptime_s: float) -> NodeStatus:
     )
 
 
-def depth(stamp_ns: int) -> Depth:
-    return Depth(node="a", stamp_ns=stamp_ns, depth_m=1.0, sigma_m=0.1)
+def depth(stamp_ns: int, node: str = "a") -> Depth:
+    return Depth(node=node, stamp_ns=stamp_ns, depth_m=1.0, sigma_m=0.1)
 
 
 def test_a_message_arrives_as_it_was_sent(client: Connect) -> None:
@@ -174,6 +174,16 @@ def test_a_late_joiner_gets_the_latest_state_before_any_stream(client: Connect) 
         *[(topics.DEPTH, ("a",))] * 3,
     ]
     assert decode(received[0].payload, NodeStatus).uptime_s == 2.0
+
+
+def test_a_late_joiner_gets_two_nodes_messages_by_their_stamps(client: Connect) -> None:
+    node, inbox = client(), Inbox()
+    for name, first in (("b", 1), ("a", 0)):
+        publisher = node.publisher(topics.DEPTH, name)
+        for i in range(first, 100, 2):
+            publisher.put(depth(i, name))
+    client().subscribe("buddyline/node/*/depth", inbox)
+    assert [decode(r.payload, Depth).stamp_ns for r in inbox.wait_for(100)] == list(range(100))
 
 
 def test_without_history_only_what_comes_from_now_on(client: Connect) -> None:
