@@ -6,16 +6,18 @@ import math
 
 import numpy as np
 
+from node.sim.glow import stands_out
 from node.sim.randomness import generator
-from node.sim.scenario import Scenario
 from node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, View
 from protocol.messages import MAX_BLOBS, Blob
 
 
-def in_picture(lamp: Lamp, scenario: Scenario) -> bool:
-    """Tell whether a lamp's image lies inside the picture."""
+def visible(scene: Scene, index: int, view: View, lamp: Lamp) -> bool:
+    """Tell whether a lamp is in the picture, nothing stands before it, and it is bright enough to be seen."""
     u, v = lamp.pixel
-    return bool(-0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5)
+    scenario, camera = scene.scenario, scene.rigs[index].camera
+    inside = -0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5
+    return bool(inside) and not view.hidden(lamp.pixel) and stands_out(lamp, scenario.water, camera.fx_px)
 
 
 def blobs(scene: Scene, index: int, view: View, stamp_ns: int) -> tuple[list[Blob], int]:
@@ -30,7 +32,7 @@ def blobs(scene: Scene, index: int, view: View, stamp_ns: int) -> tuple[list[Blo
     for lamp in (*view.lights, *view.others):
         draw = rng.standard_normal(4)
         missed, gross = rng.random(2) < (scenario.miss_share, scenario.gross_share)
-        if missed or not in_picture(lamp, scenario) or view.hidden(lamp.pixel):
+        if missed or not visible(scene, index, view, lamp):
             continue
         pixel = lamp.pixel + scenario.sigma_px * draw[:2] + gross * scenario.gross_px * draw[2:]
         size_px = 2 + 2 * LAMP_RADIUS_M * scene.rigs[index].camera.fx_px / lamp.range_m

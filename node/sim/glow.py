@@ -32,6 +32,7 @@ FORWARD_SHARE: Final = 0.7
 """Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
 SCALE_PX: Final = 900.0
 """Focal length that the lengths here in pixels belong to; they grow with it."""
+SEEN_SD: Final = 5.0
 GLARE: Final = 0.04
 """Share of a lamp's light that the lens spreads widely."""
 
@@ -53,6 +54,20 @@ def core_px(lamp: Lamp, water: Water, f_px: float) -> float:
     flux = float(flux_px(lamp, water, f_px)[1]) / scale**2
     glare_px: float = scale * (GLARE / (2 * math.pi) * flux) ** 0.4
     return max(glare_px, LAMP_RADIUS_M * f_px / lamp.range_m + BLUR_PX)
+
+
+def stands_out(lamp: Lamp, water: Water, f_px: float) -> bool:
+    """Tell whether a lamp's disc is brighter than the water by more than noise makes a pixel."""
+    size_px, edge_px = _disc_px(lamp, f_px)
+    area_px = math.pi * (size_px**2 + (math.pi * edge_px) ** 2 / 3)
+    light = float(flux_px(lamp, water, f_px).max()) / area_px
+    ambient = max(water.ambient)
+    return 255.0 * (math.sqrt(ambient + light) - math.sqrt(ambient)) > SEEN_SD * water.noise
+
+
+def _disc_px(lamp: Lamp, f_px: float) -> tuple[float, float]:
+    """Return a lamp's radius in the picture and the length over which its edge is blurred."""
+    return LAMP_RADIUS_M * f_px / lamp.range_m * math.sqrt(lamp.stretch), BLUR_PX / 1.702 * lamp.stretch
 
 
 class GlowRenderer:
@@ -146,8 +161,7 @@ class GlowRenderer:
         )
         radiance, rho = self._look_up(table, du, dv)
         radiance *= self._window(rho)[..., None]
-        size_px = LAMP_RADIUS_M * self._f_px / lamp.range_m * math.sqrt(lamp.stretch)
-        edge_px = BLUR_PX / 1.702 * lamp.stretch
+        size_px, edge_px = _disc_px(lamp, self._f_px)
         area_px = math.pi * (size_px**2 + (math.pi * edge_px) ** 2 / 3)
         near = rho < size_px + 14 * edge_px
         disc = 1.0 / (1.0 + np.exp((rho[near] - size_px) / edge_px))

@@ -17,7 +17,7 @@ from node.sim.picture import Painter
 from node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
 from node.sim.rotation import Matrix, Vector
 from node.sim.scenario import Scenario
-from node.sim.scene import Lamp, Scene, View
+from node.sim.scene import Lamp, Scene
 from node.sim.sensors import Sensors
 from protocol.messages import (
     Attitude,
@@ -96,7 +96,7 @@ class World:
                 name=name,
                 u_px=float(lamp.pixel[0]),
                 v_px=float(lamp.pixel[1]),
-                visible=self._visible(view, lamp),
+                visible=candidates.visible(self._scene, index, view, lamp),
                 merged=merged,
             )
             for name, lamp in zip(names, view.lights, strict=True)
@@ -146,9 +146,6 @@ class World:
         """Return the time since the start of a stamp on a node's clock."""
         offset_ns = self.scenario.clock_offset_ns if index == 1 else 0
         return (stamp_ns - offset_ns - self.scenario.start_ns) * 1e-9
-
-    def _visible(self, view: View, lamp: Lamp) -> bool:
-        return candidates.in_picture(lamp, self.scenario) and not view.hidden(lamp.pixel)
 
     def _merged(self, index: int, left: Lamp, right: Lamp) -> bool:
         """Tell whether the clipped cores of two lights are one."""

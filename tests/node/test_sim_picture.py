@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer
+from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, stands_out
 from node.sim.rig import BEAM_RAD, SPILL
 from node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
 from node.sim.scene import Lamp
@@ -77,6 +77,23 @@ def test_the_glow_leans_along_the_beam():
         glow = _linear(renderer, _lamp(np.radians(toe_deg)))[..., 1]
         right, left = glow[:, 450:].sum(), glow[:, :370].sum()
         assert np.sign(np.round(right / left - 1, 2)) == expected
+
+
+def test_a_lamp_is_called_visible_where_its_pixel_stands_out():
+    """The judgement against the rendering: at either side of it the pixel is, and is not, lost in noise."""
+    water = WATERS["lake"]
+    renderer = GlowRenderer(water, 820, 616, 904.0)
+    judged = []
+    for range_m in np.arange(2.0, 30.0, 1.0):
+        lamp = _lamp(np.radians(20), range_m)
+        light = _linear(renderer, lamp)[307:309, 409:411].max(axis=(0, 1))
+        step = 255 * (np.sqrt(light + water.ambient) - np.sqrt(water.ambient)).max()
+        judged.append((stands_out(lamp, water, 904.0), step / water.noise))
+    seen, lost = ([step for told, step in judged if told is answer] for answer in (True, False))
+    assert seen
+    assert lost
+    assert min(seen) > 3
+    assert max(lost) < 10
 
 
 def test_more_turbid_water_has_more_glow_about_a_weaker_light():
