@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, field
 
+from node.geomagnetism import EarthField, earth_field
 from protocol.config import Config, ConfigError, load_config
 from protocol.messages import CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
 
@@ -34,13 +35,19 @@ class DetectorConfig(Config, frozen=True, kw_only=True):
 
 
 class SensorsConfig(Config, frozen=True, kw_only=True):
-    """[sensors]: source of attitude and depth, "simulated", "stored", "i2c" or "none"."""
+    """[sensors]: source of attitude and depth, "simulated", "stored", "i2c" or "none".
+
+    imu, depth: which chips, "auto" or "none". mount_xyzw: board to body. position_deg: latitude and longitude of
+    the dive, for the declination of its day (in place of calibration.declination_rad) and the field's strength.
+    magnetometer: field = matrix (reading - offset), body frame.
+    """
 
     name: str = "simulated"
     imu: str = "auto"
     depth: str = "auto"
     i2c_bus: Annotated[int, Meta(ge=0)] = 1
     mount_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    position_deg: tuple[float, float] | None = None
     water_density_kgpm3: Positive = 997.0
     magnetometer_offset_t: Vector3 = (0.0, 0.0, 0.0)
     magnetometer_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -105,6 +112,18 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         """Time between triggers."""
         return round(1e9 / self.rate_hz)
 
+    def earth_field(self, stamp_ns: int) -> EarthField | None:
+        """Return the Earth's field at sensors.position_deg, None where that is not given."""
+        position_deg = self.sensors.position_deg
+        return None if position_deg is None else earth_field(*position_deg, stamp_ns)
+
+    def declination_rad(self, stamp_ns: int) -> float:
+        """Return what headings are corrected by: of position and day, else as configured."""
+        here = self.earth_field(stamp_ns)
+        if here is not None:
+            return here.declination_rad
+        return self.calibration.declination_rad if self.calibration else 0.0
+
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
         """Return NodeInfo out of [calibration]; raise ConfigError where there is none."""
         calibration = self.calibration
@@ -126,7 +145,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             row_time_ns=row_time_ns,
             q_body_camera_xyzw=calibration.q_body_camera_xyzw,
             depth_port_m=calibration.depth_port_m,
-            declination_rad=calibration.declination_rad,
+            declination_rad=self.declination_rad(stamp_ns),
             software=software,
             config_sha256=sha256,
         )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from statistics import median
 from typing import Final
 
 from node.drivers.samples import STANDARD_GRAVITY_MPS2, DepthSample
+from protocol.clock import S_NS
 
 FRESH_KGPM3: Final = 997.0
 STANDARD_AIR_PA: Final = 101_325.0
@@ -17,6 +20,7 @@ AIR_PA: Final = (50_000.0, 108_500.0)
 ZERO_SAMPLES: Final = 40
 ZERO_SPREAD_PA: Final = 500.0
 SAME_DAY_PA: Final = 1_500.0
+REMEMBER_NS: Final = 12 * 3600 * S_NS
 
 NOISE_SIGMA_M: Final = 0.01
 ZERO_SIGMA_M: Final = 0.03
@@ -33,25 +37,25 @@ class SurfaceZero:
     """Air pressure at the dive's start: the median of the first two seconds' samples, where that can be air.
 
     remembered_pa: the same day's zero, for a node that starts again under water. surface_pa: the best there
-    is; measured: whether it is of this start.
+    is; complete: whether looking for it is over; measured: whether it was found.
     """
 
     def __init__(self, remembered_pa: float | None = None) -> None:
         self.surface_pa = STANDARD_AIR_PA if remembered_pa is None else remembered_pa
+        self.complete = False
         self.measured = False
         self._remembered_pa = remembered_pa
         self._pressures_pa: list[float] = []
 
     def update(self, sample: DepthSample) -> bool:
-        """Take a sample; return True at the one that sets the zero."""
-        if len(self._pressures_pa) >= ZERO_SAMPLES:
-            return False
-        self._pressures_pa.append(sample.pressure_pa)
-        if len(self._pressures_pa) < ZERO_SAMPLES or not self._is_air():
-            return False
-        self.surface_pa = median(self._pressures_pa)
-        self.measured = True
-        return True
+        """Take a sample; return whether looking is over."""
+        if not self.complete:
+            self._pressures_pa.append(sample.pressure_pa)
+            self.complete = len(self._pressures_pa) >= ZERO_SAMPLES
+            if self.complete and self._is_air():
+                self.surface_pa = median(self._pressures_pa)
+                self.measured = True
+        return self.complete
 
     def _is_air(self) -> bool:
         pressures_pa = self._pressures_pa
@@ -64,3 +68,22 @@ class SurfaceZero:
         """Return the standard deviation of a depth."""
         zeroed = self.measured or self._remembered_pa is not None
         return math.hypot(NOISE_SIGMA_M, ZERO_SIGMA_M if zeroed else UNZEROED_SIGMA_M, SCALE_SIGMA * depth_m)
+
+
+def save_zero(path: Path, stamp_ns: int, surface_pa: float) -> None:
+    """Keep a zero for the rest of the day; raise OSError where it cannot be written."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = path.with_suffix(".new")
+    fresh.write_text(json.dumps({"stamp_ns": stamp_ns, "surface_pa": surface_pa}))
+    fresh.replace(path)
+
+
+def load_zero(path: Path, now_ns: int) -> float | None:
+    """Return the zero that was kept less than half a day ago, or None."""
+    try:
+        kept = json.loads(path.read_text())
+        stamp_ns, surface_pa = int(kept["stamp_ns"]), float(kept["surface_pa"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    fresh = 0 <= now_ns - stamp_ns <= REMEMBER_NS
+    return surface_pa if fresh and AIR_PA[0] < surface_pa < AIR_PA[1] else None

@@ -15,6 +15,7 @@ from protocol.clock import Clock, SystemClock
 from protocol.errors import BuddylineError
 
 AUTO: Final = "auto"
+NONE: Final = "none"
 
 # In the order in which `auto` looks: nine axes before six.
 IMUS: Final[Mapping[str, str]] = {
@@ -42,7 +43,7 @@ def open_imu(
     R_body_chip: (3, 3), maps the board's axes to the body's; default: they are the same.
     Raises DeviceError where it is not on the bus.
     """
-    _check_name("imu", name, (AUTO, *IMUS))
+    _check_name("sensors.imu", name, (AUTO, *IMUS))
     R = np.eye(3) if R_body_chip is None else R_body_chip
     for candidate in IMUS if name == AUTO else [name]:
         device: Any = _load(IMUS[candidate]).find(candidate, bus, R, clock or SystemClock())
@@ -59,15 +60,21 @@ def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> Dep
 
     Returns once the PROM has been read, after 10 ms. Raises DeviceError where it cannot be.
     """
-    _check_name("depth", name, tuple(DEPTHS))
+    _check_name("sensors.depth", name, tuple(DEPTHS))
     target, model = DEPTHS[name]
     device: DepthDevice = _load(target).open(bus, model, clock or SystemClock())
     return device
 
 
+def check_names(imu: str, depth: str) -> None:
+    """Raise BuddylineError where a configured name is none; NONE leaves the sensor out."""
+    _check_name("sensors.imu", imu, (AUTO, *IMUS, NONE))
+    _check_name("sensors.depth", depth, (*DEPTHS, NONE))
+
+
 def _check_name(kind: str, name: str, known: tuple[str, ...]) -> None:
     if name not in known:
-        raise BuddylineError(f"{kind} {name!r}: known are {', '.join(known)}")
+        raise BuddylineError(f"{kind} = {name!r}: known are {', '.join(known)}")
 
 
 def _load(target: str) -> Any:

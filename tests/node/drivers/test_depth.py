@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from node.drivers.depth import STANDARD_AIR_PA, ZERO_SAMPLES, SurfaceZero, depth_m
+from node.drivers.depth import STANDARD_AIR_PA, ZERO_SAMPLES, SurfaceZero, depth_m, load_zero, save_zero
 from node.drivers.samples import DepthSample
 
 
@@ -26,7 +26,7 @@ def test_zero_is_the_median_of_two_seconds_of_air():
     zero = SurfaceZero()
     told = feed(zero, [95_000.0 + (i % 3 - 1) * 20.0 for i in range(ZERO_SAMPLES - 1)] + [95_400.0] * 100)
     assert told.index(True) == ZERO_SAMPLES - 1
-    assert sum(told) == 1
+    assert all(told[ZERO_SAMPLES:])
     assert zero.measured
     assert zero.surface_pa == 95_000.0
 
@@ -59,3 +59,26 @@ def test_sigma_grows_with_depth():
     feed(zero, [101_000.0] * ZERO_SAMPLES)
     assert zero.sigma_m(0.0) < 0.04
     assert 0.08 < zero.sigma_m(30.0) < 0.12
+
+
+HOUR_NS = 3600 * 10**9
+
+
+def test_a_zero_is_kept_for_half_a_day(tmp_path):
+    path = tmp_path / "dives" / "a-surface.json"
+    save_zero(path, 100 * HOUR_NS, 98_765.0)
+    assert load_zero(path, 101 * HOUR_NS) == 98_765.0
+    assert load_zero(path, 113 * HOUR_NS) is None
+    assert load_zero(path, 99 * HOUR_NS) is None
+    assert [p.name for p in path.parent.iterdir()] == ["a-surface.json"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"stamp_ns": 1}', '{"stamp_ns": 1, "surface_pa": 3e5}'])
+def test_a_damaged_file_is_no_zero(tmp_path, text):
+    path = tmp_path / "zero.json"
+    path.write_text(text)
+    assert load_zero(path, 2) is None
+
+
+def test_no_file_is_no_zero(tmp_path):
+    assert load_zero(tmp_path / "zero.json", 2) is None

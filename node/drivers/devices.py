@@ -1,0 +1,266 @@
+"""Chips on the I2C bus as a node's sensors: two threads, one bus, and going on when a chip does not."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from msgspec import UNSET
+
+from node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
+from node.config import NodeConfig
+from node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
+from node.drivers.i2c import I2cBus
+from node.drivers.registry import NONE, check_names, open_depth, open_imu
+from node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
+from node.geomagnetism import MagnetometerCalibration
+from protocol.clock import MS_NS, S_NS, Clock
+from protocol.messages import Attitude, Depth, Imu, Message, Vector3
+
+log = logging.getLogger(__name__)
+
+IMU_PERIOD_NS: Final = 10 * MS_NS
+LONGEST_WAIT_NS: Final = 50 * MS_NS
+REOPEN_NS: Final = 2 * S_NS
+
+
+class Health:
+    """Says once what went wrong with a device and once that it is back. problem: "" where all is well."""
+
+    def __init__(self, name: str) -> None:
+        self.problem = ""
+        self._name = name
+
+    def update(self, problem: str) -> None:
+        """Take note of how it is now."""
+        if problem and not self.problem:
+            log.warning("%s: %s", self._name, problem)
+        elif self.problem and not problem:
+            log.info("%s: back to normal", self._name)
+        self.problem = problem
+
+
+class Metronome:
+    """Keeps a loop to a period on a clock that may be set while it runs."""
+
+    def __init__(self, period_ns: int, clock: Clock) -> None:
+        self._period_ns = period_ns
+        self._clock = clock
+        self._next_ns = clock.now_ns()
+
+    def wait(self, stop: threading.Event) -> bool:
+        """Wait for the next turn, at most a period; return True where stop is set."""
+        now_ns = self._clock.now_ns()
+        self._next_ns += self._period_ns
+        if not now_ns <= self._next_ns <= now_ns + self._period_ns:
+            self._next_ns = now_ns + self._period_ns
+        return self._clock.wait_until_ns(self._next_ns, stop)
+
+
+class ImuSource:
+    """The inertial unit at 100 Hz, and the attitude that follows from it."""
+
+    name = "imu"
+
+    def __init__(
+        self,
+        node: str,
+        bus: I2cBus,
+        open_device: Callable[[], ImuDevice],
+        attitude: AttitudeEstimator,
+        clock: Clock,
+    ) -> None:
+        self._node = node
+        self._bus = bus
+        self._open = open_device
+        self._attitude = attitude
+        self._clock = clock
+        self._device: ImuDevice | None = None
+        self._turn = Metronome(IMU_PERIOD_NS, clock)
+        self._health = Health(self.name)
+        self._compass = Health("compass")
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with it, "" where nothing is."""
+        return "; ".join(filter(None, (self._health.problem, self._compass.problem)))
+
+    def next_messages(self, stop: threading.Event) -> list[Message] | None:
+        """Wait for the next sample."""
+        while not self._turn.wait(stop):
+            try:
+                if self._device is None:
+                    self._device = self._open()
+                sample = self._device.read()
+            except DeviceError as error:
+                self._health.update(str(error))
+                if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
+                    return None
+                continue
+            self._health.update(self._device.problem)
+            return self._messages(sample)
+        return None
+
+    def _messages(self, sample: ImuSample) -> list[Message]:
+        messages: list[Message] = [
+            Imu(
+                node=self._node,
+                stamp_ns=sample.stamp_ns,
+                accel_mps2=_triple(sample.accel_mps2),
+                gyro_radps=_triple(sample.gyro_radps),
+                mag_t=UNSET if sample.mag_t is None else _triple(sample.mag_t),
+            )
+        ]
+        estimate = self._attitude.update(sample)
+        if estimate is not None:
+            self._compass.update(estimate.problem)
+            messages.append(
+                Attitude(
+                    node=self._node,
+                    stamp_ns=estimate.stamp_ns,
+                    q_ned_body_xyzw=estimate.q_ned_body_xyzw,
+                    sigma_rad=estimate.sigma_rad,
+                )
+            )
+        return messages
+
+    def close(self) -> None:
+        """Free the bus, for all of its sources."""
+        self._bus.close()
+
+
+class DepthSource:
+    """The pressure sensor, and the depth that follows from it once the surface is known."""
+
+    name = "depth"
+
+    def __init__(
+        self,
+        node: str,
+        bus: I2cBus,
+        open_device: Callable[[], DepthDevice],
+        density_kgpm3: float,
+        zero_path: Path,
+        clock: Clock,
+    ) -> None:
+        self._node = node
+        self._bus = bus
+        self._open = open_device
+        self._density_kgpm3 = density_kgpm3
+        self._zero_path = zero_path
+        self._zero = SurfaceZero(load_zero(zero_path, clock.now_ns()))
+        self._clock = clock
+        self._device: DepthDevice | None = None
+        self._health = Health(self.name)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with it, "" where nothing is."""
+        return self._health.problem
+
+    def next_messages(self, stop: threading.Event) -> list[Message] | None:
+        """Wait for the next sample."""
+        while not self._wait(stop):
+            try:
+                if self._device is None:
+                    self._device = self._open()
+                sample = self._device.step(self._clock.now_ns())
+            except DeviceError as error:
+                self._health.update(str(error))
+                if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
+                    return None
+                continue
+            if sample is None:
+                continue
+            self._health.update("")
+            if self._zero.complete or self._find_zero(sample):
+                return [self._message(sample)]
+        return None
+
+    def _wait(self, stop: threading.Event) -> bool:
+        """Wait until the device has something to do, and no longer than that can be: the clock may be set."""
+        if self._device is None:
+            return stop.is_set()
+        now_ns = self._clock.now_ns()
+        return self._clock.wait_until_ns(min(self._device.next_due_ns, now_ns + LONGEST_WAIT_NS), stop)
+
+    def _find_zero(self, sample: DepthSample) -> bool:
+        """Return whether looking for the surface is over."""
+        zero = self._zero
+        if not zero.update(sample):
+            return False
+        if zero.measured:
+            log.info("%s: surface at %.0f Pa", self.name, zero.surface_pa)
+            try:
+                save_zero(self._zero_path, sample.stamp_ns, zero.surface_pa)
+            except OSError as error:
+                log.warning("%s: surface not kept for a restart: %s", self.name, error)
+        else:
+            log.warning("%s: not started in calm air: surface taken at %.0f Pa", self.name, zero.surface_pa)
+        return True
+
+    def _message(self, sample: DepthSample) -> Depth:
+        depth = depth_m(sample.pressure_pa, self._zero.surface_pa, self._density_kgpm3)
+        return Depth(
+            node=self._node,
+            stamp_ns=sample.stamp_ns,
+            depth_m=depth,
+            sigma_m=self._zero.sigma_m(depth),
+            pressure_pa=sample.pressure_pa,
+            temperature_degc=sample.temperature_degc,
+        )
+
+    def close(self) -> None:
+        """Free the bus, for all of its sources."""
+        self._bus.close()
+
+
+def _triple(vector: Vector) -> Vector3:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSource]:
+    """Open the bus and the sensors on it; "none" leaves one out.
+
+    A chip that does not answer is looked for again every two seconds; a bus that is not there, or a name that
+    nobody knows, is an error.
+    """
+    sensors = config.sensors
+    check_names(sensors.imu, sensors.depth)
+    calibration = MagnetometerCalibration(
+        np.array(sensors.magnetometer_offset_t), np.array(sensors.magnetometer_matrix)
+    )
+    x, y, z, w = sensors.mount_xyzw
+    R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]))
+    sources: list[ImuSource | DepthSource] = []
+    bus = I2cBus(sensors.i2c_bus)
+    try:
+        if sensors.imu != NONE:
+            now_ns = clock.now_ns()
+            # What an uncalibrated magnetometer reads would never be the field of the place.
+            here = None if calibration.is_none else config.earth_field(now_ns)
+            attitude = VqfAttitude(calibration, here, config.declination_rad(now_ns))
+            sources.append(
+                ImuSource(config.node, bus, lambda: open_imu(bus, sensors.imu, R_body_chip, clock), attitude, clock)
+            )
+        if sensors.depth != NONE:
+            zero_path = Path(config.record.directory) / f"{config.node}-surface.json"
+            sources.append(
+                DepthSource(
+                    config.node,
+                    bus,
+                    lambda: open_depth(bus, sensors.depth, clock),
+                    sensors.water_density_kgpm3,
+                    zero_path,
+                    clock,
+                )
+            )
+    except BaseException:
+        bus.close()
+        raise
+    return sources

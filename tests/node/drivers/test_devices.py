@@ -1,0 +1,277 @@
+"""Sources over chips on the wire: messages, rates, and what happens when a chip or the clock misbehaves."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
+from node.drivers.devices import Metronome, open_sensors
+from node.drivers.ms5837 import compensate_30ba
+from node.drivers.samples import DeviceError
+from protocol.clock import MS_NS, S_NS, ManualClock
+from protocol.errors import BuddylineError
+from protocol.messages import Attitude, CameraModel, Depth, Imu, encode
+from tests.node.drivers import wire
+from tests.node.drivers.wire import Adapter, Sky
+
+NEVER = threading.Event()
+
+
+def d1_for(pressure_pa: float) -> int:
+    """Raw pressure of the data sheet's chip at its own temperature; found by bisection."""
+    low, high = 1, 2**24 - 1
+    while low < high:
+        middle = (low + high) // 2
+        if compensate_30ba(wire.WORDS_30BA[1:], middle, wire.D2_30BA)[0] * 10.0 < pressure_pa:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@pytest.fixture
+def sky() -> Sky:
+    return Sky()
+
+
+@pytest.fixture
+def gauge(adapter: Adapter, clock: ManualClock) -> wire.Ms5837Wire:
+    chip = wire.Ms5837Wire(clock, wire.WORDS_30BA, d1_for(101_000.0), wire.D2_30BA)
+    adapter.chips[0x76] = chip
+    return chip
+
+
+@pytest.fixture
+def board(adapter: Adapter, sky: Sky) -> dict[int, wire.StWire]:
+    chips = {0x6B: wire.lsm6ds(sky, 0x6C), 0x1E: wire.lis3mdl(sky)}
+    adapter.chips.update(chips)
+    return chips
+
+
+@pytest.fixture
+def config(tmp_path) -> NodeConfig:
+    return NodeConfig(
+        node="a", sensors=SensorsConfig(name="i2c"), record=RecordConfig(directory=str(tmp_path / "dives"))
+    )
+
+
+def collect(source, clock: ManualClock, seconds: float) -> list:
+    """Run a source until the clock has gone on by so much."""
+    end_ns = clock.now_ns() + int(seconds * S_NS)
+    messages: list = []
+    while clock.now_ns() < end_ns:
+        messages += source.next_messages(NEVER) or []
+    return messages
+
+
+pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
+
+
+def test_imu_and_attitude_at_100_hz(config, clock, board, gauge):
+    imu, depth = open_sensors(config, clock)
+    messages = collect(imu, clock, 6.0)
+    samples = [m for m in messages if isinstance(m, Imu)]
+    attitudes = [m for m in messages if isinstance(m, Attitude)]
+    assert len(samples) == 600
+    assert all(b.stamp_ns - a.stamp_ns == 10 * MS_NS for a, b in pairwise(samples))
+    assert 200 < len(attitudes) < 320
+    assert all(encode(m) for m in messages)
+    assert imu.problem == ""
+    x, y, _, _ = attitudes[-1].q_ned_body_xyzw  # level, as the sky's counts have it
+    assert abs(x) + abs(y) < 0.02
+    for source in (imu, depth):
+        source.close()
+
+
+def test_depth_follows_once_the_surface_is_found(config, clock, board, gauge):
+    imu, depth = open_sensors(config, clock)
+    first = depth.next_messages(NEVER)[0]
+    assert isinstance(first, Depth)
+    assert abs(first.depth_m) < 0.02
+    gauge.d1 = d1_for(101_000.0 + 997.0 * 9.80665 * 10.0)
+    dived = collect(depth, clock, 2.0)
+    assert 38 <= len(dived) <= 41
+    assert dived[-1].depth_m == pytest.approx(10.0, abs=0.02)
+    assert dived[-1].sigma_m < 0.06
+    assert encode(dived[-1])
+    imu.close()
+
+
+def test_a_restart_under_water_keeps_the_days_surface(config, clock, board, gauge):
+    imu, depth = open_sensors(config, clock)
+    depth.next_messages(NEVER)
+    imu.close()
+    gauge.d1 = d1_for(101_000.0 + 997.0 * 9.80665 * 0.5)
+    clock.set_ns(clock.now_ns() + 600 * S_NS)
+    imu, depth = open_sensors(config, clock)
+    again = depth.next_messages(NEVER)[0]
+    assert again.depth_m == pytest.approx(0.5, abs=0.02)
+    imu.close()
+
+
+def test_a_disk_that_cannot_be_written_does_not_stop_the_depth(config, clock, board, gauge, monkeypatch, caplog):
+    def refuse(*_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("node.drivers.devices.save_zero", refuse)
+    imu, depth = open_sensors(config, clock)
+    with caplog.at_level(logging.WARNING):
+        assert depth.next_messages(NEVER)
+    assert "Read-only" in caplog.text
+    imu.close()
+
+
+def test_salt_water_is_denser(config, clock, board, gauge):
+    salt = NodeConfig(
+        node="a",
+        sensors=SensorsConfig(name="i2c", water_density_kgpm3=1027.0),
+        record=config.record,
+    )
+    imu, depth = open_sensors(salt, clock)
+    depth.next_messages(NEVER)
+    gauge.d1 = d1_for(101_000.0 + 1027.0 * 9.80665 * 10.0)
+    assert collect(depth, clock, 0.5)[-1].depth_m == pytest.approx(10.0, abs=0.02)
+    imu.close()
+
+
+def test_chips_absent_at_the_start_are_named_and_found_later(config, clock, adapter, sky, caplog):
+    imu, _ = open_sensors(config, clock)
+    stop = threading.Event()
+    plugged = clock.now_ns() + 30 * S_NS
+
+    waits = 0
+    plain = clock.wait_until_ns
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        nonlocal waits
+        waits += 1
+        if clock.now_ns() > plugged and 0x6B not in adapter.chips:
+            adapter.chips.update({0x6B: wire.lsm6ds(sky, 0x6C), 0x1E: wire.lis3mdl(sky)})
+        return plain(instant_ns, event)
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    with caplog.at_level(logging.INFO):
+        messages = imu.next_messages(stop)
+    assert messages
+    assert waits < 60
+    assert caplog.text.count("answers") == 1
+    assert "back to normal" in caplog.text
+    assert imu.problem == ""
+    imu.close()
+
+
+def test_one_sensor_absent_leaves_the_other(config, clock, board):
+    """Depth is looked for every two seconds, each time for a moment only."""
+    imu, depth = open_sensors(config, clock)
+    assert len(collect(imu, clock, 1.0)) >= 100
+    stop = threading.Event()
+    tries = 0
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        nonlocal tries
+        tries += 1
+        if tries == 5:
+            stop.set()
+        return event.is_set()
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    assert depth.next_messages(stop) is None
+    assert "0x76" in depth.problem
+    imu.close()
+
+
+def test_a_nack_in_mid_dive_is_named_and_over(config, clock, board, gauge, caplog):
+    imu, _ = open_sensors(config, clock)
+    collect(imu, clock, 1.0)
+    board[0x6B].absent = True
+    seen = []
+    plain = clock.wait_until_ns
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        seen.append(imu.problem)
+        if len(seen) == 50:
+            board[0x6B].absent = False
+            board[0x6B].power_cycle()
+        return plain(instant_ns, event)
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    with caplog.at_level(logging.INFO):
+        messages = imu.next_messages(NEVER)
+    assert messages
+    assert any("address 0x6b" in problem for problem in seen)
+    assert imu.problem == ""
+    assert caplog.text.count("no answer") == 1
+    imu.close()
+
+
+def test_none_leaves_a_sensor_out(config, clock, adapter):
+    only = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", imu="none"), record=config.record)
+    (depth,) = open_sensors(only, clock)
+    assert depth.name == "depth"
+    depth.close()
+    assert adapter.opened == 0
+
+
+@pytest.mark.parametrize("field", ["imu", "depth"])
+def test_unknown_names_are_refused_at_start(config, clock, adapter, field):
+    wrong = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", **{field: "bno085"}), record=config.record)
+    with pytest.raises(BuddylineError, match=f"sensors.{field} = 'bno085': known are auto"):
+        open_sensors(wrong, clock)
+    assert adapter.opened == 0
+
+
+def test_a_bus_that_is_not_there_is_refused_at_start(config, clock, adapter):
+    wrong = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", i2c_bus=7), record=config.record)
+    with pytest.raises(DeviceError, match="i2c_arm=on"):
+        open_sensors(wrong, clock)
+
+
+def test_the_mount_is_the_configurations(config, clock, board):
+    upside_down = NodeConfig(
+        node="a", sensors=SensorsConfig(name="i2c", mount_xyzw=(1.0, 0.0, 0.0, 0.0)), record=config.record
+    )
+    imu, _ = open_sensors(upside_down, clock)
+    (sample,) = (m for m in imu.next_messages(NEVER) if isinstance(m, Imu))
+    assert sample.accel_mps2[2] > 9.7
+    imu.close()
+
+
+def test_declination_comes_with_the_position(config, clock, adapter):
+    pytest.importorskip("pygeomag", reason="pygeomag is not installed: pip install 'buddyline[pi]'")
+    calibration = CalibrationConfig(
+        camera=CameraModel(model="pinhole", fx_px=600.0, fy_px=600.0, cx_px=410.0, cy_px=308.0, distortion=[0.0] * 5),
+        light_left_m=(-0.44, 0.0, 0.0),
+        light_right_m=(0.44, 0.0, 0.0),
+        declination_rad=0.3,
+    )
+    here = NodeConfig(node="a", sensors=SensorsConfig(position_deg=(59.9, 10.75)), calibration=calibration)
+    info = here.node_info(clock.now_ns(), "", "", 0)
+    assert np.degrees(info.declination_rad) == pytest.approx(4.9, abs=0.5)
+    plain = NodeConfig(node="a", calibration=calibration)
+    assert plain.node_info(clock.now_ns(), "", "", 0).declination_rad == 0.3
+
+
+@pytest.mark.parametrize("step_s", [-3600, -1, 1, 3600])
+def test_the_metronome_outlives_a_clock_that_is_set(clock, step_s):
+    turn = Metronome(10 * MS_NS, clock)
+    for _ in range(5):
+        turn.wait(NEVER)
+    clock.set_ns(clock.now_ns() + step_s * S_NS)
+    before_ns = clock.now_ns()
+    for i in range(1, 6):
+        turn.wait(NEVER)
+        assert clock.now_ns() - before_ns <= i * 10 * MS_NS
+
+
+def test_the_metronome_catches_up_and_does_not_drift(clock):
+    turn = Metronome(10 * MS_NS, clock)
+    start_ns = clock.now_ns()
+    for _ in range(100):
+        turn.wait(NEVER)
+        clock.set_ns(clock.now_ns() + 3 * MS_NS)
+    assert clock.now_ns() - start_ns == 1003 * MS_NS
