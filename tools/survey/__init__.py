@@ -1,0 +1,1 @@
+"""From sightings to a survey: rests, legs, stations, adjustment, and files that surveyors use."""

@@ -1,0 +1,96 @@
+"""Means of readings that are neither independent nor free of outliers, with the standard deviations they deserve."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+OUTLIER_SIGMAS: Final = 4.0
+# Median absolute deviation to standard deviation, of a normal distribution.
+MAD_TO_SIGMA: Final = 1.4826
+# However fast readings come, a held node and a filter's memory make those within this time err alike.
+CORRELATION_S: Final = 1.0
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A value with its standard deviation, in one unit; count: how many readings it is of."""
+
+    value: float
+    sigma: float
+    count: int
+
+
+def inliers(values: Floats, least_sigma: float) -> Bools:
+    """Tell which of values (n,) or (n, k) lie with the others, in every column.
+
+    least_sigma: no scatter below it makes an outlier, so that equal readings but one do not condemn that one.
+    """
+    table = values.reshape(len(values), -1)
+    off = np.abs(table - np.median(table, axis=0))
+    sigma = np.maximum(MAD_TO_SIGMA * np.median(off, axis=0), least_sigma)
+    return np.asarray((off <= OUTLIER_SIGMAS * sigma).all(axis=1))
+
+
+def effective_count(stamps_s: Floats, values: Floats) -> float:
+    """Return how many independent readings a correlated series (n,) is worth, from 1 to n.
+
+    n / (1 + 2 sum of autocorrelations), summed until the first that is not positive (Geyer 1992's initial
+    positive sequence, lag by lag), and never more than one reading in CORRELATION_S.
+    """
+    n = len(values)
+    if n < 2:
+        return float(n)
+    centred = values - values.mean()
+    power = float(centred @ centred)
+    inflation = 1.0
+    if power > 0:
+        for lag in range(1, n // 2 + 1):
+            correlation = float(centred[lag:] @ centred[:-lag]) / power
+            if correlation <= 0:
+                break
+            inflation += 2 * correlation
+    span_s = float(np.ptp(stamps_s))
+    return max(min(n / inflation, span_s / CORRELATION_S + 1, n), 1.0)
+
+
+def mean_of_white(stamps_s: Floats, values: Floats, stated_sigma: float, floor: float) -> Mean:
+    """Return the mean of readings whose stated noise is new in each of them; floor: what no averaging takes away.
+
+    Scatter above what is stated is believed, scatter below it is not.
+    """
+    scatter = float(values.std(ddof=1)) if len(values) > 1 else 0.0
+    count = effective_count(stamps_s, values)
+    sigma = math.hypot(max(scatter, stated_sigma) / math.sqrt(count), floor)
+    return Mean(float(values.mean()), sigma, len(values))
+
+
+def mean_of_slow(stamps_s: Floats, values: Floats, stated_sigma: float, floor: float) -> Mean:
+    """Return the mean of readings whose stated error is partly slow: a compass, a tilt, a gauge.
+
+    What they scatter is the part that averages. What the stated standard deviation says beyond it has not been
+    seen to vary, so it stands for the whole series.
+    """
+    variance = float(values.var(ddof=1)) if len(values) > 1 else 0.0
+    unseen = max(stated_sigma**2 - variance, 0.0)
+    averaged = variance / effective_count(stamps_s, values)
+    return Mean(float(values.mean()), math.sqrt(unseen + averaged + floor**2), len(values))
+
+
+def unwrapped(angles_rad: Floats) -> Floats:
+    """Return angles (n,) within pi of their circular mean, so that they can be averaged."""
+    centre = math.atan2(float(np.sin(angles_rad).mean()), float(np.cos(angles_rad).mean()))
+    turned: Floats = centre + (angles_rad - centre + math.pi) % (2 * math.pi) - math.pi
+    return turned
+
+
+def wrap(angle_rad: float) -> float:
+    """Return an angle within -pi..pi."""
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi

@@ -1,0 +1,312 @@
+"""The project: one TOML file, of which a person writes the upper part and the dives give the lower.
+
+What stands above the line MARKER is kept to the letter; what stands below is made anew from the dives' logs,
+which nobody changes. The file as it was before is kept beside it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+from msgspec import UNSET, Meta, UnsetType, field
+
+from protocol.clock import S_NS
+from protocol.config import Config, ConfigError, load_config
+from protocol.errors import BuddylineError
+from protocol.messages import NodeId, NonNegative, Positive
+from tools.survey.settings import AlarmSettings, SurveySettings
+
+MARKER: Final = "# ---- From the dives, by `buddyline survey legs`: made anew each time. Edit above. ----"
+STATION_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,12}\Z")
+
+
+class About(Config, frozen=True, kw_only=True):
+    """[survey]: what heads every export. instruments: name of an instrument to what it is."""
+
+    name: str = "survey"
+    title: str = ""
+    date: date | UnsetType = UNSET
+    team: list[str] = field(default_factory=list)
+    instruments: dict[str, str] = field(default_factory=dict)
+    notes: str = ""
+
+
+class Place(Config, frozen=True, kw_only=True):
+    """[place]: where the dive is, for the declination; water_level_m: altitude of the surface, where depth
+    is 0; by default from the first fix's altitude and its station's depth, or 0."""
+
+    latitude_deg: Annotated[float, Meta(ge=-90, le=90)] | UnsetType = UNSET
+    longitude_deg: Annotated[float, Meta(ge=-180, le=180)] | UnsetType = UNSET
+    water_level_m: float | UnsetType = UNSET
+    declination_deg: float | UnsetType = UNSET
+    declination_source: str = ""
+    utm_zone: Annotated[str, Meta(pattern=r"^\d{1,2}[NS]$")] | UnsetType = UNSET
+
+
+class FixedPoint(Config, frozen=True, kw_only=True):
+    """[[fix]]: a station known from elsewhere, in metres (UTM where the place names a zone) or in degrees.
+
+    altitude_m: by default from the station's depth. sigma_m: 1 sd, 0 for exact.
+    """
+
+    station: str
+    east_m: float | UnsetType = UNSET
+    north_m: float | UnsetType = UNSET
+    latitude_deg: float | UnsetType = UNSET
+    longitude_deg: float | UnsetType = UNSET
+    altitude_m: float | UnsetType = UNSET
+    sigma_m: NonNegative = 0.0
+    entrance: bool = False
+
+
+class DiveFiles(Config, frozen=True, kw_only=True):
+    """[[dive]]: the solved log and the nodes' own, relative to the project file."""
+
+    logs: list[str]
+    note: str = ""
+
+
+class HandMark(Config, frozen=True, kw_only=True):
+    """[[mark]]: like the bus's Mark, by hand. time: UTC; or seconds from the dive's first fix."""
+
+    node: NodeId
+    time: datetime | UnsetType = UNSET
+    seconds: float | UnsetType = UNSET
+    dive: Annotated[int, Meta(ge=1)] = 1
+    kind: Literal["station", "point", "note"] = "station"
+    name: str = ""
+    note: str = ""
+
+
+class Edit(Config, frozen=True, kw_only=True):
+    """[[edit]]: a person's verdict on a leg, named "from-to" ("3-4"), or on its one repeat that began at start_ns."""
+
+    leg: str
+    start_ns: int | UnsetType = UNSET
+    use: bool = True
+    compass: Literal["both", "fore", "back"] | UnsetType = UNSET
+    note: str = ""
+
+
+class AdjustSettings(Config, frozen=True, kw_only=True):
+    """[adjust]. depth: absolute holds each station at its gauges' mean; readings lets each leg keep its own two."""
+
+    depth: Literal["absolute", "readings"] = "absolute"
+
+
+class Leg(Config, frozen=True, kw_only=True):
+    """[[leg]] and [[point]]: one shot from a station to a station or point, as read; angles magnetic, in degrees.
+
+    azimuth_deg, inclination_deg: by the node at `from`, towards `to`; back_*: by the node at `to`, towards
+    `from`. *_sigma_*: 1 sd. fixes_used, unused: triggers, as ranges; unused: by reason.
+    """
+
+    from_: str = field(name="from")
+    to: str
+    from_node: str
+    to_node: str
+    dive: int = 1
+    start_ns: int
+    end_ns: int
+    distance_m: float
+    distance_sigma_m: Positive
+    azimuth_deg: float | UnsetType = UNSET
+    azimuth_sigma_deg: float | UnsetType = UNSET
+    inclination_deg: float | UnsetType = UNSET
+    inclination_sigma_deg: float | UnsetType = UNSET
+    back_azimuth_deg: float | UnsetType = UNSET
+    back_azimuth_sigma_deg: float | UnsetType = UNSET
+    back_inclination_deg: float | UnsetType = UNSET
+    back_inclination_sigma_deg: float | UnsetType = UNSET
+    depth_from_m: float | UnsetType = UNSET
+    depth_from_sigma_m: float | UnsetType = UNSET
+    depth_to_m: float | UnsetType = UNSET
+    depth_to_sigma_m: float | UnsetType = UNSET
+    field_from_ut: float | UnsetType = UNSET
+    field_to_ut: float | UnsetType = UNSET
+    dip_from_deg: float | UnsetType = UNSET
+    dip_to_deg: float | UnsetType = UNSET
+    heading_gap_deg: float | UnsetType = UNSET
+    disturbed: list[str] = field(default_factory=list)
+    fixes: int
+    fixes_used: str = ""
+    unused: dict[str, str] = field(default_factory=dict)
+    grade: int = 0
+    alarms: list[str] = field(default_factory=list)
+    note: str = ""
+
+    @property
+    def name(self) -> str:
+        """How people and edits call it."""
+        return f"{self.from_}-{self.to}"
+
+    @property
+    def moment(self) -> datetime:
+        """When it began, UTC."""
+        return datetime.fromtimestamp(self.start_ns / S_NS, UTC)
+
+
+class Station(Config, frozen=True, kw_only=True):
+    """[[station]]: depth_m: mean of what the gauges read there; readings: how many legs' gauges."""
+
+    name: str
+    depth_m: float | UnsetType = UNSET
+    depth_sigma_m: float | UnsetType = UNSET
+    readings: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+class Problem(Config, frozen=True, kw_only=True):
+    """[[problem]]: what the dives do not settle, in words."""
+
+    text: str
+
+
+class Project(Config, frozen=True, kw_only=True):
+    """A whole project."""
+
+    survey: About = field(default_factory=About)
+    place: Place = field(default_factory=Place)
+    fix: list[FixedPoint] = field(default_factory=list)
+    dive: list[DiveFiles] = field(default_factory=list)
+    mark: list[HandMark] = field(default_factory=list)
+    edit: list[Edit] = field(default_factory=list)
+    settings: SurveySettings = field(default_factory=SurveySettings)
+    alarms: AlarmSettings = field(default_factory=AlarmSettings)
+    adjust: AdjustSettings = field(default_factory=AdjustSettings)
+    leg: list[Leg] = field(default_factory=list)
+    point: list[Leg] = field(default_factory=list)
+    station: list[Station] = field(default_factory=list)
+    problem: list[Problem] = field(default_factory=list)
+
+    def edit_of(self, leg: Leg) -> Edit | None:
+        """Return what a person said of a leg: of this very repeat, or of the leg."""
+        found = [edit for edit in self.edit if edit.leg == leg.name and edit.start_ns in (UNSET, leg.start_ns)]
+        return max(found, key=lambda edit: edit.start_ns is not UNSET, default=None)
+
+    def used(self, legs: list[Leg]) -> list[Leg]:
+        """Return the legs that nobody has taken out."""
+        return [leg for leg in legs if (edit := self.edit_of(leg)) is None or edit.use]
+
+
+def load_project(path: Path | str) -> Project:
+    """Read a project file; raise ConfigError naming file, field and value."""
+    project = load_config(path, Project)
+    for fix in project.fix:
+        metres = fix.east_m is not UNSET and fix.north_m is not UNSET
+        degrees = fix.latitude_deg is not UNSET and fix.longitude_deg is not UNSET
+        if metres == degrees:
+            raise ConfigError(
+                f"{path}: fix of {fix.station!r}: give east_m and north_m, or latitude_deg and longitude_deg"
+            )
+    names = {leg.name for leg in project.leg}
+    for edit in project.edit:
+        if names and edit.leg not in names:
+            raise ConfigError(f"{path}: edit of leg {edit.leg!r}: no such leg; known: {', '.join(sorted(names))}")
+    return project
+
+
+def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
+    """Put what the dives give below the marker; keep the file as it was as `NAME.1`, `NAME.2`, ..."""
+    old = path.read_text(encoding="utf-8")
+    upper = old.split(MARKER)[0].rstrip("\n")
+    text = f"{upper}\n\n{MARKER}\n{_toml(derived)}"
+    if text == old:
+        return
+    if MARKER in old:
+        number = 1
+        while (kept := path.with_name(f"{path.name}.{number}")).exists():
+            number += 1
+        kept.write_text(old, encoding="utf-8")
+    fresh = path.with_name(f"{path.name}.new")
+    fresh.write_text(text, encoding="utf-8")
+    os.replace(fresh, path)
+
+
+def new_project(path: Path, name: str, logs: list[str]) -> None:
+    """Write a project file to fill in; raise BuddylineError where one exists."""
+    text = TEMPLATE.format(name=_scalar(name), logs=_scalar(logs))
+    try:
+        with open(path, "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise BuddylineError(f"{path}: exists; add the dive to it as another [[dive]]") from None
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+TEMPLATE: Final = """\
+# A survey by Buddyline. Yours to edit, down to the line of dashes.
+
+[survey]
+name = {name}
+title = ""
+team = []
+notes = ""
+
+[survey.instruments]
+# tape = "optical range, calibrated 2026-04-28"
+
+[place]
+# For the declination, with the date of the first dive; or declination_deg = 3.4 and declination_source = "map".
+# latitude_deg = 45.5
+# longitude_deg = 9.2
+# water_level_m = 100.0
+
+# [[fix]]
+# station = "0"
+# latitude_deg = 45.5
+# longitude_deg = 9.2
+# entrance = true
+
+[[dive]]
+logs = {logs}
+
+# [[mark]]            # stations, points and notes by hand
+# node = "b"
+# time = 2026-05-01T10:20:30Z
+# name = "T1"
+# note = "tie-off on the big flake"
+
+# [[edit]]            # a verdict on a leg
+# leg = "3-4"
+# use = false
+# note = "line was moved"
+"""
+
+
+def _toml(tables: dict[str, list[Any]]) -> str:
+    """Write arrays of tables, of structs or dicts whose values are scalars, lists of them, or flat dicts."""
+    lines: list[str] = field(default_factory=list)
+    for name, rows in tables.items():
+        for row in rows:
+            lines.append(f"\n[[{name}]]")
+            values = row if isinstance(row, dict) else msgspec.to_builtins(row)
+            lines += [f"{key} = {_scalar(value)}" for key, value in values.items() if value not in ({}, [], "")]
+    return "\n".join(lines) + "\n"
+
+
+def _scalar(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = "".join(_ESCAPES.get(c) or (c if c.isprintable() else f"\\U{ord(c):08X}") for c in value)
+        return f'"{escaped}"'
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"cannot write {value}")
+        return repr(round(value, 6))
+    if isinstance(value, list):
+        return f"[{', '.join(map(_scalar, value))}]"
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_scalar(key)} = {_scalar(one)}" for key, one in value.items()) + " }"
+    return str(value)
+
+
+_ESCAPES: Final = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}

@@ -1,0 +1,138 @@
+"""Where in a dive both nodes rest: found from the fixes and from what the inertial sensors feel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from tools.survey.averages import Bools, Floats
+from tools.survey.readings import Node, Readings, Stamps
+from tools.survey.settings import SurveySettings
+from tools.survey.sights import Sights
+
+# A speed is the slope over this long; attitude filters wander by a degree or so within it.
+SLOPE_NS: Final = 4_000_000_000
+WANDER_RADPS: Final = 0.006
+# Fixes further apart than this are of two rests, unless the line between the nodes is still the same.
+PAUSE_NS: Final = 5_000_000_000
+# Two lines are the same if they differ by less than this, and this share of the range.
+SAME_M: Final = 0.25
+SAME_SHARE: Final = 0.06
+LEAST_RUN: Final = 3
+FEEL_NS: Final = 500_000_000
+GRAVITY_MPS2: Final = 9.80665
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Fixes at one rest of the pair: chosen (n,) of the dive's; unused: triggers in its time, by reason."""
+
+    chosen: Bools
+    start_ns: int
+    end_ns: int
+    line_m: Floats
+    unused: dict[str, list[int]] = field(default_factory=dict)
+
+
+def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Rest]:
+    """Return the rests of a dive in their order: at least rest_s long, with at least rest_fixes fixes."""
+    held = handled(readings.a, seen.stamps_ns, settings), handled(readings.b, seen.stamps_ns, settings)
+    still = (speeds_mps(seen) < settings.rest_speed_mps + WANDER_RADPS * seen.range_m) & ~held[0] & ~held[1]
+    runs = _merged(_runs(seen.stamps_ns, still), seen)
+    found = []
+    for run in runs:
+        start_ns, end_ns = int(seen.stamps_ns[run[0]]), int(seen.stamps_ns[run[-1]])
+        if len(run) < settings.rest_fixes or end_ns - start_ns < settings.rest_s * 1e9:
+            continue
+        chosen = np.zeros(len(seen.stamps_ns), dtype=bool)
+        chosen[run] = True
+        inside = (seen.stamps_ns >= start_ns) & (seen.stamps_ns <= end_ns) & ~chosen
+        unused = {"moving": seen.triggers[inside].tolist()} if inside.any() else {}
+        for one in readings.rejected:
+            if start_ns <= one.stamp_ns <= end_ns:
+                unused.setdefault(one.reason, []).append(one.trigger)
+        found.append(Rest(chosen, start_ns, end_ns, _line_m(seen, run), unused))
+    return found
+
+
+def same_line(one_m: Floats, other_m: Floats) -> bool:
+    """Tell whether two lines (3,), metres, NED, are between the same two places."""
+    tolerance_m = SAME_M + SAME_SHARE * float(np.linalg.norm(one_m))
+    return bool(np.linalg.norm(one_m - other_m) < tolerance_m)
+
+
+def speeds_mps(seen: Sights) -> Floats:
+    """Return how fast B moves relative to A at each fix, (n,): slope of the line over SLOPE_NS.
+
+    Without any attitude, of the range alone.
+    """
+    line_m = seen.line_m
+    known = np.asarray(~np.isnan(line_m).any(axis=1))
+    value = np.where(known[:, None], line_m, np.column_stack([seen.range_m] + [np.zeros_like(seen.range_m)] * 2))
+    stamps = seen.stamps_ns
+    first = np.searchsorted(stamps, stamps - SLOPE_NS // 2)
+    last = np.searchsorted(stamps, stamps + SLOPE_NS // 2, "right")
+    speed = np.zeros(len(stamps))
+    for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        part = np.flatnonzero(known[start:end] == known[i]) + start
+        if len(part) < 3:
+            continue
+        t_s = (stamps[part] - stamps[i]) / 1e9
+        # Halves' medians: one gross fix makes no motion.
+        middle = len(part) // 2
+        apart_s = float(t_s[middle:].mean() - t_s[:middle].mean())
+        moved_m = np.median(value[part[middle:]], axis=0) - np.median(value[part[:middle]], axis=0)
+        speed[i] = float(np.linalg.norm(moved_m)) / max(apart_s, 1e-3)
+    return speed
+
+
+def handled(node: Node, stamps_ns: Stamps, settings: SurveySettings) -> Bools:
+    """Tell, for each of stamps_ns (n,), whether the node is turned or jolted; False where it has no IMU."""
+    result = np.zeros(len(stamps_ns), dtype=bool)
+    if not len(node.imu_ns):
+        return result
+    turn = np.linalg.norm(node.gyro_radps, axis=1)
+    jolt = np.abs(np.linalg.norm(node.accel_mps2, axis=1) - GRAVITY_MPS2)
+    first = np.searchsorted(node.imu_ns, stamps_ns - FEEL_NS)
+    last = np.searchsorted(node.imu_ns, stamps_ns + FEEL_NS, "right")
+    for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+        if start < end:
+            result[i] = bool(
+                np.median(turn[start:end]) > settings.turn_radps or np.median(jolt[start:end]) > settings.jolt_mps2
+            )
+    return result
+
+
+def _runs(stamps_ns: Stamps, still: Bools) -> list[list[int]]:
+    runs: list[list[int]] = []
+    last = -2
+    for i in np.flatnonzero(still).tolist():
+        close = bool(runs) and int(stamps_ns[i] - stamps_ns[last]) < PAUSE_NS
+        if close and i - last <= 3:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+        last = i
+    return runs
+
+
+def _line_m(seen: Sights, run: list[int]) -> Floats:
+    line_m = seen.line_m[run]
+    if np.isnan(line_m).any():
+        return np.array([float(np.median(seen.range_m[run])), 0.0, 0.0])
+    return np.asarray(np.median(line_m, axis=0))
+
+
+def _merged(runs: list[list[int]], seen: Sights) -> list[list[int]]:
+    """Join neighbouring runs between which nobody has moved: sight was lost, or someone swayed."""
+    merged: list[list[int]] = []
+    for run in runs:
+        if len(run) < LEAST_RUN:
+            continue
+        if merged and same_line(_line_m(seen, merged[-1]), _line_m(seen, run)):
+            merged[-1].extend(run)
+        else:
+            merged.append(run)
+    return merged

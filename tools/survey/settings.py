@@ -1,0 +1,57 @@
+"""What the survey believes and tolerates: the project's [settings], every one with a default."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, field
+
+from protocol.config import Config
+from protocol.messages import NonNegative, Positive, Vector3
+
+
+class SurveySettings(Config, frozen=True, kw_only=True):
+    """How legs are made of a dive.
+
+    procedure: who moves where neither marks nor depths tell: the nodes pass one another in turn (leapfrog), or
+    node `first` stays. first: the node at the first station (default: the pair's first).
+    rest_s, rest_fixes: the least a leg is made of. rest_speed_mps: below it the pair counts as resting.
+    turn_radps, jolt_mps2: gyroscope and accelerometer above which a node is handled, not held.
+    centering_m: 1 sd, how well a node is held at its station, each axis. range_share: 1 sd, error of the ranges'
+    scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging a rest does not take away.
+    compass_common_deg: 1 sd, error of every azimuth alike (declination, mount): it turns the survey as a whole.
+    reference_m: node id to its station's point ([x, y, z], camera frame), where that is not the camera's centre.
+    """
+
+    procedure: Literal["leapfrog", "stay"] = "leapfrog"
+    first: str = ""
+    rest_s: Positive = 4.0
+    rest_fixes: Annotated[int, Meta(ge=3)] = 8
+    rest_speed_mps: Positive = 0.1
+    turn_radps: Positive = 0.6
+    jolt_mps2: Positive = 1.5
+    centering_m: NonNegative = 0.01
+    range_share: NonNegative = 0.0015
+    compass_floor_deg: NonNegative = 0.3
+    tilt_floor_deg: NonNegative = 0.2
+    depth_floor_m: NonNegative = 0.01
+    compass_common_deg: NonNegative = 0.5
+    point_s: Positive = 2.0
+    reference_m: dict[str, Vector3] = field(default_factory=dict)
+
+
+class AlarmSettings(Config, frozen=True, kw_only=True):
+    """When to speak up.
+
+    sights_deg: foresight against backsight. field_share: strength of the magnetic field against the dive's own;
+    dip_deg likewise. heading_deg: the compasses' difference against what the nodes see of each other.
+    depth_sigmas, depth_m: depths against inclination, both exceeded. range_sigmas: of a leg's fixes.
+    """
+
+    sights_deg: Positive = 2.0
+    field_share: Positive = 0.08
+    dip_deg: Positive = 5.0
+    heading_deg: Positive = 4.0
+    depth_sigmas: Positive = 3.0
+    depth_m: Positive = 0.1
+    range_sigmas: Positive = 3.0

@@ -1,0 +1,107 @@
+"""Survex: a survey in diving style with backsights and each leg's sds, or as cartesian vectors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tools.survey.heading import Heading, Reading, heading_of, reading_of
+from tools.survey.lines import Line
+from tools.survey.network import Adjusted, fixed_points, held_depths
+from tools.survey.project import Project
+
+
+def quoted(text: str) -> str:
+    """Return text between quotes, which it must not hold itself."""
+    return '"' + text.replace('"', "'").replace("\n", " ") + '"'
+
+
+def diving(project: Project, adjusted: Adjusted) -> str:
+    """Return .svx text: tape, compass, backcompass and depths; steep legs with clino."""
+    depths = held_depths(project)
+    readings = [(line, reading_of(line, project, depths)) for line in adjusted.lines]
+    body = ["*calibrate depth 0 -1 ; gauges read down, Survex wants altitude", "*units tape depth metres"]
+    body += ["*units compass backcompass clino degrees"]
+    state: dict[str, str] = {}
+    style = ""
+    for line, reading in readings:
+        wanted = (
+            "*data normal from to tape compass backcompass clino ignoreall"
+            if line.by_clino
+            else "*data diving from to tape compass backcompass fromdepth todepth ignoreall"
+        )
+        sds = _sds(reading, line.by_clino)
+        body += [f"*sd {name} {value}" for name, value in sds.items() if state.get(name) != value]
+        state |= sds
+        if wanted != style:
+            body.append(wanted)
+            style = wanted
+        body.append(_row(line, reading))
+    return _file(project, adjusted, heading_of(project, adjusted), body)
+
+
+def _sds(reading: Reading, by_clino: bool) -> dict[str, str]:
+    sds = {"tape": f"{reading.tape_sigma_m:.4f} metres"}
+    if reading.compass_deg is not None:
+        sds["compass"] = f"{reading.compass_sigma_deg:.3f} degrees"
+    if reading.back_deg is not None:
+        sds["backcompass"] = f"{reading.back_sigma_deg:.3f} degrees"
+    if by_clino:
+        sds["clino"] = f"{math.degrees(reading.rise_sigma_m / reading.tape_m):.3f} degrees"
+    else:
+        sds["depth"] = f"{reading.rise_sigma_m / math.sqrt(2):.4f} metres"
+    return sds
+
+
+def _row(line: Line, reading: Reading) -> str:
+    angles = [_angle(reading.compass_deg), _angle(reading.back_deg)]
+    if line.by_clino:
+        last = [f"{reading.clino_deg:+.3f}"]
+    else:
+        last = [f"{reading.depth_from_m:.4f}", f"{reading.depth_to_m:.4f}"]
+    return "\t".join([line.leg.from_, line.leg.to, f"{reading.tape_m:.4f}", *angles, *last, f"; {reading.remark}"])
+
+
+def _angle(angle_deg: float | None) -> str:
+    return "-" if angle_deg is None else f"{angle_deg % 360:07.3f}".replace("360.000", "000.000")
+
+
+def cartesian(project: Project, adjusted: Adjusted) -> str:
+    """Return .svx text of full vectors, grid east, north and up; sds are each axis's own, without correlations."""
+    body = [
+        "; vectors are turned to the grid's north already",
+        "*data cartesian from to easting northing altitude ignoreall",
+    ]
+    if adjusted.grid.north != "magnetic":
+        body.insert(1, "*declination 0 degrees ; not a magnetic one: there is no compass below")
+    for line in adjusted.lines:
+        sigma = np.sqrt(np.diag(line.covariance))
+        body += [f"*sd {axis} {value:.4f} metres" for axis, value in zip(("dx", "dy", "dz"), sigma, strict=True)]
+        values = "\t".join(f"{value:.4f}" for value in line.vector_m)
+        body.append(f"{line.leg.from_}\t{line.leg.to}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
+    return _file(project, adjusted, heading_of(project, adjusted), body, compass=False)
+
+
+def _file(project: Project, adjusted: Adjusted, heading: Heading, body: list[str], *, compass: bool = True) -> str:
+    grid = adjusted.grid
+    fixed = fixed_points(project, grid)
+    entrances = {fix.station for fix in project.fix if fix.entrance}
+    lines = [f"; {heading.title}", f"; {heading.why}", "; Buddyline; from is never swapped with to; sds are 1 sd"]
+    if grid.zone is not None:
+        lines += [f"*cs UTM{grid.zone}", f"*cs out UTM{grid.zone}"]
+    lines += [f"*begin {heading.name}", f"*export {' '.join(fixed)}", f"*title {quoted(heading.title)}"]
+    if heading.date:
+        lines.append(f"*date {heading.date}")
+    lines += [f"*team {quoted(person)}" for person in heading.team]
+    lines += [f"*instrument {kind} {quoted(text)}" for kind, text in heading.instruments.items()]
+    lines += [f"; {note}" for note in heading.notes]
+    for name, (position, sigma_m) in fixed.items():
+        sd = f" {sigma_m:.3f}" if sigma_m else ""
+        lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
+    lines += [f"*entrance {name}" for name in sorted(entrances & set(fixed))]
+    if compass and heading.angle_deg is not None:
+        lines.append(f"*declination {heading.angle_deg:.4f} degrees")
+    for leg, why in adjusted.left_out:
+        lines.append(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}")
+    return "\n".join([*lines, *body, f"*end {heading.name}", ""])
