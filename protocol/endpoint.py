@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from protocol.errors import BuddylineError
 from protocol.messages import MAX_MESSAGE_BYTES
 
+if TYPE_CHECKING:
+    from protocol.security import Tls
+
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
-_ENDPOINT = re.compile(r"tcp/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]{1,5})\Z")
+_ENDPOINT = re.compile(r"(?:tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]{1,5})\Z")
 
 # The lease is how long a link that fell silent is held for alive. A hub that accepts and then does not answer is
 # given up within open_timeout, or a client would be deaf for ten seconds after it thawed.
@@ -25,32 +29,71 @@ _COMMON: Final = {
 }
 
 
-def check_endpoint(endpoint: str) -> str:
-    """Return endpoint; raise BuddylineError where it is not `tcp/<host>:<port>`."""
+def host_and_port(endpoint: str) -> tuple[str, int]:
+    """Return where endpoint is; raise BuddylineError where it is not `tcp/<host>:<port>` or `tls/...`."""
     match = _ENDPOINT.match(endpoint)
     if match is None or not 0 < int(match.group(2)) < 65536:
-        raise BuddylineError(f"endpoint {endpoint!r}: write it as tcp/<host>:<port>, like {DEFAULT_ENDPOINT}")
+        raise BuddylineError(
+            f"endpoint {endpoint!r}: write it as tcp/<host>:<port> (or tls/...), like {DEFAULT_ENDPOINT}"
+        )
+    return match.group(1).strip("[]"), int(match.group(2))
+
+
+def check_endpoint(endpoint: str, tls: Tls | None = None) -> str:
+    """Return endpoint; raise BuddylineError where it is none, or where it and the [tls] table do not agree."""
+    host_and_port(endpoint)
+    if endpoint.startswith("tls/") and tls is None:
+        raise BuddylineError(f"{endpoint}: needs a [tls] table in the configuration (`buddyline keys` makes it)")
+    if endpoint.startswith("tcp/") and tls is not None:
+        raise BuddylineError(
+            f"{endpoint}: is without TLS and the configuration has a [tls] table; write tls/... or leave it out"
+        )
     return endpoint
 
 
-def hub_settings(endpoint: str) -> dict[str, object]:
-    """Return the Zenoh settings of the one process that listens."""
-    return {
+def is_loopback(endpoint: str) -> bool:
+    """Whether endpoint is reached from this machine alone, as far as its name tells."""
+    host, _ = host_and_port(endpoint)
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object] | None = None) -> dict[str, object]:
+    """Return the Zenoh settings of the one process that listens; access: `protocol.access.access_rules`."""
+    settings = {
         "mode": "router",
-        "listen/endpoints": [check_endpoint(endpoint)],
+        "listen/endpoints": [check_endpoint(endpoint, tls)],
         "connect/endpoints": [],
         **_COMMON,
+        **_tls_settings(tls, "listen"),
     }
+    return settings if access is None else {**settings, "access_control": access}
 
 
-def client_settings(endpoint: str, namespace: str | None) -> dict[str, object]:
+def client_settings(endpoint: str, namespace: str | None, tls: Tls | None = None) -> dict[str, object]:
     """Return the Zenoh settings of a client: it connects to endpoint, again and again, and listens nowhere."""
     settings = {
         "mode": "client",
         "listen/endpoints": [],
-        "connect/endpoints": [check_endpoint(endpoint)],
+        "connect/endpoints": [check_endpoint(endpoint, tls)],
         "connect/timeout_ms": 0,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5},
         **_COMMON,
+        **_tls_settings(tls, "connect"),
     }
     return settings if namespace is None else {**settings, "namespace": namespace}
+
+
+def _tls_settings(tls: Tls | None, side: str) -> dict[str, object]:
+    if tls is None:
+        return {}
+    return {
+        "transport/link/tls/root_ca_certificate": tls.ca,
+        f"transport/link/tls/{side}_certificate": tls.certificate,
+        f"transport/link/tls/{side}_private_key": tls.key,
+        "transport/link/tls/enable_mtls": True,
+        # The hub is known by its authority and its certificate's purpose: tethers change their addresses.
+        "transport/link/tls/verify_name_on_connect": False,
+    }

@@ -35,13 +35,16 @@ def buddyline(*words: str, timeout: float = 60.0, cwd: Path | None = None) -> su
 
 
 class Process:
-    """A running command; its stderr is read as it comes, so that a test can wait for a line."""
+    """A running command; its stderr is read as it comes, so that a test can wait for a line.
 
-    def __init__(self, *words: str, cwd: Path | None = None) -> None:
+    prefix: a command that runs it in its own place, as `ip netns exec`.
+    """
+
+    def __init__(self, *words: str, cwd: Path | None = None, prefix: tuple[str, ...] = ()) -> None:
         self.lines: list[str] = []
         self._changed = threading.Condition()
         self._child = subprocess.Popen(
-            [sys.executable, "-m", "tools", *map(str, words)],
+            [*prefix, sys.executable, "-m", "tools", *map(str, words)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

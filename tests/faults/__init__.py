@@ -1,0 +1,1 @@
+"""Faults injected into the real system from outside: `python -m tests.faults`."""

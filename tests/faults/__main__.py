@@ -1,0 +1,67 @@
+"""Inject faults into the real system and print what became of every frame and every trigger.
+
+python -m tests.faults --times 20 [hub node solver viewer stopped link orders]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import statistics
+import sys
+
+from tests.faults.scenarios import SCENARIOS, Report
+
+HEADER = (
+    "| fault | times | published | received | lost | duplicated | out of order | triggers | without outcome "
+    "| outcome twice | poses | recovery median s | worst s |"
+)
+
+
+def row(report: Report) -> str:
+    tally = report.tally
+    cells = [
+        report.fault,
+        len(report.recover_s),
+        tally.published,
+        tally.received,
+        tally.lost,
+        tally.duplicated,
+        tally.disordered,
+        tally.triggers,
+        tally.without_outcome,
+        tally.outcomes_doubled,
+        tally.reasons["pose"],
+        f"{statistics.median(report.recover_s):.2f}",
+        f"{max(report.recover_s):.2f}",
+    ]
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
+    parser.add_argument("faults", nargs="*", choices=[*SCENARIOS, []], help="default: all")
+    parser.add_argument("--times", type=int, default=20)
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    reports = []
+    if not args.json:
+        print(HEADER)
+        print("|" + " --- |" * HEADER[1:].count("|"))
+    for name in args.faults or SCENARIOS:
+        report = SCENARIOS[name](args.times)
+        reports.append(report)
+        if args.json:
+            continue
+        print(row(report), flush=True)
+        print(f"  {dict(report.tally.reasons.most_common())}", file=sys.stderr)
+        for note in report.notes:
+            print(f"  {note}", file=sys.stderr)
+    if args.json:
+        print(json.dumps([dataclasses.asdict(report) for report in reports], indent=2))
+    return 1 if any(report.tally.lost or report.tally.without_outcome for report in reports) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

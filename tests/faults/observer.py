@@ -1,0 +1,158 @@
+"""What a viewer on the bus has seen, and what can be said of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from protocol.bus import Bus, Received
+from protocol.clock import S_NS
+from protocol.divelog import DiveLogReader
+from protocol.messages import Candidates, Message, Rejected, RelativePose, decode
+from protocol.topics import CANDIDATES, POSE, REJECTED, parse_key
+from protocol.zenoh_bus import connect
+
+# What a node exposed in the last moment before it was stopped may not have left it.
+END_NS = S_NS
+
+Frame = tuple[str, str, int]  # node, boot, seq
+Outcome = Rejected | RelativePose
+
+
+def frame_of(message: Candidates) -> Frame:
+    return message.node, message.boot, message.seq
+
+
+@dataclass
+class Tally:
+    """Counts over one run. published: by the nodes' own logs; a trigger's outcome is its pose or rejection."""
+
+    published: int = 0
+    received: int = 0
+    lost: int = 0
+    duplicated: int = 0
+    disordered: int = 0
+    triggers: int = 0
+    without_outcome: int = 0
+    outcomes_doubled: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+
+
+class Observer:
+    """A client of the bus that keeps every frame and every outcome it receives."""
+
+    def __init__(self, endpoint: str) -> None:
+        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
+        assert bus is not None
+        self.bus: Bus = bus
+        self.frames: list[tuple[Candidates, int]] = []
+        self.outcomes: list[tuple[Outcome, int]] = []
+        self._changed = threading.Condition()
+        for topic in (CANDIDATES, POSE, REJECTED):
+            bus.subscribe(topic.key_any(), self._receive, capacity=100_000)
+
+    def close(self) -> None:
+        self.bus.close()
+
+    def _receive(self, received: Received) -> None:
+        parsed = parse_key(received.key)
+        assert parsed is not None
+        message = decode(received.payload, parsed[0].schema)
+        with self._changed:
+            if isinstance(message, Candidates):
+                self.frames.append((message, received.receive_ns))
+            elif isinstance(message, Rejected | RelativePose):
+                self.outcomes.append((message, received.receive_ns))
+            self._changed.notify_all()
+
+    def wait_for_match(self, since_ns: int, timeout_s: float) -> int:
+        """Wait for an outcome out of both nodes' frames of since_ns or later; return when it came, ns."""
+
+        def found() -> int | None:
+            return next(
+                (
+                    received_ns
+                    for outcome, received_ns in reversed(self.outcomes)
+                    if outcome.stamp_ns >= since_ns and _matched(outcome)
+                ),
+                None,
+            )
+
+        with self._changed:
+            received_ns = self._changed.wait_for(found, timeout_s)
+        if received_ns is None:
+            raise TimeoutError(f"no matched trigger within {timeout_s:g} s")
+        first = [r for o, r in self.outcomes if o.stamp_ns >= since_ns and _matched(o)]
+        return min(first)
+
+    def settle(self, quiet_s: float = 3.0, timeout_s: float = 20.0) -> None:
+        """Wait until nothing has come for a while."""
+        ends_s = time.monotonic() + timeout_s
+        with self._changed:
+            while time.monotonic() < ends_s and self._changed.wait(quiet_s):
+                pass
+
+    def tally(self, logs: Iterable[Path]) -> Tally:
+        """Compare with the nodes' own logs, from the first frame of each boot that was on the bus."""
+        frames = [frame_of(message) for message, _ in self.frames]
+        seen = Counter(frames)
+        first: dict[tuple[str, str], int] = {}
+        for node, boot, seq in frames:
+            first[node, boot] = min(seq, first.get((node, boot), seq))
+        messages = [m for path in logs for m in _messages(path) if isinstance(m, Candidates)]
+        ends_ns: dict[str, int] = {}
+        for m in messages:
+            ends_ns[m.node] = max(m.stamp_ns - END_NS, ends_ns.get(m.node, 0))
+        published = set(seen) | {
+            frame_of(m)
+            for m in messages
+            if m.stamp_ns <= ends_ns[m.node] and m.seq >= first.get((m.node, m.boot), m.seq + 1)
+        }
+        triggers = {m.trigger for m, _ in self.frames if m.stamp_ns <= ends_ns[m.node]}
+        outcomes = Counter(o.trigger for o, _ in self.outcomes)
+        return Tally(
+            published=len(published),
+            received=len(seen),
+            lost=len(published - set(seen)),
+            duplicated=len(frames) - len(seen),
+            disordered=_disordered(frames),
+            triggers=len(triggers),
+            without_outcome=sum(1 for trigger in triggers if trigger not in outcomes),
+            outcomes_doubled=sum(count - 1 for count in outcomes.values()),
+            reasons=Counter(o.reason if isinstance(o, Rejected) else "pose" for o, _ in self.outcomes),
+        )
+
+
+def _matched(outcome: Outcome) -> bool:
+    return isinstance(outcome, RelativePose) or outcome.reason not in ("unmatched", "late", "duplicate")
+
+
+def _disordered(frames: list[Frame]) -> int:
+    newest: dict[tuple[str, str], int] = defaultdict(lambda: -1)
+    count = 0
+    for node, boot, seq in frames:
+        count += seq < newest[node, boot]
+        newest[node, boot] = max(seq, newest[node, boot])
+    return count
+
+
+def _messages(path: Path) -> list[Message]:
+    with DiveLogReader(path) as reader:
+        decoded = [record.decode() for record in reader.records(lambda key: key.endswith("/candidates"))]
+    return [message for message in decoded if message is not None]
+
+
+def until(condition: Callable[[], bool], timeout_s: float) -> None:
+    """Wait for what no event announces."""
+    ends_s = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > ends_s:
+            raise TimeoutError
+        time.sleep(0.01)
