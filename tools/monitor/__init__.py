@@ -1,0 +1,1 @@
+"""Watch a pair live, look at a dive again, and report on it."""

@@ -1,0 +1,105 @@
+"""The pair in space: where what is drawn stands, in a frame of north, east and down with A's camera at its origin.
+
+Where A's attitude is unknown A is drawn level, looking north, and the scene says that it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, TypeAlias
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from protocol.messages import Attitude, NodeInfo, RelativePose
+from solver_service.geometry.rotation import matrix_of, quaternion_of
+
+Floats: TypeAlias = NDArray[np.float64]
+
+# A camera that is level and looks north: x right is east, y down is down, z forward is north.
+R_LEVEL: Final[Floats] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+# Half axes of the ellipsoid that holds a position with 95 %, in standard deviations (chi-squared, 3 degrees).
+ELLIPSOID_SD: Final = 2.795
+# Below this the shape could not be told from a point, and its axes are those of rounding.
+MIN_HALF_AXIS_M: Final = 1e-4
+MAX_HALF_AXIS_M: Final = 50.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How A's camera stands: R_s_a maps its frame into the scene's; levelled: by a measured attitude."""
+
+    R_s_a: Floats
+    levelled: bool
+
+    @staticmethod
+    def unknown() -> Frame:
+        """Return A level and looking north, for want of an attitude."""
+        return Frame(R_LEVEL, False)
+
+    def place(self, pose: RelativePose) -> tuple[float, float, float]:
+        """Return B's position in the scene (m)."""
+        if self.levelled and pose.t_ned_m is not UNSET:
+            return pose.t_ned_m
+        x, y, z = (self.R_s_a @ np.array(pose.t_a_b_m)).tolist()
+        return x, y, z
+
+    def turn_b(self, pose: RelativePose) -> Floats:
+        """Return R_s_b: B's camera in the scene."""
+        R_s_b: Floats = self.R_s_a @ matrix_of(np.array(pose.q_a_b_xyzw))
+        return R_s_b
+
+
+def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> Frame:
+    """Return how a camera stands by its mount and its node's attitude."""
+    if info is None or attitude is None:
+        return Frame.unknown()
+    R_s_body = matrix_of(np.array(attitude.q_ned_body_xyzw))
+    return Frame(R_s_body @ matrix_of(np.array(info.q_body_camera_xyzw)), True)
+
+
+def ellipsoid(pose: RelativePose, frame: Frame) -> tuple[Floats, Floats]:
+    """Return the half axes (3,) in m and R_s_axes (3, 3) of the ellipsoid that holds B with 95 %."""
+    covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] = -axes[:, 0]
+    half_m = ELLIPSOID_SD * np.sqrt(np.maximum(variances, 0.0))
+    return np.clip(half_m, MIN_HALF_AXIS_M, MAX_HALF_AXIS_M), frame.R_s_a @ axes
+
+
+def wxyz(R: Floats) -> tuple[float, float, float, float]:
+    """Return a rotation as a quaternion with its real part first."""
+    x, y, z, w = quaternion_of(R).tolist()
+    return w, x, y, z
+
+
+def fields_of_view(info: NodeInfo) -> tuple[float, float]:
+    """Return the camera's vertical field of view (rad) and aspect, as a pinhole would have them."""
+    camera = info.camera
+    return float(2.0 * np.arctan2(0.5 * info.height_px, camera.fy_px)), info.width_px / info.height_px
+
+
+def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
+    """Return eye and target (3,) from which A at the origin and B at t_m are seen side by side, from above.
+
+    aspect: width by height of the view.
+    """
+    target: Floats = 0.5 * t_m
+    across_m = float(np.hypot(t_m[0], t_m[1]))
+    forward = np.array([t_m[0], t_m[1], 0.0]) / across_m if across_m > 1e-3 else np.array([1.0, 0.0, 0.0])
+    aside = np.array([-forward[1], forward[0], 0.0])
+    distance_m = float(np.linalg.norm(t_m)) + 1.5
+    up = np.array([0.0, 0.0, -1.0])
+    if aspect < 1.0:
+        # A phone held upright: one behind the other, in the upper half; the panel covers the lower.
+        return target + distance_m * (0.45 * aside - forward + 0.75 * up), target - 0.45 * distance_m * up
+    return target + distance_m * (0.8 * aside - 0.35 * forward + 0.5 * up), target
+
+
+def age_colours(ages_s: Floats, whole_s: float) -> NDArray[np.uint8]:
+    """Return a colour (n, 3) for each age: bright amber for now, fading into dark blue at whole_s."""
+    share = np.clip(ages_s / whole_s, 0.0, 1.0)[:, None]
+    fresh, old = np.array([255.0, 190.0, 60.0]), np.array([38.0, 70.0, 120.0])
+    return np.asarray(np.round(fresh + (old - fresh) * np.sqrt(share)), np.uint8)
