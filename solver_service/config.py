@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated, cast, get_args
 
 from msgspec import Meta, field
+from msgspec.structs import replace
 
 from protocol.config import Config, ConfigError, load_config
 from protocol.messages import NodeId
+from protocol.security import SOLVER, Tls, check_identity
 from solver_service.geometry.observation import Method, Settings
 
 CHECKS = ("range", "twist", "attitude", "depth")
@@ -16,12 +18,13 @@ METHODS = get_args(Method)
 
 
 class SolveConfig(Config, frozen=True, kw_only=True):
-    """[solve]: method, the checks to use, and the ranges to believe."""
+    """[solve]: method, the checks to use, the ranges to believe; skew_sigma_s: how well the clocks agree, 1 sd."""
 
     method: str = "refined"
     checks: list[str] = field(default_factory=lambda: list(CHECKS))
     range_min_m: Annotated[float, Meta(gt=0)] = 0.5
     range_max_m: Annotated[float, Meta(gt=0)] = 30.0
+    skew_sigma_s: Annotated[float, Meta(ge=0)] = 0.0
 
     def settings(self, source: str) -> Settings:
         """Return what the geometry takes; source: the file, for errors."""
@@ -37,6 +40,7 @@ class SolveConfig(Config, frozen=True, kw_only=True):
             checks=frozenset(self.checks),
             range_min_m=self.range_min_m,
             range_max_m=self.range_max_m,
+            skew_sigma_s=self.skew_sigma_s,
         )
 
 
@@ -46,6 +50,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     nodes: list[NodeId] = field(default_factory=list)
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
+    tls: Tls | None = None
     solve: SolveConfig = field(default_factory=SolveConfig)
 
     def __post_init__(self) -> None:
@@ -56,4 +61,10 @@ class SolverConfig(Config, frozen=True, kw_only=True):
 
 def load_solver_config(path: Path | str | None) -> SolverConfig:
     """Read the solver's TOML file, or take the defaults; raise ConfigError naming file, field and value."""
-    return SolverConfig() if path is None else load_config(path, SolverConfig)
+    if path is None:
+        return SolverConfig()
+    config = load_config(path, SolverConfig)
+    if config.tls is not None:
+        config = replace(config, tls=config.tls.beside(path))
+        check_identity(config.tls, SOLVER)
+    return config

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from typing import Final
 
-from protocol.clock import S_NS
+from msgspec.structs import replace
+
+from protocol.clock import S_NS, trigger_index
 from protocol.messages import (
     Attitude,
     Candidates,
@@ -21,7 +23,8 @@ from protocol.messages import (
     Rejected,
     RelativePose,
 )
-from solver_service.geometry.trigger import Fix, Settings, solve_trigger
+from solver_service.alignment import ClockAlignment
+from solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
 from solver_service.prior import PosePrior
 from solver_service.results import relative_pose, rig_of, sensed_of, view_of
 from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
@@ -37,11 +40,12 @@ MAX_RESOLVED_MEMORY: Final = 8192
 class SolverCore:
     """Matches the frames of nodes a and b, and solves each trigger once.
 
+    clock_offset_ns: b's clock minus a's, where it is known; b's times are brought to a's clock by it.
     `counts` holds what became of the triggers ("solved" and the reasons), `late`, `duplicates`, `foreign`
-    what was not used.
+    what was not used. `alignment` says what the dive tells of the clocks' offset.
     """
 
-    def __init__(self, node_a: str, node_b: str, settings: Settings) -> None:
+    def __init__(self, node_a: str, node_b: str, settings: Settings, clock_offset_ns: int = 0) -> None:
         if node_a == node_b:
             raise ValueError(f"the two nodes have the same id, {node_a!r}")
         self.node_a = node_a
@@ -59,6 +63,8 @@ class SolverCore:
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
         self._prior = PosePrior()
+        self._clock_offset_ns = clock_offset_ns
+        self.alignment = ClockAlignment()
 
     @property
     def received(self) -> tuple[int, int]:
@@ -81,6 +87,8 @@ class SolverCore:
         if stream is None:
             self.foreign += 1
             return []
+        if self._clock_offset_ns and stream is self._b:
+            message = self._on_clock_of_a(message)
         if isinstance(message, NodeInfo):
             stream.add_info(message)
         elif isinstance(message, Attitude):
@@ -128,6 +136,14 @@ class SolverCore:
             self.late += 1
             return [self._reject(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
         return []
+
+    def _on_clock_of_a(self, message: Message) -> Message:
+        stamp_ns = max(getattr(message, "stamp_ns", 0) - self._clock_offset_ns, 0)
+        if not isinstance(message, Candidates):
+            return replace(message, stamp_ns=stamp_ns)
+        info = self._b.info_at(stamp_ns)
+        trigger = trigger_index(stamp_ns, info.trigger_period_ns) if info else message.trigger
+        return replace(message, stamp_ns=stamp_ns, trigger=trigger)
 
     def _pending(self) -> list[int]:
         return sorted(self._a.frames.keys() | self._b.frames.keys())
@@ -190,11 +206,11 @@ class SolverCore:
         stamp_ns = (frame_a.stamp_ns + frame_b.stamp_ns) // 2
         sensed_a = sensed_of(self._a.attitude, self._a.depth, frame_a.stamp_ns)
         sensed_b = sensed_of(self._b.attitude, self._b.depth, frame_b.stamp_ns)
+        rigs = rig_of(info_a), rig_of(info_b)
         outcome = solve_trigger(
             view_of(frame_a),
             view_of(frame_b),
-            rig_of(info_a),
-            rig_of(info_b),
+            *rigs,
             sensed_a,
             sensed_b,
             self.settings,
@@ -203,9 +219,23 @@ class SolverCore:
         if not isinstance(outcome, Fix):
             return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
         self._prior.update(stamp_ns, outcome)
+        self._align(frame_a, frame_b, info_a, info_b, rigs, outcome)
         self._finish(frame_a.trigger)
         self.counts["solved"] += 1
-        return relative_pose(frame_a, frame_b, rig_of(info_a), sensed_a, outcome)
+        return relative_pose(frame_a, frame_b, rigs[0], sensed_a, outcome)
+
+    def _align(
+        self,
+        frame_a: Candidates,
+        frame_b: Candidates,
+        info_a: NodeInfo,
+        info_b: NodeInfo,
+        rigs: tuple[Rig, Rig],
+        fix: Fix,
+    ) -> None:
+        known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
+        sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px
+        self.alignment.add(frame_a.stamp_ns, fix, rigs, known_s, sigma_rad)
 
     def _reject(self, frame: Candidates, reason: Reason, detail: str, stamp_ns: int | None = None) -> Rejected:
         self._finish(frame.trigger, newest=reason != "late")

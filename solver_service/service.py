@@ -30,6 +30,9 @@ PAUSE_S: Final = 2.5
 STALE_S: Final = 2.0
 # Poses of live dives have latencies; those of stored ones do not.
 LIVE_WITHIN_NS: Final = 60 * S_NS
+# The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
+REPORTED_OFFSET_SIGMA_S: Final = 0.003
+TOLERATED_OFFSET_S: Final = 0.005
 BUFFERED_BEFORE_PAIR: Final = 4096
 
 
@@ -66,6 +69,7 @@ class SolverService(Service):
             namespace=self.config.namespace or None,
             stop=self.stop,
             on_wait=lambda text: log.info("solver: %s", text),
+            tls=self.config.tls,
         )
         if bus is None:
             return
@@ -169,6 +173,10 @@ class SolverService(Service):
         if self._reported_bad:
             problems.append(self._reported_bad)
             self._reported_bad = ""
+        offset = core.alignment.estimate()
+        aligned = offset is not None and offset.sigma_s < REPORTED_OFFSET_SIGMA_S
+        if offset is not None and aligned and abs(offset.offset_s) > max(TOLERATED_OFFSET_S, 4 * offset.sigma_s):
+            problems.append(f"clock of {core.node_b} is {offset.offset_s * 1e3:+.1f} ms from that of {core.node_a}")
         latencies_s = sorted(self._latencies_s)
         self._latencies_s.clear()
         received_a, received_b = core.received
@@ -190,5 +198,6 @@ class SolverService(Service):
             latency_p99_s=latencies_s[min(len(latencies_s) * 99 // 100, len(latencies_s) - 1)]
             if latencies_s
             else UNSET,
+            clock_skew_s=offset.offset_s if offset is not None and aligned else UNSET,
             problem="; ".join(problems),
         )

@@ -35,6 +35,12 @@ COMMANDS: Final = (
     ),
     Command("hub", "tools.hub", "run the hub that all others connect to", ("buddyline hub",)),
     Command(
+        "keys",
+        "tools.keys",
+        "make keys and certificates, so that the hub may listen beyond this machine",
+        ("buddyline keys init --hub 192.168.2.1", "buddyline keys node a", "buddyline keys solver"),
+    ),
+    Command(
         "node", "node.__main__", "run one node: camera, sensors, detector, log", ("buddyline node --config a.toml",)
     ),
     Command("solver", "solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)),
@@ -59,6 +65,12 @@ COMMANDS: Final = (
         "tools.solve",
         "solve stored dives offline",
         ("buddyline solve a.mcap b.mcap -o poses.mcap", "buddyline solve dive.mcap -o p.mcap --checks range"),
+    ),
+    Command(
+        "align",
+        "tools.align",
+        "find the offset between the two nodes' clocks from a dive in which they moved",
+        ("buddyline align a.mcap b.mcap",),
     ),
     Command(
         "simulate",

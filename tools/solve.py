@@ -49,6 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NODE=FILE",
         help="calibration in place of the log's: JSON or log",
     )
+    parser.add_argument(
+        "--clock-offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="B's clock minus A's, as `buddyline align` tells it",
+    )
     parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
     parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -59,14 +66,14 @@ def run(args: argparse.Namespace) -> int:
     settings = SolveConfig(method=args.method, checks=[check for check in args.checks.split(",") if check]).settings(
         "--checks"
     )
-    replaced = _replacements(args.info)
+    replaced = replacements(args.info)
     with Dive(args.dives) as dive:
-        node_a, node_b = _pair(dive, args.nodes)
+        node_a, node_b = pair_of(dive, args.nodes)
         infos = dive.infos() | replaced
         for node in (node_a, node_b):
             if node not in infos:
                 raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; give one with --info {node}=FILE")
-        core = SolverCore(node_a, node_b, settings)
+        core = SolverCore(node_a, node_b, settings, round(args.clock_offset * 1e9))
         bad = 0
         began_s = time.monotonic()
         with DiveLogWriter(args.output, metadata={"command": "solve", "method": args.method}) as writer:
@@ -74,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
             with Progress("solve", (dive.end_ns - dive.start_ns) / 1e9) as progress:
-                for key, message, log_time_ns in _messages(dive, args, infos, node_a, node_b):
+                for key, message, log_time_ns in messages_of(dive, args, infos, node_a, node_b):
                     progress.show((log_time_ns - dive.start_ns) / 1e9)
                     if isinstance(message, MessageError):
                         bad += 1
@@ -97,7 +104,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if core.matched else 1
 
 
-def _replacements(given: list[str]) -> dict[str, NodeInfo]:
+def replacements(given: list[str]) -> dict[str, NodeInfo]:
+    """Read the calibrations of `--info NODE=FILE`."""
     replaced = {}
     for text in given:
         node, equals, path = text.partition("=")
@@ -110,7 +118,8 @@ def _replacements(given: list[str]) -> dict[str, NodeInfo]:
     return replaced
 
 
-def _pair(dive: Dive, given: list[str] | None) -> tuple[str, str]:
+def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
+    """Return the pair to solve: the given one, or the dive's two nodes; raise where there is none."""
     present = dive.nodes("candidates", "image")
     if given:
         missing = [node for node in given if node not in present]
@@ -127,7 +136,7 @@ def _pair(dive: Dive, given: list[str] | None) -> tuple[str, str]:
     return present[0], present[1]
 
 
-def _messages(
+def messages_of(
     dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str
 ) -> Iterator[tuple[str, Message | MessageError, int]]:
     """Yield what the solver and the output need, decoded; pictures of a node without candidates are detected."""

@@ -1,0 +1,76 @@
+"""`buddyline align`: the offset between two nodes' clocks, out of a dive in which they moved."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from dataclasses import asdict
+from typing import Final
+
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import MessageError
+from solver_service.alignment import ClockOffset
+from solver_service.config import SolveConfig
+from solver_service.core import SolverCore
+from tools.dives import Dive
+from tools.progress import Progress
+from tools.solve import messages_of, pair_of
+
+log = logging.getLogger(__name__)
+
+# While the clocks may disagree by this much (1 sd), the gaps are judged with that in mind.
+SKEW_SIGMA_S: Final = 0.05
+PASSES: Final = 4
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
+    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
+    parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
+    parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate the offset; return 1 where the dive does not tell it."""
+    with Dive(args.dives) as dive:
+        node_a, node_b = pair_of(dive, args.nodes)
+        offset: ClockOffset | None = None
+        # Each pass brings B's times to A's clock by what the one before found: what is left shrinks to nothing.
+        for number in range(1, PASSES + 1):
+            found = _pass(dive, args, (node_a, node_b), offset.offset_s if offset else 0.0, number)
+            offset = found and ClockOffset(
+                found.offset_s + (offset.offset_s if offset else 0.0), found.sigma_s, found.fixes
+            )
+            if found is None or abs(found.offset_s) < 0.1 * found.sigma_s:
+                break
+    if offset is None:
+        log.error("align: the fixes do not tell the offset: they are too few, or the pair did not move")
+        return 1
+    if args.json:
+        print(json.dumps({"node_a": node_a, "node_b": node_b, **asdict(offset)}))
+    else:
+        print(
+            f"the clock of {node_b} is {offset.offset_s * 1e3:+.2f} ms from that of {node_a} "
+            f"(1 sd {offset.sigma_s * 1e3:.2f} ms, {offset.fixes} fixes)\n"
+            f"solve with it: buddyline solve ... --clock-offset {offset.offset_s:.4f}"
+        )
+    return 0
+
+
+def _pass(
+    dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
+) -> ClockOffset | None:
+    core = SolverCore(*pair, SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align"), round(offset_s * S_NS))
+    with Progress(f"align, pass {number}", (dive.end_ns - dive.start_ns) / S_NS) as progress:
+        for _, message, log_time_ns in messages_of(dive, args, dive.infos(), *pair):
+            progress.show((log_time_ns - dive.start_ns) / S_NS)
+            if not isinstance(message, MessageError):
+                core.handle(message)
+    core.flush()
+    if not core.counts["solved"]:
+        raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
+    return core.alignment.estimate()
