@@ -32,9 +32,19 @@ FORWARD_SHARE: Final = 0.7
 """Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
 SCALE_PX: Final = 900.0
 """Focal length that the lengths here in pixels belong to; they grow with it."""
+PEAK_FORWARDNESS: Final = 0.97
 SEEN_SD: Final = 5.0
 GLARE: Final = 0.04
 """Share of a lamp's light that the lens spreads widely."""
+
+
+def phase(cos_angle: Image, water: Water) -> Image:
+    """Return the share of scattered light per steradian at an angle from straight on: two of Henyey-Greenstein's."""
+    peak, rest = (
+        (1 - g * g) / (4 * math.pi) * (1 + g * g - 2 * g * cos_angle) ** -1.5
+        for g in (PEAK_FORWARDNESS, water.forwardness)
+    )
+    return np.asarray(water.peak_share * peak + (1 - water.peak_share) * rest, np.float32)
 
 
 def through_water(water: Water) -> NDArray[np.float64]:
@@ -117,9 +127,7 @@ class GlowRenderer:
         path_m = (r * (sin_psi.astype(np.float32)[..., None] + np.sin(phi - psi[..., None])) / sin_phi).astype(
             np.float32
         )
-        g = self._water.forwardness
-        phase = (1 - g * g) / (4 * np.pi) * (1 + g * g - 2 * g * cos_phi) ** -1.5
-        weight = self._node_w * phi * span[..., None] * phase * beam(cos_beam)
+        weight = self._node_w * phi * span[..., None] * phase(cos_phi, self._water) * beam(cos_beam, lamp.beam_rad)
         table = np.empty((STEPS, AZIMUTHS, 3), np.float32)
         front = (self._rho[:, None] / (r * sin_psi)).astype(np.float32)
         for channel in range(3):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,15 +16,21 @@ from protocol.messages import CameraModel
 Q_BODY_CAMERA: Final = (0.5, 0.5, 0.5, 0.5)
 R_BODY_CAMERA: Final = rotation.from_quaternion(Q_BODY_CAMERA)
 LEFT, RIGHT = 0, 1
+SPILL: Final = 0.015
 
 
 @dataclass(frozen=True)
 class Rig:
-    """One node as built. lights_m, aims: (2, 3), left and right, in its camera frame; aims are unit vectors."""
+    """One node as built. lights_m, aims: (2, 3), left and right, in its camera frame; aims are unit vectors.
+
+    beams_rad, intensities: (2,), of the lamps: 1 sd of the beam, and how bright on its axis.
+    """
 
     camera: CameraModel
     lights_m: Vector
     aims: Vector
+    beams_rad: Vector
+    intensities: Vector
     depth_port_m: Vector
 
 
@@ -38,15 +43,13 @@ def build(scenario: Scenario, index: int) -> Rig:
     toe_rad = np.radians(rng.uniform(3, 8, 2)) * (-1, 1)
     tilt_rad = np.radians(rng.uniform(-3, 3, 2))
     aims = np.stack([np.sin(toe_rad) * np.cos(tilt_rad), np.sin(tilt_rad), np.cos(toe_rad) * np.cos(tilt_rad)], axis=1)
+    beams_rad = np.radians(rng.uniform(9, 16, 2))
+    intensities = rng.uniform(0.7, 1.4, 2)
     port_m = np.array([0.0, 0.06, -0.12]) if scenario.rig_sigma_m > 0 else np.zeros(3)
-    return Rig(scenario.camera(index), lights_m, aims, port_m)
+    return Rig(scenario.camera(index), lights_m, aims, beams_rad, intensities, port_m)
 
 
-BEAM_RAD: Final = math.radians(10.5)
-SPILL: Final = 0.015
-
-
-def beam(cos_off_axis: Vector) -> Vector:
+def beam(cos_off_axis: Vector, beam_rad: float) -> Vector:
     """Return a lamp's intensity against its axis (1): a Gaussian beam and some spill all around."""
     off_axis_rad2 = 2.0 * (1.0 - cos_off_axis)
-    return np.asarray(SPILL + (1.0 - SPILL) * np.exp(-0.5 * off_axis_rad2 / BEAM_RAD**2))
+    return np.asarray(SPILL + (1.0 - SPILL) * np.exp(-0.5 * off_axis_rad2 / beam_rad**2))

@@ -22,7 +22,8 @@ Bgr: TypeAlias = tuple[float, float, float]
 class Water:
     """Optics and layout of an environment; colours in the order of OpenCV: blue, green, red.
 
-    absorption_per_m, scattering_per_m: coefficients by colour. forwardness: Henyey-Greenstein's g.
+    absorption_per_m, scattering_per_m: coefficients by colour. peak_share: of scattered light that keeps to a
+    narrow peak (turbid water widens it); forwardness: Henyey-Greenstein's g of the rest.
     ambient: radiance of the open water as a share of full scale (0: dark); lamp_gain: exposure, as the radiance
     (share of full scale) that a lamp's light of unit intensity has per steradian. noise: sd in grey levels.
     depth_m: of A; floor_depth_m: of the sea floor, 0 where none is in view. density_kgpm3: for pressure.
@@ -31,6 +32,7 @@ class Water:
 
     absorption_per_m: Bgr
     scattering_per_m: Bgr
+    peak_share: float
     forwardness: float
     ambient: Bgr
     lamp_gain: float
@@ -46,20 +48,20 @@ class Water:
 
 WATERS: Final[dict[str, Water]] = {
     "cavern": Water(
-        (0.05, 0.06, 0.40), (0.015, 0.015, 0.015), 0.90, (0.0, 0.0, 0.0), 8.0, 2.4, 13.0, 0.0, 998.0, 12, 0, 0, 9.0
+        (0.05, 0.06, 0.40), (0.03, 0.03, 0.03), 0.5, 0.85, (0.0, 0.0, 0.0), 5.0, 2.4, 13.0, 0.0, 998.0, 12, 0, 0, 9.0
     ),
     "night_reef": Water(
-        (0.06, 0.07, 0.42), (0.09, 0.09, 0.09), 0.90, (0.0, 0.0, 0.0), 0.5, 2.4, 8.0, 0.0, 1025.0, 30, 0, 0, 9.0
+        (0.06, 0.07, 0.42), (0.12, 0.12, 0.12), 0.5, 0.85, (0.0, 0.0, 0.0), 0.4, 2.4, 8.0, 0.0, 1025.0, 30, 0, 0, 9.0
     ),
     "lake": Water(
-        (0.55, 0.25, 0.38), (0.85, 0.85, 0.85), 0.75, (0.12, 0.28, 0.21), 0.40, 1.2, 2.6, 0.0, 998.0, 18, 0, 0, 4.5
+        (0.75, 0.22, 0.45), (0.9, 0.9, 0.9), 0.1, 0.75, (0.12, 0.28, 0.21), 0.22, 1.2, 2.6, 0.0, 998.0, 18, 0, 0, 4.5
     ),
     "basin": Water(
-        (0.05, 0.05, 0.22), (0.08, 0.08, 0.08), 0.85, (0.12, 0.11, 0.06), 0.12, 1.4, 2.2, 5.0, 998.0, 8, 1.0,
+        (0.05, 0.05, 0.22), (0.08, 0.08, 0.08), 0.5, 0.85, (0.12, 0.11, 0.06), 0.12, 1.4, 2.2, 5.0, 998.0, 8, 1.0,
         1.0, 10.0,
     ),
     "day_reef": Water(
-        (0.05, 0.08, 0.40), (0.10, 0.10, 0.10), 0.85, (0.24, 0.20, 0.02), 0.10, 1.4, 8.0, 11.0, 1025.0, 14, 0.8,
+        (0.05, 0.08, 0.40), (0.10, 0.10, 0.10), 0.5, 0.85, (0.24, 0.20, 0.02), 0.10, 1.4, 8.0, 11.0, 1025.0, 14, 0.8,
         0.0, 9.0,
     ),
 }  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -21,16 +21,28 @@ PASSING_SHARE = 0.6
 
 
 @dataclass(frozen=True)
-class Lamp:
-    """A lamp before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture.
+class Source:
+    """A lamp in the water, in NED. intensity: on its axis; beam_rad: 1 sd of its beam.
 
-    intensity: on its axis. stretch: how much ripples draw its image out, up and down (a reflection), 1 for none.
+    stretch: how much ripples draw its image out, up and down (a reflection), 1 for none.
     """
+
+    position_ned_m: Vector
+    aim_ned: Vector
+    intensity: float
+    beam_rad: float
+    stretch: float = 1.0
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A Source before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture."""
 
     position_m: Vector
     aim: Vector
     pixel: Vector
-    intensity: float = 1.0
+    intensity: float
+    beam_rad: float
     stretch: float = 1.0
 
     @property
@@ -41,7 +53,7 @@ class Lamp:
     @property
     def towards_camera(self) -> float:
         """Intensity in the camera's direction."""
-        return self.intensity * float(beam(np.array(-self.position_m @ self.aim / self.range_m)))
+        return self.intensity * float(beam(np.array(-self.position_m @ self.aim / self.range_m), self.beam_rad))
 
 
 @dataclass(frozen=True)
@@ -96,52 +108,56 @@ class Scene:
         placement = self.motion.placement(index, t_s)
         lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))
         other_a_b = self.motion.placement(0, t_s), self.motion.placement(1, t_s)
-        others = [self._lamp(index, placement, *diver.lamp(other_a_b, t_s), diver.intensity) for diver in self._divers]
+        sources = [diver.source(other_a_b, t_s) for diver in self._divers]
         if self.scenario.water.surface > 0:
-            others += [self._reflection(index, placement, side, t_s) for side in (LEFT, RIGHT)]
-        return View(placement, (lights[0], lights[1]), tuple(others), self._passers(index, t_s, lights))
+            sources += [self._reflection(1 - index, side, t_s) for side in (LEFT, RIGHT)]
+        others = tuple(self._seen(index, placement, source) for source in sources)
+        return View(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights))
 
     def _light(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
-        lamp = self._lamp(index, placement, *self._light_ned(1 - index, side, t_s))
+        lamp = self._seen(index, placement, self._source(1 - index, side, t_s))
         row_time_ns = self.scenario.row_time_ns
         if row_time_ns == 0 or math.isnan(lamp.pixel[1]):
             return lamp
         for _ in range(2):
             row_s = t_s + self.row_delay_s(float(lamp.pixel[1]))
-            lamp = self._lamp(index, self.motion.placement(index, row_s), *self._light_ned(1 - index, side, row_s))
+            lamp = self._seen(index, self.motion.placement(index, row_s), self._source(1 - index, side, row_s))
         return lamp
 
     def row_delay_s(self, v_px: float) -> float:
         """Return when a row is exposed, against the middle row."""
         return (v_px - (self.scenario.height_px - 1) / 2) * self.scenario.row_time_ns * 1e-9
 
-    def _light_ned(self, index: int, side: int, t_s: float) -> tuple[Vector, Vector]:
-        """Return a node's light and its aim in NED."""
+    def _source(self, index: int, side: int, t_s: float) -> Source:
+        """Return a node's own light."""
         placement, rig = self.motion.placement(index, t_s), self.rigs[index]
         R_ned_camera = placement.R_ned_body @ R_BODY_CAMERA
-        return placement.position_ned_m + R_ned_camera @ rig.lights_m[side], R_ned_camera @ rig.aims[side]
+        return Source(
+            placement.position_ned_m + R_ned_camera @ rig.lights_m[side],
+            R_ned_camera @ rig.aims[side],
+            float(rig.intensities[side]),
+            float(rig.beams_rad[side]),
+        )
 
-    def _lamp(
-        self,
-        index: int,
-        placement: Placement,
-        position_ned_m: Vector,
-        aim_ned: Vector,
-        intensity: float = 1.0,
-        stretch: float = 1.0,
-    ) -> Lamp:
-        R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
-        position_m = R_camera_ned @ (position_ned_m - placement.position_ned_m)
-        pixel = project(position_m[None], self.rigs[index].camera)[0]
-        return Lamp(position_m, R_camera_ned @ aim_ned, pixel, intensity, stretch)
-
-    def _reflection(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
+    def _reflection(self, index: int, side: int, t_s: float) -> Source:
         """Return a light's mirror image in the surface; ripples move it and draw it out."""
-        position_m, aim = self._light_ned(1 - index, side, t_s)
+        source = self._source(index, side, t_s)
         mirror = np.array([1.0, 1.0, -1.0])
-        ripple_m = 0.05 * self._ripple[side][0](t_s), 0.05 * self._ripple[side][1](t_s)
-        wobble = np.array([ripple_m[0], ripple_m[0], ripple_m[1]])
-        return self._lamp(index, placement, position_m * mirror + wobble, aim * mirror, 0.25, 3.0)
+        across_m, up_m = (0.05 * ripple(t_s) for ripple in self._ripple[side])
+        return replace(
+            source,
+            position_ned_m=source.position_ned_m * mirror + [across_m, across_m, up_m],
+            aim_ned=source.aim_ned * mirror,
+            intensity=0.25 * source.intensity,
+            stretch=3.0,
+        )
+
+    def _seen(self, index: int, placement: Placement, source: Source) -> Lamp:
+        """Return a lamp as A (0) or B (1) sees it."""
+        R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
+        position_m = R_camera_ned @ (source.position_ned_m - placement.position_ned_m)
+        pixel = project(position_m[None], self.rigs[index].camera)[0]
+        return Lamp(position_m, R_camera_ned @ source.aim_ned, pixel, source.intensity, source.beam_rad, source.stretch)
 
     def _passers(self, index: int, t_s: float, lights: tuple[Lamp, ...]) -> tuple[Passer, ...]:
         if not self.scenario.interruptions or self.scenario.trajectory == "rest":
@@ -192,15 +208,16 @@ class _Diver:
     """Another diver with one lamp, who swims to and fro beside the line between the nodes."""
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
-        self.intensity = float(rng.uniform(0.3, 1.0))
+        self._intensity = float(rng.uniform(0.3, 1.0))
+        self._beam_rad = math.radians(rng.uniform(8, 20))
         self._along = float(rng.uniform(0.2, 0.9))
         self._side_m = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.8, 2.2))
         self._climb_m = float(rng.uniform(-0.8, 0.8))
         self._ways = [Sway(rng, 12.0, 40.0) for _ in range(3)]
         self._aims = [Sway(rng, 6.0, 25.0) for _ in range(2)]
 
-    def lamp(self, nodes: tuple[Placement, Placement], t_s: float) -> tuple[Vector, Vector]:
-        """Return the lamp's position and aim in NED."""
+    def source(self, nodes: tuple[Placement, Placement], t_s: float) -> Source:
+        """Return the lamp."""
         start_m, end_m = (node.position_ned_m for node in nodes)
         line_m = end_m - start_m
         right = np.array([-line_m[1], line_m[0], 0.0]) / math.hypot(line_m[0], line_m[1])
@@ -210,4 +227,4 @@ class _Diver:
         azimuth = math.pi * 2 * self._aims[0](t_s)
         tilt = 0.6 * self._aims[1](t_s)
         aim = np.array([math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt)])
-        return position_m, aim
+        return Source(position_m, aim, self._intensity, self._beam_rad)

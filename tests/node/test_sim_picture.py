@@ -4,13 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, stands_out
-from node.sim.rig import BEAM_RAD, SPILL
+from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, phase, stands_out
+from node.sim.rig import SPILL
 from node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
 from node.sim.scene import Lamp
 from node.sim.world import World
 
 S_NS = 1_000_000_000
+BEAM_RAD = np.radians(12)
 QUIET = {"interruptions": False, "other_lamps": 0}
 
 
@@ -58,7 +59,7 @@ def test_without_scattering_the_centroid_is_the_source_to_a_fraction_of_a_pixel(
 
 def _lamp(toe_rad, range_m=2.0, width_px=820, height_px=616):
     aim = np.array([np.sin(toe_rad), 0.0, -np.cos(toe_rad)])
-    return Lamp(np.array([0.0, 0.0, range_m]), aim, np.array([(width_px - 1) / 2, (height_px - 1) / 2]))
+    return Lamp(np.array([0.0, 0.0, range_m]), aim, np.array([(width_px - 1) / 2, (height_px - 1) / 2]), 1.0, BEAM_RAD)
 
 
 def _linear(renderer, lamp, width_px=820, height_px=616):
@@ -131,17 +132,24 @@ def test_the_table_follows_the_integral():
     d1 = np.linalg.norm(path, axis=1)
     cos_scatter = -(path @ ray) / d1
     cos_beam = path @ lamp.aim / d1
-    g = water.forwardness
-    phase = (1 - g * g) / (4 * np.pi) * (1 + g * g - 2 * g * cos_scatter) ** -1.5
     beam = SPILL + (1 - SPILL) * np.exp(-(1 - cos_beam) / BEAM_RAD**2)
     k = water.absorption_per_m[1] + 0.3 * water.scattering_per_m[1]
-    scattered = water.scattering_per_m[1] * np.trapezoid(phase * beam * np.exp(-k * (d1 + s)) / d1**2, s)
+    scattered = water.scattering_per_m[1] * np.trapezoid(
+        phase(cos_scatter, water) * beam * np.exp(-k * (d1 + s)) / d1**2, s
+    )
     flux_px = (
         904.0**2 * np.exp(-k * 3.0) / 9.0 * (SPILL + (1 - SPILL) * np.exp(-(1 - np.cos(np.radians(6))) / BEAM_RAD**2))
     )
     rho = np.hypot(ray[0], ray[1]) / ray[2] * SCALE_PX
     glare = GLARE * (SCALE_PX / 904.0) ** 2 / (2 * np.pi) / (rho**2 + 9) ** 1.25 * flux_px
     assert found == pytest.approx(water.lamp_gain * (scattered + glare), rel=0.05)
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_scattering_loses_and_makes_no_light(environment):
+    cos_angle = np.linspace(-1, 1, 2_000_001)
+    total = 2 * np.pi * np.trapezoid(phase(cos_angle, WATERS[environment]), cos_angle)
+    assert total == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_passer_hides_the_light_that_truth_calls_hidden():
