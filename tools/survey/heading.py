@@ -62,7 +62,10 @@ def heading_of(project: Project, adjusted: Adjusted) -> Heading:
 
 @dataclass(frozen=True)
 class Reading:
-    """One leg as surveyors write it: degrees, metres, depths positive down; None: not read. sigmas: 1 sd."""
+    """One leg as surveyors write it: degrees, metres, depths positive down; None: not read. sigmas: 1 sd.
+
+    compass_sigma_deg: of each sight, alike for both, as their plain mean wants them.
+    """
 
     tape_m: float
     compass_deg: float | None
@@ -72,7 +75,6 @@ class Reading:
     depth_to_m: float | None
     tape_sigma_m: float
     compass_sigma_deg: float
-    back_sigma_deg: float
     rise_sigma_m: float
     remark: str
 
@@ -89,8 +91,9 @@ def reading_of(line: Line, project: Project, depths_m: dict[str, float]) -> Read
     held = leg.from_ in depths_m and leg.to in depths_m
     own = [None if d is UNSET else d for d in (leg.depth_from_m, leg.depth_to_m)]
     depths = [depths_m[leg.from_], depths_m[leg.to]] if held else own
+    both = bearing.fore is not None and bearing.back is not None
     remark = f"{leg.from_node}>{leg.to_node} n={leg.fixes} grade {leg.grade} {leg.moment:%H:%M:%S}"
-    if held and None not in own:
+    if None not in own:
         remark += f" gauges {own[0]:.2f} {own[1]:.2f}"
     if leg.alarms:
         remark += " ALARM " + "; ".join(leg.alarms)
@@ -102,8 +105,7 @@ def reading_of(line: Line, project: Project, depths_m: dict[str, float]) -> Read
         depth_from_m=None if line.by_clino else depths[0],
         depth_to_m=None if line.by_clino else depths[1],
         tape_sigma_m=line.distance_sigma_m,
-        compass_sigma_deg=math.degrees(bearing.fore_sigma),
-        back_sigma_deg=math.degrees(bearing.back_sigma),
+        compass_sigma_deg=math.degrees(bearing.sigma) * (math.sqrt(2) if both else 1.0),
         rise_sigma_m=line.rise_sigma_m,
         remark=remark,
     )

@@ -158,10 +158,10 @@ def adjust(project: Project) -> Adjusted:
     lines = [line for line in lines if line.leg.from_ in reached]
     solution = _Solution(lines, fixed)
     positions = solution.positions(math.radians(project.settings.compass_common_deg))
-    for station in project.station if depths else []:
+    for held in project.station if depths else []:
         # Held at its depth, a station's altitude is as good as its gauge.
-        if station.name in positions and station.depth_sigma_m is not UNSET:
-            positions[station.name].covariance[2, 2] += station.depth_sigma_m**2
+        if held.name in positions and held.depth_sigma_m is not UNSET:
+            positions[held.name].covariance[2, 2] += held.depth_sigma_m**2
     points = []
     for leg in project.used(project.point):
         line = line_of(leg, project, grid.to_grid_rad, {})

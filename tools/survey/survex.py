@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
@@ -18,48 +19,54 @@ def quoted(text: str) -> str:
 
 
 def diving(project: Project, adjusted: Adjusted) -> str:
-    """Return .svx text: tape, compass, backcompass and depths; steep legs with clino."""
+    """Return .svx text: tape, compass, backcompass and depths, each leg with its own sds.
+
+    Legs that close a loop, steep ones, and those without depths are written with the clino that follows: of
+    diving legs cavern (1.4.4, and 1.4.9) takes the covariances in a wrong order, which bends the loops they are
+    in. Elsewhere covariances move nothing. Fore- and backsight have one sd, because it weighs unequal ones wrongly.
+    """
     depths = held_depths(project)
-    readings = [(line, reading_of(line, project, depths)) for line in adjusted.lines]
-    body = ["*calibrate depth 0 -1 ; gauges read down, Survex wants altitude", "*units tape depth metres"]
-    body += ["*units compass backcompass clino degrees"]
+    checked = {id(one.leg) for one in adjusted.residuals if one.chi2 is not None}
+    body = [
+        "*calibrate depth 0 -1 ; gauges read down, Survex wants altitude",
+        "*units tape depth metres",
+        "*units compass backcompass clino degrees",
+        "*sd position 0.001 metres ; how well a node is held is in each leg's own",
+    ]
     state: dict[str, str] = {}
     style = ""
-    for line, reading in readings:
-        wanted = (
-            "*data normal from to tape compass backcompass clino ignoreall"
-            if line.by_clino
-            else "*data diving from to tape compass backcompass fromdepth todepth ignoreall"
-        )
-        sds = _sds(reading, line.by_clino)
+    for line in adjusted.lines:
+        reading = reading_of(line, project, depths)
+        by_clino = line.by_clino or id(line.leg) in checked
+        sds = _sds(reading, by_clino)
         body += [f"*sd {name} {value}" for name, value in sds.items() if state.get(name) != value]
         state |= sds
+        wanted = NORMAL if by_clino else DIVING
         if wanted != style:
             body.append(wanted)
             style = wanted
-        body.append(_row(line, reading))
+        body.append(_row(line, reading, by_clino))
     return _file(project, adjusted, heading_of(project, adjusted), body)
 
 
+NORMAL: Final = "*data normal from to tape compass backcompass clino ignoreall"
+DIVING: Final = "*data diving from to tape compass backcompass fromdepth todepth ignoreall"
+
+
 def _sds(reading: Reading, by_clino: bool) -> dict[str, str]:
-    sds = {"tape": f"{reading.tape_sigma_m:.4f} metres"}
-    if reading.compass_deg is not None:
-        sds["compass"] = f"{reading.compass_sigma_deg:.3f} degrees"
-    if reading.back_deg is not None:
-        sds["backcompass"] = f"{reading.back_sigma_deg:.3f} degrees"
+    compass = f"{reading.compass_sigma_deg:.3f} degrees"
+    sds = {"tape": f"{reading.tape_sigma_m:.4f} metres", "compass": compass, "backcompass": compass}
     if by_clino:
-        sds["clino"] = f"{math.degrees(reading.rise_sigma_m / reading.tape_m):.3f} degrees"
+        run_m = reading.tape_m * math.cos(math.radians(reading.clino_deg))
+        sds["clino"] = f"{max(math.degrees(reading.rise_sigma_m / run_m), 0.001):.3f} degrees"
     else:
         sds["depth"] = f"{reading.rise_sigma_m / math.sqrt(2):.4f} metres"
     return sds
 
 
-def _row(line: Line, reading: Reading) -> str:
+def _row(line: Line, reading: Reading, by_clino: bool) -> str:
     angles = [_angle(reading.compass_deg), _angle(reading.back_deg)]
-    if line.by_clino:
-        last = [f"{reading.clino_deg:+.3f}"]
-    else:
-        last = [f"{reading.depth_from_m:.4f}", f"{reading.depth_to_m:.4f}"]
+    last = [f"{reading.clino_deg:+.3f}"] if by_clino else [f"{reading.depth_from_m:.4f}", f"{reading.depth_to_m:.4f}"]
     return "\t".join([line.leg.from_, line.leg.to, f"{reading.tape_m:.4f}", *angles, *last, f"; {reading.remark}"])
 
 
@@ -71,10 +78,9 @@ def cartesian(project: Project, adjusted: Adjusted) -> str:
     """Return .svx text of full vectors, grid east, north and up; sds are each axis's own, without correlations."""
     body = [
         "; vectors are turned to the grid's north already",
+        "*sd position 0.001 metres",
         "*data cartesian from to easting northing altitude ignoreall",
     ]
-    if adjusted.grid.north != "magnetic":
-        body.insert(1, "*declination 0 degrees ; not a magnetic one: there is no compass below")
     for line in adjusted.lines:
         sigma = np.sqrt(np.diag(line.covariance))
         body += [f"*sd {axis} {value:.4f} metres" for axis, value in zip(("dx", "dy", "dz"), sigma, strict=True)]

@@ -15,6 +15,12 @@ from tools.survey.heading import heading_of
 from tools.survey.network import Adjusted, Position
 from tools.survey.project import Leg, Project
 
+STATION_COLUMNS = (
+    *("name", "kind", "east_m", "north_m", "up_m", "depth_m"),
+    *("sigma_east_m", "sigma_north_m", "sigma_up_m"),
+    *("ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg", "latitude_deg", "longitude_deg"),
+)
+
 
 def legs_csv(project: Project, adjusted: Adjusted) -> str:
     """Return every leg and point with all its readings, as text; `used` says whether it took part."""
@@ -41,24 +47,7 @@ def stations_csv(project: Project, adjusted: Adjusted) -> str:
     depths = {station.name: station.depth_m for station in project.station}
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        [
-            "name",
-            "kind",
-            "east_m",
-            "north_m",
-            "up_m",
-            "depth_m",
-            "sigma_east_m",
-            "sigma_north_m",
-            "sigma_up_m",
-            "ellipse_major_m",
-            "ellipse_minor_m",
-            "ellipse_azimuth_deg",
-            "latitude_deg",
-            "longitude_deg",
-        ]
-    )
+    writer.writerow(STATION_COLUMNS)
     for kind, position in _all(adjusted):
         major_m, minor_m, azimuth = position.ellipse
         depth_m = depths.get(position.name, UNSET)

@@ -33,13 +33,12 @@ def centreline(project: Project, adjusted: Adjusted) -> str:
     rows += [f"station {fix.station} {quoted('')} entrance" for fix in project.fix if fix.entrance]
     if heading.angle_deg is not None:
         rows.append(f"declination {heading.angle_deg:.4f} degrees")
-    rows += ["units length depth metres", "units compass backcompass clino degrees", "calibrate depth 0 -1"]
+    rows += ["units length depth metres", "units compass clino degrees", "calibrate depth 0 -1"]
     style = ""
     for line in adjusted.lines:
         reading = reading_of(line, project, depths)
         sds = {"length": f"{reading.tape_sigma_m:.4f} metres"}
-        compass_deg = reading.compass_sigma_deg if reading.compass_deg is not None else reading.back_sigma_deg
-        sds["compass"] = f"{compass_deg:.3f} degrees"
+        sds["compass"] = f"{reading.compass_sigma_deg:.3f} degrees"
         if line.by_clino:
             wanted = "data normal from to length compass backcompass clino"
             sds["clino"] = f"{math.degrees(reading.rise_sigma_m / reading.tape_m):.3f} degrees"
