@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta, field
+from msgspec.structs import replace
 
 from node.geomagnetism import EarthField, earth_field
 from protocol.config import Config, ConfigError, load_config
 from protocol.messages import CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
+from protocol.security import Tls
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
@@ -98,6 +100,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     node: NodeId
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
+    tls: Tls | None = None
     rate_hz: Annotated[float, Meta(gt=0, le=200)] = 10.0
     camera: CameraConfig = field(default_factory=CameraConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
@@ -153,4 +156,5 @@ class NodeConfig(Config, frozen=True, kw_only=True):
 
 def load_node_config(path: Path | str) -> NodeConfig:
     """Read a node's TOML file; raise ConfigError naming file, field and value."""
-    return load_config(path, NodeConfig)
+    config = load_config(path, NodeConfig)
+    return config if config.tls is None else replace(config, tls=config.tls.beside(path))

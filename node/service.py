@@ -9,7 +9,7 @@ import time
 import uuid
 from collections import Counter, deque
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
@@ -26,13 +26,18 @@ from protocol.clock import S_NS, Clock, SystemClock
 from protocol.config import ConfigError, config_sha256
 from protocol.messages import CompressedImage, FoxgloveTime, NodeInfo, NodeStatus
 from protocol.recorder import Recorder
+from protocol.security import RefusedError, SecurityError, check_identity, node_name
 from protocol.service import Service
 from protocol.topics import TOPICS
+
+if TYPE_CHECKING:
+    from protocol.bus import Bus
 
 log = logging.getLogger(__name__)
 
 FRAME_QUEUE: Final = 2
 STALE_S: Final = 2.0
+REFUSED_RETRY_S: Final = 5.0
 
 
 class NodeService(Service):
@@ -183,14 +188,7 @@ class NodeService(Service):
                 self.outlet.send(message)
 
     def _connect(self) -> None:
-        from protocol.zenoh_bus import connect
-
-        bus = connect(
-            self.config.connect,
-            namespace=self.config.namespace or None,
-            stop=self.stop,
-            on_wait=lambda text: log.info("%s: %s; recording meanwhile", self.name, text),
-        )
+        bus = self._open_bus()
         if bus is None:
             return
         with bus:
@@ -205,6 +203,31 @@ class NodeService(Service):
             log.info("%s: connected to %s", self.name, self.config.connect)
             self.stop.wait()
             self.outlet.disconnect()
+
+    def _open_bus(self) -> Bus | None:
+        """Connect, again and again where the hub and this node do not accept each other: the log goes on anyway."""
+        from protocol.zenoh_bus import connect
+
+        while not self.stop.is_set():
+            try:
+                if self.config.tls is not None:
+                    check_identity(self.config.tls, node_name(self.config.node))
+                bus = connect(
+                    self.config.connect,
+                    namespace=self.config.namespace or None,
+                    stop=self.stop,
+                    on_wait=lambda text: log.info("%s: %s; recording meanwhile", self.name, text),
+                    tls=self.config.tls,
+                )
+            except (SecurityError, RefusedError) as error:
+                if self._problems.get("bus") != str(error):
+                    log.error("%s: not on the bus: %s; recording meanwhile", self.name, error)
+                self._problems["bus"] = str(error)
+                self.stop.wait(REFUSED_RETRY_S)
+            else:
+                self._problems.pop("bus", None)
+                return bus
+        return None
 
     def _report(self) -> None:
         while not self.stop.wait(1.0):
@@ -223,6 +246,7 @@ class NodeService(Service):
         self._sent_before, self._status_s = sent, now_s
         ages_s = {name: now_s - last_s for name, last_s in self._last_s.items()}
         problems = [f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > STALE_S]
+        problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
         if self.recorder.error is not None:
             problems.append(f"log: {self.recorder.error}; not recording")
         if self.recorder.dropped:

@@ -21,6 +21,7 @@ from protocol.clock import Clock, SystemClock
 from protocol.delivery import CLOSE_S, Delivery, FailureLatch, RateCap
 from protocol.endpoint import DEFAULT_ENDPOINT, client_settings, hub_settings
 from protocol.errors import BuddylineError
+from protocol.security import RefusedError, Tls, refusal
 from protocol.topics import Topic, parse_key
 
 # `**` does not match chunks that begin with @: nobody takes a token for a message.
@@ -74,9 +75,11 @@ class Hub:
         self.close()
 
 
-def open_hub(endpoint: str = DEFAULT_ENDPOINT) -> Hub:
+def open_hub(
+    endpoint: str = DEFAULT_ENDPOINT, *, tls: Tls | None = None, access: dict[str, object] | None = None
+) -> Hub:
     """Listen on endpoint; raise BuddylineError where the port is taken or the address is not this machine's."""
-    config = _config(hub_settings(endpoint))
+    config = _config(hub_settings(endpoint, tls, access))
     try:
         return Hub(zenoh.open(config), endpoint)
     except zenoh.ZError as error:
@@ -95,27 +98,43 @@ def connect(
     on_wait: Callable[[str], None],
     clock: Clock | None = None,
     cache_s: float = CACHE_S,
+    tls: Tls | None = None,
 ) -> ZenohBus | None:
     """Connect to the hub, waiting for it where it is not there yet; None where stop was set before.
 
     on_wait is called once, with what is being waited for. cache_s: how long an outage may last without loss.
+    Raises RefusedError where a hub is there and the two do not accept each other.
     """
-    config = _config(client_settings(endpoint, namespace))
+    config = _config(client_settings(endpoint, namespace, tls))
     session = _open_when_there(
         config,
         stop,
-        lambda: on_wait(f"no hub at {endpoint} yet, waiting for it (start one with `buddyline hub`)"),
+        lambda: on_wait(
+            f"no hub{' with TLS' if tls else ''} at {endpoint} yet, waiting for it (start one with `buddyline hub`)"
+        ),
+        lambda: refusal(endpoint, tls),
     )
     return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
 
 
-def _open_when_there(config: zenoh.Config, stop: threading.Event, on_wait: Callable[[], None]) -> zenoh.Session | None:
-    """Open a session, trying again until stop is set; on_wait is called once, after the first failure."""
+def _open_when_there(
+    config: zenoh.Config,
+    stop: threading.Event,
+    on_wait: Callable[[], None] = lambda: None,
+    why_refused: Callable[[], str | None] = lambda: None,
+) -> zenoh.Session | None:
+    """Open a session, trying again until stop is set; on_wait is called once, after the first failure.
+
+    Raises RefusedError where why_refused finds, after a failure, that trying again is of no use.
+    """
     waiting = False
     while not stop.is_set():
         session = _try_open(config, stop)
         if session is not None:
             return session
+        reason = None if stop.is_set() else why_refused()
+        if reason is not None:
+            raise RefusedError(reason)
         if not waiting and not stop.is_set():
             on_wait()
             waiting = True
@@ -185,7 +204,7 @@ class BulkLink:
             self.session.close()  # type: ignore[no-untyped-call]
 
     def _run(self) -> None:
-        self.session = _open_when_there(self._config, self._stop, lambda: None)
+        self.session = _open_when_there(self._config, self._stop)
 
 
 class ZenohPublisher(Publisher):

@@ -5,35 +5,76 @@ from __future__ import annotations
 import argparse
 import logging
 
+from msgspec import field
+from msgspec.structs import replace
+
+from protocol.config import Config, load_config
+from protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
+from protocol.errors import BuddylineError
+from protocol.messages import NodeId
+from protocol.security import HUB, Tls, check_identity
 from protocol.service import Service
 
 log = logging.getLogger(__name__)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+class HubConfig(Config, frozen=True, kw_only=True):
+    """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it."""
+
+    listen: str = DEFAULT_ENDPOINT
+    namespace: str = ""
+    nodes: list[NodeId] = field(default_factory=list)
+    tls: Tls | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--config", metavar="FILE.toml", help="the hub's configuration")
     parser.add_argument("--listen", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    parser.add_argument("--insecure", action="store_true", help="listen beyond this machine without TLS")
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+
+
+def load_hub_config(path: str | None) -> HubConfig:
+    """Read the hub's TOML file, or take the defaults; raise ConfigError naming file, field and value."""
+    if path is None:
+        return HubConfig()
+    config = load_config(path, HubConfig)
+    return config if config.tls is None else replace(config, tls=config.tls.beside(path))
+
+
+def check_exposure(config: HubConfig, *, insecure: bool) -> str | None:
+    """Return what to warn of; raise BuddylineError where the hub would let anyone in without being told to."""
+    if config.tls is not None:
+        check_identity(config.tls, HUB)
+        return None if config.nodes else "no node may publish: `nodes` is empty"
+    if config.nodes:
+        raise BuddylineError("hub: `nodes` says who may publish, and without a [tls] table nobody is known")
+    if is_loopback(config.listen):
+        return None
+    if not insecure:
+        raise BuddylineError(
+            f"hub: {config.listen} is open to the network: use TLS (`buddyline keys init`), or say --insecure "
+            "where the network is yours alone"
+        )
+    return f"INSECURE: whoever reaches {config.listen} can read and send everything"
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the hub until it is stopped."""
-    from protocol.config import Config, load_config
-
-    class HubConfig(Config, frozen=True, kw_only=True):
-        """The hub's TOML file."""
-
-        listen: str = DEFAULT_ENDPOINT
-
+    from protocol.access import access_rules
     from protocol.zenoh_bus import open_hub
 
-    config = load_config(args.config, HubConfig) if args.config else HubConfig()
+    config = load_hub_config(args.config)
+    if args.listen:
+        config = replace(config, listen=args.listen)
+    warning = check_exposure(config, insecure=args.insecure)
+    if warning is not None:
+        log.warning("hub: %s", warning)
+    access = None if config.tls is None else access_rules(config.nodes, config.namespace)
     service = Service("hub")
     service.handle_signals()
-    with open_hub(args.listen or config.listen):
-        log.info("hub: listens on %s", args.listen or config.listen)
+    with open_hub(config.listen, tls=config.tls, access=access):
+        log.info("hub: listens on %s%s", config.listen, " (TLS, client certificates)" if config.tls else "")
         service.wait(args.seconds)
     return service.join()

@@ -15,12 +15,12 @@ from msgspec.structs import replace
 
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.divelog import Record
+from protocol.endpoint import DEFAULT_ENDPOINT
 from protocol.errors import BuddylineError
 from protocol.messages import CompressedImage, FoxgloveTime, Message, MessageError, encode
 from protocol.service import Service
 from protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
 from tools.dives import Dive
-from tools.hub import DEFAULT_ENDPOINT
 from tools.progress import Progress
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from protocol.messages import MessageError, decode
 from protocol.recorder import Recorder
 from protocol.service import Service
 from protocol.topics import EVERYTHING, parse_key
-from tools.hub import DEFAULT_ENDPOINT
+from tools.client import add_client_arguments, client_config
 
 if TYPE_CHECKING:
     from protocol.bus import Received
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("output", metavar="OUT.mcap")
-    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    add_client_arguments(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
@@ -57,17 +57,24 @@ def run(args: argparse.Namespace) -> int:
     """Record until stopped."""
     from protocol.zenoh_bus import connect
 
+    config = client_config(args)
     service = Service("record")
     service.handle_signals()
     with Recorder(args.output, metadata={"command": "record"}) as recorder:
         sink = BusRecorder(recorder)
-        bus = connect(args.connect, stop=service.stop, on_wait=lambda text: log.info("record: %s", text))
+        bus = connect(
+            config.connect,
+            namespace=config.namespace or None,
+            stop=service.stop,
+            on_wait=lambda text: log.info("record: %s", text),
+            tls=config.tls,
+        )
         if bus is None:
             return service.join()
         with bus:
             bus.on_failure(lambda error: service.fail("bus", error))
             subscriber = bus.subscribe(EVERYTHING, sink.receive, capacity=16384)
-            log.info("record: %s into %s; Ctrl-C ends", args.connect, args.output)
+            log.info("record: %s into %s; Ctrl-C ends", config.connect, args.output)
             began_s = time.monotonic()
             while not service.stop.wait(0.5):
                 if args.seconds is not None and time.monotonic() - began_s >= args.seconds:

@@ -1,0 +1,46 @@
+"""Who may publish what: the hub's access rules, by the common name in each client's certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from protocol.security import SOLVER, VIEWER, node_name
+
+_ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
+_SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
+
+
+def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
+    """Return Zenoh's `access_control`: a node publishes its own keys, the solver its pair's, all read all.
+
+    Everything else is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do not match: they
+    are named beside each key, or history would be lost in silence.
+    """
+    root = f"{namespace}/buddyline" if namespace else "buddyline"
+    everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**"]
+    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER]
+    rules: list[dict[str, object]] = [
+        _rule("ask", ["ingress", "egress"], _ASK, everything),
+        _rule("hear", ["egress"], _SAY, everything),
+    ]
+    policies: list[dict[str, object]] = [{"rules": ["ask", "hear"], "subjects": clients}]
+    for name, keys, alive in [
+        *((node_name(node), f"{root}/node/{node}/*", f"node/{node}") for node in nodes),
+        (SOLVER, f"{root}/pair/*/*/*", "solver"),
+        (VIEWER, None, "viewer"),
+    ]:
+        own = [f"{root}/@alive/{alive}/**"] + ([keys, f"{keys}/@adv/**"] if keys else [])
+        rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))
+        policies.append({"rules": [f"say {name}"], "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": name, "cert_common_names": [name]} for name in clients],
+        "policies": policies,
+    }
+
+
+def _rule(name: str, flows: list[str], messages: list[str], keys: list[str]) -> dict[str, object]:
+    return {"id": name, "permission": "allow", "flows": flows, "messages": messages, "key_exprs": keys}

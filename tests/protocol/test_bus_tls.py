@@ -1,0 +1,195 @@
+"""The bus over TLS: who is refused and told why, and who may publish what."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from protocol import topics
+from protocol.access import access_rules
+from protocol.bus import Received
+from protocol.errors import BuddylineError
+from protocol.security import RefusedError, Tls
+from protocol.zenoh_bus import ZenohBus, connect, open_hub
+from tests.processes import Process, free_endpoint
+from tests.tools.identities import copy_of, expired, make_keys, tls
+
+WAIT_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_keys(tmp_path_factory.mktemp("keys"), "a", "b")
+
+
+def tls_endpoint() -> str:
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+def join(endpoint: str, identity: Tls | None) -> ZenohBus:
+    bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, tls=identity)
+    assert bus is not None
+    return bus
+
+
+class Inbox:
+    def __init__(self) -> None:
+        self.keys: list[str] = []
+        self._changed = threading.Condition()
+
+    def __call__(self, received: Received) -> None:
+        with self._changed:
+            self.keys.append(received.key)
+            self._changed.notify_all()
+
+    def wait_for(self, key: str) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: key in self.keys, WAIT_S), self.keys
+
+
+def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
+    endpoint = tls_endpoint()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
+        join(endpoint, tls(keys, "node-a")) as a,
+        join(endpoint, tls(keys, "node-b")) as b,
+        join(endpoint, tls(keys, "solver")) as solver,
+        join(endpoint, tls(keys, "viewer")) as viewer,
+        join(endpoint, tls(keys, "viewer")) as watcher,
+    ):
+        inbox, alive = Inbox(), Inbox()
+        watcher.subscribe(topics.EVERYTHING, inbox, history=False)
+        watcher.watch_alive(lambda name, here: alive(Received(f"{name} {here}", b"", 0, "")))
+        # Denied first, allowed last, of one session and one priority: what is denied would come before.
+        for bus, denied, allowed in (
+            (a, [(topics.DEPTH, "b"), (topics.TRUTH, "a", "b")], (topics.DEPTH, "a")),
+            (b, [(topics.CANDIDATES, "a"), (topics.POSE, "a", "b")], (topics.CANDIDATES, "b")),
+            (solver, [(topics.CANDIDATES, "a")], (topics.POSE, "a", "b")),
+        ):
+            for topic, *ids in [*denied, allowed]:
+                assert bus.publisher(topic, *ids).put_bytes(b'{"stamp_ns":1}')
+        for topic, *ids in ((topics.DEPTH, "a"), (topics.CANDIDATES, "b"), (topics.POSE, "a", "b")):
+            assert viewer.publisher(topic, *ids).put_bytes(b'{"stamp_ns":2}')
+        b.declare_alive("node/a")
+        viewer.declare_alive("solver/any")
+        for bus, name in ((a, "node/a"), (b, "node/b"), (solver, "solver/a_b"), (viewer, "viewer/v")):
+            bus.declare_alive(name)
+            alive.wait_for(f"{name} True")
+        said = ["buddyline/node/a/depth", "buddyline/node/b/candidates", "buddyline/pair/a/b/pose"]
+        for key in said:
+            inbox.wait_for(key)
+        # What was denied never got into anybody's history either, and what was allowed did.
+        late = Inbox()
+        with join(endpoint, tls(keys, "viewer")) as latecomer:
+            latecomer.subscribe(topics.EVERYTHING, late)
+            for key in said:
+                late.wait_for(key)
+        assert sorted(inbox.keys) == said
+        assert sorted(late.keys) == said
+        assert sorted(set(alive.keys)) == [f"{n} True" for n in ("node/a", "node/b", "solver/a_b", "viewer/v")]
+
+
+def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> None:
+    endpoint = tls_endpoint()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"])),
+        join(endpoint, tls(keys, "node-a")) as a,
+        join(endpoint, tls(keys, "solver")) as solver,
+    ):
+        publisher = a.publisher(topics.CANDIDATES, "a")
+        for k in range(50):
+            publisher.put_bytes(b'{"stamp_ns":%d}' % k)
+        received: list[bytes] = []
+        done = threading.Event()
+
+        def take(message: Received) -> None:
+            received.append(message.payload)
+            if len(received) == 60:
+                done.set()
+
+        solver.subscribe(topics.CANDIDATES.key_any(), take)
+        for k in range(50, 60):
+            publisher.put_bytes(b'{"stamp_ns":%d}' % k)
+        assert done.wait(WAIT_S), len(received)
+        assert received == [b'{"stamp_ns":%d}' % k for k in range(60)]
+
+
+@pytest.mark.parametrize(
+    ("hub_is", "client_is", "says"),
+    [
+        ("sound", "expired", "refuses .*node-a.crt: it has expired"),
+        ("sound", "foreign", "refuses .*node-a.crt: it is of another authority"),
+        ("sound", "hub's own", "refuses .*hub.crt: it is not for a client"),
+        ("sound", "plain", "wants TLS"),
+        ("expired", "sound", "certificate of the hub at .* has expired"),
+        ("foreign", "sound", "certificate of the hub at .* was not made by our authority"),
+        ("a node's", "sound", "certificate of the hub at .* is not for this end"),
+    ],
+)
+def test_a_refusal_says_which_and_why(keys: Path, tmp_path: Path, hub_is: str, client_is: str, says: str) -> None:
+    own = copy_of(keys, tmp_path / "own")
+    other = make_keys(tmp_path / "other", "a")
+    sound = {"hub": tls(own, "hub"), "client": tls(own, "node-a")}
+    foreign = {
+        side: Tls(ca=sound["hub"].ca, certificate=t.certificate, key=t.key)
+        for side, t in (("hub", tls(other, "hub")), ("client", tls(other, "node-a")))
+    }
+    if hub_is == "expired":
+        expired(own, "hub", "127.0.0.1")
+    if client_is == "expired":
+        expired(own, "node-a")
+    hub = {"foreign": foreign["hub"], "a node's": tls(own, "node-b")}.get(hub_is, sound["hub"])
+    client = {"foreign": foreign["client"], "hub's own": tls(own, "hub"), "plain": None}.get(client_is, sound["client"])
+    endpoint = free_endpoint()
+    tls_there = endpoint.replace("tcp/", "tls/")
+    with open_hub(tls_there, tls=hub), pytest.raises(RefusedError, match=says):
+        join(endpoint if client is None else tls_there, client)
+
+
+def test_endpoint_and_tls_table_must_agree(keys: Path) -> None:
+    with pytest.raises(BuddylineError, match="needs a \\[tls\\] table"):
+        join("tls/127.0.0.1:7447", None)
+    with pytest.raises(BuddylineError, match="without TLS"):
+        open_hub("tcp/127.0.0.1:7447", tls=tls(keys, "hub"))
+
+
+def test_a_hub_without_tls_is_waited_for_and_what_is_missing_is_said(keys: Path) -> None:
+    endpoint, said, stop = free_endpoint(), [], threading.Event()
+
+    def on_wait(text: str) -> None:
+        said.append(text)
+        stop.set()
+
+    with open_hub(endpoint):
+        wanted = endpoint.replace("tcp/", "tls/")
+        assert connect(wanted, stop=stop, on_wait=on_wait, tls=tls(keys, "node-a")) is None
+    assert len(said) == 1
+    assert "no hub with TLS" in said[0]
+
+
+def test_a_node_that_is_refused_records_all_the_same_and_says_so(keys: Path, tmp_path: Path) -> None:
+    """Processes from the files as `buddyline keys` wrote them, but for the endpoint."""
+    own = copy_of(keys, tmp_path / "own")
+    endpoint = tls_endpoint()
+    for name in ("hub", "node-a", "viewer"):
+        path = own / f"{name}.toml"
+        text = path.read_text().replace("tls/0.0.0.0:7447", endpoint).replace("tls/127.0.0.1:7447", endpoint)
+        if name == "node-a":
+            text = text.replace("[tls]", f'[record]\ndirectory = "{tmp_path}/logs"\n\n[tls]')
+        path.write_text(text)
+    expired(own, "node-a")
+    with (
+        Process("hub", "--config", own / "hub.toml") as hub,
+        Process("node", "--config", own / "node-a.toml") as node,
+        Process("record", tmp_path / "r.mcap", "--config", own / "viewer.toml") as record,
+    ):
+        hub.wait_for("TLS, client certificates")
+        assert "node-a.crt: has expired; recording meanwhile" in node.wait_for("not on the bus")
+        record.wait_for("Ctrl-C ends")
+        assert node.end() == 0
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    assert b"PRIVATE KEY" not in log.read_bytes()
+    for process in (hub, node, record):
+        assert not any("PRIVATE KEY" in line for line in process.lines)

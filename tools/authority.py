@@ -1,0 +1,155 @@
+"""An authority in a directory: its certificate and key, and the certificates that it issues, as PEM files."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import os
+import secrets
+from pathlib import Path
+from typing import Final, Self
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from protocol.errors import BuddylineError
+
+# A node without a clock of its own may be behind by as much when it is switched on.
+BACKDATED: Final = datetime.timedelta(days=7)
+
+
+class Authority:
+    """Issues certificates; its files are ca.crt and ca.key."""
+
+    def __init__(self, directory: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
+        self.directory = directory
+        self._certificate = certificate
+        self._key = key
+
+    @property
+    def certificate_path(self) -> Path:
+        """What every process needs to know the others by."""
+        return self.directory / "ca.crt"
+
+    @property
+    def key_path(self) -> Path:
+        """What makes certificates."""
+        return self.directory / "ca.key"
+
+    @classmethod
+    def create(cls, directory: Path, days: int) -> Self:
+        """Make a new authority; raise BuddylineError where there is one."""
+        try:
+            directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise BuddylineError(f"{directory}: cannot be made: {error.strerror}") from error
+        key = ec.generate_private_key(ec.SECP256R1())
+        # Two authorities differ by name, so that a foreign certificate is told from a forged one.
+        name = _name(f"buddyline authority {secrets.token_hex(4)}")
+        certificate = (
+            _begin(name, name, key.public_key(), days)
+            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+            .add_extension(_key_usage(signs_certificates=True), critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+            .sign(key, hashes.SHA256())
+        )
+        authority = cls(directory, certificate, key)
+        _write_pair(authority.certificate_path, certificate, authority.key_path, key)
+        return authority
+
+    @classmethod
+    def open(cls, directory: Path) -> Self:
+        """Read an authority; raise BuddylineError naming what is wrong with its files."""
+        try:
+            certificate = x509.load_pem_x509_certificate((directory / "ca.crt").read_bytes())
+            key = serialization.load_pem_private_key((directory / "ca.key").read_bytes(), password=None)
+        except FileNotFoundError as error:
+            raise BuddylineError(f"{error.filename}: is missing; begin with `buddyline keys init`") from error
+        except (OSError, ValueError, TypeError) as error:
+            raise BuddylineError(f"{directory}: ca.crt or ca.key cannot be read: {error}") from error
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
+            raise BuddylineError(f"{directory / 'ca.key'}: is not the key of ca.crt")
+        return cls(directory, certificate, key)
+
+    def issue(self, name: str, days: int, server_host: str | None = None) -> list[Path]:
+        """Make certificate and key for name, as a client, or as the server at server_host; return their files."""
+        key = ec.generate_private_key(ec.SECP256R1())
+        purpose = ExtendedKeyUsageOID.SERVER_AUTH if server_host else ExtendedKeyUsageOID.CLIENT_AUTH
+        builder = (
+            _begin(_name(name), self._certificate.subject, key.public_key(), days)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_key_usage(signs_certificates=False), critical=True)
+            .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+            .add_extension(x509.SubjectAlternativeName([_general_name(server_host or name)]), critical=False)
+            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)
+        )
+        paths = [self.directory / f"{name}.crt", self.directory / f"{name}.key"]
+        _write_pair(paths[0], builder.sign(self._key, hashes.SHA256()), paths[1], key)
+        return paths
+
+    def hub_host(self) -> str:
+        """Return where clients find the hub, as its certificate says."""
+        path = self.directory / "hub.crt"
+        try:
+            certificate = x509.load_pem_x509_certificate(path.read_bytes())
+            names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+            host = next(iter(names)).value
+        except (OSError, ValueError, x509.ExtensionNotFound) as error:
+            raise BuddylineError(f"{path}: cannot be read: {error}") from error
+        return f"[{host}]" if isinstance(host, ipaddress.IPv6Address) else str(host)
+
+
+def _begin(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int) -> x509.CertificateBuilder:
+    now = datetime.datetime.now(datetime.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - BACKDATED)
+        .not_valid_after(now + datetime.timedelta(days=days))
+    )
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _write_pair(
+    certificate_path: Path, certificate: x509.Certificate, key_path: Path, key: ec.EllipticCurvePrivateKey
+) -> None:
+    for path in (certificate_path, key_path):
+        if path.exists():
+            raise BuddylineError(f"{path}: exists; no key is ever overwritten, move it away first")
+    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    try:
+        # The mode is there before the first byte is: nobody else can open it in between.
+        with open(os.open(key_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(pem)
+        certificate_path.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    except OSError as error:
+        raise BuddylineError(f"{error.filename}: cannot be written: {error.strerror}") from error

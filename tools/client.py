@@ -1,0 +1,37 @@
+"""Where a command finds the hub, and by what right: `--connect`, or a configuration with a [tls] table."""
+
+from __future__ import annotations
+
+import argparse
+
+from msgspec.structs import replace
+
+from protocol.config import Config, load_config
+from protocol.endpoint import DEFAULT_ENDPOINT
+from protocol.security import VIEWER, Tls, check_identity
+
+
+class ClientConfig(Config, frozen=True, kw_only=True):
+    """The TOML file of a command that only reads the bus (`buddyline keys viewer` writes one)."""
+
+    connect: str = DEFAULT_ENDPOINT
+    namespace: str = ""
+    tls: Tls | None = None
+
+
+def add_client_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what says where the hub is."""
+    parser.add_argument("--config", metavar="FILE.toml", help="where the hub is, with [tls] (`buddyline keys viewer`)")
+    parser.add_argument("--connect", metavar="ENDPOINT", help=f"the hub; default: {DEFAULT_ENDPOINT}")
+
+
+def client_config(args: argparse.Namespace) -> ClientConfig:
+    """Return what the arguments say; raise BuddylineError naming the file and what is wrong with it."""
+    config = load_config(args.config, ClientConfig) if args.config else ClientConfig()
+    if config.tls is not None:
+        config = replace(config, tls=config.tls.beside(args.config))
+    if args.connect:
+        config = replace(config, connect=args.connect)
+    if config.tls is not None:
+        check_identity(config.tls, VIEWER)
+    return config

@@ -1,0 +1,128 @@
+"""`buddyline keys`: a small authority of one's own, and certificates for hub, nodes, solver and viewers."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from protocol.endpoint import host_and_port
+from protocol.errors import BuddylineError
+from protocol.security import HUB, SOLVER, VIEWER, node_name
+from protocol.topics import check_node_id
+
+if TYPE_CHECKING:
+    from tools.authority import Authority
+
+DIRECTORY: Final = "keys"
+PORT: Final = 7447
+DAYS: Final = 730
+AUTHORITY_DAYS: Final = 3650
+
+_NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("--directory", default=DIRECTORY, metavar="DIR", help=f"where all of it is: {DIRECTORY}/")
+    parser.add_argument("--days", type=int, metavar="N", help=f"how long it is valid; {DAYS}, the authority 10 years")
+    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer")
+    first = whose.add_parser("init", help="make the authority and the hub's certificate")
+    first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find the hub; 127.0.0.1")
+    node = whose.add_parser("node", help="make a node's certificate, and let it publish what is its own")
+    node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
+    whose.add_parser("solver", help="make the solver's certificate, which may publish poses")
+    whose.add_parser("viewer", help="make the certificate of all that only read: record, monitor")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make keys; never over others."""
+    try:
+        from tools.authority import Authority
+    except ImportError as error:
+        raise BuddylineError("keys: the package cryptography is missing; `pip install 'buddyline[keys]'`") from error
+    if args.days is not None and args.days < 1:
+        raise BuddylineError(f"--days {args.days}: at least 1")
+    directory = Path(args.directory)
+    days = args.days or DAYS
+    if args.whose == "init":
+        made = _init(directory, args.hub, days, args.days or AUTHORITY_DAYS)
+    else:
+        made = _client(Authority.open(directory), args, days)
+    for path in made:
+        print(path)
+    return 0
+
+
+def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Path]:
+    from tools.authority import Authority
+
+    host_and_port(f"tls/{host}:{PORT}")
+    authority = Authority.create(directory, authority_days)
+    made = [authority.certificate_path, *authority.issue(HUB, days, server_host=host)]
+    text = (
+        f"# `buddyline hub --config hub.toml`: listens beyond this machine, for those with a certificate alone.\n"
+        f'listen = "tls/0.0.0.0:{PORT}"\n\n'
+        "# Nodes that may publish, each its own keys; `buddyline keys node ID` adds one.\nnodes = []\n\n"
+        f"{_tls_table(HUB)}"
+    )
+    path = directory / "hub.toml"
+    _write_new(path, text)
+    _say(f"{authority.key_path} makes certificates: it stays on this machine, and is copied nowhere")
+    return [*made, path]
+
+
+def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[Path]:
+    name = {"solver": SOLVER, "viewer": VIEWER}.get(args.whose) or node_name(check_node_id(args.node))
+    made = authority.issue(name, days)
+    path = authority.directory / f"{name}.toml"
+    connect = f'connect = "tls/{authority.hub_host()}:{PORT}"\n\n{_tls_table(name)}'
+    first = f'node = "{args.node}"\n' if args.whose == "node" else ""
+    _write_new(
+        path, f"# For the configuration of {name}; ca.crt, {name}.crt and {name}.key go beside it.\n{first}{connect}"
+    )
+    if args.whose == "node":
+        _admit(authority.directory / "hub.toml", args.node)
+    _say(
+        f"copy ca.crt, {name}.crt, {name}.key and {name}.toml to that machine; the key stays readable by its user alone"
+    )
+    return [*made, path]
+
+
+def _tls_table(name: str) -> str:
+    return f'[tls]\nca = "ca.crt"\ncertificate = "{name}.crt"\nkey = "{name}.key"\n'
+
+
+def _admit(path: Path, node: str) -> None:
+    """Add a node to the hub's list, in its place, leaving all else as it is."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError:
+        text = ""
+    line = _NODES_LINE.search(text)
+    if line is None:
+        _say(f'{path}: no line `nodes = [...]`; add "{node}" to the hub\'s nodes yourself')
+        return
+    nodes = [word for word in re.findall(r'"([^"]*)"', line.group(1)) if word != node] + [node]
+    listed = ", ".join(f'"{word}"' for word in sorted(nodes))
+    path.write_text(f"{text[: line.start()]}nodes = [{listed}]{text[line.end() :]}", encoding="utf-8")
+    _say(f"{path}: node {node} may publish; a hub that runs reads it when it is started again")
+
+
+def _write_new(path: Path, text: str) -> None:
+    try:
+        with open(path, "x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise BuddylineError(f"{path}: exists; nothing is overwritten, remove it first") from None
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _say(text: str) -> None:
+    print(f"keys: {text}", file=sys.stderr)
+
+
+__all__ = ["add_arguments", "run"]
