@@ -1,0 +1,52 @@
+"""From frames to messages: numbers, rows' times, and what is left out."""
+
+import numpy as np
+import pytest
+
+from node.detect import Detection, make_detector
+from node.devices import CAMERAS, Frame, load
+from node.pipeline import Pipeline, blobs_of
+from protocol.errors import BuddylineError
+from protocol.messages import MAX_BLOBS, Blob
+
+PERIOD_NS = 100_000_000
+NOTHING = np.zeros((0, 2))
+
+
+def detection(u_px, v_px, sigma_px=0.5):
+    blob = Blob(u_px=u_px, v_px=v_px, sigma_px=sigma_px, area_px=1.0, peak=9.0, elongation=1.0)
+    return Detection(blob, NOTHING, NOTHING, "")
+
+
+def frame(stamp_ns=0, row_time_ns=0):
+    return Frame(np.zeros((101, 200, 3), np.uint8), stamp_ns, row_time_ns)
+
+
+def test_rows_have_their_own_times():
+    blobs, _ = blobs_of([detection(5.0, 0.0), detection(5.0, 50.0), detection(5.0, 100.0)], frame(row_time_ns=1000))
+    assert [blob.dt_ns for blob in blobs] == [-50_000, 0, 50_000]
+
+
+def test_what_is_outside_is_left_out_and_what_is_too_much_counted():
+    blobs, truncated = blobs_of([detection(-0.6, 5.0), detection(5.0, 100.6), detection(199.4, 100.4)], frame())
+    assert [(blob.u_px, blob.v_px) for blob in blobs] == [(199.4, 100.4)]
+    assert truncated == 0
+    blobs, truncated = blobs_of([detection(float(i), 5.0) for i in range(MAX_BLOBS + 6)], frame())
+    assert (len(blobs), truncated) == (MAX_BLOBS, 6)
+    assert blobs[0].u_px == 0.0
+
+
+def test_triggers_are_the_nearest_and_come_once():
+    pipeline = Pipeline("a", "boot", PERIOD_NS, make_detector("paper", "cavern"))
+    first = pipeline.candidates(frame(7 * PERIOD_NS + 3_000_000))
+    assert (first.trigger, first.seq) == (7, 0)
+    assert pipeline.candidates(frame(7 * PERIOD_NS - 3_000_000)) is None
+    assert pipeline.repeated == 1
+    second = pipeline.candidates(frame(9 * PERIOD_NS - 1_000_000))
+    assert (second.trigger, second.seq) == (9, 1)
+    assert pipeline.residual_s == pytest.approx(0.001)
+
+
+def test_unknown_device_names_the_known():
+    with pytest.raises(BuddylineError, match="simulated, stored, picamera2"):
+        load(CAMERAS, "camera", "webcam")

@@ -1,0 +1,83 @@
+"""Playback: what is sent, when, and how a dive goes round and round."""
+
+import threading
+
+import pytest
+
+from protocol.clock import ManualClock
+from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.local_bus import LocalNetwork
+from protocol.messages import Candidates, NodeInfo, Rejected, decode
+from protocol.topics import EVERYTHING, parse_key
+from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
+from tools.dives import Dive
+from tools.play import Player, _selected, _span
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("play") / "dive.mcap"
+    with DiveLogWriter(path) as writer:
+        for message in dive_messages(seconds=2.0)[0]:
+            writer.write_message(message)
+        old = Rejected(node_a="a", node_b="b", stamp_ns=START_NS + PERIOD_NS, trigger=1, reason="late")
+        writer.write_message(old)
+    return path
+
+
+class Played:
+    """A dive played onto a bus of this process; what came of it, by topic."""
+
+    def __init__(self, log, *, start_s=0.0, end_s=None, laps=1, speed=1.0):
+        self.received = []
+        self.clock = ManualClock(5)
+        network = LocalNetwork()
+        with Dive([log]) as dive, network.connect() as bus, network.connect() as listener:
+            listener.subscribe(EVERYTHING, self.received.append, capacity=10_000)
+            player = Player(bus, speed, self.clock, threading.Event())
+            player.declare(dive.keys)
+            start_ns, stop_ns = _span(dive, start_s, end_s)
+            for lap in range(laps):
+                for record in _selected(dive, start_ns, stop_ns):
+                    player.send(record, lap * 30, PERIOD_NS)
+        self.sent = player.sent
+
+    def messages(self, kind):
+        parsed = [(parse_key(r.key)[0].schema, r.payload) for r in self.received]
+        return [decode(payload, kind) for schema, payload in parsed if schema is kind]
+
+
+def test_everything_but_what_a_solver_made_is_sent(log):
+    played = Played(log)
+    assert played.sent == len(played.received) == len(dive_messages(seconds=2.0)[0])
+    assert not any("/pair/" in received.key for received in played.received)
+    assert len(played.messages(Candidates)) == 2 * 18
+
+
+def test_pace_follows_speed(log):
+    assert Played(log).clock.now_ns() - 5 == pytest.approx(1.98e9, abs=1e8)
+    assert Played(log, speed=4.0).clock.now_ns() - 5 == pytest.approx(1.98e9 / 4, abs=3e7)
+
+
+def test_a_part_comes_with_its_calibration(log):
+    played = Played(log, start_s=0.5, end_s=1.0)
+    stamps = [message.stamp_ns for message in played.messages(Candidates)]
+    assert len(stamps) == 10
+    assert min(stamps) >= START_NS + 500_000_000 - 20_000_000
+    assert len(played.messages(NodeInfo)) == 2
+
+
+def test_laps_carry_times_and_triggers_on(log):
+    frames = Played(log, laps=2).messages(Candidates)
+    first, second = frames[: len(frames) // 2], frames[len(frames) // 2 :]
+    for one, other in zip(first, second, strict=True):
+        assert other.stamp_ns - one.stamp_ns == 30 * PERIOD_NS
+        assert other.trigger - one.trigger == 30
+        assert other.blobs == one.blobs
+
+
+@pytest.mark.parametrize(("start_s", "end_s"), [(-1.0, None), (99.0, None), (1.0, 0.5)])
+def test_a_part_outside_the_dive_is_refused(log, start_s, end_s):
+    with Dive([log]) as dive, pytest.raises(BuddylineError, match="the dive goes from 0 to"):
+        _span(dive, start_s, end_s)
