@@ -51,18 +51,25 @@ class PhaseLock:
     Measures phase and drift over a few frames, asks for one frame of another duration, and waits until that must
     have come through. A frame lasts a whole number of lines, and clocks differ: the drift that is left is aimed
     off for, so that the phase is none in the middle between two corrections.
-    frame_period_ns: a whole fraction of the trigger period. min_frame_ns: the shortest that the camera can.
-    line_ns: time of a line. residual_ns: phase last measured, None before that.
+    frames: how many a trigger period. min_frame_ns: the shortest that the camera can. line_ns: time of a line.
+    residual_ns: phase last measured, None before that.
     """
 
     def __init__(
-        self, frame_period_ns: int, min_frame_ns: int, line_ns: float, latency_frames: int = LATENCY_FRAMES
+        self,
+        trigger_period_ns: int,
+        frames: int,
+        min_frame_ns: int,
+        line_ns: float,
+        latency_frames: int = LATENCY_FRAMES,
     ) -> None:
         self.residual_ns: int | None = None
-        self._period_ns = frame_period_ns
+        self._trigger_period_ns = trigger_period_ns
+        self._frames_per_trigger = frames
+        self._period_ns = trigger_period_ns / frames
         self._min_ns = min_frame_ns
         self._line_ns = line_ns
-        self._lines = round(frame_period_ns / line_ns)
+        self._lines = round(self._period_ns / line_ns)
         self._latency_frames = latency_frames
         self._waiting_frames = 0
         self._enough_frames = PHASES
@@ -99,11 +106,15 @@ class PhaseLock:
         return self._correct(self.residual_ns, drift_ns)
 
     def _phase_ns(self, time_ns: int) -> int:
-        """Return how far after the nearest point of the grid a time is: from -period/2 to +period/2."""
-        return (time_ns + self._period_ns // 2) % self._period_ns - self._period_ns // 2
+        """Return how far after the nearest point of the grid a time is: from -period/2 to +period/2.
+
+        The grid starts anew at each instant: a period that is no whole number of ns must not add up since 1970.
+        """
+        since_ns = time_ns % self._trigger_period_ns
+        return since_ns - round(round(since_ns / self._period_ns) * self._period_ns)
 
     def _frames(self, span_ns: int) -> int:
-        return (span_ns + self._period_ns // 2) // self._period_ns
+        return round(span_ns / self._period_ns)
 
     def _drift_ns(self, stamps_ns: list[int]) -> float:
         """Return how much longer than the period a frame takes: the median of all pairs' slopes."""

@@ -14,6 +14,7 @@ from msgspec import UNSET
 from node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
 from node.config import NodeConfig
 from node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
+from node.drivers.health import Health
 from node.drivers.i2c import I2cBus
 from node.drivers.registry import NONE, check_names, open_depth, open_imu
 from node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
@@ -26,22 +27,6 @@ log = logging.getLogger(__name__)
 IMU_PERIOD_NS: Final = 10 * MS_NS
 LONGEST_WAIT_NS: Final = 50 * MS_NS
 REOPEN_NS: Final = 2 * S_NS
-
-
-class Health:
-    """Says once what went wrong with a device and once that it is back. problem: "" where all is well."""
-
-    def __init__(self, name: str) -> None:
-        self.problem = ""
-        self._name = name
-
-    def update(self, problem: str) -> None:
-        """Take note of how it is now."""
-        if problem and not self.problem:
-            log.warning("%s: %s", self._name, problem)
-        elif self.problem and not problem:
-            log.info("%s: back to normal", self._name)
-        self.problem = problem
 
 
 class Metronome:

@@ -29,7 +29,9 @@ class FreeCamera:
     seed: int = 1
     asked_ns: list[int] = field(default_factory=list)
 
-    def run(self, lock: PhaseLock, seconds: float, period_ns: int, step: tuple[float, int] | None = None):
+    def run(
+        self, lock: PhaseLock, seconds: float, period_ns: int, step: tuple[float, int] | None = None, frames: int = 1
+    ):
         """Return when (s) and how far off the grid (ns) the middle of each exposure was.
 
         step: (s, ns), the wall clock is set by so much at that time.
@@ -44,7 +46,8 @@ class FreeCamera:
             shift_ns = step[1] if step and now_s >= step[0] else 0
             wall_ns = t_ns + shift_ns
             times.append(now_s)
-            offs.append((wall_ns + period_ns // 2) % period_ns - period_ns // 2)
+            after_ns = wall_ns % period_ns
+            offs.append(after_ns - round(after_ns * frames / period_ns) * period_ns / frames)
             if rng.uniform() >= self.lost:
                 answer_ns = lock.update(wall_ns + int(rng.normal(0, self.jitter_ns)))
                 if answer_ns is not None:
@@ -57,8 +60,8 @@ class FreeCamera:
         return np.array(times), np.array(offs)
 
 
-def lock_for(camera: FreeCamera, period_ns: int = PERIOD_NS) -> PhaseLock:
-    return PhaseLock(period_ns, camera.min_ns, camera.line_ns)
+def lock_for(camera: FreeCamera, period_ns: int = PERIOD_NS, frames: int = 1) -> PhaseLock:
+    return PhaseLock(period_ns, frames, camera.min_ns, camera.line_ns)
 
 
 @pytest.mark.parametrize("ppm", [-40.0, -10.0, 0.0, 25.0, 40.0])
@@ -67,6 +70,15 @@ def lock_for(camera: FreeCamera, period_ns: int = PERIOD_NS) -> PhaseLock:
 def test_locks_within_two_seconds_and_stays(ppm, line_ns, seed):
     camera = FreeCamera(ppm=ppm, line_ns=line_ns, seed=seed)
     times_s, off_ns = camera.run(lock_for(camera), 60.0, PERIOD_NS)
+    assert np.abs(off_ns[times_s >= 2.0]).max() <= LOCKED_NS
+
+
+@pytest.mark.parametrize(("rate_hz", "frames"), [(7, 2), (3, 4), (30, 1), (10, 2)])
+def test_any_rate_and_number_of_frames(rate_hz, frames):
+    """A seventh of a second is no whole number of ns: the grid must not slide away with the years."""
+    period_ns = round(1e9 / rate_hz)
+    camera = FreeCamera(ppm=30.0)
+    times_s, off_ns = camera.run(lock_for(camera, period_ns, frames), 20.0, period_ns, frames=frames)
     assert np.abs(off_ns[times_s >= 2.0]).max() <= LOCKED_NS
 
 

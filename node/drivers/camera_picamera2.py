@@ -1,0 +1,285 @@
+"""A Raspberry Pi camera through picamera2 (0.3.25 or later): running freely, everything fixed, frames by trigger.
+
+The camera is never started or stopped for a picture. Its exposure, gain and white balance do not move, so a
+light looks alike from frame to frame; one control alone moves, the frame's duration, to lock the phase.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.config import CameraConfig, NodeConfig
+from node.devices import Frame
+from node.drivers.health import Health
+from node.drivers.readout import GLOBAL_SHUTTERS, Readout, boottime_ns, line_time_ns, wall_offset_ns
+from node.drivers.samples import DeviceError
+from node.trigger import FrameChooser, PhaseLock, frames_per_trigger
+from protocol.clock import MS_NS, S_NS, Clock
+from protocol.messages import NodeInfo
+
+log = logging.getLogger(__name__)
+
+BUFFERS: Final = 6
+COLOUR_GAINS: Final = (2.0, 1.7)  # white light near 5500 K; the brightness that counts hardly depends on it
+FOCUS_DIOPTRES: Final = 0.5  # two metres: sharp from one to infinity
+
+POLL_S: Final = 0.2
+SILENCE_NS: Final = 2 * S_NS
+REOPEN_NS: Final = 2 * S_NS
+CLOSE_S: Final = 1.5
+OLDEST_NS: Final = 2 * S_NS
+EARLY_NS: Final = 5 * MS_NS
+
+SYNC_MODES: Final = {"server": 1, "client": 2}
+
+# What picamera2, libcamera's bindings and their threads raise when a camera or its cable fails.
+CAMERA_ERRORS: Final = (RuntimeError, OSError, ValueError, LookupError, AssertionError)
+
+
+class Picamera2Camera:
+    """One camera.
+
+    colour: BGR pictures, else luminance alone. problem: what is wrong, "" where nothing is. row_time_ns: from
+    one row to the next. skipped: frames that were not given out, by reason.
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        trigger_period_ns: int,
+        colour: bool,
+        clock: Clock,
+        boottime: Callable[[], int] = boottime_ns,
+    ) -> None:
+        self.row_time_ns = 0
+        self.skipped: Counter[str] = Counter()
+        self._config = config
+        self._colour = colour
+        self._trigger_period_ns = trigger_period_ns
+        self._frames = frames_per_trigger(trigger_period_ns)
+        self._frame_period_ns = trigger_period_ns // self._frames
+        self._clock = clock
+        self._boottime = boottime
+        self._health = Health("camera")
+        self._camera: Any = None
+        self._open()
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with it, "" where nothing is."""
+        return self._health.problem
+
+    def info(self) -> NodeInfo | None:
+        """Return None: the calibration stands in the configuration."""
+        return None
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next trigger's frame; None once stop is set. A camera that fails is opened anew."""
+        while not stop.is_set():
+            try:
+                frame = self._next(stop)
+            except CAMERA_ERRORS as error:
+                self._health.update(f"{type(error).__name__}: {error}")
+                self._reopen(stop)
+                continue
+            if frame is not None:
+                return frame
+        return None
+
+    def close(self) -> None:
+        """Free the camera."""
+        camera, self._camera = self._camera, None
+        if camera is None:
+            return
+        # libcamera can hang on a camera that is gone; the node's end must not.
+        closing = threading.Thread(target=_close, args=(camera,), name="camera closing", daemon=True)
+        closing.start()
+        closing.join(CLOSE_S)
+        if closing.is_alive():
+            log.warning("camera: still closing after %.1f s", CLOSE_S)
+
+    def _open(self) -> None:
+        try:
+            from picamera2 import MappedArray, Picamera2
+        except ModuleNotFoundError as error:
+            raise DeviceError(
+                f"camera: needs {error.name}: apt install python3-picamera2, and a venv with --system-site-packages"
+            ) from error
+        self._mapped_array: Any = MappedArray
+        if not Picamera2.global_camera_info():
+            raise DeviceError("camera: none found: check its cable, and rpicam-hello --list-cameras")
+        try:
+            self._camera = Picamera2()
+            self._configure()
+            self._camera.start()
+        except CAMERA_ERRORS as error:
+            self.close()
+            raise DeviceError(f"camera: cannot be opened: {error}") from error
+        except DeviceError:
+            self.close()
+            raise
+
+    def _configure(self) -> None:
+        camera, config = self._camera, self._config
+        size = (config.width_px, config.height_px)
+        mode = choose_mode(camera.sensor_modes, size)
+        camera.configure(
+            camera.create_preview_configuration(
+                main={"format": "RGB888" if self._colour else "YUV420", "size": size},
+                raw=None,
+                buffer_count=BUFFERS,
+                display=None,
+                encode=None,
+                sensor={"output_size": mode["size"], "bit_depth": mode["bit_depth"]},
+            )
+        )
+        got = tuple(camera.camera_configuration()["main"]["size"])
+        if got != size:
+            raise DeviceError(f"camera: gives {got[0]}x{got[1]}, not camera.width_px x height_px = {size[0]}x{size[1]}")
+        self._mode_crop, self._mode_height = tuple(mode["crop_limits"]), int(mode["size"][1])
+        model = str(camera.camera_properties.get("Model", "unknown"))
+        shortest_us = int(camera.camera_controls["FrameDurationLimits"][0])
+        line_ns = line_time_ns(model, shortest_us, self._mode_height)
+        self._line_ns = 0.0 if model in GLOBAL_SHUTTERS else line_ns
+        self._lock = PhaseLock(self._trigger_period_ns, self._frames, shortest_us * 1000, line_ns)
+        self._chooser = FrameChooser(self._trigger_period_ns, self._frame_period_ns)
+        whole = Readout.of_crop(self._mode_crop, self._mode_crop, self._mode_height, self._line_ns)
+        self.row_time_ns = round(whole.row_time_ns(config.height_px))
+        if self._frame_period_ns < shortest_us * 1000 or self._frame_period_ns <= config.exposure_us * 1000:
+            raise DeviceError(
+                f"camera: a frame each {self._frame_period_ns / 1e6:.1f} ms cannot be had (mode: "
+                f"{shortest_us / 1e3:.1f} ms, exposure {config.exposure_us / 1e3:.1f} ms): lower rate_hz or exposure_us"
+            )
+        camera.set_controls(self._controls(camera.camera_controls))
+
+    def _controls(self, known: dict[str, tuple[Any, Any, Any]]) -> dict[str, Any]:
+        """Return all controls, fixed. Enumerations go by libcamera's numbers."""
+        config = self._config
+        controls: dict[str, Any] = {
+            "AeEnable": False,
+            "ExposureTime": config.exposure_us,
+            "AnalogueGain": config.gain,
+            "FrameDurationLimits": _limits(self._lock.duration_ns),
+        }
+        wanted = {
+            "AwbEnable": False,
+            "ColourGains": COLOUR_GAINS,
+            "NoiseReductionMode": 0,
+            "Sharpness": 0.0,
+            "AfMode": 0,
+            "LensPosition": FOCUS_DIOPTRES,
+        }
+        controls |= {name: value for name, value in wanted.items() if name in known}
+        if config.sync != "off":
+            if "SyncMode" not in known:
+                raise DeviceError(f"camera: camera.sync = {config.sync!r} needs a libcamera with SyncMode")
+            controls["SyncMode"] = SYNC_MODES[config.sync]
+        return controls
+
+    def _reopen(self, stop: threading.Event) -> None:
+        while True:
+            self.close()
+            if self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
+                return
+            try:
+                self._open()
+                return
+            except DeviceError as error:
+                self._health.update(str(error))
+
+    def _next(self, stop: threading.Event) -> Frame | None:
+        request = self._wait_request(stop)
+        if request is None:
+            return None
+        try:
+            metadata = request.get_metadata()
+            wrong = self._wrong_time(metadata)
+            if wrong:
+                self._health.update(wrong)
+                return None
+            readout = Readout.of_crop(
+                tuple(metadata.get("ScalerCrop", self._mode_crop)), self._mode_crop, self._mode_height, self._line_ns
+            )
+            stamp_ns = readout.middle_ns(metadata["SensorTimestamp"], metadata["ExposureTime"])
+            stamp_ns += wall_offset_ns(self._boottime, self._clock.now_ns)
+            self._keep_phase(stamp_ns)
+            if not self._chooser.is_nearest(stamp_ns):
+                self.skipped["not_nearest"] += 1
+                return None
+            image = self._copy(request)
+        finally:
+            # What set_controls was given goes out with the request that is released next.
+            request.release()
+        self._health.update("")
+        return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])))
+
+    def _wait_request(self, stop: threading.Event) -> Any:
+        camera, asked_ns = self._camera, self._boottime()
+        job = camera.capture_request(wait=False)
+        while True:
+            try:
+                return camera.wait(job, timeout=POLL_S)
+            except TimeoutError:
+                if stop.is_set():
+                    camera.cancel_all_and_flush()
+                    return None
+                if self._boottime() - asked_ns > SILENCE_NS + self._frame_period_ns:
+                    camera.cancel_all_and_flush()
+                    raise RuntimeError(f"no frame for {SILENCE_NS / 1e9:.0f} s") from None
+
+    def _wrong_time(self, metadata: dict[str, Any]) -> str:
+        """Say why a frame does not tell when it was taken, "" where it does."""
+        sensor_ns = metadata.get("SensorTimestamp")
+        if sensor_ns is None or metadata.get("ExposureTime") is None:
+            self.skipped["no_time"] += 1
+            return "a frame without SensorTimestamp or ExposureTime"
+        age_ns = self._boottime() - sensor_ns
+        if not -EARLY_NS <= age_ns <= OLDEST_NS:
+            self.skipped["wrong_clock"] += 1
+            return f"SensorTimestamp is {age_ns / 1e9:.3f} s away from CLOCK_BOOTTIME"
+        return ""
+
+    def _keep_phase(self, stamp_ns: int) -> None:
+        if self._config.sync == "client":
+            return  # libcamera moves this camera's frames to the server's
+        duration_ns = self._lock.update(stamp_ns)
+        if duration_ns is not None:
+            self._camera.set_controls({"FrameDurationLimits": _limits(duration_ns)})
+
+    def _copy(self, request: Any) -> NDArray[np.uint8]:
+        """Return the picture, out of the camera's memory: that is overwritten once the request is released."""
+        height, width = self._config.height_px, self._config.width_px
+        with self._mapped_array(request, "main") as mapped:
+            return np.array(mapped.array[:height, :width], np.uint8, order="C")
+
+
+def choose_mode(modes: list[dict[str, Any]], size: tuple[int, int]) -> dict[str, Any]:
+    """Return the sensor mode with the widest view that has all the pixels asked for, and no more than needed."""
+    enough = [m for m in modes if "crop_limits" in m and m["size"][0] >= size[0] and m["size"][1] >= size[1]]
+    if not enough:
+        raise DeviceError(f"camera: no mode has {size[0]}x{size[1]} pixels")
+    return max(enough, key=lambda m: (m["crop_limits"][2] * m["crop_limits"][3], -m["size"][0], m["bit_depth"]))
+
+
+def _limits(duration_ns: int) -> tuple[int, int]:
+    duration_us = round(duration_ns / 1000)
+    return duration_us, duration_us
+
+
+def _close(camera: Any) -> None:
+    try:
+        camera.close()
+    except CAMERA_ERRORS as error:
+        log.warning("camera: closing: %s: %s", type(error).__name__, error)
+
+
+def open_camera(config: NodeConfig, clock: Clock) -> Picamera2Camera:
+    """Open the camera; raise DeviceError where there is none. Detection by colour alone needs colour pictures."""
+    return Picamera2Camera(config.camera, config.trigger_period_ns, config.detector.method == "paper", clock)
