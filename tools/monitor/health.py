@@ -201,11 +201,11 @@ def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
     return [Finding("bad", "pair", f"No pose: {reason_words(reason)}{share}.", picture.pose_ns, advice)]
 
 
-def since_words(finding: Finding, now_ns: int) -> str:
-    """Return since when a finding holds: `for 12 s`, `for 3 min`, or nothing."""
+def sentence(finding: Finding, now_ns: int) -> str:
+    """Return what a finding says, and since when."""
     if finding.since_ns is None:
-        return ""
-    return f"for {duration_words((now_ns - finding.since_ns) / S_NS)}"
+        return finding.what
+    return f"{finding.what.rstrip('.')}, for {duration_words((now_ns - finding.since_ns) / S_NS)}."
 
 
 def duration_words(seconds: float) -> str:

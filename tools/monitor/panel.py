@@ -13,10 +13,12 @@ from msgspec import UNSET
 
 from protocol.clock import S_NS
 from protocol.messages import Candidates, CompressedImage, Rejected, RelativePose
-from tools.monitor.health import Finding, duration_words, findings, reason_words, since_words
+from tools.monitor.health import Finding, duration_words, findings, reason_words, sentence
 from tools.monitor.picture import STALE_NS, Miss, NodePicture, PairPicture, Point
 from tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 
+# A status older than this says nothing of now.
+STATUS_STALE_NS: Final = 3 * S_NS
 PLOTTED_NS: Final = 120 * S_NS
 # Poses further apart than this are not joined by a line: between them nothing is known.
 BREAK_NS: Final = 3 * S_NS // 2
@@ -52,7 +54,7 @@ def block(*parts: str) -> str:
 def headline(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
     """Return the worst thing to say, and the newest pose in large figures, struck through once it is stale."""
     worst = findings(picture, now_ns, live=live)[0]
-    banner = f'<div class="banner {worst.level}">{escape(worst.what)} {escape(since_words(worst, now_ns))}</div>'
+    banner = f'<div class="banner {worst.level}">{escape(sentence(worst, now_ns))}</div>'
     return block(banner, _figures(picture, now_ns))
 
 
@@ -95,17 +97,16 @@ def health(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
 
 
 def _finding(finding: Finding, now_ns: int) -> str:
-    since = since_words(finding, now_ns)
     advice = f'<div class="dim">What to do: {escape(finding.advice)}.</div>' if finding.advice else ""
-    return f'<div class="find {finding.level}">{escape(finding.what)} {escape(since)}{advice}</div>'
+    return f'<div class="find {finding.level}">{escape(sentence(finding, now_ns))}{advice}</div>'
 
 
 def _node_row(node: NodePicture, now_ns: int) -> str:
     age_ns = node.age_ns("candidates", now_ns)
     pictures = "no pictures yet" if age_ns is None else f"newest picture {duration_words(age_ns / S_NS)} ago"
     facts = [pictures]
-    status = node.status
-    if status is not None:
+    status, said_ns = node.status, node.age_ns("status", now_ns)
+    if status is not None and said_ns is not None and said_ns < STATUS_STALE_NS:
         facts += [f"{escape(what)} {rate:.0f}/s" for what, rate in sorted(status.rates_hz.items()) if rate >= 0.5]
         facts += [
             f"{count} {escape(cause.replace('_', ' '))} dropped" for cause, count in status.drops.items() if count

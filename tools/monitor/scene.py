@@ -99,7 +99,10 @@ def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
 
 
 def age_colours(ages_s: Floats, whole_s: float) -> NDArray[np.uint8]:
-    """Return a colour (n, 3) for each age: bright amber for now, fading into dark blue at whole_s."""
+    """Return a colour (n, 3) for each age: bright amber for now, fading into blue at whole_s.
+
+    Linear light, as colours of single points are taken, not sRGB.
+    """
     share = np.clip(ages_s / whole_s, 0.0, 1.0)[:, None]
-    fresh, old = np.array([255.0, 190.0, 60.0]), np.array([38.0, 70.0, 120.0])
-    return np.asarray(np.round(fresh + (old - fresh) * np.sqrt(share)), np.uint8)
+    fresh, old = np.array([1.0, 0.45, 0.04]), np.array([0.03, 0.09, 0.26])
+    return np.asarray(np.round(255.0 * (fresh + (old - fresh) * np.sqrt(share))), np.uint8)

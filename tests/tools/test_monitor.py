@@ -1,0 +1,338 @@
+"""The state of a pair, what is said of it in plain words, and how it is put on the page."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from protocol.bus import Received
+from protocol.clock import S_NS, ManualClock
+from protocol.messages import Message, encode
+from protocol.topics import POSE, key_of
+from tests.tools.evaluated import FACING, INFOS, OFFSET_PX, frame, pose, rejection
+from tests.tools.watched import at, attitude, feed, image, solver_status, status, watched
+from tools.monitor import panel
+from tools.monitor.coverage import Coverage, clock_words
+from tools.monitor.health import REASONS, findings, sentence
+from tools.monitor.inbox import QUEUED, Inbox
+from tools.monitor.picture import KEPT_NS, Miss, PairPicture
+from tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of
+from tools.monitor.svg import Line, Plot, svg, ticks
+
+HALF = math.sqrt(0.5)
+
+
+def words(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
+    return " ".join(sentence(finding, now_ns) + finding.advice for finding in findings(picture, now_ns, live=live))
+
+
+class TestPicture:
+    def test_a_level_camera_that_looks_north_sees_b_in_the_north(self) -> None:
+        frame_a = frame_of(INFOS["a"], attitude("a", 0))
+        np.testing.assert_allclose(frame_a.R_s_a, R_LEVEL, atol=1e-12)
+        assert frame_a.levelled
+        np.testing.assert_allclose(frame_a.place(pose(0)), (3.0, 0.0, 0.0), atol=1e-12)
+
+    def test_a_camera_that_looks_east_sees_b_in_the_east_and_its_right_is_south(self) -> None:
+        frame_a = frame_of(INFOS["a"], attitude("a", 0, (0.0, 0.0, HALF, HALF)))
+        np.testing.assert_allclose(frame_a.place(pose(0)), (0.0, 3.0, 0.0), atol=1e-12)
+        np.testing.assert_allclose(frame_a.R_s_a @ (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), atol=1e-12)
+
+    def test_two_nodes_that_face_each_other_look_in_opposite_directions(self) -> None:
+        frame_a = frame_of(INFOS["a"], attitude("a", 0))
+        ahead = np.array([0.0, 0.0, 1.0])
+        np.testing.assert_allclose(frame_a.turn_b(pose(0)) @ ahead, -(frame_a.R_s_a @ ahead), atol=1e-12)
+        assert FACING == (0.0, 1.0, 0.0, 0.0)
+
+    def test_without_an_attitude_the_scene_says_that_it_is_drawn_level(self) -> None:
+        assert not frame_of(INFOS["a"], None).levelled
+        assert not frame_of(None, attitude("a", 0)).levelled
+
+    def test_b_is_where_the_solver_says_where_it_knows_north(self) -> None:
+        picture = watched(1)
+        picture.take(pose(1, t_ned_m=(1.0, 2.0, 3.0), azimuth_rad=1.1, inclination_rad=-0.9), None, at(5))
+        assert picture.points[-1].t_m == (1.0, 2.0, 3.0)
+
+    def test_stale_within_a_second(self) -> None:
+        picture = watched(5)
+        assert not picture.is_stale(at(4) + S_NS // 2)
+        assert picture.is_stale(at(4) + S_NS)
+        assert PairPicture().is_stale(0)
+
+    def test_trail_keeps_minutes_and_no_more(self) -> None:
+        picture = PairPicture()
+        for k in range(0, 4000, 2):
+            picture.take(pose(k), None, at(k))
+        assert picture.points[-1].at_ns - picture.points[0].at_ns <= KEPT_NS
+        assert len(picture.points) == KEPT_NS // (2 * (at(1) - at(0))) + 1
+        assert len(picture.results) <= 128
+
+    def test_another_pair_s_poses_are_named_and_not_shown(self) -> None:
+        picture = watched(3)
+        picture.take(pose(3, node_b="c", range_m=99.0), None, at(3))
+        assert picture.pose is not None
+        assert picture.pose.range_m == 3.0
+        assert "another pair, a and c" in words(picture, at(3))
+
+    def test_latency_of_a_log_solved_offline_is_unknown(self) -> None:
+        picture = PairPicture()
+        picture.take(pose(0), None, at(0))
+        picture.take(pose(10), None, at(10) + S_NS // 20)
+        assert [point.latency_s for point in picture.points] == [None, 0.05]
+
+
+class TestHealth:
+    def test_a_healthy_pair_is_said_to_be_well(self) -> None:
+        assert "All is well" in words(watched(), at(29) + S_NS // 10)
+
+    def test_nothing_yet(self) -> None:
+        assert "start hub, nodes and solver" in words(PairPicture(), 5)
+
+    def test_a_killed_node_is_named_with_what_to_do(self) -> None:
+        picture = watched()
+        picture.alive("node/b", False, at(30))
+        feed(picture, 31, "a")
+        said = findings(picture, at(31))[0]
+        assert (said.level, said.who, said.since_ns) == ("bad", "b", at(30))
+        assert "power" in said.advice
+
+    def test_a_node_that_came_back_is_not_gone(self) -> None:
+        picture = watched()
+        picture.alive("node/b", False, at(30))
+        for k in range(50, 70):
+            feed(picture, k)
+        assert "All is well" in words(picture, at(69))
+
+    def test_a_frozen_node_is_silent_though_nobody_saw_it_leave(self) -> None:
+        picture = watched()
+        for k in range(30, 50):
+            feed(picture, k, "a")
+        assert sentence(findings(picture, at(50))[0], at(50)) == "Node b is silent, for 2.1 s."
+
+    def test_a_dead_hub_is_told_from_dead_nodes(self) -> None:
+        picture = watched()
+        said = findings(picture, at(29) + 5 * S_NS)
+        assert [finding.who for finding in said] == ["bus"]
+        assert said[0].since_ns == at(29)
+
+    def test_the_solver_is_missed(self) -> None:
+        picture = watched()
+        picture.alive("solver/any", False, at(29))
+        assert "The solver has left the bus" in words(picture, at(30))
+        picture.alive("solver/any", True, at(30))
+        assert "The solver is silent" in words(watched(1), at(0) + S_NS) + words(_unsolved(), at(60))
+
+    def test_what_a_node_reports_is_passed_on_with_its_beginning(self) -> None:
+        picture = watched()
+        for k, figure in ((30, "2.1"), (40, "3.1"), (50, "4.1")):
+            picture.take(status("a", at(k), f"camera: nothing for {figure} s"), None, at(k))
+            feed(picture, k + 1)
+        said = [finding for finding in findings(picture, at(51)) if "reports" in finding.what]
+        assert [finding.since_ns for finding in said] == [at(30)]
+
+    @pytest.mark.parametrize("reason", sorted(REASONS))
+    def test_each_reason_is_said_in_plain_words_with_advice(self, reason: str) -> None:
+        picture = watched()
+        for k in range(30, 60):
+            for message in (frame("a", k), frame("b", k), rejection(k, reason)):
+                picture.take(message, None, at(k))
+            picture.take(solver_status(at(k)), None, at(k))
+        said = next(finding for finding in findings(picture, at(60)) if finding.who == "pair")
+        assert said.what == f"No pose: {REASONS[reason][0]}."
+        assert said.advice == REASONS[reason][1]
+
+    def test_a_log_without_poses_says_how_to_get_them(self) -> None:
+        picture = PairPicture()
+        for k in range(40):
+            picture.take(frame("a", k), None, at(k))
+            picture.take(frame("b", k), None, at(k))
+        assert "buddyline solve" in words(picture, at(39), live=False)
+
+
+def _unsolved() -> PairPicture:
+    picture = watched(11)
+    for k in range(11, 61):
+        picture.take(frame("a", k), None, at(k))
+        picture.take(frame("b", k), None, at(k))
+    return picture
+
+
+class TestInbox:
+    def received(self, message: Message, receive_ns: int) -> Received:
+        return Received(key_of(message), encode(message), receive_ns, "")
+
+    def test_only_the_newest_attitude_is_decoded_and_every_pose(self) -> None:
+        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
+        for k in range(20):
+            inbox.receive(self.received(attitude("a", at(k)), at(k)))
+            inbox.receive(self.received(pose(k), at(k)))
+        assert inbox.empty_into(picture) == 21
+        assert picture.solved == 20
+        assert picture.nodes["a"].attitude == attitude("a", at(19))
+
+    def test_a_flood_drops_the_oldest(self) -> None:
+        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
+        for k in range(QUEUED + 5):
+            inbox.receive(self.received(pose(k), at(k)))
+        assert inbox.empty_into(picture) == QUEUED
+        assert inbox.dropped == 5
+        assert picture.pose == pose(QUEUED + 4)
+
+    def test_a_bad_message_is_counted_and_changes_nothing(self) -> None:
+        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
+        inbox.receive(Received(POSE.key("a", "b"), b'{"range_m": "far"}', 0, ""))
+        inbox.receive(self.received(pose(1), at(1)))
+        inbox.empty_into(picture)
+        assert inbox.bad_count == 1
+        assert picture.solved == 1
+
+    def test_who_leaves_is_seen(self) -> None:
+        inbox, picture = Inbox(ManualClock(at(30))), watched()
+        inbox.presence("node/b", False)
+        inbox.empty_into(picture)
+        assert picture.nodes["b"].left_ns == at(30)
+
+
+class TestPanel:
+    def test_stale_figures_are_struck_through_and_said_to_be_old(self) -> None:
+        picture = watched()
+        fresh, old = panel.headline(picture, at(29)), panel.headline(picture, at(29) + S_NS)
+        assert "STALE" not in fresh
+        assert 'class="grid old"' in old
+        assert "STALE: 1.0 s old" in old
+
+    def test_words_from_the_bus_cannot_become_markup(self) -> None:
+        picture = watched()
+        picture.take(status("a", at(30), "<script>alert(1)</script>"), None, at(30))
+        picture.take(replace_detail("<img src=x>"), None, at(30))
+        for drawn in (panel.headline, panel.health):
+            assert "<script>alert" not in drawn(picture, at(31))
+        assert "<img" not in panel.camera(picture, picture.nodes["a"], at(30))
+
+    def test_the_chosen_pair_is_marked_left_and_right(self) -> None:
+        drawn = panel.marked_picture(None, frame("a", 0), pose(0, blobs_a=(1, 0)), "a")
+        root = ET.fromstring(drawn)
+        named = {text.text: float(text.attrib["x"]) for text in root.iter("text")}
+        assert named["L"] == pytest.approx(409.5 - OFFSET_PX, abs=30)
+        assert named["R"] == pytest.approx(409.5 + OFFSET_PX, abs=30)
+        assert len(list(root.iter("circle"))) == 3
+
+    def test_of_one_light_only_that_one_is_marked(self) -> None:
+        drawn = panel.marked_picture(None, frame("a", 0), pose(0, blobs_a=(-1, 0)), "a")
+        assert [text.text for text in ET.fromstring(drawn).iter("text")] == ["R"]
+
+    def test_a_picture_carries_its_own_candidates_not_the_newest(self) -> None:
+        picture = watched(5)
+        picture.take(image("a", at(2)), "a", at(4))
+        drawn = panel.camera(picture, picture.nodes["a"], at(4))
+        assert "data:image/png;base64," in drawn
+        assert "Pose at 3.00 m" in drawn
+        assert "STALE" in panel.camera(picture, picture.nodes["a"], at(4) + 4 * S_NS)
+
+    def test_a_picture_of_an_unknown_kind_is_not_passed_on(self) -> None:
+        drawn = panel.marked_picture(image("a", at(0), 'svg+xml;"><script>'), frame("a", 0), None, "a")
+        assert "script" not in drawn
+        assert "<image" not in drawn
+
+    def test_a_rejection_is_said_on_the_picture(self) -> None:
+        assert "more than one arrangement fits (two, alike)" in panel.result_words(rejection(0), "a")
+
+    def test_azimuths_are_plotted_across_north_without_a_jump(self) -> None:
+        picture = PairPicture()
+        for k in range(0, 40, 2):
+            azimuth_rad = math.radians((350 + k) % 360)
+            picture.take(pose(k, azimuth_rad=azimuth_rad, inclination_rad=0.0), None, at(k))
+        plot = panel.time_plots(list(picture.points), at(0), (0.0, 4.0), [], "s")[1]
+        drawn = [xy[1] for xy in plot.lines[0].points if xy is not None]
+        assert np.max(np.abs(np.diff(drawn))) < 5.0
+
+    def test_a_gap_breaks_the_line(self) -> None:
+        picture = PairPicture()
+        for k in (0, 2, 4, 40, 42):
+            picture.take(pose(k), None, at(k))
+        line = panel.time_plots(list(picture.points), at(0), (0.0, 5.0), [], "s")[0].lines[0]
+        assert [xy is None for xy in line.points] == [False, False, False, True, False, False]
+
+    def test_misses_in_a_row_are_one_stretch_and_a_pose_parts_them(self) -> None:
+        misses = [Miss(at(k), "ambiguous", "") for k in (1, 2, 3, 5, 6)]
+        assert panel.stretches(misses, [at(4)]) == [(at(1), at(3)), (at(5), at(6))]
+        assert panel.stretches(misses, []) == [(at(1), at(6))]
+
+    @pytest.mark.parametrize("draw", [panel.headline, panel.health])
+    def test_every_state_can_be_drawn(self, draw: Callable[[PairPicture, int], str]) -> None:
+        for picture in (PairPicture(), watched(1), watched(30), _unsolved()):
+            assert draw(picture, at(30)).startswith("<style>")
+            assert "<svg" in panel.plots(picture, at(30))
+
+
+def replace_detail(detail: str) -> Message:
+    return replace(rejection(29), detail=detail)
+
+
+class TestScene:
+    def test_the_ellipsoid_s_longest_axis_lies_along_the_line_of_sight(self) -> None:
+        half_m, R_s_axes = ellipsoid(pose(0), frame_of(INFOS["a"], attitude("a", 0)))
+        longest = int(np.argmax(half_m))
+        assert half_m[longest] == pytest.approx(2.795 * 0.02)
+        np.testing.assert_allclose(np.abs(R_s_axes[:, longest]), (1.0, 0.0, 0.0), atol=1e-9)
+        assert np.linalg.det(R_s_axes) == pytest.approx(1.0)
+
+    @pytest.mark.parametrize("aspect", [0.46, 1.6])
+    def test_the_view_has_both_nodes_before_the_eye(self, aspect: float) -> None:
+        t_m = np.array([0.0, -8.0, 1.0])
+        eye, target = fit(t_m, aspect)
+        ahead = (target - eye) / np.linalg.norm(target - eye)
+        for point_m in (np.zeros(3), t_m):
+            seen = point_m - eye
+            assert seen @ ahead / np.linalg.norm(seen) > math.cos(math.radians(40))
+        assert eye[2] < target[2]
+
+    def test_age_is_a_colour(self) -> None:
+        colours = age_colours(np.array([0.0, 60.0, 500.0]), 120.0).astype(int)
+        assert np.all(np.diff(colours[:, 0]) < 0)
+
+
+class TestPlot:
+    @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 9))
+    @settings(max_examples=60, deadline=None)
+    def test_ticks_are_few_round_and_inside(self, low: float, span: float, count: int) -> None:
+        found = ticks(low, low + span, count)
+        assert len(found) <= count + 1
+        assert all(low - 1e-6 * span - 1e-9 <= x <= low + span * (1 + 1e-6) + 1e-9 for x in found)
+
+    def test_a_plot_is_sound_svg_whatever_it_holds(self) -> None:
+        for points in ([], [(0.0, 1.0)], [(0.0, 1.0), None, (2.0, 1.0)], [(k / 10, math.sin(k)) for k in range(50)]):
+            root = ET.fromstring(svg(Plot("A & B", "<m>", [Line("x", points)], bands=[(0.0, 1.0, "#f00")])))
+            assert root.attrib["viewBox"] == "0 0 460 130"
+
+    def test_equal_scales_are_equal(self) -> None:
+        drawn = svg(Plot("plan", "m", [Line("", [(0.0, 0.0), (10.0, 0.0), (10.0, 1.0)])], equal=True, height=400))
+        path = next(ET.fromstring(drawn).iter("path"))
+        numbers = [float(x) for x in path.attrib["d"].replace("M", " ").replace("L", " ").replace("h0", " ").split()]
+        xs, ys = numbers[0::2], numbers[1::2]
+        assert (xs[1] - xs[0]) / 10.0 == pytest.approx((ys[1] - ys[2]) / 1.0, abs=0.2)
+
+
+class TestCoverage:
+    def test_stretches_without_poses_are_found_with_their_reasons(self) -> None:
+        coverage = Coverage(0, 100 * S_NS, bins=100)
+        for k in range(100):
+            coverage.add(k * S_NS, "ambiguous" if 40 <= k < 60 else None)
+        assert [(begin, end) for begin, end, _ in coverage.without()] == [(40 * S_NS, 60 * S_NS)]
+        assert coverage.words(*coverage.without()[0]) == "from 0:40.0 for 20 s: more than one arrangement fits (20)"
+
+    def test_the_strip_marks_where_playback_stands(self) -> None:
+        coverage = Coverage(0, 100 * S_NS, bins=100)
+        coverage.add(0, None)
+        root = ET.fromstring(coverage.strip(50 * S_NS))
+        assert [float(rect.attrib["x"]) for rect in root.iter("rect") if rect.attrib.get("fill") == "#fff"] == [48.5]
+
+    def test_times_are_said_as_people_say_them(self) -> None:
+        assert [clock_words(s) for s in (0.0, 59.96, 61.5, 3661.0)] == ["0:00.0", "1:00.0", "1:01.5", "1:01:01.0"]

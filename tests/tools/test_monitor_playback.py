@@ -1,0 +1,165 @@
+"""Stored dives: played from any instant, surveyed, and reported on one page."""
+
+from __future__ import annotations
+
+import html.parser
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from protocol.clock import S_NS
+from protocol.divelog import DiveLogReader, DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.messages import Message
+from tests.tools.evaluated import INFOS, frame, info, pose, rejection, truth, write_log
+from tests.tools.watched import at, image, tick, watched
+from tools.dives import Dive
+from tools.monitor.coverage import Coverage
+from tools.monitor.playback import LEAD_NS, Playback, survey
+from tools.monitor.report import report_html
+from tools.monitor.summary import summarize
+
+TICKS = 600
+
+
+def dive_messages(ticks: int = TICKS) -> list[Message]:
+    messages: list[Message] = list(INFOS.values())
+    for k in range(ticks):
+        said = tick(k)
+        if 200 <= k < 230:
+            said = [rejection(k) if message == pose(k) else message for message in said]
+        messages += said
+    return messages
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return write_log(tmp_path_factory.mktemp("dive") / "dive.mcap", *dive_messages(), image("a", at(300)))
+
+
+class TestPlayback:
+    def test_playing_on_gives_what_was_known_then(self, dive: str) -> None:
+        with Playback([dive]) as playback:
+            for k in range(0, 60, 7):
+                playback.advance(at(k))
+            playback.advance(at(59))
+            expected = watched(60)
+            assert playback.picture.pose == expected.pose
+            assert playback.picture.points == expected.points
+            assert playback.picture.nodes["b"].depth == expected.nodes["b"].depth
+
+    def test_a_jump_ends_where_playing_on_would(self, dive: str) -> None:
+        with Playback([dive]) as played, Playback([dive]) as jumped:
+            played.advance(at(450))
+            jumped.seek(at(500))
+            jumped.seek(at(450))
+            assert jumped.picture.pose == played.picture.pose
+            assert jumped.picture.nodes["a"].info == INFOS["a"]
+            begin_ns = jumped.picture.points[0].at_ns
+            assert at(450) - LEAD_NS <= begin_ns <= at(450) - LEAD_NS + S_NS
+            assert list(jumped.picture.points) == [p for p in played.picture.points if p.at_ns >= begin_ns]
+
+    def test_a_jump_past_the_ends_stays_inside(self, dive: str) -> None:
+        with Playback([dive]) as playback:
+            playback.seek(0)
+            assert playback.position_ns == playback.start_ns
+            playback.seek(2**62)
+            assert playback.position_ns == playback.end_ns == at(TICKS - 1)
+
+    def test_a_log_without_messages_is_refused(self, tmp_path: Path) -> None:
+        with DiveLogWriter(tmp_path / "empty.mcap"):
+            pass
+        with pytest.raises(BuddylineError, match="no message"):
+            Playback([str(tmp_path / "empty.mcap")])
+
+    def test_the_survey_finds_the_stretch_without_poses(self, dive: str) -> None:
+        coverage = Coverage(at(0), at(TICKS - 1))
+        assert not coverage.complete
+        for _ in survey([dive], coverage):
+            pass
+        assert coverage.complete
+        ((begin_ns, end_ns, reasons),) = coverage.without()
+        assert reasons == {"ambiguous": 30}
+        assert abs(begin_ns - at(200)) <= S_NS // 5
+        assert abs(end_ns - at(230)) <= S_NS // 5
+
+
+class TestReadingFromATime:
+    def test_chunks_before_it_and_of_other_topics_are_not_read(self, tmp_path: Path) -> None:
+        with DiveLogWriter(tmp_path / "d.mcap") as writer:
+            writer.write_message(INFOS["a"], at(0))
+            writer.flush()
+            for k in range(100):
+                writer.write_message(pose(k), at(k))
+                if k % 10 == 9:
+                    writer.flush()
+        with DiveLogReader(tmp_path / "d.mcap") as reader:
+            read: list[int] = []
+            whole = reader._chunk_messages
+            reader._chunk_messages = lambda offset: (read.append(offset), whole(offset))[1]  # type: ignore[method-assign]
+            assert len(list(reader.records(lambda key: key.endswith("/info")))) == 1
+            assert len(read) == 1
+            read.clear()
+            late = list(reader.records(None, at(85)))
+            assert [record.log_time_ns for record in late] == [at(k) for k in range(85, 100)]
+            assert len(read) == 2
+
+
+class TestReport:
+    def test_the_page_is_whole_and_asks_nothing_of_any_network(self, dive: str) -> None:
+        with Dive([dive]) as opened:
+            page = report_html(opened)
+        outside = _Addresses()
+        outside.feed(page)
+        assert [address for address in outside.found if not address.startswith("data:")] == []
+        assert "default-src 'none'" in page
+        assert not re.search(r"https?://", page)
+        for text in ("570 (95%)", "for 3.0 s: more than one arrangement fits (30)", "light spacing", "3.00 to 3.00 m"):
+            assert text in page
+
+    def test_the_replay_has_the_poses(self, dive: str) -> None:
+        with Dive([dive]) as opened:
+            page = report_html(opened)
+        frames = json.loads(re.search(r"FRAMES=(\[.*?\]);\n", page).group(1))  # type: ignore[union-attr]
+        times = np.array([keyframe[0] for keyframe in frames])
+        np.testing.assert_allclose(frames[0][1], (3.0, 0.0, 0.0), atol=1e-4)
+        assert times[-1] == pytest.approx((TICKS - 2) / 10, abs=0.2)
+        assert [keyframe[4] for keyframe in frames].count(False) == 2
+
+    def test_figures_against_truth(self, tmp_path: Path) -> None:
+        messages = [*INFOS.values(), *(pose(k, (0.0, 0.0, 3.02)) for k in range(5)), *(truth(k) for k in range(5))]
+        with Dive([write_log(tmp_path / "t.mcap", *messages)]) as opened:
+            errors_m = summarize(opened).errors_m
+        np.testing.assert_allclose(errors_m, [[0.02, 0.02]] * 5, atol=1e-9)
+
+    def test_pictures_are_shown_with_what_became_of_them(self, dive: str) -> None:
+        with Dive([dive]) as opened:
+            shots = summarize(opened).shots
+        assert list(shots) == ["a"]
+        assert shots["a"].words.startswith("Pose at 3.00 m")
+
+    def test_a_log_without_poses_is_reported_and_says_so(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "raw.mcap", *INFOS.values(), *(frame("a", k) for k in range(20)))
+        with Dive([path]) as opened:
+            page = report_html(opened)
+        assert "this log holds no pose; solve it first" in page
+
+    def test_names_in_a_log_cannot_become_markup(self, tmp_path: Path) -> None:
+        bad = info("a", software="</script><img src=http://x>")
+        with Dive([write_log(tmp_path / "x.mcap", bad, pose(0))]) as opened:
+            page = report_html(opened)
+        assert "<img src=http" not in page
+
+
+class _Addresses(html.parser.HTMLParser):
+    """Collects what a page would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href", "action")]
