@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 
 import cv2
 
+from node.sim import tags
 from node.sim.dive import Plan, messages
 from node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
 from node.sim.world import World
@@ -41,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--baseline", type=float, default=scenario.baseline_a_m, metavar="M", help="default: %(default)s"
     )
     world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
+    world.add_argument("--tags", action="store_true", help="two AR tags on each node, to compare with")
     world.add_argument("--undisturbed", action="store_true", help="nobody looks away, nothing passes before a light")
     faults = parser.add_argument_group("noise and faults")
     faults.add_argument("--sigma-px", type=float, default=scenario.sigma_px, metavar="PX", help="noise of candidates")
@@ -73,12 +75,15 @@ def run(args: argparse.Namespace) -> int:
         miss_share=args.misses,
         false_lights=args.false,
         other_lamps=args.others,
+        tags=args.tags,
         interruptions=not args.undisturbed,
         clock_offset_ns=round(args.clock_offset_ms * MS_NS),
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
     )
     plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
+    if scenario.tags:
+        metadata |= {f"tags_{node}": tags.describe(scenario.index(node)) for node in (scenario.node_a, scenario.node_b)}
     with (
         DiveLogWriter(args.output, metadata=metadata) as writer,
         Progress("simulate", plan.seconds) as progress,

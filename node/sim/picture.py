@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from node.sim import tags
 from node.sim.glow import GlowRenderer
 from node.sim.randomness import generator
 from node.sim.scenario import Scenario
@@ -21,7 +22,7 @@ class Painter:
     """Renders the pictures of one node. Linear light throughout; the camera's tone curve is a square root.
 
     Under a square root shot noise has one size at every brightness, so that one tile of noise, shifted at random
-    for every frame, serves.
+    for every frame, serves. Its buffers serve one caller at a time.
     """
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
@@ -44,6 +45,8 @@ class Painter:
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_wide(coarse, lamp, table)
         self._scenery.paint(view, t_s, coarse, full)
+        for tag in view.tags:
+            tags.paint(full, tag)
         for lamp, table in zip(lamps, tables, strict=True):
             self._glow.add_near(full, lamp, table)
         for passer in view.passers:

@@ -75,6 +75,7 @@ class Scenario:
     off the ideal bar (NodeInfo states where they truly are). range_max_m: 0 for the environment's own.
     sigma_px: noise of synthetic candidates; gross_share of them off by gross_px; miss_share are missing;
     false_lights are put in at random places of each picture. other_lamps: other divers' lamps in the water.
+    tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
     magnetometer_off_rad: constant error of B's heading, outside what its sigma says.
     """
@@ -101,6 +102,7 @@ class Scenario:
     miss_share: float = 0.03
     false_lights: int = 3
     other_lamps: int = 1
+    tags: bool = False
     interruptions: bool = True
     clock_offset_ns: int = 0
     magnetometer_off_rad: float = 0.0

@@ -8,11 +8,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from node.sim import tags
 from node.sim.camera import project
 from node.sim.randomness import Sway, generator
 from node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, Rig, beam, build
 from node.sim.rotation import Matrix, Vector
 from node.sim.scenario import Scenario
+from node.sim.tags import SeenTag
 from node.sim.trajectory import Motion, Placement
 
 LAMP_RADIUS_M = 0.02
@@ -79,6 +81,7 @@ class View:
     lights: tuple[Lamp, Lamp]
     others: tuple[Lamp, ...]
     passers: tuple[Passer, ...]
+    tags: tuple[SeenTag, ...] = ()
 
     @property
     def R_ned_camera(self) -> Matrix:
@@ -112,7 +115,8 @@ class Scene:
         if self.scenario.water.surface > 0:
             sources += [self._reflection(1 - index, side, t_s) for side in (LEFT, RIGHT)]
         others = tuple(self._seen(index, placement, source) for source in sources)
-        return View(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights))
+        seen_tags = self._tags(index, placement, t_s) if self.scenario.tags else ()
+        return View(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights), seen_tags)
 
     def _light(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
         lamp = self._seen(index, placement, self._source(1 - index, side, t_s))
@@ -158,6 +162,31 @@ class Scene:
         position_m = R_camera_ned @ (source.position_ned_m - placement.position_ned_m)
         pixel = project(position_m[None], self.rigs[index].camera)[0]
         return Lamp(position_m, R_camera_ned @ source.aim_ned, pixel, source.intensity, source.beam_rad, source.stretch)
+
+    def _tags(self, index: int, placement: Placement, t_s: float) -> tuple[SeenTag, ...]:
+        """Return the other node's tags, lit by the sun and by the lamps of the node that looks."""
+        water, rig, other = self.scenario.water, self.rigs[index], self.motion.placement(1 - index, t_s)
+        R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
+        R_camera_other = R_camera_ned @ other.R_ned_body @ R_BODY_CAMERA
+        t_camera_other_m = R_camera_ned @ (other.position_ned_m - placement.position_ned_m)
+        k = np.array(water.absorption_per_m) + np.array(water.scattering_per_m)
+        seen = []
+        for tag in tags.layout(1 - index):
+            corners_m = tags.board(tag.corners_m) @ R_camera_other.T + t_camera_other_m
+            pixels = project(corners_m, rig.camera)
+            if np.isnan(pixels).any():
+                continue
+            centre_m = corners_m.mean(axis=0)
+            path_m = centre_m - rig.lights_m
+            far_m = np.linalg.norm(path_m, axis=1)
+            rays = path_m / far_m[:, None]
+            facing = np.clip(-rays @ R_camera_other[:, 2], 0.0, None)
+            on_axis = np.array([beam(ray @ aim, b) for ray, aim, b in zip(rays, rig.aims, rig.beams_rad, strict=True)])
+            lit = (rig.intensities * on_axis * facing / far_m**2) @ np.exp(-np.outer(far_m, k)) / math.pi
+            through = np.exp(-k * np.linalg.norm(centre_m))
+            light = water.lamp_gain * lit + 1.2 * np.array(water.ambient)
+            seen.append(SeenTag(tag.id, pixels, light, through))
+        return tuple(seen)
 
     def _passers(self, index: int, t_s: float, lights: tuple[Lamp, ...]) -> tuple[Passer, ...]:
         if not self.scenario.interruptions or self.scenario.trajectory == "rest":

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from node.sim import candidates, rotation
+from node.sim import candidates, rotation, tags
 from node.sim.glow import core_px
 from node.sim.picture import Painter
 from node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
@@ -19,6 +19,7 @@ from node.sim.rotation import Matrix, Vector
 from node.sim.scenario import Scenario
 from node.sim.scene import Lamp, Scene
 from node.sim.sensors import Sensors
+from node.sim.tags import Tag
 from protocol.messages import (
     Attitude,
     Candidates,
@@ -109,6 +110,10 @@ class World:
         index = self.scenario.index(node)
         t_s = self._seconds(index, stamp_ns)
         return self._painter(index).paint(self._scene.view(index, t_s), t_s, stamp_ns)
+
+    def tags(self, node: str) -> tuple[Tag, ...]:
+        """Return the AR tags that a node carries, none where the scenario has none."""
+        return tags.layout(self.scenario.index(node)) if self.scenario.tags else ()
 
     def imu(self, node: str, stamp_ns: int) -> Imu:
         """Return the inertial sample at stamp_ns."""
