@@ -85,6 +85,24 @@ COMMANDS: Final = (
         ("buddyline evaluate poses.mcap --truth dive.truth.mcap",),
     ),
     Command(
+        "monitor",
+        "tools.monitor.live",
+        "watch a running pair in the browser: scene, cameras, plots, health",
+        ("buddyline monitor", "buddyline monitor --connect tcp/192.168.2.1:7447 --open"),
+    ),
+    Command(
+        "view",
+        "tools.monitor.view",
+        "look at a stored dive in the browser, played from anywhere",
+        ("buddyline view poses.mcap", "buddyline view pictures.mcap poses.mcap --start 60"),
+    ),
+    Command(
+        "report",
+        "tools.monitor.report",
+        "write a dive's report: one page to keep and to send",
+        ("buddyline report poses.mcap -o report.html",),
+    ),
+    Command(
         "export",
         "tools.export",
         "write poses for other programs",
