@@ -22,6 +22,7 @@ from protocol.delivery import CLOSE_S, Delivery, FailureLatch, RateCap
 from protocol.endpoint import DEFAULT_ENDPOINT, client_settings, hub_settings
 from protocol.errors import BuddylineError
 from protocol.security import RefusedError, Tls, refusal
+from protocol.sequence import Gap, Sequence, Source
 from protocol.topics import Topic, parse_key
 
 # `**` does not match chunks that begin with @: nobody takes a token for a message.
@@ -31,7 +32,8 @@ HEARTBEAT_S: Final = 0.25
 RETRY_S: Final = 0.25
 QUERY_S: Final = 2.0
 INTAKE: Final = 8192
-MAX_PUBLISHERS: Final = 4096
+MAX_FETCHING: Final = 16
+FETCHES: Final = 16
 
 _PRIORITIES: Final = {
     "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
@@ -291,7 +293,7 @@ class ZenohSubscription:
     """A Subscription over Zenoh: samples in order, each once, with what can be fetched of those that are missing.
 
     Zenoh's own recovery does most of it. What it leaves: a publisher first heard of in the middle of its
-    numbers, and a gap whose query was lost with the link.
+    numbers, and gaps whose query was lost with the link, as when the hub stood still for longer than the lease.
     """
 
     def __init__(
@@ -304,19 +306,24 @@ class ZenohSubscription:
         clock: Clock,
         failures: FailureLatch,
     ) -> None:
-        self.missed = 0
         self._session = session
         self._delivery = delivery
         self._history = history
         self._clock = clock
-        # The newest number of each publisher, the one longest silent first.
-        self._last: dict[tuple[str, int], int] = {}
+        self._failures = failures
+        self._lock = threading.Lock()
+        self._sequence = Sequence(self._deliver)
+        self._fetching: set[threading.Thread] = set()
+        self._stop = threading.Event()
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
         subscriber: AnySubscriber
         if history:
             recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
             subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, recovery=recovery)
-            for sample in sorted(self._query(f"{key_expr}/@adv/pub/**"), key=_held_order):
+            held = list(self._query(f"{key_expr}/@adv/pub/**"))
+            for sample in sorted(held, key=_number):
+                self._sequence.begin(_source(sample), _number(sample))
+            for sample in sorted(held, key=_held_order):
                 self._accept(sample)
         else:
             subscriber = session.declare_subscriber(key_expr, ring)
@@ -327,47 +334,70 @@ class ZenohSubscription:
         """How many were dropped because the handler was too slow."""
         return self._delivery.dropped
 
+    @property
+    def missed(self) -> int:
+        """How many of its publishers' samples never came."""
+        return self._sequence.missed
+
     def close(self) -> None:
         """Let the handler finish what is queued, one second at most, and end the threads."""
+        self._stop.set()
         self._intake.close()
         self._delivery.close()
+        with self._lock:
+            threads = list(self._fetching)
+        for thread in threads:
+            thread.join(CLOSE_S)
 
     def _accept(self, sample: zenoh.Sample) -> None:
-        """Deliver a sample, after those of its publisher that should have come before it."""
+        """Deliver a sample, or hold it until those of its publisher that should have come before are fetched."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
-        info = sample.source_info
-        if info is None:
+        if sample.source_info is None:
             self._deliver(sample)
             return
-        source = (str(info.source_id.zid), info.source_id.eid)
-        sn, last = info.source_sn, self._last.pop(source, None)
-        self._last[source] = sn if last is None else max(sn, last)
-        if len(self._last) > MAX_PUBLISHERS:
-            del self._last[next(iter(self._last))]
-        if last is not None and sn <= last:
-            return
-        first_due = 0 if last is None else last + 1
-        if sn > first_due:
-            self._fill(sample, source, range(first_due, sn), known=last is not None)
-        self._deliver(sample)
-
-    def _fill(self, sample: zenoh.Sample, source: tuple[str, int], gap: range, *, known: bool) -> None:
-        """Fetch and deliver what is missing before a sample; what nobody holds any more is counted."""
         key = str(sample.key_expr)
         parsed = parse_key(key)
-        if parsed is None or parsed[0].latest_only:
-            return
-        found = 0
-        if self._history:
-            zid, eid = source
-            selector = f"{key}/@adv/pub/{zid}/{eid}/**?_sn={gap[0]}..{gap[-1]}"
-            for earlier in sorted(self._query(selector), key=_number):
-                if _number(earlier) in gap:
-                    self._deliver(earlier)
-                    found += 1
-        if known:
-            self.missed += len(gap) - found
+        newest_only = parsed is None or parsed[0].latest_only
+        with self._lock:
+            gap = self._sequence.accept(
+                _source(sample), _number(sample), key, sample, recover=self._history, newest_only=newest_only
+            )
+            # Whoever invents publishers with gaps must not have a thread for each.
+            while gap is not None and len(self._fetching) >= MAX_FETCHING:
+                gap = self._sequence.close(gap, [])
+            if gap is not None:
+                thread = threading.Thread(target=self._fill, args=(gap,), name=f"bus fetch {key}", daemon=True)
+                self._fetching.add(thread)
+                thread.start()
+
+    def _fill(self, gap: Gap) -> None:
+        """Fetch what is missing and go on, in a thread of its own: other publishers' samples do not wait for it."""
+        try:
+            due: Gap | None = gap
+            while due is not None:
+                found = self._fetch(due)
+                with self._lock:
+                    due = self._sequence.close(due, found)
+        except Exception as error:
+            if not self._stop.is_set():
+                self._failures.report(f"bus fetch {gap.key}", error)
+        finally:
+            with self._lock:
+                self._fetching.discard(threading.current_thread())
+
+    def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
+        """Return what its publisher still holds of a gap; what does not answer is asked again for a while."""
+        zid, eid = gap.source
+        # The number after the gap has come, so whoever answers holds it: with it, all there is has been said.
+        after = gap.missing[-1] + 1
+        selector = f"{gap.key}/@adv/pub/{zid}/{eid}/**?_sn={gap.missing[0]}..{after}"
+        found: dict[int, zenoh.Sample] = {}
+        for _ in range(FETCHES):
+            found.update((_number(sample), sample) for sample in self._query(selector))
+            if after in found or self._stop.wait(RETRY_S):
+                break
+        return list(found.items())
 
     def _query(self, selector: str) -> Iterator[zenoh.Sample]:
         for reply in self._session.get(
@@ -388,6 +418,11 @@ class ZenohSubscription:
             encoding=str(sample.encoding),
         )
         self._delivery.offer(received, len(received.payload))
+
+
+def _source(sample: zenoh.Sample) -> Source:
+    info = sample.source_info
+    return ("", 0) if info is None else (str(info.source_id.zid), info.source_id.eid)
 
 
 def _number(sample: zenoh.Sample) -> int:

@@ -1,6 +1,6 @@
 """Inject faults into the real system and print what became of every frame and every trigger.
 
-python -m tests.faults --times 20 [hub node solver viewer stopped link orders]
+python -m tests.faults --times 20 [hub frozen_hub node solver viewer stopped link orders]
 """
 
 from __future__ import annotations

@@ -69,6 +69,20 @@ def hub(times: int) -> Report:
     return kill_and_return("hub", times, seed=1)
 
 
+def frozen_hub(times: int) -> Report:
+    """The hub stands still for longer than its clients' patience, then goes on as if nothing had been."""
+    report = Report(f"hub stopped for {FREEZE_S:g} s")
+    with running() as system:
+        for _ in range(times):
+            time.sleep(1.0)
+            system.freeze("hub")
+            time.sleep(FREEZE_S)
+            system.thaw("hub")
+            measure(system, report, time.time_ns())
+        report.tally = system.finish()
+    return report
+
+
 def node(times: int) -> Report:
     return kill_and_return("a", times, seed=2)
 
@@ -178,6 +192,7 @@ def ip(*words: str) -> None:
 
 SCENARIOS: dict[str, Callable[[int], Report]] = {
     "hub": hub,
+    "frozen_hub": frozen_hub,
     "node": node,
     "solver": solver,
     "viewer": frozen_viewer,

@@ -1,0 +1,152 @@
+"""Order out of what comes: laws over random losses, and the cases by hand."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from protocol import sequence
+from protocol.sequence import Gap, Sequence
+
+A, B = ("a", 1), ("b", 1)
+
+
+class Listener:
+    """A sequence and what it has handed on."""
+
+    def __init__(self) -> None:
+        self.got: list[tuple[str, int]] = []
+        self.sequence = Sequence(self.got.append)
+
+    def accept(self, source: tuple[str, int], number: int, **more: bool) -> Gap | None:
+        return self.sequence.accept(source, number, "key", (source[0], number), **more)
+
+    def close(self, gap: Gap, found: list[int]) -> Gap | None:
+        return self.sequence.close(gap, [(number, (gap.source[0], number)) for number in found])
+
+    def numbers(self, source: tuple[str, int] = A) -> list[int]:
+        return [number for name, number in self.got if name == source[0]]
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([A, B]), st.booleans(), st.booleans()), max_size=60),
+    st.lists(st.integers(0, 5), max_size=60),
+)
+def test_all_that_can_be_had_comes_in_order_and_once(
+    samples: list[tuple[tuple[str, int], bool, bool]], delays: list[int]
+) -> None:
+    """Some samples are lost on their way, some of those are still held; fetching takes a while."""
+    listener, sent, held_by, open_gaps = Listener(), {A: 0, B: 0}, {A: [], B: []}, []
+    expected: dict[tuple[str, int], list[int]] = {A: [], B: []}
+    delay = iter(delays)
+
+    def fetch(gap: Gap) -> Gap | None:
+        return listener.close(gap, [n for n in held_by[gap.source] if n in gap.missing])
+
+    for source, lost, kept in [*samples, (A, False, True), (B, False, True)]:
+        number = sent[source]
+        sent[source] += 1
+        if kept:
+            held_by[source].append(number)
+        if kept or not lost:
+            expected[source].append(number)
+        if not lost:
+            gap = listener.accept(source, number)
+            if gap is not None:
+                open_gaps.append([gap, next(delay, 0)])
+        for entry in list(open_gaps):
+            entry[1] -= 1
+            if entry[1] < 0:
+                entry[0] = fetch(entry[0])
+                if entry[0] is None:
+                    open_gaps.remove(entry)
+    for gap, _ in open_gaps:
+        due = gap
+        while due is not None:
+            due = fetch(due)
+    assert {source: listener.numbers(source) for source in (A, B)} == expected
+    counted = sum(sent.values()) - len(listener.got)
+    # What a publisher sent before it was heard of, and holds no more, is no loss.
+    assert listener.sequence.missed <= counted
+
+
+def test_what_follows_a_gap_waits_for_it_and_other_publishers_do_not() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    gap = listener.accept(A, 3)
+    assert gap == Gap(A, "key", range(1, 3), known=True)
+    assert listener.accept(A, 4) is None
+    listener.accept(B, 0)
+    assert listener.got == [("a", 0), ("b", 0)]
+    assert listener.close(gap, [2]) is None
+    assert listener.numbers() == [0, 2, 3, 4]
+    assert listener.sequence.missed == 1
+
+
+def test_a_gap_behind_a_gap_is_closed_in_its_turn() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    first = listener.accept(A, 2)
+    assert listener.accept(A, 5) is None
+    second = listener.close(first, [1])
+    assert second == Gap(A, "key", range(3, 5), known=True)
+    assert listener.numbers() == [0, 1, 2]
+    assert listener.close(second, []) is None
+    assert listener.numbers() == [0, 1, 2, 5]
+    assert listener.sequence.missed == 2
+
+
+def test_what_was_before_a_publisher_was_heard_of_is_fetched_and_not_missed() -> None:
+    listener = Listener()
+    gap = listener.accept(A, 5)
+    assert gap == Gap(A, "key", range(5), known=False)
+    assert listener.close(gap, [3, 4]) is None
+    assert listener.numbers() == [3, 4, 5]
+    assert listener.sequence.missed == 0
+    listener.sequence.begin(B, 7)
+    assert listener.accept(B, 7) is None
+
+
+def test_duplicates_and_latecomers_are_dropped() -> None:
+    listener = Listener()
+    for number in (0, 1, 1, 0, 2):
+        listener.accept(A, number)
+    gap = listener.accept(A, 4)
+    listener.accept(A, 4)
+    listener.accept(A, 1)
+    listener.close(gap, [1, 3, 3, 4, 9])
+    assert listener.numbers() == [0, 1, 2, 3, 4]
+
+
+def test_without_recovery_losses_are_counted_and_passed_over() -> None:
+    listener = Listener()
+    for number in (10, 11, 14):
+        assert listener.accept(A, number, recover=False) is None
+    assert listener.numbers() == [10, 11, 14]
+    assert listener.sequence.missed == 2
+
+
+def test_superseded_states_are_no_loss() -> None:
+    listener = Listener()
+    for number in (3, 9, 8, 12):
+        assert listener.accept(A, number, newest_only=True) is None
+    assert listener.numbers() == [3, 9, 12]
+    assert listener.sequence.missed == 0
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequence, "MAX_HELD", 3)
+    monkeypatch.setattr(sequence, "MAX_PUBLISHERS", 2)
+    listener = Listener()
+    listener.accept(A, 0)
+    gap = listener.accept(A, 2)
+    for number in range(3, 10):
+        listener.accept(A, number)
+    assert listener.close(gap, [1]) is None
+    assert listener.numbers() == [0, 1, 2, 3, 4]
+    assert listener.accept(A, 10) == Gap(A, "key", range(5, 10), known=True)
+    for name in ("x", "y"):
+        listener.accept((name, 1), 0)
+    assert listener.close(Gap(A, "key", range(5, 10), known=True), []) is None
+    assert listener.numbers() == [0, 1, 2, 3, 4]
