@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+from protocol.endpoint import is_loopback
 from tests.faults.observer import Observer, Tally
 from tests.processes import Process, free_endpoint
 
@@ -41,7 +42,7 @@ class System:
     def spawn(self, name: str, namespace: str | None = None) -> Process:
         """Start a process and do not wait for it; namespace: the network namespace it lives in."""
         if name == "hub":
-            words = ["hub", "--listen", self.endpoint]
+            words = ["hub", "--listen", self.endpoint, *([] if is_loopback(self.endpoint) else ["--insecure"])]
         elif name == "solver":
             words = ["solver", "--connect", self.endpoint]
         elif name == "viewer":
