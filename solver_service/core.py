@@ -26,7 +26,7 @@ from protocol.messages import (
 from solver_service.alignment import ClockAlignment
 from solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
 from solver_service.prior import PosePrior
-from solver_service.results import relative_pose, rig_of, sensed_of, view_of
+from solver_service.results import relative_pose, sensed_of, view_of
 from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
 
 # How long, in the dive's own time, a frame waits for the other node's frame that may still come.
@@ -141,8 +141,8 @@ class SolverCore:
         stamp_ns = max(getattr(message, "stamp_ns", 0) - self._clock_offset_ns, 0)
         if not isinstance(message, Candidates):
             return replace(message, stamp_ns=stamp_ns)
-        info = self._b.info_at(stamp_ns)
-        trigger = trigger_index(stamp_ns, info.trigger_period_ns) if info else message.trigger
+        calibration = self._b.calibration_at(stamp_ns)
+        trigger = trigger_index(stamp_ns, calibration[0].trigger_period_ns) if calibration else message.trigger
         return replace(message, stamp_ns=stamp_ns, trigger=trigger)
 
     def _pending(self) -> list[int]:
@@ -173,16 +173,16 @@ class SolverCore:
                 return None
             return self._reject(frame, "unmatched", f"no frame of {other.node} for this trigger")
         expired = at_once or self._expired(frame_a, self._b) or self._expired(frame_b, self._a)
-        info_a, info_b = self._a.info_at(frame_a.stamp_ns), self._b.info_at(frame_b.stamp_ns)
-        if info_a is None or info_b is None:
+        known_a, known_b = self._a.calibration_at(frame_a.stamp_ns), self._b.calibration_at(frame_b.stamp_ns)
+        if known_a is None or known_b is None:
             if not expired:
                 return None
-            missing = " and ".join(n for n, info in ((self.node_a, info_a), (self.node_b, info_b)) if info is None)
+            missing = " and ".join(n for n, known in ((self.node_a, known_a), (self.node_b, known_b)) if known is None)
             return self._reject(frame_a, "no_info", f"no NodeInfo of {missing}")
         covered = self._a.sensors_cover(frame_a.stamp_ns) and self._b.sensors_cover(frame_b.stamp_ns)
         if not covered and not at_once:
             return None
-        return self._solve(frame_a, frame_b, info_a, info_b)
+        return self._solve(frame_a, frame_b, known_a, known_b)
 
     def _expired(self, frame: Candidates, other: NodeStream) -> bool:
         """Whether the other node's frame for the same trigger can be given up."""
@@ -193,9 +193,14 @@ class SolverCore:
         return MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS or own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
 
     def _solve(
-        self, frame_a: Candidates, frame_b: Candidates, info_a: NodeInfo, info_b: NodeInfo
+        self,
+        frame_a: Candidates,
+        frame_b: Candidates,
+        calibration_a: tuple[NodeInfo, Rig],
+        calibration_b: tuple[NodeInfo, Rig],
     ) -> RelativePose | Rejected:
         self.matched += 1
+        (info_a, rig_a), (info_b, rig_b) = calibration_a, calibration_b
         for frame, info in ((frame_a, info_a), (frame_b, info_b)):
             if (frame.width_px, frame.height_px) != (info.width_px, info.height_px):
                 detail = (
@@ -206,11 +211,11 @@ class SolverCore:
         stamp_ns = (frame_a.stamp_ns + frame_b.stamp_ns) // 2
         sensed_a = sensed_of(self._a.attitude, self._a.depth, frame_a.stamp_ns)
         sensed_b = sensed_of(self._b.attitude, self._b.depth, frame_b.stamp_ns)
-        rigs = rig_of(info_a), rig_of(info_b)
         outcome = solve_trigger(
             view_of(frame_a),
             view_of(frame_b),
-            *rigs,
+            rig_a,
+            rig_b,
             sensed_a,
             sensed_b,
             self.settings,
@@ -219,10 +224,10 @@ class SolverCore:
         if not isinstance(outcome, Fix):
             return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
         self._prior.update(stamp_ns, outcome)
-        self._align(frame_a, frame_b, info_a, info_b, rigs, outcome)
+        self._align(frame_a, frame_b, info_a, info_b, (rig_a, rig_b), outcome)
         self._finish(frame_a.trigger)
         self.counts["solved"] += 1
-        return relative_pose(frame_a, frame_b, rigs[0], sensed_a, outcome)
+        return relative_pose(frame_a, frame_b, rig_a, sensed_a, outcome)
 
     def _align(
         self,

@@ -9,6 +9,8 @@ from typing import Final
 
 from protocol.clock import S_NS
 from protocol.messages import Attitude, Candidates, Depth, NodeInfo
+from solver_service.geometry.rig import Rig
+from solver_service.results import rig_of
 from solver_service.sensors import DEPTH_LAG_NS, SampleStream
 
 # A frame further than this from the node's others is not of the same time line ...
@@ -40,23 +42,23 @@ class NodeStream:
         self.received = 0
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
-        self._infos: list[NodeInfo] = []
+        self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
         self._far: list[int] = []
 
     def add_info(self, info: NodeInfo) -> None:
         """Take a calibration; it holds from its stamp on."""
-        at = bisect.bisect_left([known.stamp_ns for known in self._infos], info.stamp_ns)
-        if at < len(self._infos) and self._infos[at].stamp_ns == info.stamp_ns:
-            self._infos[at] = info
+        at = bisect.bisect_left(self._calibrations, info.stamp_ns, key=_since)
+        if at < len(self._calibrations) and _since(self._calibrations[at]) == info.stamp_ns:
+            self._calibrations[at] = (info, rig_of(info))
         else:
-            self._infos.insert(at, info)
-            del self._infos[:-MAX_INFOS]
+            self._calibrations.insert(at, (info, rig_of(info)))
+            del self._calibrations[:-MAX_INFOS]
 
-    def info_at(self, stamp_ns: int) -> NodeInfo | None:
+    def calibration_at(self, stamp_ns: int) -> tuple[NodeInfo, Rig] | None:
         """Return the calibration in force at stamp_ns (before the first one: the first)."""
-        at = bisect.bisect_right([known.stamp_ns for known in self._infos], stamp_ns)
-        return self._infos[max(at - 1, 0)] if self._infos else None
+        at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
+        return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
     def add_frame(self, frame: Candidates, other_newest_ns: int | None) -> Arrival:
         """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap."""
@@ -116,3 +118,7 @@ class NodeStream:
         return self.attitude.covers(stamp_ns, self.first_ns, self.newest_ns) and self.depth.covers(
             stamp_ns, self.first_ns, self.newest_ns
         )
+
+
+def _since(calibration: tuple[NodeInfo, Rig]) -> int:
+    return calibration[0].stamp_ns

@@ -1,0 +1,106 @@
+"""The clocks' offset out of the motion: found where the pair moves, not made up where it rests."""
+
+import numpy as np
+import pytest
+
+from solver_service.alignment import ClockAlignment, gap_slopes
+from solver_service.core import SolverCore
+from solver_service.geometry.camera import Camera
+from solver_service.geometry.rig import Rig
+from solver_service.geometry.rotation import rotation_exp
+from solver_service.geometry.trigger import Settings
+from tests.solver_service.conftest import dive_messages
+from tests.solver_service.test_prior import fix
+
+STEP_S = 0.1
+FACING = np.diag([-1.0, 1.0, -1.0])
+
+
+def rig(left_m=(-0.44, 0.0, 0.0), right_m=(0.44, 0.0, 0.0)):
+    camera = Camera("pinhole", 820, 616, 904.0, 904.0, 409.5, 307.5, (0.0,) * 5)
+    return Rig(camera=camera, lights_m=np.array([left_m, right_m]))
+
+
+def seen(offset_s, rng, rigs, fixes=250, moving=1.0, noise=1.0):
+    """Fixes of a pair whose gaps are those of a B seen offset_s earlier than said; noise: in units of the sd."""
+    sigma_rad = 0.7 / 904
+    rows = []
+    for k in range(fixes):
+        s = k * STEP_S
+        t = np.array([0.5 * np.sin(0.4 * s), 0.3 * np.cos(0.3 * s), 3.0 + np.sin(0.2 * s)])
+        w = moving * np.array([0.15 * np.sin(0.9 * s), 0.3 * np.cos(0.6 * s), 0.2 * np.sin(0.8 * s)])
+        rates = np.array([0.2 * np.cos(0.4 * s), -0.09 * np.sin(0.3 * s), 0.2 * np.cos(0.2 * s), 0, 0, 0]) * moving
+        t = t if moving else np.array([0.1, 0.0, 3.0])
+        now = fix(t, rotation_exp(w) @ FACING, np.eye(6) * 1e-6)
+        after = rotation_exp(
+            moving
+            * np.array(
+                [0.15 * np.sin(0.9 * (s + 1e-4)), 0.3 * np.cos(0.6 * (s + 1e-4)), 0.2 * np.sin(0.8 * (s + 1e-4))]
+            )
+        )
+        turn = after @ rotation_exp(w).T
+        rates[3:] = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2e-4
+        expected, slopes, apart = gap_slopes(now, rates, rigs)
+        sd = np.sqrt(2.0) * np.hypot(sigma_rad / apart[0], sigma_rad / apart[1])
+        gaps = np.array(expected) - np.array(slopes) * offset_s + noise * sd * rng.normal(size=2)
+        object.__setattr__(now, "range_a_m", 3.0 * np.exp(gaps[0]))
+        object.__setattr__(now, "twist_gap_rad", float(gaps[1]))
+        rows.append((round(s * 1e9), now, (sigma_rad, sigma_rad)))
+    return rows
+
+
+def estimate(rows, rigs, known_s=0.0):
+    alignment = ClockAlignment()
+    for stamp_ns, now, sigma_rad in rows:
+        alignment.add(stamp_ns, now, rigs, known_s, sigma_rad)
+    return alignment.estimate()
+
+
+@pytest.mark.parametrize("rigs", [(rig(), rig()), (rig((-0.4, 0.05, 0.02)), rig((-0.3, 0.0, 0.1), (0.5, 0.02, 0.0)))])
+@pytest.mark.parametrize("offset_s", [0.05, -0.02, 0.0])
+def test_offset_is_found(rigs, offset_s):
+    found = estimate(seen(offset_s, np.random.default_rng(1), rigs), rigs)
+    assert found.sigma_s < 0.005
+    assert abs(found.offset_s - offset_s) < 3.5 * found.sigma_s
+
+
+def test_stated_sigma_is_true():
+    rigs = (rig(), rig())
+    off = []
+    for seed in range(12):
+        found = estimate(seen(0.01, np.random.default_rng(seed), rigs, fixes=100), rigs)
+        off.append((found.offset_s - 0.01) / found.sigma_s)
+    # The bounds of the chi-square distribution of 12 degrees of freedom, one in a thousand on either side.
+    assert 2.2 / 12 < np.mean(np.square(off)) < 32.9 / 12
+
+
+def test_known_part_of_the_offset_is_taken_out():
+    rigs = (rig(), rig())
+    rows = seen(0.03, np.random.default_rng(2), rigs)
+    assert estimate(rows, rigs, known_s=-0.03).offset_s == pytest.approx(estimate(rows, rigs).offset_s - 0.03, abs=1e-6)
+
+
+def test_a_resting_pair_tells_nothing():
+    rigs = (rig(), rig())
+    found = estimate(seen(0.05, np.random.default_rng(3), rigs, moving=0.0), rigs)
+    assert found is None or found.sigma_s > 1.0
+
+
+def test_too_few_fixes_tell_nothing():
+    rigs = (rig(), rig())
+    assert estimate(seen(0.05, np.random.default_rng(4), rigs, fixes=20), rigs) is None
+
+
+def test_a_dive_with_a_clock_that_is_off():
+    messages, _ = dive_messages(seconds=15, seed=1, clock_offset_ns=50_000_000, range_max_m=3.0)
+    core = SolverCore("a", "b", Settings(skew_sigma_s=0.05))
+    for message in messages:
+        core.handle(message)
+    core.flush()
+    found = core.alignment.estimate()
+    assert abs(found.offset_s - 0.05) < 4 * found.sigma_s + 0.005
+    corrected = SolverCore("a", "b", Settings(), clock_offset_ns=50_000_000)
+    results = [result for message in messages for result in corrected.handle(message)]
+    assert corrected.counts["solved"] >= core.counts["solved"] * 0.9
+    # B's pictures were taken 50 ms before A's, and are now known to have been.
+    assert all(abs(result.skew_ns - 50_000_000) < 10_000_000 for result in results if hasattr(result, "skew_ns"))

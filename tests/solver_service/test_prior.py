@@ -1,0 +1,94 @@
+"""The prediction from earlier fixes: honest, lost after a while, never stubborn."""
+
+import numpy as np
+import pytest
+
+from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from solver_service.geometry.trigger import Fix
+from solver_service.prior import LIFETIME_NS, PosePrior
+
+STEP_NS = 100_000_000
+
+
+def fix(t_a_b_m, R_a_b, covariance):
+    return Fix(
+        t_a_b_m=np.asarray(t_a_b_m, float),
+        q_a_b_xyzw=quaternion_of(R_a_b),
+        covariance=covariance,
+        range_a_m=3.0,
+        range_b_m=3.0,
+        range_gap_m=0.0,
+        twist_gap_rad=0.0,
+        chi2=0.0,
+        hypotheses=1,
+        pair_a=(0, 1),
+        pair_b=(0, 1),
+        method="refined",
+        checks=(),
+        probability=1.0,
+    )
+
+
+def moving(seconds, rng, noise=1.0):
+    """A pair in a swell: (stamp, t, R, fix) ten times a second."""
+    covariance = np.diag([0.002, 0.002, 0.01, 0.004, 0.004, 0.002]) ** 2
+    for k in range(int(seconds * 10)):
+        s = k * 0.1
+        t = np.array([0.3 * np.sin(0.7 * s), 0.2 * np.cos(0.5 * s), 4 + 0.1 * s])
+        R = rotation_exp(np.array([0.1 * np.sin(0.9 * s), 0.2 * np.cos(0.6 * s), 0.1 * np.sin(s)]))
+        off = noise * rng.normal(size=6) * np.sqrt(np.diag(covariance))
+        yield k * STEP_NS, t, R, fix(t + off[:3], rotation_exp(off[3:]) @ R, covariance)
+
+
+def test_predictions_cover_what_comes():
+    rng = np.random.default_rng(1)
+    prior, errors = PosePrior(), []
+    for stamp_ns, t, R, seen in moving(60, rng):
+        predicted = prior.at(stamp_ns)
+        if predicted is not None and stamp_ns > 20 * STEP_NS:
+            off = np.concatenate((t - predicted.t_a_b_m, rotation_log(R @ matrix_of(predicted.q_a_b_xyzw).T)))
+            errors.append(off @ np.linalg.solve(predicted.covariance, off))
+        prior.update(stamp_ns, seen)
+    # Wider than the truth needs is allowed, too narrow is not: six degrees of freedom.
+    assert np.mean(errors) < 6.0
+    assert np.quantile(errors, 0.99) < 16.8
+
+
+def test_velocity_is_followed():
+    prior = PosePrior()
+    for stamp_ns, _, _, seen in moving(5, np.random.default_rng(2), noise=0.0):
+        prior.update(stamp_ns, seen)
+    predicted = prior.at(stamp_ns)
+    s = stamp_ns / 1e9
+    expected = [0.3 * 0.7 * np.cos(0.7 * s), -0.2 * 0.5 * np.sin(0.5 * s), 0.1]
+    assert predicted.rates[:3] == pytest.approx(expected, abs=0.05)
+    assert np.all(np.linalg.eigvalsh(predicted.rates_covariance) > 0)
+
+
+def test_lost_after_a_while_and_found_again():
+    prior = PosePrior()
+    assert prior.at(0) is None
+    fixes = list(moving(1, np.random.default_rng(3)))
+    stamp_ns, _, _, seen = fixes[0]
+    prior.update(stamp_ns, seen)
+    assert prior.at(stamp_ns + LIFETIME_NS) is not None
+    assert prior.at(stamp_ns + LIFETIME_NS + 1) is None
+    assert prior.at(stamp_ns - 1) is None
+    later_ns = stamp_ns + 10 * LIFETIME_NS
+    prior.update(later_ns, fixes[5][3])
+    assert prior.at(later_ns).t_a_b_m == pytest.approx(fixes[5][3].t_a_b_m)
+    prior.lose()
+    assert prior.at(later_ns) is None
+
+
+def test_a_fix_elsewhere_starts_it_anew():
+    prior = PosePrior()
+    fixes = list(moving(3, np.random.default_rng(4)))
+    for stamp_ns, _, _, seen in fixes:
+        prior.update(stamp_ns, seen)
+    stamp_ns, _, R, seen = fixes[-1]
+    elsewhere = fix([5.0, -3.0, 9.0], rotation_exp(np.array([0.0, 1.0, 0.0])) @ R, seen.covariance)
+    prior.update(stamp_ns + STEP_NS, elsewhere)
+    predicted = prior.at(stamp_ns + STEP_NS)
+    assert predicted.t_a_b_m == pytest.approx(elsewhere.t_a_b_m)
+    assert not predicted.rates.any()
