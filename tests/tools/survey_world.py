@@ -1,7 +1,7 @@
 """Simulated surveys: two nodes leapfrog along a line, solved by the true solver, with truth beside it.
 
 Candidates come from node.sim's forward camera; sensors err as cheap ones do: a compass with what calibration
-leaves of its iron, slow wander and noise, at some stations disturbed; a gauge off by a constant and drifting.
+leaves of its iron, slow wander and noise, at some stations disturbed; a gauge that drifts.
 """
 
 from __future__ import annotations
@@ -65,7 +65,9 @@ def line(rng, legs):
 
 def _next(rng, place, heading, range_m):
     climb = float(np.clip(rng.normal(0, 0.18), -0.4, 0.4))
-    step = range_m * np.array([math.cos(heading) * math.cos(climb), math.sin(heading) * math.cos(climb), -math.sin(climb)])
+    step = range_m * np.array(
+        [math.cos(heading) * math.cos(climb), math.sin(heading) * math.cos(climb), -math.sin(climb)]
+    )
     there = place + step
     there[2] = np.clip(there[2], 4.0, 30.0)
     return there
@@ -109,7 +111,8 @@ class _Node:
         self.iron = rng.normal(0, yaw * math.sqrt(0.4), 2)
         self.slow = _Slow(rng, 60.0)
         self.tilts = [_Slow(rng, 15.0), _Slow(rng, 15.0)]
-        self.gauge = rng.normal(0, flaws.depth_m * math.sqrt(0.4))
+        # Zeroed at the surface, a gauge errs by drift and noise more than by a constant.
+        self.gauge = rng.normal(0, flaws.depth_m * math.sqrt(0.1))
         self.drift = _Slow(rng, 120.0)
         self.disturbance = 0.0
         calibrated = self.lights + rng.normal(0, flaws.calibration_m, (2, 3))
@@ -146,7 +149,7 @@ class _Node:
             node=self.name, stamp_ns=stamp_ns, q_ned_body_xyzw=rotation.to_quaternion(R), sigma_rad=(tilt, tilt, yaw)
         )
         port_m = place[2] + float((R_ned_body @ R_BODY_CAMERA @ self.port)[2])
-        wrong = self.gauge + flaws.depth_m * (math.sqrt(0.3) * self.drift.at(t_s) + math.sqrt(0.3) * rng.normal())
+        wrong = self.gauge + flaws.depth_m * (math.sqrt(0.6) * self.drift.at(t_s) + math.sqrt(0.3) * rng.normal())
         depth = Depth(node=self.name, stamp_ns=stamp_ns, depth_m=port_m + wrong, sigma_m=flaws.depth_m)
         strength = FIELD_T * (1 + 0.008 * abs(self.disturbance) + 0.01 * rng.normal())
         dip = DIP_RAD + math.radians(0.5 * self.disturbance + 0.5 * rng.normal())
@@ -168,9 +171,13 @@ class _Node:
         rng, flaws = self.rng, self.flaws
         gross = (rng.random((2, 1)) < 0.03) * rng.normal(0, 6.0, (2, 2))
         pixels = pixels + rng.normal(0, flaws.sigma_px, (2, 2)) + gross
-        pixels = np.concatenate([pixels[rng.random(2) > 0.03], rng.uniform((0, 0), (WIDTH - 1, HEIGHT - 1), (flaws.false_lights, 2))])
+        pixels = np.concatenate(
+            [pixels[rng.random(2) > 0.03], rng.uniform((0, 0), (WIDTH - 1, HEIGHT - 1), (flaws.false_lights, 2))]
+        )
         inside = [(u, v) for u, v in pixels.tolist() if -0.5 <= u <= WIDTH - 0.5 and -0.5 <= v <= HEIGHT - 0.5]
-        blobs = [Blob(u_px=u, v_px=v, sigma_px=flaws.sigma_px, area_px=60.0, peak=255.0, elongation=1.0) for u, v in inside]
+        blobs = [
+            Blob(u_px=u, v_px=v, sigma_px=flaws.sigma_px, area_px=60.0, peak=255.0, elongation=1.0) for u, v in inside
+        ]
         return replace(self.dark(stamp_ns, seq), blobs=blobs)
 
     def dark(self, stamp_ns, seq):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +16,9 @@ from tools.survey.project import Leg
 from tools.survey.settings import AlarmSettings
 from tools.survey.shots import Shot
 
+# Sights further apart than this many of their sigmas, and a field this share of its limit off, are suspect together.
+SUSPECT_SIGMAS: Final = 2.0
+SUSPECT_SHARE: Final = 0.25
 # British Cave Research Association's grades as 1 sd: compass (deg), distance (m).
 GRADES: Final = ((5, 0.5, 0.05), (4, 0.85, 0.1), (3, 1.25, 0.25))
 
@@ -29,10 +33,11 @@ class UsualFields:
 
 def usual_fields(shots: list[Shot]) -> UsualFields:
     """Return the medians over a dive's rests: what is disturbed must be the exception."""
-    return UsualFields(_median([s.field_a for s in shots]), _median([s.field_b for s in shots]))
+    return UsualFields(median_field([s.field_a for s in shots]), median_field([s.field_b for s in shots]))
 
 
-def _median(fields: list[Field | None]) -> Field | None:
+def median_field(fields: Sequence[Field | None]) -> Field | None:
+    """Return the median of what is known; None where nothing is."""
     known = [one for one in fields if one is not None]
     if not known:
         return None
@@ -54,9 +59,28 @@ def field_alarm(field: Field | None, usual: Field | None, limits: AlarmSettings)
 
 
 def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tuple[str, str]) -> list[str]:
-    """Return the nodes whose field was disturbed."""
-    said = (field_alarm(shot.field_a, usual.a, limits), field_alarm(shot.field_b, usual.b, limits))
-    return [node for node, text in zip(nodes, said, strict=True) if text]
+    """Return the nodes whose compasses are not to be believed.
+
+    A field beyond its limits condemns. Where the sights contradict each other, so does less: what is clearly
+    further off its usual field than the other node's.
+    """
+    off = [_off(shot.field_a, usual.a, limits), _off(shot.field_b, usual.b, limits)]
+    found = [node for node, far in zip(nodes, off, strict=True) if far > 1]
+    if found or shot.sight_a is None or shot.sight_b is None:
+        return found
+    gap = wrap(shot.sight_a.azimuth.value - shot.sight_b.azimuth.value - math.pi)
+    if abs(gap) <= SUSPECT_SIGMAS * math.hypot(shot.sight_a.azimuth.sigma, shot.sight_b.azimuth.sigma):
+        return []
+    worse = 0 if off[0] > off[1] else 1
+    return [nodes[worse]] if off[worse] > max(SUSPECT_SHARE, 2 * off[1 - worse]) else []
+
+
+def _off(field: Field | None, usual: Field | None, limits: AlarmSettings) -> float:
+    """Return how far a field is from the usual one, as a share of what is tolerated; 0 where it is not known."""
+    if field is None or usual is None:
+        return 0.0
+    share = abs(field.norm_t / usual.norm_t - 1) / limits.field_share
+    return max(share, abs(math.degrees(field.dip_rad - usual.dip_rad)) / limits.dip_deg)
 
 
 def of_leg(leg: Leg, shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tuple[str, str]) -> list[str]:

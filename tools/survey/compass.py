@@ -38,9 +38,13 @@ def dat(project: Project, adjusted: Adjusted) -> str:
     depths = held_depths(project)
     for line in adjusted.lines:
         reading = reading_of(line, project, depths)
-        angles = [MISSING if angle is None else f"{angle:.2f}" for angle in (reading.compass_deg, reading.back_deg)]
+        fore_deg, back_deg, remark = reading.compass_deg, reading.back_deg, reading.remark
+        if fore_deg is None and back_deg is not None:
+            # The format has no leg without a bearing.
+            fore_deg, remark = (back_deg + 180) % 360, f"bearing by backsight; {remark}"
+        angles = [MISSING if angle is None else f"{angle:.2f}" for angle in (fore_deg, back_deg)]
         rows.append(
             f"{line.leg.from_:>12} {line.leg.to:>12} {reading.tape_m / FOOT_M:.3f} {angles[0]} {reading.clino_deg:.3f} "
-            f"-9.90 -9.90 -9.90 -9.90 {angles[1]} {MISSING} {reading.remark}"
+            f"-9.90 -9.90 -9.90 -9.90 {angles[1]} {MISSING} {remark}"
         )
     return "\r\n".join(rows) + "\r\n\f\r\n"

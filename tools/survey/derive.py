@@ -154,38 +154,42 @@ class _OneDive:
         return marked[-1].name if marked and not around else None
 
     def _leg(self, shot: Shot, at_a: str, at_b: str, rear: Who, usual: alarms.UsualFields) -> Leg:
-        node_a, node_b = self.readings.nodes
-        a = (at_a, node_a, shot.sight_a, shot.depth_a, shot.field_a)
-        b = (at_b, node_b, shot.sight_b, shot.depth_b, shot.field_b)
-        (from_, from_node, fore, depth_from, field_from), (to, to_node, back, depth_to, field_to) = (
-            (a, b) if rear == "a" else (b, a)
-        )
-        leg = Leg(
-            from_=from_,
-            to=to,
-            from_node=from_node,
-            to_node=to_node,
-            dive=self.dive,
-            start_ns=shot.start_ns,
-            end_ns=shot.end_ns,
-            distance_m=round(shot.distance.value, 4),
-            distance_sigma_m=round(shot.distance.sigma, 4),
-            **_angles("", fore),
-            **_angles("back_", back),
-            **_depth("from", depth_from),
-            **_depth("to", depth_to),
-            field_from_ut=round(field_from.norm_t * 1e6, 2) if field_from else UNSET,
-            field_to_ut=round(field_to.norm_t * 1e6, 2) if field_to else UNSET,
-            dip_from_deg=round(math.degrees(field_from.dip_rad), 2) if field_from else UNSET,
-            dip_to_deg=round(math.degrees(field_to.dip_rad), 2) if field_to else UNSET,
-            heading_gap_deg=UNSET if shot.heading_gap_rad is None else round(math.degrees(shot.heading_gap_rad), 2),
-            disturbed=alarms.disturbed(shot, usual, self.limits, (node_a, node_b)),
-            fixes=len(shot.used),
-            fixes_used=ranges(shot.used.tolist()),
-            unused={reason: ranges(triggers) for reason, triggers in sorted(shot.unused.items())},
-        )
-        leg = replace(leg, alarms=alarms.of_leg(leg, shot, usual, self.limits, (node_a, node_b)))
+        nodes = self.readings.nodes
+        leg = one_leg(shot, nodes, (at_a, at_b), rear)
+        leg = replace(leg, dive=self.dive, disturbed=alarms.disturbed(shot, usual, self.limits, nodes))
+        leg = replace(leg, alarms=alarms.of_leg(leg, shot, usual, self.limits, nodes))
         return replace(leg, grade=alarms.grade(leg))
+
+
+def one_leg(shot: Shot, nodes: tuple[str, str], at: tuple[str, str] = ("a", "b"), rear: Who = "a") -> Leg:
+    """Return a shot as a leg from the rear node's station; nodes, at: ids and stations of a and b."""
+    a = (at[0], nodes[0], shot.sight_a, shot.depth_a, shot.field_a)
+    b = (at[1], nodes[1], shot.sight_b, shot.depth_b, shot.field_b)
+    (from_, from_node, fore, depth_from, field_from), (to, to_node, back, depth_to, field_to) = (
+        (a, b) if rear == "a" else (b, a)
+    )
+    return Leg(
+        from_=from_,
+        to=to,
+        from_node=from_node,
+        to_node=to_node,
+        start_ns=shot.start_ns,
+        end_ns=shot.end_ns,
+        distance_m=round(shot.distance.value, 4),
+        distance_sigma_m=round(shot.distance.sigma, 4),
+        **_angles("", fore),
+        **_angles("back_", back),
+        **_depth("from", depth_from),
+        **_depth("to", depth_to),
+        field_from_ut=round(field_from.norm_t * 1e6, 2) if field_from else UNSET,
+        field_to_ut=round(field_to.norm_t * 1e6, 2) if field_to else UNSET,
+        dip_from_deg=round(math.degrees(field_from.dip_rad), 2) if field_from else UNSET,
+        dip_to_deg=round(math.degrees(field_to.dip_rad), 2) if field_to else UNSET,
+        heading_gap_deg=UNSET if shot.heading_gap_rad is None else round(math.degrees(shot.heading_gap_rad), 2),
+        fixes=len(shot.used),
+        fixes_used=ranges(shot.used.tolist()),
+        unused={reason: ranges(triggers) for reason, triggers in sorted(shot.unused.items())},
+    )
 
 
 def _angles(prefix: str, sight: Sight | None) -> dict[str, Any]:

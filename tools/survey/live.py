@@ -1,0 +1,164 @@
+"""Alarms while the dive goes on: the survey's own checks over the last seconds, said on the bus as marks."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Final
+
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import Attitude, Depth, Imu, Mark, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.service import Service
+from protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
+from tools.client import client_config
+from tools.survey import alarms
+from tools.survey.derive import one_leg
+from tools.survey.magnetism import Field, field_of
+from tools.survey.readings import Readings, of_messages
+from tools.survey.rests import rests
+from tools.survey.settings import AlarmSettings, SurveySettings
+from tools.survey.shots import shoot
+from tools.survey.sights import sights
+
+if TYPE_CHECKING:
+    from protocol.bus import Bus, Publisher, Received
+
+log = logging.getLogger(__name__)
+
+WINDOW_NS: Final = 8 * S_NS
+CHECK_NS: Final = 2 * S_NS
+# The same alarm is not said again within this time.
+QUIET_NS: Final = 20 * S_NS
+MEMORY: Final = 300
+LEARNED: Final = 5
+
+
+class LiveAlarms:
+    """Takes the pair's messages in any order; returns alarms as marks on the node nearest to blame."""
+
+    def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
+        self._settings, self._limits = settings, limits
+        self._infos: dict[str, NodeInfo] = {}
+        self._recent: dict[tuple[type[Message], str], deque[Message]] = {}
+        self._checked_ns = 0
+        self._said_ns: dict[str, int] = {}
+        self._fields: dict[str, deque[Field]] = {}
+
+    def handle(self, message: Message) -> list[Mark]:
+        """Take one message."""
+        if isinstance(message, NodeInfo):
+            self._infos[message.node] = message
+        elif isinstance(message, RelativePose):
+            self._keep(message, "", message.stamp_ns)
+            if abs(message.stamp_ns - self._checked_ns) >= CHECK_NS:
+                self._checked_ns = message.stamp_ns
+                return self._check(message)
+        elif isinstance(message, Attitude | Depth | Imu):
+            self._keep(message, message.node, message.stamp_ns)
+        return []
+
+    def _keep(self, message: Message, node: str, stamp_ns: int) -> None:
+        recent = self._recent.setdefault((type(message), node), deque())
+        recent.append(message)
+        while recent and abs(stamp_ns - int(getattr(recent[0], "stamp_ns"))) > WINDOW_NS:  # noqa: B009
+            recent.popleft()
+
+    def _messages(self) -> Iterator[Message]:
+        yield from self._infos.values()
+        for recent in self._recent.values():
+            yield from recent
+
+    def _check(self, pose: RelativePose) -> list[Mark]:
+        if pose.node_a not in self._infos or pose.node_b not in self._infos:
+            return []
+        readings = of_messages(self._messages())
+        found = self._field_alarms(readings, pose.stamp_ns)
+        seen = sights(readings, self._settings)
+        resting = rests(readings, seen, self._settings)
+        if resting:
+            shot = shoot(readings, seen, resting[-1].chosen, self._settings)
+            leg = one_leg(shot, readings.nodes)
+            usual = alarms.UsualFields(None, None)
+            for text in alarms.of_leg(leg, shot, usual, self._limits, readings.nodes):
+                check, _, what = text.partition(": ")
+                found.append((readings.nodes[0], check, what))
+        return [mark for node, check, what in found if (mark := self._mark(node, check, what, pose.stamp_ns))]
+
+    def _field_alarms(self, readings: Readings, now_ns: int) -> list[tuple[str, str, str]]:
+        found = []
+        for node in (readings.a, readings.b):
+            now = field_of(node, now_ns - CHECK_NS, now_ns)
+            if now is None:
+                continue
+            known = self._fields.setdefault(node.info.node, deque(maxlen=MEMORY))
+            text = alarms.field_alarm(now, alarms.median_field(list(known)), self._limits)
+            if text and len(known) >= LEARNED:
+                found.append((node.info.node, "field", f"the magnetic field is not the usual one ({text})"))
+            known.append(now)
+        return found
+
+    def _mark(self, node: str, check: str, what: str, stamp_ns: int) -> Mark | None:
+        key = f"{node} {check}"
+        if abs(stamp_ns - self._said_ns.get(key, -QUIET_NS)) < QUIET_NS:
+            return None
+        self._said_ns[key] = stamp_ns
+        return Mark(node=node, stamp_ns=stamp_ns, kind="alarm", name=check, note=what)
+
+
+class _Watch:
+    """The alarms on a bus."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
+        self._bus = bus
+        self._publishers: dict[str, Publisher] = {}
+        self._lock = threading.Lock()
+
+    def receive(self, received: Received) -> None:
+        """Take one message off the bus."""
+        parsed = parse_key(received.key)
+        if parsed is None:
+            return
+        try:
+            message = decode(received.payload, parsed[0].schema)
+            with self._lock:
+                marks = self._alarms.handle(message)
+        except (MessageError, BuddylineError) as error:
+            log.warning("survey watch: %s: %s", received.key, error)
+            return
+        for mark in marks:
+            log.warning("%s: %s: %s", mark.node, mark.name, mark.note)
+            publisher = self._publishers.get(mark.node)
+            if publisher is None:
+                publisher = self._publishers[mark.node] = self._bus.publisher(MARK, mark.node)
+            publisher.put(mark)
+
+
+def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
+    """Watch a bus until stopped."""
+    from protocol.zenoh_bus import connect
+
+    service = Service("survey watch")
+    service.handle_signals()
+    config = client_config(args)
+    bus = connect(
+        config.connect,
+        namespace=config.namespace or None,
+        stop=service.stop,
+        on_wait=lambda text: log.info("survey watch: %s", text),
+        tls=config.tls,
+    )
+    if bus is None:
+        return service.join()
+    with bus:
+        bus.on_failure(lambda error: service.fail("bus", error))
+        watch = _Watch(bus)
+        bus.subscribe(INFO.key_any(), watch.receive)
+        for topic in (ATTITUDE, DEPTH, IMU, POSE):
+            bus.subscribe(topic.key_any(), watch.receive, capacity=4096, history=False)
+        service.wait(seconds)
+    return service.join()

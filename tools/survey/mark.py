@@ -1,0 +1,65 @@
+"""`buddyline mark`: say where a node stands, on the bus, for all logs to keep."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import threading
+
+from protocol.clock import SystemClock
+from protocol.errors import BuddylineError
+from protocol.messages import Mark
+from protocol.topics import MARK, check_node_id
+from tools.client import add_client_arguments, client_config
+from tools.survey.marks import KINDS, stamp_ns_of
+from tools.survey.project import STATION_NAME
+
+log = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("name", nargs="?", default="", help="station or point: 1 to 12 of A-Z a-z 0-9 _ -")
+    parser.add_argument("--node", required=True, metavar="NODE", help="the node that stands there")
+    parser.add_argument("--kind", choices=KINDS, default="station", help="default: station")
+    parser.add_argument("--note", default="", metavar="TEXT")
+    parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
+    add_client_arguments(parser)
+    parser.add_argument("--linger", type=float, default=1.0, metavar="S", help="stay on the bus so long; default: 1")
+
+
+def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
+    """Return the message; raise BuddylineError where it says nothing, or in no name's form."""
+    if args.kind != "note" and not STATION_NAME.match(args.name):
+        raise BuddylineError(f"name {args.name!r}: use 1 to 12 of A-Z a-z 0-9 _ -")
+    if args.kind == "note" and not args.note:
+        raise BuddylineError("a note needs --note TEXT")
+    try:
+        stamp_ns = stamp_ns_of(args.at, now_ns) if args.at else now_ns
+    except ValueError as error:
+        raise BuddylineError(f"--at {args.at}: {error}") from error
+    return Mark(node=check_node_id(args.node), stamp_ns=stamp_ns, kind=args.kind, name=args.name, note=args.note)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Publish one mark."""
+    from protocol.zenoh_bus import connect
+
+    mark = mark_of(args, SystemClock().now_ns())
+    stop = threading.Event()
+    config = client_config(args)
+    bus = connect(
+        config.connect,
+        namespace=config.namespace or None,
+        stop=stop,
+        on_wait=lambda text: log.info("mark: %s", text),
+        tls=config.tls,
+    )
+    if bus is None:
+        return 2
+    with bus:
+        bus.publisher(MARK, mark.node).put(mark)
+        # Who records subscribes to the cache as well: leaving at once could take the mark along.
+        stop.wait(args.linger)
+    print(f"{mark.kind} {mark.name or mark.note}: node {mark.node}")
+    return 0
