@@ -91,8 +91,8 @@ class GlowRenderer:
         self._b = np.array(water.scattering_per_m)
         shape = -(-height_px // COARSE), -(-width_px // COARSE)
         self.coarse_shape = shape
-        self._coarse_u = (np.arange(shape[1], dtype=np.float32) + 0.5) * COARSE - 0.5
-        self._coarse_v = (np.arange(shape[0], dtype=np.float32) + 0.5) * COARSE - 0.5
+        self._coarse_u = ((np.arange(shape[1]) + 0.5) * width_px / shape[1] - 0.5).astype(np.float32)
+        self._coarse_v = ((np.arange(shape[0]) + 0.5) * height_px / shape[0] - 0.5).astype(np.float32)
         self._scale = f_px / SCALE_PX
         reach = 1.6 * math.hypot(width_px, height_px)
         self._log_step = math.log(reach / RHO_MIN_PX) / (STEPS - 1)
