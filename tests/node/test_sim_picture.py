@@ -38,7 +38,7 @@ def test_a_near_light_is_a_clipped_core_at_its_true_place(environment):
 def test_without_scattering_the_centroid_is_the_source_to_a_fraction_of_a_pixel():
     """In the clear basin: the disc, its edge and the sub-pixel place are unbiased."""
     errors = []
-    for seed in range(3):
+    for seed in range(2):
         world = World(Scenario(environment="basin", seed=seed, **QUIET))
         stamps = [k * S_NS for k in (1, 2, 4)]
         views = [
@@ -52,7 +52,7 @@ def test_without_scattering_the_centroid_is_the_source_to_a_fraction_of_a_pixel(
             rows, columns = np.mgrid[v - 18 : v + 19, u - 18 : u + 19]
             errors.append(((patch * columns).sum() / patch.sum() - light.u_px,
                            (patch * rows).sum() / patch.sum() - light.v_px))  # fmt: skip
-    assert len(errors) >= 12
+    assert len(errors) >= 8
     assert np.abs(np.mean(errors, axis=0)).max() < 0.1
     assert np.abs(errors).max() < 0.5
 
