@@ -152,8 +152,8 @@ class Picamera2:
         sensor={},  # noqa: B006
     ) -> dict[str, Any]:
         main = {"format": "XBGR8888", "size": (640, 480), **main}
-        if main["size"][0] % 2 or main["size"][1] % 2:
-            raise RuntimeError("width and height should be even")
+        width, height = main["size"]
+        main["size"] = (width - width % 2, height - height % 2)  # without a word, as the real one
         return {"main": main, "buffer_count": buffer_count, "controls": controls, "queue": queue, "sensor": sensor}
 
     def configure(self, camera_config: dict[str, Any]) -> None:

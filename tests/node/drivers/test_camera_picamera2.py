@@ -328,7 +328,7 @@ def test_a_camera_in_use_elsewhere(sensor):
 @pytest.mark.parametrize(
     ("config", "period_ns", "what"),
     [
-        (CameraConfig(width_px=821, height_px=616), PERIOD_NS, "even"),
+        (CameraConfig(width_px=821, height_px=616), PERIOD_NS, "gives 820x616"),
         (CameraConfig(width_px=9000, height_px=616), PERIOD_NS, "no mode"),
         (CameraConfig(exposure_us=150_000), PERIOD_NS, "exposure 150.0 ms"),
         (CameraConfig(), 20 * MS_NS, "cannot be had"),
