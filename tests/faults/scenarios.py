@@ -48,7 +48,12 @@ def running(endpoint: str | None = None) -> Iterator[System]:
 def measure(system: System, report: Report, since_ns: int) -> None:
     """Wait for the first trigger that was exposed, matched and answered since the path was back."""
     assert system.observer is not None
-    report.recover_s.append((system.observer.wait_for_match(since_ns, BACK_S) - since_ns) / S_NS)
+    try:
+        matched_ns = system.observer.wait_for_match(since_ns, BACK_S)
+    except TimeoutError as error:
+        lines = {name: process.lines[-3:] for name, process in system.processes.items()}
+        raise RuntimeError(f"{report.fault}: {error}; {lines}") from error
+    report.recover_s.append((matched_ns - since_ns) / S_NS)
 
 
 def kill_and_return(name: str, times: int, seed: int) -> Report:

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 import pytest
 import zenoh
 
-from protocol import topics
+from protocol import topics, zenoh_bus
 from protocol.bus import Bus, Received
 from protocol.errors import BuddylineError
 from protocol.zenoh_bus import connect, open_hub
@@ -31,7 +31,7 @@ with open_hub(sys.argv[1]):
     sys.stdin.readline()
 """
 
-# What a process has open, told by itself: sockets that listen, sockets that are not TCP.
+# What a process has open, told by itself: sockets that listen or are not TCP, and how many links to the hub.
 SOCKETS = """
 import json, os, sys, threading
 from protocol import topics
@@ -40,29 +40,33 @@ from protocol.zenoh_bus import connect, open_hub
 def sockets():
     links = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]
     own = {os.readlink(link) for link in links if os.path.lexists(link)}
-    found = []
+    found, links = [], 0
     for protocol in ("tcp", "tcp6", "udp", "udp6"):
         with open(f"/proc/self/net/{protocol}") as table:
             for line in list(table)[1:]:
                 fields = line.split()
-                if f"socket:[{fields[9]}]" in own and (protocol[:3] == "udp" or fields[3] == "0A"):
+                if f"socket:[{fields[9]}]" not in own:
+                    continue
+                if protocol[:3] == "udp" or fields[3] == "0A":
                     address, port = fields[1].split(":")
                     found.append([protocol, address, int(port, 16)])
-    return found
+                links += fields[3] == "01"
+    return found, links
 
 role, endpoint = sys.argv[1:]
 if role == "hub":
     with open_hub(endpoint):
-        result = sockets()
+        result = [sockets()]
 else:
     with connect(endpoint, stop=threading.Event(), on_wait=print) as bus:
         bus.publisher(topics.DEPTH, "a").put_bytes(b"{}")
         bus.subscribe(topics.EVERYTHING, lambda _: None)
         bus.declare_alive("node/a")
+        result = [sockets()]
         previews = bus.publisher(topics.IMAGE, "a")
         while not previews.put_bytes(b"{}"):
             pass
-        result = sockets()
+        result.append(sockets())
 print(json.dumps(result))
 """
 
@@ -275,13 +279,15 @@ def test_nothing_listens_but_the_hub_and_stdout_is_ours() -> None:
         )
         return json.loads(done.stdout)
 
-    assert sockets("hub") == [["tcp", "0100007F", port]]
+    assert sockets("hub") == [[[["tcp", "0100007F", port]], 0]]
     with open_hub(endpoint):
-        assert sockets("client") == []
+        # Previews, and nothing else, have a link of their own.
+        assert sockets("client") == [[[], 1], [[], 2]]
 
 
-def test_samples_that_never_came_are_counted() -> None:
+def test_samples_that_never_came_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foreign publisher whose numbers jump, and who cannot be asked for what is missing."""
+    monkeypatch.setattr(zenoh_bus, "FETCHES", 2)
     inbox = Inbox()
     with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
         subscription = bus.subscribe("buddyline/node/*/depth", inbox)
