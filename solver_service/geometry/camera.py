@@ -46,6 +46,11 @@ class Camera:
         """Give the unit bearings (N, 3) of distorted pixels (N, 2)."""
         return self.rays(pixels)[0]
 
+    @property
+    def area_px2(self) -> float:
+        """The picture's area."""
+        return float(self.width_px * self.height_px)
+
     @cached_property
     def solid_angle_sr(self) -> float:
         """The solid angle that the picture covers."""
@@ -62,7 +67,7 @@ class Camera:
 
     def _pinhole_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
         x, y = xd, yd
-        a00, a01, a10, a11 = np.ones_like(x), np.zeros_like(x), np.zeros_like(x), np.ones_like(x)
+        tangents = np.zeros((len(x), 2, 3))
         if any(self.distortion):
             k1, k2, p1, p2, k3 = self.distortion
             for _ in range(_MAX_STEPS):
@@ -71,30 +76,30 @@ class Camera:
                 slope = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
                 a00 = radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
                 a01 = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-                a10 = a01
                 a11 = radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
                 ex = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - xd
                 ey = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - yd
-                det = a00 * a11 - a01 * a10
+                det = a00 * a11 - a01 * a01
                 dx = (a11 * ex - a01 * ey) / det
-                dy = (a00 * ey - a10 * ex) / det
+                dy = (a00 * ey - a01 * ex) / det
                 x, y = x - dx, y - dy
                 step = np.abs(dx) + np.abs(dy)
                 if not (step > _TOLERANCE).any():
                     break
             # Past the fold of the distortion a solution is none: no scene point images there.
-            bad = ~((step < 1e-9) & (det > 0.0) & (a00 + a11 > 0.0))
-            x = np.where(bad, np.nan, x)
+            x = np.where((step < 1e-9) & (det > 0.0) & (a00 + a11 > 0.0), x, np.nan)
+            tangents[:, 0, 0], tangents[:, 0, 1] = a00, a01
+            tangents[:, 1, 0], tangents[:, 1, 1] = a01, a11
+            tangents[:, 0, 2], tangents[:, 1, 2] = -(a00 * x + a01 * y), -(a01 * x + a11 * y)
+        else:
+            tangents[:, 0, 0] = tangents[:, 1, 1] = 1.0
+            tangents[:, 0, 2], tangents[:, 1, 2] = -x, -y
         norm = np.sqrt(x * x + y * y + 1.0)
-        bearings = np.stack((x / norm, y / norm, 1.0 / norm), axis=-1)
-        tangents = np.empty((*x.shape, 2, 3))
-        fx, fy = self.fx_px * norm, self.fy_px * norm
-        tangents[:, 0, 0] = fx * a00
-        tangents[:, 0, 1] = fx * a01
-        tangents[:, 0, 2] = -fx * (a00 * x + a01 * y)
-        tangents[:, 1, 0] = fy * a10
-        tangents[:, 1, 1] = fy * a11
-        tangents[:, 1, 2] = -fy * (a10 * x + a11 * y)
+        bearings = np.empty((len(x), 3))
+        bearings[:, 0], bearings[:, 1], bearings[:, 2] = x, y, 1.0
+        bearings /= norm[:, None]
+        tangents[:, 0] *= (self.fx_px * norm)[:, None]
+        tangents[:, 1] *= (self.fy_px * norm)[:, None]
         return bearings, tangents
 
     def _fisheye_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:

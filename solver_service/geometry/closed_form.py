@@ -20,30 +20,52 @@ from solver_service.geometry.rotation import Floats
 
 Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"]
 
-# Each round shrinks the error by about alpha^2 / 4, and where a bar does not pass through its camera by the ratio
-# of that offset to the range.
+# A round of the split shrinks its error by about alpha^2 / 4, a round of the offset by its ratio to the range.
 _ROUNDS: Final = 9
 
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """The two light bars, each in its own camera's frame: axis and middle (2, 3, 1), length (2, 1)."""
+    """The two light bars along the x axes of their level frames: middle (2, 3, 1), length (2, 1)."""
 
-    axis: Floats
     middle_m: Floats
     length_m: Floats
     centred: bool
 
     @staticmethod
-    def of(rig_a: Rig, rig_b: Rig) -> Bars:
-        """Take the bars of two rigs."""
-        middle_m = np.array((rig_a.middle_m, rig_b.middle_m))[:, :, None]
+    def of(level_a: Rig, level_b: Rig) -> Bars:
+        """Take the bars of two level rigs."""
         return Bars(
-            axis=np.array((rig_a.axis, rig_b.axis))[:, :, None],
-            middle_m=middle_m,
-            length_m=np.array(((rig_a.length_m,), (rig_b.length_m,))),
-            centred=not middle_m.any(),
+            middle_m=np.array((level_a.middle_m, level_b.middle_m))[:, :, None],
+            length_m=np.array(((level_a.length_m,), (level_b.length_m,))),
+            centred=level_a.offset_m == 0.0 == level_b.offset_m,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """The other node's bar as each view sees it: unit bisector c and chord w (2, 3, K) left to right, chord (2, K).
+
+    The chord's length is 2 sin(alpha / 2).
+    """
+
+    c: Floats
+    w: Floats
+    chord: Floats
+
+    @staticmethod
+    def of(left: Floats, right: Floats) -> Spans:
+        """Take unit bearings (2, 3, K) of left and right."""
+        total, difference = left + right, right - left
+        chord = np.sqrt(dot(difference, difference))
+        return Spans(total / np.sqrt(dot(total, total))[:, None], difference / chord[:, None], chord)
+
+    @property
+    def ends(self) -> tuple[Floats, Floats]:
+        """The bearings of left and right."""
+        half = 0.5 * self.chord[:, None]
+        along, across = self.c * np.sqrt(1.0 - half * half), self.w * half
+        return along - across, along + across
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +96,9 @@ def wrap(angle_rad: Floats) -> Floats:
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar product over the axis before the last."""
-    product: Floats = (a * b).sum(-2)
-    return product
-
-
-def cross(a: Floats, b: Floats) -> Floats:
-    """Cross product over the axis before the last."""
-    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
-    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
-    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-2)
+    product = a * b
+    total: Floats = product[..., 0, :] + product[..., 1, :] + product[..., 2, :]
+    return total
 
 
 def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m: Floats) -> Floats:
@@ -93,64 +109,102 @@ def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m
     return range_m
 
 
-def closed_form(
-    left: Floats, right: Floats, bars: Bars, variant: Variant = "exact", rounds: int = _ROUNDS
-) -> ClosedForm:
-    """Solve K hypotheses.
+def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Variant = "exact") -> ClosedForm:
+    """Solve K hypotheses for T_a_b between the cameras' frames.
 
-    left, right: (2, 3, K) unit bearings of the other node's lights, [0] in A's frame, [1] in B's. variant:
+    left, right: (2, 3, K) unit bearings of the other node's lights, [0] in A's camera frame, [1] in B's. variant:
     "paper" splits alpha in half, "paper_midpoint" takes the middle of the two images on the plane z = 1,
     "paper_literal" the latter and the angle to the optical axis for beta, as the paper's text has them.
     """
-    c, w, cos_alpha, sin_alpha = _bisect(left, right)
-    u, span = c, w
+    levels = np.array((rig_a.R_level_camera, rig_b.R_level_camera))
+    spans = Spans.of(levels @ left, levels @ right)
+    bars = Bars.of(rig_a.level, rig_b.level)
     if variant == "exact":
-        for i in range(rounds):
-            if i and not bars.centred:
-                c, w, cos_alpha, sin_alpha = _bisect(*_from_middles(left, right, u, span, cos_alpha, sin_alpha, bars))
-            sin_beta = np.clip(dot(u, bars.axis)[::-1], -1.0, 1.0)
-            half = 0.5 * (np.arcsin(sin_beta) - np.arcsin(sin_beta * cos_alpha))
-            cosine, sine = np.cos(half)[:, None], np.sin(half)[:, None]
-            u, span = c * cosine - w * sine, w * cosine + c * sine
-    elif variant in {"paper_midpoint", "paper_literal"}:
-        middle = left / left[:, 2:3] + right / right[:, 2:3]
-        u = middle / np.sqrt(dot(middle, middle))[:, None]
-        span = w - u * dot(u, w)[:, None]
-        span = span / np.sqrt(dot(span, span))[:, None]
-    sin_beta = np.clip(dot(u, bars.axis), -1.0, 1.0)
-    slant = np.sqrt(np.clip(1.0 - u[:, 2] ** 2, 0.0, 1.0)) if variant == "paper_literal" else sin_beta
-    range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], slant, bars.length_m)
+        solved = solve_exact(spans, bars)
+    else:
+        u = spans.c
+        if variant != "paper":
+            u = left / left[:, 2:3] + right / right[:, 2:3]
+            u = levels @ (u / np.sqrt(dot(u, u))[:, None])
+        slant = u[:, 0]
+        if variant == "paper_literal":
+            slant = np.sqrt(np.clip(1.0 - (levels.swapaxes(1, 2) @ u)[:, 2] ** 2, 0.0, 1.0))
+        span = spans.w - u * dot(u, spans.w)[:, None]
+        solved = _pose(u, span / np.sqrt(dot(span, span))[:, None], slant, spans.chord, bars, mean_twist=False)
+    turn_a, turn_b = levels
+    return ClosedForm(
+        u=levels.swapaxes(1, 2) @ solved.u,
+        range_m=solved.range_m,
+        twist_rad=solved.twist_rad,
+        R_a_b=np.einsum("ia,ijk,jb->abk", turn_a, solved.R_a_b, turn_b),
+        t_a_b_m=turn_a.T @ solved.t_a_b_m,
+    )
 
-    own = bars.axis - u * sin_beta[:, None]
-    own = own / np.sqrt(dot(own, own))[:, None]
-    side = cross(u, own)
-    twist = np.arctan2(dot(side, span), dot(own, span))
-    # The paper uses one of the two twists only.
-    mean = twist[0] if variant != "exact" else twist[0] - 0.5 * wrap(twist[0] - twist[1])
-    y = own[0] * np.cos(mean) + side[0] * np.sin(mean)
-    z = cross(u[0], y)
-    # B's frame about the same line of sight: -u_B, its bar across it, and their cross product.
-    R = y[:, None] * own[1][None] - u[0][:, None] * u[1][None] - z[:, None] * side[1][None]
-    t = bars.middle_m[0] + u[0] * (0.5 * (range_m[0] + range_m[1]))
+
+def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
+    """Solve K hypotheses between the level frames."""
+    u, span = _split(spans, split_rounds)
+    chord = spans.chord
     if not bars.centred:
-        t = t - (R * bars.middle_m[1][None]).sum(1)
+        ends = spans.ends
+        for _ in range(offset_rounds):
+            moved = Spans.of(*_from_middles(*ends, u, span, chord, bars))
+            u, span = _split(moved, split_rounds)
+            chord = moved.chord
+    return _pose(u, span, u[:, 0], chord, bars, mean_twist=True)
+
+
+def _angles(chord: Floats) -> tuple[Floats, Floats]:
+    """Give cos and sin of alpha."""
+    chord2 = chord * chord
+    return 1.0 - 0.5 * chord2, chord * np.sqrt(1.0 - 0.25 * chord2)
+
+
+def _split(spans: Spans, rounds: int) -> tuple[Floats, Floats]:
+    """Turn the bisector and the chord to the bar's middle, in their plane."""
+    c, w = spans.c, spans.w
+    cos_alpha = 1.0 - 0.5 * spans.chord * spans.chord
+    sin_beta = along_c = c[:, 0]
+    along_w = w[:, 0]
+    for _ in range(rounds):
+        other = sin_beta[::-1]
+        half = 0.5 * (np.arcsin(other) - np.arcsin(other * cos_alpha))
+        cosine, sine = np.cos(half), np.sin(half)
+        sin_beta = along_c * cosine - along_w * sine
+    cosine, sine = cosine[:, None], sine[:, None]
+    return c * cosine - w * sine, w * cosine + c * sine
+
+
+def _pose(u: Floats, span: Floats, slant: Floats, chord: Floats, bars: Bars, *, mean_twist: bool) -> ClosedForm:
+    """Put a pose together from lines of sight u, the bars across them, and sin beta as Eq. 1 is to take it."""
+    cos_alpha, sin_alpha = _angles(chord)
+    range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], slant, bars.length_m)
+    cos_beta = np.sqrt(1.0 - u[:, 0] * u[:, 0])
+    # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
+    side = np.zeros_like(u)
+    side[:, 1], side[:, 2] = u[:, 2] / cos_beta, -u[:, 1] / cos_beta
+    twist = np.arctan2(u[:, 2] * span[:, 1] - u[:, 1] * span[:, 2], span[:, 0])
+    # The paper uses one of the two twists only.
+    mean = twist[0] - 0.5 * wrap(twist[0] - twist[1]) if mean_twist else twist[0]
+    own = u * (-u[:, 0] / cos_beta)[:, None]
+    own[:, 0] += 1.0 / cos_beta
+    cosine, sine = np.cos(mean), np.sin(mean)
+    y = own[0] * cosine + side[0] * sine
+    z = side[0] * cosine - own[0] * sine
+    # B's frame about the same line of sight: -u_B, its bar across it, and their cross product.
+    R = y[:, None] * own[1] - u[0][:, None] * u[1] - z[:, None] * side[1]
+    t = u[0] * (0.5 * (range_m[0] + range_m[1]))
+    if not bars.centred:
+        t = t + bars.middle_m[0] - (R * bars.middle_m[1]).sum(1)
     return ClosedForm(u, range_m, twist, R, t)
 
 
-def _bisect(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Give the bisector, the unit vector from left to right across it, and cos and sin of the angle."""
-    total, difference = left + right, right - left
-    chord2 = dot(difference, difference)
-    chord = np.sqrt(chord2)
-    c = total / np.sqrt(dot(total, total))[:, None]
-    return c, difference / chord[:, None], 1.0 - 0.5 * chord2, chord * np.sqrt(1.0 - 0.25 * chord2)
-
-
 def _from_middles(
-    left: Floats, right: Floats, u: Floats, span: Floats, cos_alpha: Floats, sin_alpha: Floats, bars: Bars
+    left: Floats, right: Floats, u: Floats, span: Floats, chord: Floats, bars: Bars
 ) -> tuple[Floats, Floats]:
     """Move the bearings from the cameras to the middles of their own bars, by the distances known so far."""
-    sin_beta = np.clip(dot(u, bars.axis), -1.0, 1.0)
+    cos_alpha, sin_alpha = _angles(chord)
+    sin_beta = u[:, 0]
     range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, bars.length_m).mean(0)
     sin_beta, cos_beta = sin_beta[::-1, None], np.sqrt(1.0 - sin_beta * sin_beta)[::-1, None]
     middle = bars.middle_m + range_m * u

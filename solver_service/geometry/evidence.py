@@ -17,9 +17,10 @@ from typing import Final
 
 import numpy as np
 
+from solver_service.geometry.closed_form import dot
 from solver_service.geometry.observation import Settings
 from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp
+from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
@@ -31,7 +32,8 @@ _DEPTH_BROKEN: Final = 0.02
 # Added to what the sensors say of themselves: mount, and a heading's slow bias.
 _MOUNT_SIGMA_RAD: Final = math.radians(1.0)
 _HEADING_SIGMA_RAD: Final = math.radians(3.0)
-_DEFAULT_SIGMA_RAD: Final = np.radians((2.0, 2.0, 10.0))
+_DEFAULT_SIGMA_RAD: Final = (math.radians(2.0), math.radians(2.0), math.radians(10.0))
+_UPRIGHT_DOWN: Final = np.array([0.0, 1.0, 0.0])
 _DEPTH_SIGMA_M: Final = 0.02
 # A diver who is not known to lie otherwise is upright to about this (1 sd).
 _UPRIGHT_SIGMA_RAD: Final = 0.45
@@ -43,7 +45,7 @@ _PITCH_SPREAD: Final = 1.1
 _HEADING_SPREAD: Final = 1.5
 _DEPTH_SPREAD_M: Final = 6.0
 # A prediction from earlier poses is believed this much at most, and costs at most half where it is wrong.
-_MAX_PRIOR_GAIN: Final = 1e3
+_MAX_LOG_PRIOR: Final = 7.0
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
 AGREES: Final = 20.0
 
@@ -67,46 +69,12 @@ class Sensors:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
-    """Log likelihood ratios (K,) of hypotheses, and chi^2 (K,) of tilt and depth by themselves."""
+class Support:
+    """Log likelihood ratios (K,) of hypotheses without their gaps, and chi^2 (K,) of tilt and depth by themselves."""
 
     log_ratio: Floats
     tilt_chi2: Floats
     depth_chi2: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What speaks for and against the hypotheses of one trigger. candidates: how many each picture has."""
-
-    rigs: tuple[Rig, Rig]
-    candidates: tuple[int, int]
-    sensors: Sensors
-    prediction: Prediction | None
-    settings: Settings
-
-    def weigh(
-        self, R_a_b: Floats, t_a_b_m: Floats, u: Floats, chi2: Floats, variance: Floats, log_weight: Floats
-    ) -> Weighed:
-        """Weigh K poses R_a_b (3, 3, K), t_a_b_m (3, K) along the lines of sight u (3, K).
-
-        chi2: (K,) of the gaps, whose variance (of ln range and of twist) is (K,). log_weight: (K,) of the four
-        candidates without a pose.
-        """
-        checks = self.settings.checks
-        limits_m = self.settings.range_min_m, self.settings.range_max_m
-        views_sr = self.rigs[0].camera.solid_angle_sr, self.rigs[1].camera.solid_angle_sr
-        pairings = math.prod(n * (n - 1) for n in self.candidates)
-        constant = math.log(views_sr[0] * views_sr[1] / (pairings * math.log(limits_m[1] / limits_m[0])))
-        gaps = len(checks & {"range", "twist"})
-        # A gap that nobody looks at says what chance says: about one turn, or an e-fold of range.
-        constant -= (2 - gaps) * math.log(2.0 * math.pi)
-        log_ratio = constant + log_weight + log_gaps(chi2, variance, gaps)
-        sensed = weigh_sensors(R_a_b, t_a_b_m, u, variance, self.sensors, self.rigs, checks)
-        log_ratio = log_ratio + sensed.log_ratio
-        if self.prediction is not None:
-            log_ratio = log_ratio + log_prior(R_a_b, t_a_b_m, variance, self.prediction, limits_m, views_sr)
-        return Weighed(log_ratio, sensed.tilt_chi2, sensed.depth_chi2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +97,19 @@ def combine(
     down, tilt, heading, R_ned_camera = [], 0.0, 0.0, []
     for rig, q_ned_body, sigma_rad in zip(rigs, attitudes, sigmas_rad, strict=True):
         if q_ned_body is None:
-            down.append(np.array([0.0, 1.0, 0.0]))
+            down.append(_UPRIGHT_DOWN)
             tilt += _UPRIGHT_SIGMA_RAD**2
             continue
-        sigma = _DEFAULT_SIGMA_RAD if sigma_rad is None else sigma_rad
-        # What a heading has been corrected by is taken back: both then count from magnetic north.
-        magnetic = rotation_exp(np.array([0.0, 0.0, -rig.declination_rad]))
-        R_ned_body = magnetic @ matrix_of(q_ned_body)
+        R_ned_body = matrix_of(q_ned_body)
+        if rig.declination_rad:
+            # What a heading has been corrected by is taken back: both then count from magnetic north.
+            R_ned_body = rotation_exp(np.array([0.0, 0.0, -rig.declination_rad])) @ R_ned_body
         R_ned_camera.append(R_ned_body @ rig.R_body_camera)
         down.append(R_ned_camera[-1][2])
         # Roll turns about the body's x axis, pitch about the horizontal across it, yaw about the vertical.
         steep2 = float(R_ned_body[2, 0]) ** 2
-        roll2, pitch2, yaw2 = (float(x) ** 2 for x in sigma)
+        sigma = _DEFAULT_SIGMA_RAD if sigma_rad is None else sigma_rad.tolist()
+        roll2, pitch2, yaw2 = (x * x for x in sigma)
         tilt += 0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2
         heading += yaw2 + roll2 * steep2 + _HEADING_SIGMA_RAD**2
     both = len(R_ned_camera) == 2
@@ -163,110 +132,137 @@ def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
     return density
 
 
-def log_intruder(chi2: float, freedom: Floats, candidates: int, variance_px2: Floats, area_px2: float) -> Floats:
-    """Give the log odds that one of four is a false candidate where a light is missing, not that light.
+def intruder_odds(chi2: float, freedom: Floats, per_area: Floats) -> float:
+    """Give the odds that one of four lights is missing and a false candidate stands in for it.
 
-    chi2: of the pose. freedom: of that light's sighting. candidates, variance_px2, area_px2: of its picture.
-    The other three foretell where it stands; a false one falls there by chance.
+    chi2: of the pose. freedom: (4,) of the sightings. per_area: (4,) candidates per variance of position (px^2).
+    The other three foretell where a light stands; a false candidate falls there by chance.
     """
-    foretold = log_gaps(np.array(chi2), 1.0 / np.sqrt(np.maximum(freedom, 1e-12)), 2)
-    odds: Floats = np.log(_MISSING_ODDS * candidates * variance_px2 / area_px2) - foretold
-    return odds
+    foretold = math.exp(float(log_gaps(np.array(chi2), np.array(1.0), 2)))
+    return _MISSING_ODDS / foretold * float((per_area / np.sqrt(np.maximum(freedom, 1e-12))).sum())
 
 
-def weigh_sensors(
+def log_chance(rigs: tuple[Rig, Rig], counts: tuple[int, int], settings: Settings) -> float:
+    """Give the part of the log ratio that all hypotheses of a trigger share; counts: candidates in each picture."""
+    views_sr = rigs[0].camera.solid_angle_sr * rigs[1].camera.solid_angle_sr
+    pairings = math.prod(n * (n - 1) for n in counts)
+    unseen = 2 - len(settings.checks & {"range", "twist"})
+    # A gap that nobody looks at says what chance says: about one turn, or an e-fold of range.
+    spread = math.log(settings.range_max_m / settings.range_min_m) * (2.0 * math.pi) ** unseen
+    return math.log(views_sr / (pairings * spread))
+
+
+def weigh(
     R_a_b: Floats,
     t_a_b_m: Floats,
     u: Floats,
     variance: Floats,
-    sensors: Sensors,
     rigs: tuple[Rig, Rig],
-    uses: frozenset[str],
-) -> Weighed:
-    """Weigh K poses, R_a_b (3, 3, K), t_a_b_m (3, K), against attitude and depth.
+    sensors: Sensors,
+    prediction: Prediction | None,
+    settings: Settings,
+) -> Support:
+    """Weigh K poses R_a_b (3, 3, K), t_a_b_m (3, K) by attitude, depth and earlier poses.
 
-    u: (3, K) their lines of sight in A's frame. variance: (K,) of ln range and twist gaps.
+    u: (3, K) lines of sight in A's frame. variance: (K,) of the gaps of ln range and of twist.
     """
-    log_ratio = np.zeros(t_a_b_m.shape[1])
-    down_a = sensors.down_a[:, None]
-    down_b = (R_a_b * sensors.down_b[None, :, None]).sum(1)
-    # The rotation that brings B's down onto A's, as a vector across it.
-    ax, ay, az = sensors.down_a
+    down_a = sensors.down_a
+    down_b = R_a_b[:, 0] * sensors.down_b[0] + R_a_b[:, 1] * sensors.down_b[1] + R_a_b[:, 2] * sensors.down_b[2]
+    along = down_a @ u
+    if "attitude" in settings.checks:
+        log_ratio, tilt_chi2 = _weigh_tilt(down_b, u, along, variance, sensors)
+        if sensors.R_a_b is not None:
+            log_ratio += _log_heading(R_a_b, sensors.R_a_b, down_a, sensors.heading_variance + 0.25 * variance)
+    else:
+        # The reading is upright; of half a turn nothing is known.
+        tilt_chi2 = np.zeros_like(variance)
+        log_ratio = tilt_chi2 - math.log(math.pi)
+    depth_chi2 = np.zeros_like(variance)
+    if sensors.depth_m is not None and "depth" in settings.checks:
+        down = down_a[:, None] + down_b
+        below = t_a_b_m
+        if rigs[0].depth_port_m.any() or rigs[1].depth_port_m.any():
+            below = below - rigs[0].depth_port_m[:, None] + (R_a_b * rigs[1].depth_port_m[:, None]).sum(1)
+        fall = dot(down, below) / np.sqrt(dot(down, down))
+        square = fall * fall
+        spread2 = 0.25 * (sensors.tilt_variance * (dot(below, below) - square) + variance * square)
+        spread2 += sensors.depth_variance
+        depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
+        density = (_DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
+        log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
+    if prediction is not None:
+        log_ratio += _log_prior(R_a_b, t_a_b_m, u, variance, prediction, rigs, settings)
+    return Support(log_ratio, tilt_chi2, depth_chi2)
+
+
+def _weigh_tilt(down_b: Floats, u: Floats, along: Floats, variance: Floats, sensors: Sensors) -> tuple[Floats, Floats]:
+    """Weigh the angle between A's down and B's, turned into A's frame (3, K): log ratio and chi^2 (K,)."""
+    ax, ay, az = sensors.down_a.tolist()
     bx, by, bz = down_b
-    tilt = np.stack((by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax))
-    sine = np.sqrt((tilt * tilt).sum(0))
-    angle = np.arctan2(sine, sensors.down_a @ down_b)
-    tilt = tilt * (angle / np.maximum(sine, 1e-12))
+    # The rotation that brings B's down onto A's, as a vector across it.
+    tx, ty, tz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
+    sine2 = tx * tx + ty * ty + tz * tz
+    sine = np.sqrt(sine2)
+    angle = np.arctan2(sine, ax * bx + ay * by + az * bz)
     # The picture's own noise turns B about the line of sight by half the twist gap's.
     s2, about = sensors.tilt_variance, 0.25 * variance
-    across = about * (1.0 - (sensors.down_a @ u) ** 2)
-    chi2 = (angle * angle - about * (tilt * u).sum(0) ** 2 / (s2 + across)) / s2
-    area = 2.0 * math.pi * np.sqrt(s2 * (s2 + across))
-    if "attitude" not in uses:
-        # Nothing is known of the twist, and the reading is upright.
-        log_ratio -= math.log(math.pi)
-        chi2 = np.zeros_like(chi2)
-    else:
-        density = (1.0 - _TILT_BROKEN) * np.exp(-0.5 * chi2) / area + _TILT_BROKEN / (4.0 * math.pi)
-        log_ratio += np.log(density * _PITCH_SPREAD)
-        if sensors.R_a_b is not None:
-            log_ratio += _log_heading(R_a_b, sensors.R_a_b, sensors, about)
-    depth_chi2 = np.zeros_like(chi2)
-    if sensors.depth_m is not None and "depth" in uses:
-        down = down_a + down_b
-        down = down / np.sqrt((down * down).sum(0))
-        below = t_a_b_m - rigs[0].depth_port_m[:, None]
-        if rigs[1].depth_port_m.any():
-            below = below + (R_a_b * rigs[1].depth_port_m[None, :, None]).sum(1)
-        fall = (down * below).sum(0)
-        level2 = (below * below).sum(0) - fall * fall
-        spread2 = sensors.depth_variance + 0.25 * s2 * level2 + 0.25 * variance * fall * fall
-        depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
-        density = (1.0 - _DEPTH_BROKEN) * np.exp(-0.5 * depth_chi2) / np.sqrt(2.0 * math.pi * spread2)
-        log_ratio += np.log(density * _DEPTH_SPREAD_M + _DEPTH_BROKEN)
-    return Weighed(log_ratio, chi2, depth_chi2)
+    across = about * (1.0 - along * along)
+    about_sight2 = (tx * u[0] + ty * u[1] + tz * u[2]) ** 2 / np.maximum(sine2, 1e-30)
+    total = s2 + across
+    chi2 = angle * angle * (1.0 - about * about_sight2 / total) / s2
+    density = (_PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * chi2) / np.sqrt(s2 * total)
+    return np.log(density + _PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi)), chi2
 
 
-def _log_heading(R_a_b: Floats, predicted: Floats, sensors: Sensors, about: Floats) -> Floats:
-    """Weigh the turn about the vertical between poses and attitudes, loosely."""
+def _log_heading(R_a_b: Floats, predicted: Floats, down: Floats, variance: Floats) -> Floats:
+    """Weigh the turn about down (3,) between poses and attitudes, loosely."""
     flat = R_a_b.reshape(9, -1)
-    across = np.cross(sensors.down_a, predicted.T).T
-    turn = 2.0 * np.arctan2(across.reshape(9) @ flat, 1.0 + predicted.reshape(9) @ flat)
-    spread2 = sensors.heading_variance + about
-    density = (1.0 - _HEADING_BROKEN) * np.exp(-0.5 * turn * turn / spread2) / np.sqrt(2.0 * math.pi * spread2)
-    log_ratio: Floats = np.log((density + _HEADING_BROKEN / (2.0 * math.pi)) * _HEADING_SPREAD)
+    sine, cosine = (skew(down) @ predicted).ravel() @ flat, 1.0 + predicted.ravel() @ flat
+    turn = 2.0 * np.arctan2(sine, cosine)
+    density = (_HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
+    log_ratio: Floats = np.log(
+        density / np.sqrt(2.0 * math.pi * variance) + _HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi)
+    )
     return log_ratio
 
 
-def log_prior(
+def _log_prior(
     R_a_b: Floats,
     t_a_b_m: Floats,
+    u: Floats,
     variance: Floats,
     prediction: Prediction,
-    range_limits_m: tuple[float, float],
-    views_sr: tuple[float, float],
+    rigs: tuple[Rig, Rig],
+    settings: Settings,
 ) -> Floats:
-    """Weigh K poses against a prediction from earlier ones: a bounded gain, and never more than half lost.
-
-    variance: (K,) of ln range and twist, by which the poses themselves scatter along and about the line of sight.
-    """
+    """Weigh K poses against a prediction from earlier ones: a bounded gain, and never more than half lost."""
     away = t_a_b_m - prediction.t_a_b_m[:, None]
-    turned = (R_a_b[:, None] * prediction.R_a_b[None, :, :, None]).sum(2)
-    vector = 0.5 * np.stack((turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]))
-    range2 = (t_a_b_m * t_a_b_m).sum(0)
-    u = t_a_b_m / np.sqrt(range2)
+    turned = np.tensordot(prediction.R_a_b, R_a_b, (1, 1))  # [i, j] of R_a_b R_predicted^T stands at [j, i]
+    e = np.empty((6, len(variance)))
+    e[:3] = away
+    e[3], e[4], e[5] = turned[1, 2] - turned[2, 1], turned[2, 0] - turned[0, 2], turned[0, 1] - turned[1, 0]
+    e[3:] *= 0.5
+    range2 = dot(t_a_b_m, t_a_b_m)
     # Along the line of sight a pose scatters with its range, about it with its twist: on top of the prediction.
-    own = np.zeros((len(range2), 6, 6))
-    sight = u.T[:, :, None] * u.T[:, None, :]
-    own[:, :3, :3] = sight * (0.25 * variance * range2)[:, None, None]
-    own[:, 3:, 3:] = sight * (0.25 * variance)[:, None, None]
-    total = own + prediction.covariance
-    e = np.concatenate((away, vector)).T[:, :, None]
-    chi2 = (e * np.linalg.solve(total, e)).sum((1, 2))
-    density = np.exp(-0.5 * chi2) / np.sqrt((2.0 * math.pi) ** 6 * np.linalg.det(total))
+    sight = prediction.t_a_b_m / math.sqrt(float(prediction.t_a_b_m @ prediction.t_a_b_m) + 1e-12)
+    along = np.zeros((6, 2))
+    along[:3, 0] = sight
+    along[3:, 1] = sight
+    inverse = np.linalg.inv(prediction.covariance)
+    weighted = inverse @ e
+    chi2 = (e * weighted).sum(0)
+    log_area = 0.5 * math.log(max(float(np.linalg.det(prediction.covariance)), 1e-60)) + 3.0 * math.log(2.0 * math.pi)
+    reduced = along.T @ inverse @ along
+    for k, own in enumerate((0.25 * variance * range2, 0.25 * variance)):
+        # One direction's variance at a time (Sherman-Morrison); the two hardly share any.
+        grown = 1.0 + own * reduced[k, k]
+        chi2 = chi2 - own * (along[:, k] @ weighted) ** 2 / grown
+        log_area = log_area + 0.5 * np.log(grown)
     # Half a turn away the vector is short again.
-    density = np.where(turned[0, 0] + turned[1, 1] + turned[2, 2] > 1.0, density, 0.0)
-    spread = math.log(range_limits_m[1] / range_limits_m[0])
-    chance = 1.0 / (spread * views_sr[0] * views_sr[1] * 2.0 * math.pi * range2 * np.sqrt(range2))
-    gain: Floats = np.log(0.5 + 0.5 * np.minimum(np.nan_to_num(density / chance), _MAX_PRIOR_GAIN))
+    near = turned[0, 0] + turned[1, 1] + turned[2, 2] > 1.0
+    views_sr = rigs[0].camera.solid_angle_sr * rigs[1].camera.solid_angle_sr
+    spread = math.log(settings.range_max_m / settings.range_min_m) * views_sr * 2.0 * math.pi
+    log_chance = -1.5 * np.log(range2) - math.log(spread)
+    log_gain = np.where(near, np.minimum(-0.5 * chi2 - log_area - log_chance, _MAX_LOG_PRIOR), -np.inf)
+    gain: Floats = np.log(0.5 + 0.5 * np.exp(log_gain))
     return gain

@@ -7,6 +7,7 @@ join of two sorted lists finds the hypotheses that pass both gaps, and only thes
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -14,10 +15,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.closed_form import cross
+from solver_service.geometry.candidates import Candidates
+from solver_service.geometry.closed_form import Spans
 from solver_service.geometry.evidence import GROSS_SCALE
-from solver_service.geometry.observation import Settings, View
+from solver_service.geometry.observation import Settings
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats
 
@@ -37,11 +38,11 @@ _NEAREST: Final = 1.5
 _MAX_CHORD2: Final = 3.9
 # The least share of a picture over which a pair may be shifted and stay in view.
 _LEAST_IN_VIEW: Final = 0.02
-# Square of the log ratio of two areas, from which on they are no less alike.
-_MAX_UNLIKE: Final = 4.0
-# A message holds no more.
-_MAX_CANDIDATES: Final = 64
-_MIN_SIGMA_PX: Final = 0.05
+# How the log ratio of two areas scatters (1 sd): of two lamps of a kind, and of any two candidates; and the most
+# that areas may speak against two lamps.
+_LIKE_LOG_AREA: Final = 0.8
+_ANY_LOG_AREA: Final = 1.2
+_MAX_UNLIKE: Final = 1.0
 # How many hypotheses may pass gates that are widened for gross errors; beyond, chance hides the right one.
 _MAX_WIDE: Final = 1000
 # Gravity across the line of sight (product of both) below which both readings of left and right are weighed.
@@ -49,37 +50,21 @@ _UNDECIDED: Final = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Sky:
-    """What one node saw, as bearings: the N candidates that can be used.
-
-    bearings: (3, N). tangents: (N, 2, 3), px per rad over sigma_px. variance: (N,) of the bearing, rad^2 per axis.
-    index: (N,) into the view. pixels: (2, N), sigma_px: (N,). dt_s: (N,) after the instant that the pose is for.
-    log_score, log_area: (N,) weak evidence.
-    """
-
-    bearings: Floats
-    tangents: Floats
-    variance: Floats
-    index: NDArray[np.intp]
-    pixels: Floats
-    sigma_px: Floats
-    dt_s: Floats
-    log_score: Floats
-    log_area: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class Pairs:
-    """The P pairs of one image that may be the other node's bar.
+    """The pairs of candidates of either image that may be the other node's bar; P in all, `split` of them A's.
 
-    first, second: (P,) indices into the sky. key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from
-    one's own bar to the direction first -> second. variance: of ln alpha and of the twist. chord: of alpha, rad.
-    log_weight: weak evidence, and how rarely chance puts two candidates so near each other. tan2_beta: of the
-    widest. down: (2, P) gravity across the line of sight, along one's own bar and across it.
+    first, second: (P,) candidates. c, w: (3, P) unit bisector, and unit chord from first to second, level frame.
+    key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's own bar to the direction first -> second.
+    variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2). log_weight: how rarely chance puts two candidates
+    so near each other. tan2_beta: of the widest. down: (2, P) gravity across the line of sight, along one's own bar
+    and across it.
     """
 
+    split: int
     first: NDArray[np.intp]
     second: NDArray[np.intp]
+    c: Floats
+    w: Floats
     key: Floats
     twist_rad: Floats
     variance: Floats
@@ -88,177 +73,154 @@ class Pairs:
     tan2_beta: float
     down: Floats
 
-    def __len__(self) -> int:
-        """Count the pairs."""
-        return len(self.key)
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Count A's and B's pairs."""
+        return self.split, len(self.key) - self.split
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """K hypotheses: indices into the skies (4, K) (B's left and right in A's, A's left and right in B's).
+    """K hypotheses: candidates (4, K) as B's left and right in A's image, A's left and right in B's.
 
-    variance: (K,) of the gap of ln range, and of twist. log_weight: (K,) what does not depend on the pose.
+    spans: both bars as seen. variance: (K,) of the gap of ln range, and of twist. log_weight: (K,) what does not
+    depend on the pose.
     """
 
     lights: NDArray[np.intp]
+    spans: Spans
     variance: Floats
     log_weight: Floats
 
 
-def find_sky(view: View, camera: Camera, offset_s: float) -> Sky:
-    """Turn a view into bearings; offset_s: its stamp after the instant that the pose is for.
-
-    Candidates whose position or noise is not finite, and pixels that the camera model does not reach, are left out.
-    """
-    pixels = np.asarray(view.pixels, dtype=np.float64).reshape(-1, 2)[:_MAX_CANDIDATES]
-    bearings, tangents = camera.rays(pixels)
-    usable = np.isfinite(tangents).all((1, 2)) & np.isfinite(view.sigma_px[:_MAX_CANDIDATES])
-    index = np.flatnonzero(usable)
-    if len(index) < len(pixels):
-        pixels, bearings, tangents = pixels[index], bearings[index], tangents[index]
-    sigma_px = np.maximum(view.sigma_px[index], _MIN_SIGMA_PX)
-    tangents = tangents / sigma_px[:, None, None]
-    gram = (tangents * tangents).sum(2)
-    slant = (tangents[:, 0] * tangents[:, 1]).sum(1)
-    score, area_px = view.score[index], view.area_px[index]
-    # Half the log odds of a score count, within a factor of e^1.5.
-    odds = np.clip(np.where(np.isfinite(score), score, 0.5), 1e-3, 1.0 - 1e-3)
-    return Sky(
-        bearings=bearings.T.copy(),
-        tangents=tangents,
-        variance=1.0 / np.sqrt(gram[:, 0] * gram[:, 1] - slant * slant),
-        index=index,
-        pixels=pixels.T,
-        sigma_px=sigma_px,
-        dt_s=view.dt_s[index] + offset_s,
-        log_score=np.clip(0.5 * np.log(odds / (1.0 - odds)), -1.5, 1.5),
-        log_area=np.log(np.maximum(np.where(np.isfinite(area_px), area_px, 1.0), 1.0)),
-    )
+@lru_cache(maxsize=64)
+def _combinations(count_a: int, count_b: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Give all pairs of A's candidates, then of B's: first, second, and whose they are."""
+    of_a, of_b = np.triu_indices(count_a, 1), np.triu_indices(count_b, 1)
+    first = np.concatenate((of_a[0], of_b[0] + count_a))
+    second = np.concatenate((of_a[1], of_b[1] + count_a))
+    node = np.repeat((0, 1), (len(of_a[0]), len(of_b[0])))
+    for array in (first, second, node):
+        array.flags.writeable = False
+    return first, second, node
 
 
-@lru_cache(maxsize=128)
-def _combinations(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    first, second = np.triu_indices(count, 1)
-    first.flags.writeable = second.flags.writeable = False
-    return first, second
-
-
-def find_pairs(sky: Sky, own: Rig, other: Rig, down: Floats, settings: Settings) -> Pairs:
-    """Give the pairs whose angle fits the other node's bar within the range limits.
-
-    down: (3,) gravity in the own camera's frame.
-    """
-    first, second = _combinations(len(sky.index))
-    b = sky.bearings
-    b_first, b_second = b[:, first], b[:, second]
-    difference = b_second - b_first
-    chord2 = (difference * difference).sum(0)
-    variance = sky.variance[first] + sky.variance[second]
-    shortest = (_FORESHORTENING * other.length_m / settings.range_max_m) ** 2
-    longest = min((_NEAREST * other.length_m / settings.range_min_m) ** 2, _MAX_CHORD2)
-    keep = (chord2 >= shortest) & (chord2 <= longest) & (variance < _MAX_RELATIVE_VARIANCE * chord2)
+def find_pairs(
+    candidates: Candidates, levels: tuple[Rig, Rig], down: tuple[Floats, Floats], settings: Settings
+) -> Pairs:
+    """Give the pairs whose angle fits the other node's bar within the range limits; down: in each level frame."""
+    first, second, node = _combinations(*candidates.counts)
+    in_a = candidates.counts[0]
+    table = np.empty((7, len(candidates.index)))
+    table[:3], table[3:5], table[5] = candidates.bearings, candidates.shares, candidates.variance
+    for part, fall in ((slice(0, in_a), down[0]), (slice(in_a, None), down[1])):
+        table[6, part] = fall @ candidates.bearings[:, part]
+    one, two = table.take(first, axis=1), table.take(second, axis=1)
+    w, total = two - one, two + one
+    # Of the cross product of the two, what turns about the bar.
+    about = one[1] * two[2] - one[2] * two[1]
+    chord2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    variance = total[5] / chord2
+    other_m = np.array((levels[1].length_m, levels[0].length_m))
+    shortest = (_FORESHORTENING / settings.range_max_m * other_m) ** 2
+    longest = np.minimum((_NEAREST / settings.range_min_m * other_m) ** 2, _MAX_CHORD2)
+    keep = (chord2 >= shortest.take(node)) & (chord2 <= longest.take(node)) & (variance < _MAX_RELATIVE_VARIANCE)
     if not keep.all():
-        first, second = first[keep], second[keep]
-        b_first, b_second, difference = b_first[:, keep], b_second[:, keep], difference[:, keep]
+        first, second, node = first[keep], second[keep], node[keep]
+        w, total, about = w[:, keep], total[:, keep], about[keep]
         chord2, variance = chord2[keep], variance[keep]
     chord = np.sqrt(chord2)
-    norm2 = 4.0 - chord2
-    norm = np.sqrt(norm2)
-    c = (b_first + b_second) / norm
-    sin_beta = own.axis @ c
+    norm = np.sqrt(4.0 - chord2)
+    total /= norm
+    sin_beta = total[0]
     cos_beta2 = np.maximum(1.0 - sin_beta * sin_beta, 1e-6)
-    # The own bar and its perpendicular, seen along the line of sight c.
-    side = cross(np.broadcast_to(own.axis[:, None], c.shape), c)
-    sine, cosine = -(side * difference).sum(0), own.axis @ difference
-    apart_px = np.abs(sky.pixels[:, second] - sky.pixels[:, first])
-    camera = own.camera
-    in_view = (1.0 - apart_px[0] / camera.width_px) * (1.0 - apart_px[1] / camera.height_px)
-    alike = np.minimum((sky.log_area[second] - sky.log_area[first]) ** 2, _MAX_UNLIKE)
-    weak = sky.log_score[first] + sky.log_score[second] - 0.25 * alike
-    if len(weak):
-        # Its exponential is one on average: what all candidates share is no evidence.
-        weak = weak - np.log(np.exp(weak).mean())
+    room = 1.0 - np.abs(w[3:5])
+    own_m = np.array((levels[0].length_m, levels[1].length_m)).take(node)
+    falls = np.array(down).T.take(node, axis=1)
+    # Gravity along the bar and along its perpendicular, both as seen across the line of sight.
+    across = np.empty((2, len(chord)))
+    across[0] = falls[0] - sin_beta * total[6]
+    across[1] = falls[1] * total[2] - falls[2] * total[1]
     return Pairs(
+        split=int(node.searchsorted(1)),
         first=first,
         second=second,
-        key=np.log(chord * np.sqrt(cos_beta2) * own.length_m) + 0.125 * chord2,
-        twist_rad=np.arctan2(sine, cosine),
-        variance=variance / chord2,
+        c=total[:3],
+        w=w[:3] / chord,
+        key=0.5 * np.log(chord2 * cos_beta2 * own_m * own_m) + 0.125 * chord2,
+        twist_rad=np.arctan2(-2.0 * about / norm, w[0]),
+        variance=variance,
         chord=chord,
-        log_weight=weak - np.log(chord2 * np.maximum(in_view, _LEAST_IN_VIEW)),
-        tan2_beta=float(1.0 / cos_beta2.min(initial=1.0) - 1.0),
-        down=np.stack((down @ own.axis - sin_beta * (down @ c), -(down @ side))) / np.sqrt(cos_beta2),
+        log_weight=-np.log(chord2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
+        tan2_beta=1.0 / float(cos_beta2.min(initial=1.0)) - 1.0,
+        down=across / np.sqrt(cos_beta2),
     )
+
+
+def _alike(area_px: Floats, one: NDArray[np.intp], two: NDArray[np.intp]) -> Floats:
+    """Give the log likelihood ratio of two areas for lamps of a kind, against any two candidates."""
+    square = np.log(area_px[one] / area_px[two]) ** 2
+    weight = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA) - square * (0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2)
+    return np.where(np.isfinite(weight), np.maximum(weight, -_MAX_UNLIKE), 0.0)
 
 
 def join(
-    a: Pairs,
-    b: Pairs,
-    rig_a: Rig,
-    rig_b: Rig,
-    gate_sigma: float,
-    motion_variance: Floats,
-    *,
-    by_range: bool,
-    by_twist: bool,
+    pairs: Pairs, levels: tuple[Rig, Rig], gate_sigma: float, motion_variance: Floats, *, by_range: bool, by_twist: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Give the combinations of pairs that pass the gates: indices into a, into b, and whether one order swaps.
+    """Give the combinations of A's and B's pairs that pass the gates, and whether one order swaps.
 
-    motion_variance: (len(a),) what relative motion between the exposures adds to both gaps, rad^2.
+    motion_variance: of A's pairs, what relative motion between the exposures adds to both gaps, rad^2.
     swap: the twists agree where one of the two pairs is read second -> first.
     """
-    if not len(a.key) or not len(b.key):
-        nothing = np.empty(0, dtype=np.intp)
-        return nothing, nothing, np.empty(0, dtype=np.bool_)
-    ratio = rig_a.length_m / rig_b.length_m
-    chord2 = (a.chord * max(1.0, ratio)) ** 2
-    offset_m = float(np.linalg.norm(rig_a.middle_m) + np.linalg.norm(rig_b.middle_m))
-    slack = (_OFFSET_SLOPE * offset_m / rig_b.length_m) * a.chord
+    split, other = pairs.split, pairs.counts[1]
+    chord, variance = pairs.chord[:split], pairs.variance[:split] + motion_variance
+    slack = (_OFFSET_SLOPE * (levels[0].offset_m + levels[1].offset_m) / levels[1].length_m) * chord
+    chord2 = (max(1.0, levels[0].length_m / levels[1].length_m) * chord) ** 2
     if by_range:
+        key_a, key_b = pairs.key[:split], pairs.key[split:]
         # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
-        least_b = np.exp(a.key) / rig_b.length_m
-        worst_b = (b.variance * b.chord * b.chord).max() / (least_b * least_b)
-        term = _KEY_TERM + _KEY_SLOPE * max(a.tan2_beta, b.tan2_beta)
-        reach = gate_sigma * np.sqrt(a.variance + worst_b + motion_variance) + term * chord2 + slack
-        order = np.argsort(b.key, kind="stable")
-        keys = b.key[order]
-        low = np.searchsorted(keys, a.key - reach)
-        count = np.searchsorted(keys, a.key + reach, side="right") - low
-        start = np.cumsum(count) - count
-        ia = np.repeat(np.arange(len(a.key)), count)
-        ib = order[np.arange(len(ia)) + (low - start)[ia]]
+        least2 = np.exp(2.0 * key_a) / levels[1].length_m ** 2
+        worst = (pairs.variance[split:] * pairs.chord[split:] ** 2).max()
+        term = _KEY_TERM + _KEY_SLOPE * pairs.tan2_beta
+        reach = gate_sigma * np.sqrt(variance + worst / least2) + term * chord2 + slack
+        order = np.argsort(key_b, kind="stable")
+        keys = key_b[order]
+        low = keys.searchsorted(key_a - reach)
+        count = keys.searchsorted(key_a + reach, side="right") - low
+        ia = np.arange(split).repeat(count)
+        ib = order[np.arange(len(ia)) - (count.cumsum() - count - low).repeat(count)] + split
     else:
-        ia = np.repeat(np.arange(len(a.key)), len(b.key))
-        ib = np.tile(np.arange(len(b.key)), len(a.key))
+        ia = np.repeat(np.arange(split), other)
+        ib = np.tile(np.arange(split, split + other), split)
     # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
-    off_half_turn = np.abs(np.abs(a.twist_rad[ia] - b.twist_rad[ib]) - np.pi)
+    off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - np.pi)
     swap = off_half_turn < 0.5 * np.pi
     if by_twist:
         gap = np.where(swap, off_half_turn, np.pi - off_half_turn)
-        spread = np.sqrt(a.variance[ia] + b.variance[ib] + motion_variance[ia])
+        spread = np.sqrt(variance[ia] + pairs.variance[ib])
         keep = gap < gate_sigma * spread + (_TWIST_TERM * chord2 + slack)[ia]
         ia, ib, swap = ia[keep], ib[keep], swap[keep]
     return ia, ib, swap
 
 
 def search(
-    a: Pairs, b: Pairs, rigs: tuple[Rig, Rig], motion_variance: Floats, checks: frozenset[str], gate_sigma: float
+    candidates: Candidates, pairs: Pairs, levels: tuple[Rig, Rig], motion_variance: Floats, settings: Settings
 ) -> Hypotheses | str:
     """Give the hypotheses whose gaps pass, read as gravity has them, or the name of the gap that none passes."""
-    by_range, by_twist = "range" in checks, "twist" in checks
-    for gate in (gate_sigma * GROSS_SCALE, gate_sigma):
-        ia, ib, swap = join(a, b, *rigs, gate, motion_variance, by_range=by_range, by_twist=by_twist)
+    by_range, by_twist = "range" in settings.checks, "twist" in settings.checks
+    for gate in (settings.gate_sigma * GROSS_SCALE, settings.gate_sigma):
+        ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=by_range, by_twist=by_twist)
         if len(ia) <= _MAX_WIDE:
             break
     if not len(ia):
-        if not by_range or not by_twist:
+        if not (by_range and by_twist):
             return "range_gap" if by_range else "twist_gap"
-        ia, ib, swap = join(a, b, *rigs, gate, motion_variance, by_range=True, by_twist=False)
+        ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=True, by_twist=False)
         return "twist_gap" if len(ia) else "range_gap"
     # With first -> second as left -> right in A, and B read to agree with it, B's gravity turned into A's frame;
     # across the line of sight the two count the other way round.
-    cosine, sine = np.cos(a.twist_rad[ia]), np.sin(a.twist_rad[ia])
-    da, db = a.down[:, ia], b.down[:, ib]
+    cosine, sine = np.cos(pairs.twist_rad[ia]), np.sin(pairs.twist_rad[ia])
+    da, db = pairs.down[:, ia], pairs.down[:, ib]
     upright = da[0] * (cosine * db[0] + sine * db[1]) + da[1] * (sine * db[0] - cosine * db[1])
     flip = upright < 0.0
     undecided = np.flatnonzero(np.abs(upright) < _UNDECIDED)
@@ -267,17 +229,21 @@ def search(
         ia, ib, swap = ia[both], ib[both], swap[both]
         flip = np.concatenate((flip, ~flip[undecided]))
     swap = swap != flip
-    first_a, second_a, first_b, second_b = a.first[ia], a.second[ia], b.first[ib], b.second[ib]
-    lights = np.stack(
-        (
-            np.where(flip, second_a, first_a),
-            np.where(flip, first_a, second_a),
-            np.where(swap, second_b, first_b),
-            np.where(swap, first_b, second_b),
-        )
-    )
+    lights = np.empty((4, len(ia)), dtype=np.intp)
+    first_a, second_a, first_b, second_b = pairs.first[ia], pairs.second[ia], pairs.first[ib], pairs.second[ib]
+    lights[0], lights[1] = np.where(flip, second_a, first_a), np.where(flip, first_a, second_a)
+    lights[2], lights[3] = np.where(swap, second_b, first_b), np.where(swap, first_b, second_b)
+    both = np.array((ia, ib))
+    w = pairs.w.take(both, axis=1)
+    w[:, 0] *= 1.0 - 2.0 * flip
+    w[:, 1] *= 1.0 - 2.0 * swap
+    log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
+    log_weight += _alike(candidates.area_px, lights[::2], lights[1::2]).sum(0)
+    if candidates.log_score is not None:
+        log_weight += candidates.log_score[lights].sum(0)
     return Hypotheses(
         lights=lights,
-        variance=a.variance[ia] + b.variance[ib] + motion_variance[ia],
-        log_weight=a.log_weight[ia] + b.log_weight[ib],
+        spans=Spans(pairs.c.take(both, axis=1).swapaxes(0, 1), w.swapaxes(0, 1), pairs.chord[both]),
+        variance=pairs.variance[ia] + pairs.variance[ib] + motion_variance[ia],
+        log_weight=log_weight,
     )

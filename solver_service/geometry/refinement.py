@@ -9,14 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, rotation_exp, skew
+from solver_service.geometry.rotation import Floats, rotation_exp, rotation_near, skew
 
 _MAX_STEPS: Final = 12
-# A step this small (m and rad) leaves an error of its square.
-_SMALL: Final = 1e-7
-# Where the coordinates determine a pose less than this, relative to the best determined one, they do not.
-_SINGULAR: Final = 1e-13
-_SIGNS: Final = np.array([1.0, 1.0, -1.0, -1.0])[:, None, None]
+# A step this small, relative to the range and in rad, leaves less than its square.
+_SMALL: Final = 5e-4
+# A combination of coordinates that the picture determines this much worse than each alone is not determined.
+_UNDETERMINED: Final = 1e10
+_DIAGONAL: Final = np.arange(6)
+_DAMPING: Final = 1e-13 * np.eye(6)
+# Which sightings a later clock of B moves, and where to.
+_SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,55 +52,70 @@ class Refined:
     """K poses: t_a_b_m (K, 3), R_a_b (K, 3, 3), covariance (K, 6, 6), chi2 (K,) of two degrees of freedom.
 
     covariance: of position in A's camera frame, then of the small rotation w with R_true = exp(w) R_a_b, in A's
-    camera frame. sound: (K,), False where the pose is not determined or lies behind a camera.
+    camera frame. sound: (K,), False where the pose is not determined or lies behind a camera. freedom: (K, 4)
+    what of each sighting the other three leave open: the determinant of its residual's covariance, 0 to 1.
     """
 
     t_a_b_m: Floats
     R_a_b: Floats
     covariance: Floats
     chi2: Floats
-    freedom: Floats
     sound: NDArray[np.bool_]
+    derivatives: Floats
+
+    def freedom(self, k: int) -> Floats:
+        """Give what of each sighting of pose k the other three leave open (4,): a variance ratio squared, 0 to 1.
+
+        The determinant of its residual's covariance, where residuals are not correlated.
+        """
+        J = self.derivatives[k].reshape(4, 2, 6)
+        left = np.eye(2) - J @ self.covariance[k] @ J.swapaxes(1, 2)
+        area: Floats = np.clip(left[:, 0, 0] * left[:, 1, 1] - left[:, 0, 1] * left[:, 1, 0], 0.0, 1.0)
+        return area
 
 
 def refine(
-    t_a_b_m: Floats, R_a_b: Floats, seen: Sightings, rig_a: Rig, rig_b: Rig, motion: Motion, steps: int | None = None
+    t_a_b_m: Floats,
+    R_a_b: Floats,
+    seen: Sightings,
+    rig_a: Rig,
+    rig_b: Rig,
+    motion: Motion,
 ) -> Refined:
-    """Refine K poses, t_a_b_m (K, 3) and R_a_b (K, 3, 3); with no steps, give only covariance and chi2."""
+    """Refine K poses, t_a_b_m (K, 3) and R_a_b (K, 3, 3)."""
     t, R = t_a_b_m, R_a_b
-    steps = _MAX_STEPS if steps is None else steps
-    weight = _weight(t, R, seen, rig_a, rig_b, motion)
-    lights = (rig_a.lights_m, rig_b.lights_m)
-    moved = seen.dt_s.any() and motion.rates.any()
-    for step in range(steps + 1):
-        r, J, depth = _residuals(t, R, seen, lights, motion.rates if moved else None)
-        Jw = J if weight is None else weight @ J
-        H = Jw.swapaxes(1, 2) @ J
-        scale = H[:, range(6), range(6)]
+    lights = rig_a.lights_m, rig_b.lights_m
+    timed = bool(seen.dt_s.any())
+    rates = motion.rates if timed and motion.rates.any() else None
+    weight = None
+    steps = 0
+    while True:
+        r, J, depth = _residuals(t, R, seen, lights, rates)
+        if steps == 0 and (timed or motion.skew_sigma_s > 0.0):
+            weight = _weight(J, seen.dt_s, motion)
+        JtW = J.swapaxes(1, 2) if weight is None else J.swapaxes(1, 2) @ weight
+        H = JtW @ J
         # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-        unit = 1.0 / np.sqrt(np.where(scale > 0.0, scale, 1.0))
-        H = H * (unit[:, :, None] * unit[:, None, :])
-        if step == steps:
+        unit = 1.0 / np.sqrt(H[:, _DIAGONAL, _DIAGONAL])
+        scale = unit[:, :, None] * unit[:, None, :]
+        inverse = np.linalg.inv(H * scale + _DAMPING)
+        covariance = inverse * scale
+        column = r[:, :, None]
+        g = JtW @ column
+        rw = column if weight is None else weight @ column
+        chi2 = (column * rw).sum((1, 2))
+        if steps == _MAX_STEPS:
             break
-        H[:, range(6), range(6)] += 1e-12
-        g = (Jw.swapaxes(1, 2) @ r[:, :, None]) * unit[:, :, None]
-        move = -np.linalg.solve(H, g)[:, :, 0] * unit
-        t, R = t + move[:, :3], rotation_exp(move[:, 3:]) @ R
+        move = covariance @ g
+        chi2 = chi2 - (g * move).sum((1, 2))
+        t, R = t - move[:, :3, 0], rotation_near(-move[:, 3:, 0]) @ R
+        steps += 1
+        move[:, :3] /= np.sqrt((t * t).sum(1))[:, None, None]
         if not (np.abs(move) > _SMALL).any():
-            steps = step + 1
-            r, J, depth = _residuals(t, R, seen, lights, motion.rates if moved else None)
             break
-    finite = np.isfinite(H.sum(axis=(1, 2)) + r.sum(axis=1))
-    H = np.where(finite[:, None, None], H, np.eye(6))
-    values, vectors = np.linalg.eigh(H)
-    sound = finite & (values[:, 0] > _SINGULAR * values[:, 5]) & (depth > 0.0).all(1)
-    vectors = vectors * unit[:, :, None]
-    covariance = (vectors / np.maximum(values, _SINGULAR)[:, None, :]) @ vectors.swapaxes(1, 2)
-    rw = r if weight is None else (weight @ r[:, :, None])[:, :, 0]
-    J4 = J.reshape(-1, 4, 2, 6)
-    open_ = np.eye(2) - J4 @ covariance[:, None] @ J4.swapaxes(2, 3)
-    freedom = open_[..., 0, 0] * open_[..., 1, 1] - open_[..., 0, 1] * open_[..., 1, 0]
-    return Refined(t, R, covariance, (r * rw).sum(1), np.clip(freedom, 0.0, 1.0), sound)
+    determined = inverse[:, _DIAGONAL, _DIAGONAL].max(1) < _UNDETERMINED
+    sound = determined & (depth > 0.0).all(1) & np.isfinite(covariance.sum((1, 2)) + chi2 + t.sum(1))
+    return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound, J)
 
 
 def _residuals(
@@ -108,45 +126,40 @@ def _residuals(
     A light seen at dt sees the pose moved by rates * dt.
     """
     K = len(t)
-    y = np.empty((K, 4, 3))
+    Rt = R.swapaxes(1, 2)
     q = np.empty((K, 4, 3))
-    y[:, :2] = lights[1] @ R.swapaxes(1, 2)
-    if rates is None:
-        q[:, :2] = y[:, :2] + t[:, None]
-        y[:, 2:] = lights[0] - t[:, None]
-        q[:, 2:] = y[:, 2:] @ R
-    else:
+    # The lights about the point that the pose turns them about, in A's axes: B's about B, A's seen from B.
+    y = np.empty((K, 4, 3))
+    y[:, :2] = lights[1] @ Rt
+    y[:, 2:] = lights[0] - t[:, None]
+    if rates is not None:
         turn = rotation_exp(seen.dt_s[:, :, None] * rates[3:])
         shift = seen.dt_s[:, :, None] * rates[:3]
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
-        q[:, :2] = y[:, :2] + t[:, None] + shift[:, :2]
-        y[:, 2:] = ((lights[0] - t[:, None] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
-        q[:, 2:] = y[:, 2:] @ R
+        y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
+    q[:, :2] = y[:, :2] + t[:, None]
+    q[:, 2:] = y[:, 2:] @ R
+    if rates is not None:
+        q[:, :2] += shift[:, :2]
     depth = (seen.bearings * q).sum(2)
     G = seen.tangents / depth[:, :, None, None]
-    r = (G @ q[..., None])[..., 0]
-    D = G - r[..., None] * (seen.bearings / depth[:, :, None])[:, :, None]
-    D[:, 2:] = D[:, 2:] @ R.swapaxes(1, 2)[:, None]
-    D *= _SIGNS
+    r = G @ q[..., None]
+    D = G - r * (seen.bearings / depth[:, :, None])[:, :, None]
+    D[:, 2:] = D[:, 2:] @ -Rt[:, None]
     J = np.empty((K, 4, 2, 6))
     J[..., :3] = D
-    # d (y x v) = (d x y) v: row d's derivative by the rotation is y x d.
-    J[..., 3:] = -D @ skew(y)
+    # A turn w moves y by w x y = -[y]x w; for A's lights both signs are already turned.
+    J[..., 3:] = D @ -skew(y)
     return r.reshape(K, 8), J.reshape(K, 8, 6), depth
 
 
-def _weight(t: Floats, R: Floats, seen: Sightings, rig_a: Rig, rig_b: Rig, motion: Motion) -> Floats | None:
-    """Give the inverse covariance (K, 8, 8) of the residuals where the rates' uncertainty adds to the pixels'."""
-    skewed = motion.skew_sigma_s > 0.0
-    if not seen.dt_s.any() and not skewed:
-        return None
-    _, J, _ = _residuals(t, R, seen, (rig_a.lights_m, rig_b.lights_m), None)
-    by_rate = J * np.repeat(seen.dt_s, 2, axis=1)[:, :, None]
-    total = np.eye(8) + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
-    if skewed:
-        second = motion.covariance + np.outer(motion.rates, motion.rates)
-        by_skew = J * (0.5 * motion.skew_sigma_s * np.repeat((1.0, 1.0, -1.0, -1.0), 2))[:, None]
-        total = total + by_skew @ second @ by_skew.swapaxes(1, 2)
+def _weight(J: Floats, dt_s: Floats, motion: Motion) -> Floats:
+    """Give the inverse covariance (K, 8, 8) of the residuals: pixel noise, and what is not known of the motion."""
+    by_rate = J * np.repeat(dt_s, 2, axis=1)[:, :, None]
+    total: Floats = np.eye(8) + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
+    if motion.skew_sigma_s > 0.0:
+        square = motion.covariance + np.outer(motion.rates, motion.rates)
+        by_skew = J * (motion.skew_sigma_s * _SKEW_SIGNS)
+        total += by_skew @ square @ by_skew.swapaxes(1, 2)
     total[~np.isfinite(total.sum(axis=(1, 2)))] = np.eye(8)
-    inverse: Floats = np.linalg.inv(total)
-    return inverse
+    return np.asarray(np.linalg.inv(total), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""One node's calibration, and what follows from it for a pair."""
+"""One node's calibration, and what follows from it."""
 
 from __future__ import annotations
 
@@ -35,6 +35,11 @@ class Rig:
         return middle
 
     @cached_property
+    def offset_m(self) -> float:
+        """How far the bar's middle stands off the camera."""
+        return float(np.linalg.norm(self.middle_m))
+
+    @cached_property
     def length_m(self) -> float:
         """The distance between the lights."""
         return float(np.linalg.norm(self.lights_m[1] - self.lights_m[0]))
@@ -44,6 +49,34 @@ class Rig:
         """The unit vector (3,) from the left to the right light, camera frame."""
         axis: Floats = (self.lights_m[1] - self.lights_m[0]) / self.length_m
         return axis
+
+    @cached_property
+    def R_level_camera(self) -> Floats:
+        """The turn (3, 3) of the camera's frame that lays the x axis along the bar, y as near to y as it goes."""
+        x = self.axis
+        y = np.array([0.0, 1.0, 0.0]) if abs(x[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
+        y = y - x * (x @ y)
+        y = y / np.linalg.norm(y)
+        return np.array((x, y, np.cross(x, y)))
+
+    @cached_property
+    def both_level_camera(self) -> Floats:
+        """The same turn (6, 6) of a position and a small rotation."""
+        both = np.zeros((6, 6))
+        both[:3, :3] = both[3:, 3:] = self.R_level_camera
+        return both
+
+    @cached_property
+    def level(self) -> Rig:
+        """The same rig in a frame whose x axis is the bar's. Its camera still gives bearings in the camera's frame."""
+        turn = self.R_level_camera
+        return Rig(
+            camera=self.camera,
+            lights_m=self.lights_m @ turn.T,
+            R_body_camera=self.R_body_camera @ turn.T,
+            depth_port_m=turn @ self.depth_port_m,
+            declination_rad=self.declination_rad,
+        )
 
     @property
     def usable(self) -> bool:

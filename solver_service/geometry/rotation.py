@@ -10,26 +10,31 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 
-# v @ CROSS, reshaped to (3, 3), is the matrix of the cross product v x .
-CROSS: Final[Floats] = np.zeros((3, 3, 3))
+# v @ _CROSS, reshaped to (3, 3), is the matrix of the cross product v x .
+_CROSS: Final[Floats] = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    CROSS[_i, _k, _j] = 1.0
-    CROSS[_i, _j, _k] = -1.0
+    _CROSS[_i, _k, _j] = 1.0
+    _CROSS[_i, _j, _k] = -1.0
+_CROSS_FLAT: Final[Floats] = _CROSS.reshape(3, 9)
+_EYE: Final[Floats] = np.eye(3)
 
 
 def skew(v: Floats) -> Floats:
     """Give the (..., 3, 3) matrices of the cross products with v (..., 3)."""
-    return (v @ CROSS.reshape(3, 9)).reshape(*v.shape, 3)
+    return (v @ _CROSS_FLAT).reshape(*v.shape, 3)
 
 
 def matrix_of(q_xyzw: Floats) -> Floats:
-    """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
-    q = np.asarray(q_xyzw, dtype=np.float64)
-    q = q / np.sqrt((q * q).sum(-1, keepdims=True))
-    v, w = q[..., :3], q[..., 3]
-    R: Floats = 2.0 * v[..., :, None] * v[..., None, :] + 2.0 * w[..., None, None] * skew(v)
-    R[..., (0, 1, 2), (0, 1, 2)] += (2.0 * w * w - 1.0)[..., None]
-    return R
+    """Turn one quaternion (4,), of any length but zero, into its matrix (3, 3)."""
+    x, y, z, w = np.asarray(q_xyzw, dtype=np.float64).tolist()
+    s = 2.0 / (x * x + y * y + z * z + w * w)
+    return np.array(
+        (
+            (1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
+            (s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)),
+            (s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)),
+        )
+    )
 
 
 def quaternion_of(R: Floats) -> Floats:
@@ -53,14 +58,21 @@ def quaternion_of(R: Floats) -> Floats:
 
 def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
-    square = (w_rad * w_rad).sum(-1)
-    angle = np.sqrt(square)
+    angle = np.sqrt((w_rad * w_rad).sum(-1))
     # sin(x)/x and (1 - cos x)/x^2, without a division by zero.
     first = np.sinc(angle / np.pi)
     second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     K = skew(w_rad)
-    R: Floats = first[..., None, None] * K + second[..., None, None] * (K @ K)
-    R[..., (0, 1, 2), (0, 1, 2)] += 1.0
+    R: Floats = _EYE + first[..., None, None] * K + second[..., None, None] * (K @ K)
+    return R
+
+
+def rotation_near(w_rad: Floats) -> Floats:
+    """Turn small rotation vectors (K, 3) into matrices (K, 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
+    half = 0.5 * w_rad
+    K = skew(half)
+    scale = 2.0 / (1.0 + (half * half).sum(1))
+    R: Floats = _EYE + scale[:, None, None] * (K + K @ K)
     return R
 
 

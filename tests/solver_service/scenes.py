@@ -85,13 +85,16 @@ class Scene:
             for p, r in ((self.clear_a, self.rig_a), (self.clear_b, self.rig_b))
         )
 
-    def views(self, rng, sigma_px=0.0, false=0, stated_px=None):
+    def views(self, rng=None, sigma_px=0.0, false=0, stated_px=None):
         """Both views, candidates shuffled, and where the true ones stand: (left, right) in each."""
         out = []
         for clear, rig in ((self.clear_a, self.rig_a), (self.clear_b, self.rig_b)):
             size = rig.camera.width_px, rig.camera.height_px
             pixels = np.concatenate(
-                (clear + sigma_px * rng.standard_normal((2, 2)), rng.uniform((0, 0), size, (false, 2)))
+                (
+                    clear + (sigma_px * rng.standard_normal((2, 2)) if sigma_px else 0.0),
+                    rng.uniform((0, 0), size, (false, 2)) if false else np.empty((0, 2)),
+                )
             )
             order = rng.permutation(len(pixels)) if false else np.arange(2)
             at = np.argsort(order)[:2]
@@ -130,19 +133,25 @@ def view(pixels, sigma_px=1.0, dt_s=0.0, stamp_ns=0, score=math.nan):
     )
 
 
-def random_scene(rng, range_m, rig_a=IDEAL, rig_b=IDEAL, roll_rad=0.2, lean_rad=0.25):
+def random_scene(rng, range_m, rig_a=IDEAL, rig_b=IDEAL, roll_rad=0.2, lean_rad=0.2):
     """A pose at range_m (or within (low, high)) with all four lights in view, both divers about upright."""
+    camera = rig_a.camera
     while True:
         r = rng.uniform(*range_m) if isinstance(range_m, tuple) else range_m
-        R_ned = []
-        heading = rng.uniform(-math.pi, math.pi)
-        for turn in (0.0, math.pi):
-            R = rotation((0, 0, 1), heading + turn + rng.normal(0, 0.2))
-            R = R @ rotation((0, 1, 0), rng.normal(0, lean_rad)) @ rotation((1, 0, 0), rng.normal(0, roll_rad))
-            R_ned.append(R @ NOMINAL_R_BODY_CAMERA)
-        camera = rig_a.camera
-        pixel = rng.uniform((0, 0), (camera.width_px, camera.height_px), (1, 2))
+        # Near bars stay in view only about the middle: nothing else need be tried.
+        edge = min(0.4 * rig_b.length_m / r * camera.fx_px, 0.45 * camera.width_px)
+        pixel = rng.uniform((edge, 0), (camera.width_px - edge, camera.height_px), (1, 2))
         u = camera.bearings(pixel)[0]
-        scene = Scene(rig_a, rig_b, r * u, R_ned[0].T @ R_ned[1], R_ned[0], rng.uniform(2, 40))
+        R_ned_a = upright(rng.uniform(-math.pi, math.pi), rng.normal(0, lean_rad), rng.normal(0, roll_rad))
+        back = -R_ned_a @ u
+        heading = math.atan2(back[1], back[0]) + rng.normal(0, lean_rad)
+        R_ned_b = upright(heading, -math.asin(back[2]) + rng.normal(0, lean_rad), rng.normal(0, roll_rad))
+        scene = Scene(rig_a, rig_b, r * u, R_ned_a.T @ R_ned_b, R_ned_a, rng.uniform(2, 40))
         if scene.visible:
             return scene
+
+
+def upright(heading_rad, pitch_rad, roll_rad):
+    """Camera to NED of the nominal mount."""
+    R_ned_body = rotation((0, 0, 1), heading_rad) @ rotation((0, 1, 0), pitch_rad) @ rotation((1, 0, 0), roll_rad)
+    return R_ned_body @ NOMINAL_R_BODY_CAMERA

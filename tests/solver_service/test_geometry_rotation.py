@@ -1,0 +1,62 @@
+"""Laws of rotations, near the identity and near half a turn too."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from solver_service.geometry.rotation import (
+    matrix_of,
+    quaternion_of,
+    rotation_exp,
+    rotation_log,
+    rotation_near,
+    skew,
+)
+
+DIRECTIONS = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)
+ANGLES = st.one_of(st.floats(0, math.pi), st.sampled_from([0.0, 1e-12, 1e-8, 1e-4, math.pi - 1e-6, math.pi]))
+
+
+def vector(direction, angle):
+    return np.array(direction) / np.linalg.norm(direction) * angle
+
+
+@given(DIRECTIONS, ANGLES)
+def test_exp_gives_a_rotation_and_log_takes_it_back(direction, angle):
+    w = vector(direction, angle)
+    R = rotation_exp(w)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) > 0
+    back = rotation_log(R)
+    np.testing.assert_allclose(rotation_exp(back), R, atol=1e-9)
+    assert np.linalg.norm(back) <= math.pi + 1e-9
+
+
+@given(DIRECTIONS, ANGLES)
+def test_quaternion_and_matrix_are_one_rotation(direction, angle):
+    R = rotation_exp(vector(direction, angle))
+    q = quaternion_of(R)
+    assert abs(np.linalg.norm(q) - 1) < 1e-12
+    np.testing.assert_allclose(matrix_of(q), R, atol=1e-12)
+    np.testing.assert_allclose(matrix_of(-3.0 * q), R, atol=1e-12)
+
+
+def test_a_quarter_turn_about_z_takes_x_to_y():
+    q = np.array([0, 0, math.sqrt(0.5), math.sqrt(0.5)])
+    np.testing.assert_allclose(matrix_of(q) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(rotation_exp(np.array([0, 0, math.pi / 2])) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+@given(DIRECTIONS, st.floats(0, 1e-2))
+def test_the_near_rotation_is_orthogonal_and_third_order_close(direction, angle):
+    w = vector(direction, angle)
+    R = rotation_near(w[None])[0]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+    assert np.abs(R - rotation_exp(w)).max() <= angle**3 / 12 + 1e-15
+
+
+@given(DIRECTIONS, DIRECTIONS)
+def test_skew_is_the_cross_product(a, b):
+    np.testing.assert_allclose(skew(np.array(a)) @ b, np.cross(a, b), atol=1e-14)
