@@ -18,7 +18,7 @@ from protocol.errors import BuddylineError
 from protocol.messages import Rejected, RelativePose, Truth
 from tools.evaluation.logs import load, parse_pair
 
-FORMATS: Final = ("tum", "csv")
+FORMATS: Final = ("tum", "csv", "foxglove")
 
 _SD_FIELDS: Final = ("sd_x_m", "sd_y_m", "sd_z_m", "sd_wx_rad", "sd_wy_rad", "sd_wz_rad")
 _CSV_FIELDS: Final = (
@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=FORMATS,
         required=True,
-        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row a pose, units in the header",
+        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row a pose, units in the header; foxglove: a log "
+        "with pictures, marks and transforms as Foxglove, Lichtblick and rerun draw them",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses in place of the solved ones (tum)")
@@ -52,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--truth: only with --format tum")
     if args.rejected and args.format != "csv":
         raise BuddylineError("--rejected: only with --format csv")
+    if args.format == "foxglove":
+        return _export_foxglove(args)
     recorded = load(args.logs, pair=args.pair)
     poses: Sequence[RelativePose | Truth] = recorded.truths if args.truth else recorded.poses
     rejected = recorded.rejected if args.rejected else []
@@ -71,6 +74,18 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"{args.output}: exists; name another or remove it first") from None
     except OSError as error:
         raise BuddylineError(f"{args.output}: cannot be written: {error.strerror}") from error
+    return 0
+
+
+def _export_foxglove(args: argparse.Namespace) -> int:
+    from tools.dives import Dive
+    from tools.export_foxglove import export_foxglove
+
+    if args.output is None:
+        raise BuddylineError("--format foxglove: give -o FILE.mcap")
+    with Dive(args.logs) as dive:
+        count = export_foxglove(dive, args.output)
+    print(f"{args.output}: {count} messages", file=sys.stderr)
     return 0
 
 

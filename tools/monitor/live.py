@@ -8,8 +8,8 @@ import webbrowser
 from typing import Final
 
 from protocol.clock import Clock, SystemClock
-from protocol.endpoint import DEFAULT_ENDPOINT
 from protocol.service import Service
+from tools.client import ClientConfig, add_client_arguments, client_config
 from tools.monitor.inbox import Inbox
 from tools.monitor.page import DEFAULT_HOST, DEFAULT_PORT, Page, open_server
 from tools.monitor.picture import PairPicture
@@ -23,7 +23,7 @@ PLOTS_EVERY: Final = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    add_client_arguments(parser)
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
     add_page_arguments(parser)
 
@@ -53,12 +53,13 @@ def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until stopped."""
+    config = client_config(args)
     service = Service("monitor")
     service.handle_signals()
     page = open_page(args, "Buddyline", live=True)
     clock = SystemClock()
     inbox = Inbox(clock)
-    service.spawn("bus", lambda: _follow(service, args.connect, inbox))
+    service.spawn("bus", lambda: _follow(service, config, inbox))
     service.spawn("page", lambda: _draw(service, page, inbox, clock))
     service.wait(args.seconds)
     status = service.join()
@@ -66,10 +67,16 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
-def _follow(service: Service, endpoint: str, inbox: Inbox) -> None:
+def _follow(service: Service, config: ClientConfig, inbox: Inbox) -> None:
     from protocol.zenoh_bus import connect
 
-    bus = connect(endpoint, stop=service.stop, on_wait=lambda text: log.info("monitor: %s", text))
+    bus = connect(
+        config.connect,
+        namespace=config.namespace or None,
+        stop=service.stop,
+        on_wait=lambda text: log.info("monitor: %s", text),
+        tls=config.tls,
+    )
     if bus is None:
         return
     with bus:

@@ -1,0 +1,268 @@
+"""The page in a real browser: a running pair, a stored dive, a report. Screenshots go to build/screenshots."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.tools.evaluated import INFOS, rejection, write_log
+from tests.tools.watched import at, image, tick
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytest.importorskip("viser", reason="viser is not installed")
+CHROMIUM = shutil.which("chromium")
+if CHROMIUM is None:
+    pytest.skip("chromium is not installed", allow_module_level=True)
+
+ROOT = Path(__file__).parents[2]
+SCREENSHOTS = ROOT / "build" / "screenshots"
+SIZES = {"desk": (1280, 800), "phone": (390, 844)}
+FLAGS = [
+    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+]
+# Drawing in software on a busy machine: what the page shows may take long, what it says may not.
+PATIENCE_MS = 90_000
+NODE_TOML = """
+node = "{node}"
+connect = "{endpoint}"
+rate_hz = 2.0
+[camera]
+name = "simulated"
+[sensors]
+name = "simulated"
+[record]
+directory = {directory}
+[simulation]
+environment = "cavern"
+seed = 1
+start_ns = {start_ns}
+"""
+
+
+class Browser:
+    """One page of a headless Chromium, and all that it asked for and complained of."""
+
+    def __init__(self, page: Any, name: str) -> None:
+        self.page = page
+        self.requests: list[str] = []
+        self.complaints: list[str] = []
+        self._name = name
+        page.set_default_timeout(PATIENCE_MS)
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
+
+    def wait_for(self, text: str, timeout_s: float = PATIENCE_MS / 1e3) -> float:
+        """Wait until the page says this; return how long that took, in seconds."""
+        began_s = time.monotonic()
+        try:
+            self.page.wait_for_function(
+                "text => document.body.innerText.includes(text)", arg=text, timeout=timeout_s * 1e3, polling=100
+            )
+        except sync_api.TimeoutError:
+            said = self.page.inner_text("body")
+            pytest.fail(f"no {text!r} in {timeout_s:g} s; complaints {self.complaints}; the page says:\n{said}")
+        return time.monotonic() - began_s
+
+    def screenshot(self, what: str) -> None:
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        self.page.screenshot(path=str(SCREENSHOTS / f"{self._name}-{what}.png"), timeout=PATIENCE_MS)
+
+    def colours(self, selector: str = "canvas") -> int:
+        """Return how many different colours a part of the page shows."""
+        import cv2
+        import numpy as np
+
+        data = self.page.locator(selector).first.screenshot(timeout=PATIENCE_MS)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).reshape(-1, 3)
+        return len(np.unique(pixels, axis=0))
+
+    def check_clean(self, *allowed: str) -> None:
+        outside = [
+            url for url in self.requests if not url.startswith(("data:", "blob:", "http://127.0.0.1:", *allowed))
+        ]
+        assert outside == []
+        assert self.complaints == []
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def looking(chromium: Any, name: str, size: str = "desk") -> Iterator[Browser]:
+    width, height = SIZES[size]
+    page = chromium.new_page(viewport={"width": width, "height": height})
+    try:
+        yield Browser(page, f"{name}-{size}")
+    finally:
+        page.close()
+
+
+class Processes:
+    """`buddyline` commands, ended by their own ids."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, *words: str) -> None:
+        with open(self._directory / f"{name}.log", "ab") as log:
+            self.running[name] = subprocess.Popen(
+                [sys.executable, "-m", "tools", *words], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+
+    def kill(self, name: str) -> None:
+        child = self.running.pop(name)
+        child.kill()
+        child.wait(10)
+
+    def end(self) -> None:
+        for child in self.running.values():
+            child.terminate()
+        for child in self.running.values():
+            try:
+                child.wait(10)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait(10)
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    started = Processes(tmp_path)
+    yield started
+    started.end()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for_server(address: str) -> None:
+    ends_s = time.monotonic() + 60
+    while True:
+        try:
+            urllib.request.urlopen(address, timeout=5).close()
+        except OSError:
+            if time.monotonic() > ends_s:
+                raise
+            time.sleep(0.1)
+        else:
+            return
+
+
+def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Processes, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    port = free_port()
+    address = f"http://127.0.0.1:{port}"
+    start_ns = time.time_ns()
+    for node in "ab":
+        directory = json.dumps(str(tmp_path))
+        text = NODE_TOML.format(node=node, endpoint=endpoint, directory=directory, start_ns=start_ns)
+        (tmp_path / f"{node}.toml").write_text(text)
+    # The page is there before the hub is, and finds it by itself.
+    processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
+    wait_for_server(address)
+    with looking(chromium, "live") as seen:
+        seen.page.goto(address)
+        seen.wait_for("Nothing has come over the bus yet")
+        processes.start("hub", "hub", "--listen", endpoint)
+        processes.start("a", "node", "--config", str(tmp_path / "a.toml"))
+        processes.start("b", "node", "--config", str(tmp_path / "b.toml"))
+        processes.start("solver", "solver", "--connect", endpoint)
+        seen.wait_for("Pose at ")
+        seen.wait_for("All is well")
+        assert seen.colours() > 50
+        seen.screenshot("well")
+
+        processes.kill("b")
+        assert seen.wait_for("Node b has left the bus") < 3.0
+        seen.wait_for("STALE")
+        seen.screenshot("node-killed")
+
+        processes.kill("hub")
+        seen.wait_for("Nothing comes over the bus any more")
+        seen.screenshot("hub-killed")
+        processes.start("hub", "hub", "--listen", endpoint)
+        processes.start("b", "node", "--config", str(tmp_path / "b.toml"))
+        seen.wait_for("All is well")
+        seen.screenshot("well-again")
+        seen.check_clean()
+
+
+def dive_log(directory: Path) -> str:
+    """A dive of a minute: no pose from 20 s to 26 s, a picture of each node every second."""
+    messages = list(INFOS.values())
+    for k in range(600):
+        said = [m for m in tick(k) if not (200 <= k < 260 and type(m).__name__ == "RelativePose")]
+        messages += said  # type: ignore[arg-type]
+        if 200 <= k < 260:
+            messages.append(rejection(k))  # type: ignore[arg-type]
+        if k % 10 == 0:
+            messages += [image("a", at(k)), image("b", at(k))]  # type: ignore[list-item]
+    return write_log(directory / "dive.mcap", *messages)
+
+
+@pytest.mark.parametrize("size", list(SIZES))
+def test_a_stored_dive_is_played_and_scrubbed(chromium: Any, processes: Processes, tmp_path: Path, size: str) -> None:
+    port = free_port()
+    address = f"http://127.0.0.1:{port}"
+    processes.start("view", "view", dive_log(tmp_path), "--paused", "--port", str(port))
+    wait_for_server(address)
+    with looking(chromium, "view", size) as seen:
+        seen.page.goto(address)
+        seen.wait_for("green: poses")
+        seen.wait_for("0:00.0 of 0:59.9")
+        seen.page.get_by_label("Seconds").last.fill("22")
+        seen.page.keyboard.press("Enter")
+        seen.wait_for("0:22.0 of 0:59.9")
+        seen.wait_for("No pose: more than one arrangement fits")
+        seen.screenshot("no-pose")
+        seen.page.get_by_text("64", exact=True).click()
+        seen.page.get_by_role("button", name="Play").click()
+        seen.wait_for("0:59.9 of 0:59.9")
+        seen.wait_for("paused")
+        assert seen.colours() > 50
+        seen.screenshot("end")
+        seen.check_clean()
+
+
+@pytest.mark.parametrize("size", list(SIZES))
+def test_a_report_is_read_without_a_network(chromium: Any, tmp_path: Path, size: str) -> None:
+    from tools.cli import main
+
+    output = tmp_path / "report.html"
+    assert main(["report", dive_log(tmp_path), "-o", str(output)]) == 0
+    with looking(chromium, "report", size) as seen:
+        seen.page.goto(output.as_uri())
+        seen.wait_for("Dive report: dive.mcap")
+        assert seen.colours("#replay") > 10
+        before = seen.page.locator("#said").inner_text()
+        seen.page.locator("#at").fill("900")
+        assert seen.page.locator("#said").inner_text() != before
+        assert seen.page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        seen.page.screenshot(path=str(SCREENSHOTS / f"report-{size}.png"), full_page=True, timeout=PATIENCE_MS)
+        seen.check_clean("file:///")

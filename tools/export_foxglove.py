@@ -1,0 +1,248 @@
+"""A dive as Foxglove's own messages, which Foxglove, Lichtblick and rerun draw without any set-up.
+
+World is east, north, up with its origin on the surface above A, or at A where no depth is known. A stands in it by
+its attitude and depth, and B in A's camera frame by the solved pose.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import (
+    Attitude,
+    Blob,
+    Candidates,
+    CompressedImage,
+    Depth,
+    Message,
+    MessageError,
+    NodeInfo,
+    RelativePose,
+)
+from protocol.topics import parse_key
+from solver_service.geometry.rotation import matrix_of, quaternion_of
+from tools.dives import Dive
+
+WORLD: Final = "world"
+TRANSFORMS: Final = "/tf"
+# Between poses A's own transform need not come faster than eyes follow.
+ATTITUDE_SPACING_NS: Final = S_NS // 20
+KEPT_FRAMES: Final = 256
+DISTORTION_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "kannala_brandt"}
+R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Level, looking north: what A is drawn as until its attitude is known.
+R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
+
+
+class Translation:
+    """Turns a dive's messages into Foxglove's, one by one."""
+
+    def __init__(self, schemas: Any) -> None:
+        self._fox = schemas
+        self._infos: dict[str, NodeInfo] = {}
+        self._frames: dict[str, deque[Candidates]] = {}
+        self._depth_m: dict[str, float] = {}
+        self._attitude_ns: dict[str, int] = {}
+        self._base: str | None = None
+
+    def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
+        """Yield what stands before the first message: A level at the origin. base: A's id."""
+        self._infos.update(infos)
+        self._base = base
+        if base is not None:
+            yield TRANSFORMS, at_ns, self._transform(WORLD, f"{base}_camera", np.zeros(3), R_ENU_LEVEL, at_ns)
+
+    def messages(self, message: Message) -> Iterator[tuple[str, int, Any]]:
+        """Yield (topic, stamp_ns, Foxglove message) for one of ours."""
+        if isinstance(message, NodeInfo):
+            self._infos[message.node] = message
+        elif isinstance(message, Depth):
+            self._depth_m[message.node] = message.depth_m
+        elif isinstance(message, Attitude):
+            yield from self._attitude(message)
+        elif isinstance(message, CompressedImage):
+            yield from self._image(message)
+        elif isinstance(message, Candidates):
+            self._frames.setdefault(message.node, deque(maxlen=KEPT_FRAMES)).append(message)
+            yield f"/{message.node}/camera/candidates", message.stamp_ns, self._candidates(message)
+        elif isinstance(message, RelativePose):
+            yield from self._pose(message)
+
+    def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
+        node, stamp_ns = attitude.node, attitude.stamp_ns
+        info = self._infos.get(node)
+        before_ns = self._attitude_ns.get(node)
+        if node != self._base or info is None:
+            return
+        if before_ns is not None and 0 <= stamp_ns - before_ns < ATTITUDE_SPACING_NS:
+            return
+        self._attitude_ns[node] = stamp_ns
+        R_ned_camera = matrix_of(np.array(attitude.q_ned_body_xyzw)) @ matrix_of(np.array(info.q_body_camera_xyzw))
+        origin_m = np.array([0.0, 0.0, -self._depth_m.get(node, 0.0)])
+        transform = self._transform(WORLD, f"{node}_camera", origin_m, R_ENU_NED @ R_ned_camera, stamp_ns)
+        yield TRANSFORMS, stamp_ns, transform
+
+    def _image(self, image: CompressedImage) -> Iterator[tuple[str, int, Any]]:
+        node = image.frame_id.removesuffix("_camera")
+        stamp_ns = image.stamp_ns
+        info = self._infos.get(node)
+        if info is not None:
+            yield f"/{node}/camera/calibration", stamp_ns, self._calibration(info, stamp_ns)
+        picture = self._fox.CompressedImage(
+            timestamp=self._time(stamp_ns), frame_id=image.frame_id, data=image.data, format=image.format
+        )
+        yield f"/{node}/camera/image", stamp_ns, picture
+
+    def _calibration(self, info: NodeInfo, stamp_ns: int) -> Any:
+        camera = info.camera
+        K = [camera.fx_px, 0.0, camera.cx_px, 0.0, camera.fy_px, camera.cy_px, 0.0, 0.0, 1.0]
+        return self._fox.CameraCalibration(
+            timestamp=self._time(stamp_ns),
+            frame_id=f"{info.node}_camera",
+            width=info.width_px,
+            height=info.height_px,
+            distortion_model=DISTORTION_MODELS[camera.model],
+            D=camera.distortion,
+            K=K,
+            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            P=[*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0],
+        )
+
+    def _candidates(self, frame: Candidates) -> Any:
+        circles = [self._ring(frame, blob, OTHER, 2.6) for blob in frame.blobs]
+        return self._fox.ImageAnnotations(timestamp=self._time(frame.stamp_ns), circles=circles)
+
+    def _ring(self, frame: Candidates, blob: Blob, colour: tuple[float, float, float], per_cent: float) -> Any:
+        fox, unit_px = self._fox, frame.width_px / 100
+        return fox.CircleAnnotation(
+            timestamp=self._time(frame.stamp_ns),
+            position=fox.Point2(x=blob.u_px, y=blob.v_px),
+            diameter=per_cent * unit_px,
+            thickness=0.4 * unit_px,
+            outline_color=fox.Color(r=colour[0], g=colour[1], b=colour[2], a=1.0),
+        )
+
+    def _pose(self, pose: RelativePose) -> Iterator[tuple[str, int, Any]]:
+        fox, stamp_ns = self._fox, pose.stamp_ns
+        base, child = f"{pose.node_a}_camera", f"{pose.node_b}_camera"
+        t_m, R = np.array(pose.t_a_b_m), matrix_of(np.array(pose.q_a_b_xyzw))
+        yield TRANSFORMS, stamp_ns, self._transform(base, child, t_m, R, stamp_ns)
+        placed = fox.PoseInFrame(
+            timestamp=self._time(stamp_ns),
+            frame_id=base,
+            pose=fox.Pose(position=self._vector(t_m), orientation=self._quaternion(R)),
+        )
+        yield f"/pair/{pose.node_a}/{pose.node_b}/pose", stamp_ns, placed
+        for node, chosen in ((pose.node_a, pose.blobs_a), (pose.node_b, pose.blobs_b)):
+            frame = next((f for f in reversed(self._frames.get(node, ())) if f.trigger == pose.trigger), None)
+            if frame is not None and max(chosen) < len(frame.blobs):
+                yield f"/{node}/camera/chosen", frame.stamp_ns, self._chosen(frame, chosen)
+
+    def _chosen(self, frame: Candidates, chosen: tuple[int, int]) -> Any:
+        fox = self._fox
+        circles, texts = [], []
+        for index, name, colour in zip(chosen, "LR", (LEFT, RIGHT), strict=True):
+            if index < 0:
+                continue
+            blob = frame.blobs[index]
+            circles.append(self._ring(frame, blob, colour, 4.4))
+            texts.append(
+                fox.TextAnnotation(
+                    timestamp=self._time(frame.stamp_ns),
+                    position=fox.Point2(x=blob.u_px, y=blob.v_px - 0.03 * frame.width_px),
+                    text=name,
+                    font_size=0.03 * frame.width_px,
+                    text_color=fox.Color(r=colour[0], g=colour[1], b=colour[2], a=1.0),
+                )
+            )
+        return fox.ImageAnnotations(timestamp=self._time(frame.stamp_ns), circles=circles, texts=texts)
+
+    def _transform(self, parent: str, child: str, t_m: Any, R: Any, stamp_ns: int) -> Any:
+        fox = self._fox
+        x, y, z = (float(value) for value in t_m)
+        return fox.FrameTransforms(
+            transforms=[
+                fox.FrameTransform(
+                    timestamp=self._time(stamp_ns),
+                    parent_frame_id=parent,
+                    child_frame_id=child,
+                    translation=fox.Vector3(x=x, y=y, z=z),
+                    rotation=self._quaternion(R),
+                )
+            ]
+        )
+
+    def _time(self, stamp_ns: int) -> Any:
+        return self._fox.Timestamp(sec=stamp_ns // S_NS, nsec=stamp_ns % S_NS)
+
+    def _vector(self, t_m: Any) -> Any:
+        x, y, z = (float(value) for value in t_m)
+        return self._fox.Vector3(x=x, y=y, z=z)
+
+    def _quaternion(self, R: Any) -> Any:
+        x, y, z, w = (float(value) for value in quaternion_of(R))
+        return self._fox.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def export_foxglove(dive: Dive, output: Path) -> int:
+    """Write a dive as Foxglove messages into output, which must not exist; return how many there are."""
+    try:
+        from foxglove import messages as fox
+    except ImportError as error:
+        raise BuddylineError(
+            "--format foxglove needs foxglove-sdk, which is not installed: pip install 'buddyline[foxglove]'"
+        ) from error
+    from mcap.writer import CompressionType, Writer
+
+    translation = Translation(fox)
+    try:
+        file = open(output, "xb")
+    except FileExistsError:
+        raise BuddylineError(f"{output}: exists; name another or remove it first") from None
+    except OSError as error:
+        raise BuddylineError(f"{output}: cannot be written: {error.strerror}") from error
+    count = 0
+    schemas: dict[str, int] = {}
+    channels: dict[str, int] = {}
+    with file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="buddyline")
+        for topic, stamp_ns, message in _translated(dive, translation):
+            if topic not in channels:
+                schema = message.get_schema()
+                if schema.name not in schemas:
+                    schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[topic] = writer.register_channel(topic, "protobuf", schemas[schema.name])
+            writer.add_message(channels[topic], stamp_ns, message.encode(), stamp_ns, count & 0xFFFFFFFF)
+            count += 1
+        writer.finish()
+    return count
+
+
+def _translated(dive: Dive, translation: Translation) -> Iterator[tuple[str, int, Any]]:
+    topics = ("info", "candidates", "attitude", "depth", "image", "pose")
+    yield from translation.start(dive.infos(), _base(dive), dive.start_ns)
+    for record in dive.records(*topics):
+        try:
+            message = record.decode()
+        except MessageError:
+            continue
+        if message is not None:
+            yield from translation.messages(message)
+
+
+def _base(dive: Dive) -> str | None:
+    """Return A's id: of the first pair with poses, else the first node."""
+    for key in dive.keys:
+        parsed = parse_key(key)
+        if parsed is not None and parsed[0].name == "pose":
+            return parsed[1][0]
+    return next(iter(dive.nodes("info", "candidates", "image")), None)
