@@ -66,7 +66,7 @@ class AttitudeEstimator(Protocol):
 
 def quaternion_to_matrix(q_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotation matrix, (3, 3), of a unit quaternion in VQF's order w, x, y, z."""
-    w, x, y, z = (float(v) for v in q_wxyz)
+    w, x, y, z = q_wxyz.tolist()
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -81,7 +81,7 @@ def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[f
 
     q_ned_enu is half a turn about the line between x and y: (x, y, z, w) = (1, 1, 0, 0) / sqrt(2).
     """
-    w, x, y, z = (float(v) for v in q_enu_body_wxyz)
+    w, x, y, z = q_enu_body_wxyz.tolist()
     h = math.sqrt(0.5)
     nx, ny, nz, nw = h * (w + z), h * (w - z), h * (y - x), -h * (x + y)
     c, s = math.cos(turn_rad / 2), math.sin(turn_rad / 2)

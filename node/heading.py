@@ -125,7 +125,7 @@ class HeadingFilter:
         if self._smooth_t is None:
             self._smooth_t = mag_level_t
         self._smooth_t = self._smooth_t + min(1.0, dt_s / SMOOTHING_S) * (mag_level_t - self._smooth_t)
-        x, y, z = (float(v) for v in self._smooth_t)
+        x, y, z = self._smooth_t.tolist()
         horizontal_t = math.hypot(x, y)
         norm_t, dip_rad, delta_rad = math.hypot(horizontal_t, z), math.atan2(-z, horizontal_t), math.atan2(x, y)
         if math.isnan(self._norm_t):
