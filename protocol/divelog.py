@@ -11,33 +11,37 @@ from pathlib import Path
 from typing import IO, Final
 
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 from protocol import topics
 from protocol.errors import BuddylineError
 from protocol.messages import Message, MessageError, decode, encode, payload_stamp_ns
+from protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
 from protocol.schemas import json_schema
 
 CHUNK_BYTES: Final = 1024 * 1024
-MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
-_CHANNEL_METADATA: Final = "buddyline.channel"
+LOG_NOTE: Final = "buddyline.log"
+MAX_NOTES: Final = 100
 _DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError, ZstdError)
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One message of a log: its key, times in ns, and payload as it went over the bus."""
+    """One message of a log: its key, times in ns, and payload as it went over the bus.
+
+    sequence: how many its writer had written before it, modulo 2**32, in the logs of DiveLogWriter.
+    """
 
     key: str
     schema_name: str
     log_time_ns: int
     publish_time_ns: int
     payload: bytes
+    sequence: int = 0
 
     def decode(self) -> Message | None:
         """Return the message, None where the key is none of ours; raise MessageError where it is not sound."""
@@ -64,7 +68,7 @@ class DiveLogWriter:
         self._schemas: dict[str, int] = {}
         self.count = 0
         if metadata:
-            self._writer.add_metadata("buddyline.log", metadata)
+            self._writer.add_metadata(LOG_NOTE, metadata)
         self._writer.flush()
 
     def write(
@@ -96,7 +100,7 @@ class DiveLogWriter:
             schema_id = self._schemas[name] = self._writer.register_schema(name, "jsonschema", described)
         channel = self._writer.register_channel(key, "json", schema_id)
         # Outside the chunks, so that a later chunk can be read where the one that declares it is damaged.
-        self._writer.add_metadata(_CHANNEL_METADATA, {"id": str(channel), "topic": key, "schema": name})
+        self._writer.add_metadata(CHANNEL_NOTE, {"id": str(channel), "topic": key, "schema": name})
         return channel
 
     def flush(self, *, sync: bool = False) -> None:
@@ -131,25 +135,29 @@ class _Contents:
     chunks: list[tuple[int, int, int, frozenset[int] | None]] = field(default_factory=list)
     channels: dict[int, tuple[str, str]] = field(default_factory=dict)  # id: topic, schema name
     loose: list[McapMessage] = field(default_factory=list)
+    metadata: dict[str, str] = field(default_factory=dict)
 
 
 class DiveLogReader:
-    """Reads one MCAP file, whole or damaged; `damage` says in words what could not be read."""
+    """Reads one MCAP file, whole or damaged; `damage` says in words what could not be read.
 
-    def __init__(self, path: Path | str) -> None:
+    trust_index: take the index at the end of a file that has one, or walk through the file all the same.
+    """
+
+    def __init__(self, path: Path | str, *, trust_index: bool = True) -> None:
         self.path = Path(path)
         self.damage: list[str] = []
         try:
-            size = self.path.stat().st_size
+            self._size = self.path.stat().st_size
             self._file = open(self.path, "rb")
         except OSError as error:
             raise BuddylineError(f"{self.path}: cannot be read: {error.strerror}") from error
         try:
-            if size == 0:
+            if self._size == 0:
                 raise BuddylineError(f"{self.path}: is empty; nothing was recorded in it")
-            if self._file.read(8) != b"\x89MCAP0\r\n":
+            if self._file.read(len(MAGIC)) != MAGIC:
                 raise BuddylineError(f"{self.path}: is not a dive log (an MCAP file begins with other bytes)")
-            self._contents = self._index() or self._scan()
+            self._contents = (self._index() if trust_index else None) or self._scan()
         except BaseException:
             self._file.close()
             raise
@@ -173,16 +181,7 @@ class DiveLogReader:
 
     def metadata(self) -> dict[str, str]:
         """Return what the writer noted about the log itself."""
-        self._file.seek(0)
-        try:
-            for record in StreamReader(self._file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES).records:
-                if isinstance(record, Metadata) and record.name == "buddyline.log":
-                    return dict(record.metadata)
-                if isinstance(record, Chunk):
-                    break
-        except _DAMAGE:
-            pass
-        return {}
+        return dict(self._contents.metadata)
 
     def records(self, wanted: Callable[[str], bool] | None = None, since_ns: int | None = None) -> Iterator[Record]:
         """Yield the records by log time (ties: as in the file); memory holds only chunks that overlap.
@@ -229,20 +228,15 @@ class DiveLogReader:
         topic, schema = channel
         if wanted is not None and not wanted(topic):
             return None
-        return Record(topic, schema, message.log_time, message.publish_time, message.data)
+        return Record(topic, schema, message.log_time, message.publish_time, message.data, message.sequence)
 
     def _note(self, text: str) -> None:
-        if text not in self.damage:
-            self.damage.append(text)
+        if len(self.damage) < MAX_NOTES and text not in self.damage:
+            self.damage.append(text if len(self.damage) < MAX_NOTES - 1 else "and more")
 
     def _chunk_messages(self, offset: int) -> list[McapMessage]:
-        self._file.seek(offset)
-        stream = StreamReader(self._file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
         try:
-            chunk = next(iter(stream.records))
-            if not isinstance(chunk, Chunk):
-                raise ValueError("no chunk where the index says")
-            contents = breakup_chunk(chunk, validate_crc=True)
+            contents = read_chunk(self._file, offset, self._size)
         except _DAMAGE as error:
             self._note(f"chunk at byte {offset}: {error or type(error).__name__}; its messages are lost")
             return []
@@ -261,7 +255,8 @@ class DiveLogReader:
         """Take the summary at the end of a log that was closed; None where there is none."""
         self._file.seek(0)
         try:
-            summary = make_reader(self._file).get_summary()
+            reader = SeekingReader(self._file, record_size_limit=MAX_RECORD_BYTES)
+            summary = reader.get_summary()
         except _DAMAGE:
             return None
         if summary is None or not summary.chunk_indexes or not summary.channels:
@@ -276,39 +271,42 @@ class DiveLogReader:
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
             contents.channels[channel.id] = (channel.topic, schema.name if schema else "")
+        try:
+            noted = next((note for note in reader.iter_metadata() if note.name == LOG_NOTE), None)
+        except _DAMAGE as error:
+            self._note(f"what was noted about the log is lost ({error or type(error).__name__})")
+        else:
+            contents.metadata = dict(noted.metadata) if noted else {}
         return contents
 
     def _scan(self) -> _Contents:
-        """Walk through a log without a summary, up to where it breaks off."""
+        """Walk through a log, past what is damaged, to where it ends or breaks off."""
         contents = self._contents = _Contents()
-        self._file.seek(0)
-        stream = StreamReader(self._file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
         declared: list[object] = []
-        closed = False
-        try:
-            offset = 8
-            for record in stream.records:
-                if isinstance(record, Chunk):
-                    contents.chunks.append((record.message_start_time, record.message_end_time, offset, None))
-                    record.data = b""
-                elif isinstance(record, McapMessage):
-                    contents.loose.append(record)
-                elif isinstance(record, Schema | Channel):
-                    declared.append(record)
-                elif isinstance(record, Metadata) and record.name == _CHANNEL_METADATA:
-                    noted = record.metadata
-                    contents.channels[int(noted["id"])] = (noted["topic"], noted["schema"])
-                offset = self._file.tell()
-            closed = True
-        except (*_DAMAGE, KeyError) as error:
-            self._note(f"breaks off at byte {self._file.tell()} ({error or type(error).__name__})")
+        for found in walk(self._file, self._size, self._note):
+            if isinstance(found, ChunkAt):
+                contents.chunks.append((found.start_ns, found.end_ns, found.offset, None))
+            elif isinstance(found, McapMessage):
+                contents.loose.append(found)
+            elif isinstance(found, Metadata):
+                self._take_note(found)
+            else:
+                declared.append(found)
         self._declare(declared)
-        if not closed and not self.damage:
-            self._note("was not closed")
         if not contents.channels:
             for _, _, offset, _ in contents.chunks:
                 self._chunk_messages(offset)
         return contents
+
+    def _take_note(self, note: Metadata) -> None:
+        if note.name == LOG_NOTE:
+            self._contents.metadata = dict(note.metadata)
+        elif note.name == CHANNEL_NOTE:
+            try:
+                channel = int(note.metadata["id"])
+                self._contents.channels[channel] = (note.metadata["topic"], note.metadata["schema"])
+            except (KeyError, ValueError):
+                self._note("the note of a channel makes no sense")
 
     def close(self) -> None:
         """Close the file."""

@@ -52,6 +52,18 @@ COMMANDS: Final = (
     ),
     Command("record", "tools.record", "record the bus into a dive log", ("buddyline record topside.mcap",)),
     Command(
+        "repair",
+        "tools.repair",
+        "make a proper log out of a damaged one, and say what was lost",
+        ("buddyline repair cut.mcap -o whole.mcap",),
+    ),
+    Command(
+        "backfill",
+        "tools.backfill",
+        "complete a topside recording out of the nodes' own logs",
+        ("buddyline backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
+    ),
+    Command(
         "detect",
         "tools.detect",
         "find light candidates in stored pictures or a dive's pictures",

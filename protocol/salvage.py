@@ -1,0 +1,161 @@
+"""Walks an MCAP file record by record, past what is damaged, to its end or to where it breaks off.
+
+Where a record makes no sense, the next chunk (or note of a channel) is looked for byte by byte: each begins with
+bytes, and lengths that agree with one another, which other data has only by a rare chance. A chunk's own
+checksum is left to whoever reads it.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from typing import IO, Final, TypeAlias
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import breakup_chunk
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
+CHANNEL_NOTE: Final = "buddyline.channel"
+
+_HEAD_BYTES: Final = 9
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, its checksum, length of the compression
+_COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
+_RESUME: Final = re.compile(
+    rb"\x06.{8}.{28}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
+    rb"|\x0c.{8}" + struct.pack("<I", len(CHANNEL_NOTE)) + re.escape(CHANNEL_NOTE.encode()),
+    re.DOTALL,
+)
+_IN_CHUNKS: Final = (McapMessage, Schema, Channel)
+_KNOWN: Final = frozenset(Opcode)
+_MALFORMED: Final = (struct.error, ValueError, EOFError, MemoryError, RuntimeError)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkAt:
+    """A chunk that begins at offset; times in ns, of the messages in it."""
+
+    offset: int
+    start_ns: int
+    end_ns: int
+
+
+Found: TypeAlias = ChunkAt | McapMessage | Schema | Channel | Metadata
+
+
+class MalformedError(ValueError):
+    """Bytes that are no record."""
+
+
+def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Found]:
+    """Yield what stands in an MCAP file of size bytes; note is told of everything that is passed over."""
+    offset = suspect = len(MAGIC)
+    while offset < size:
+        try:
+            end, found, last = _record_at(file, offset, size)
+        except MalformedError as error:
+            resumed = _resume(file, suspect, offset, size)
+            if resumed is None:
+                note(f"breaks off at byte {offset} of {size} ({error})")
+                return
+            note(f"bytes {offset} to {resumed} are damaged and passed over ({error})")
+            offset = suspect = resumed
+            continue
+        if found is not None:
+            yield found
+        # Lengths of records that prove nothing may have led astray: what is looked for begins after the last chunk.
+        if isinstance(found, ChunkAt):
+            suspect = end
+        offset = end
+        if last:
+            file.seek(offset)
+            if file.read(len(MAGIC)) != MAGIC:
+                note("was not closed")
+            return
+    note("was not closed")
+
+
+def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
+    """Return the record's end, what it is where anyone wants it, and whether it is the last."""
+    file.seek(offset)
+    head = file.read(_HEAD_BYTES)
+    if len(head) < _HEAD_BYTES:
+        raise MalformedError("ends within a record's head")
+    opcode, length = head[0], int.from_bytes(head[1:], "little")
+    end = offset + _HEAD_BYTES + length
+    if opcode not in _KNOWN and opcode < 0x80:
+        raise MalformedError(f"no record is of kind {opcode}")
+    if end > size:
+        raise MalformedError("ends within a record")
+    if length > MAX_RECORD_BYTES:
+        raise MalformedError(f"a record of {length} bytes")
+    if opcode == Opcode.CHUNK:
+        return end, _chunk_at(file, offset, length), False
+    if opcode not in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
+        return end, None, opcode == Opcode.FOOTER
+    content = ReadDataStream(BytesIO(file.read(length)))
+    try:
+        if opcode == Opcode.MESSAGE:
+            found: Found = McapMessage.read(content, length)
+        elif opcode == Opcode.SCHEMA:
+            found = Schema.read(content)
+        elif opcode == Opcode.CHANNEL:
+            found = Channel.read(content)
+        else:
+            found = Metadata.read(content)
+    except _MALFORMED as error:
+        raise MalformedError(f"a malformed record: {error or type(error).__name__}") from error
+    return end, found, False
+
+
+def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Schema | Channel]:
+    """Return what is in the chunk at offset; raise MalformedError, or what ails its compression or checksum."""
+    end, found, _ = _record_at(file, offset, size)
+    if not isinstance(found, ChunkAt):
+        raise MalformedError("no chunk where the index says")
+    file.seek(offset + _HEAD_BYTES)
+    chunk = Chunk.read(ReadDataStream(BytesIO(file.read(end - offset - _HEAD_BYTES))))
+    # What a frame says of its size is allocated before it is looked at.
+    if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MAX_RECORD_BYTES:
+        raise MalformedError("a chunk too big to unpack")
+    return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, _IN_CHUNKS)]
+
+
+def _chunk_at(file: IO[bytes], offset: int, length: int) -> ChunkAt:
+    head = file.read(_CHUNK_HEAD.size)
+    if len(head) < _CHUNK_HEAD.size:
+        raise MalformedError("ends within a chunk's head")
+    start_ns, end_ns, uncompressed, _, name_bytes = _CHUNK_HEAD.unpack(head)
+    name = file.read(name_bytes) if name_bytes <= max(map(len, _COMPRESSIONS)) else None
+    data_bytes = int.from_bytes(file.read(8), "little")
+    if name not in _COMPRESSIONS or _CHUNK_HEAD.size + name_bytes + 8 + data_bytes != length:
+        raise MalformedError("a chunk whose lengths do not agree")
+    if uncompressed > MAX_RECORD_BYTES:
+        raise MalformedError(f"a chunk of {uncompressed} bytes")
+    return ChunkAt(offset, start_ns, end_ns)
+
+
+def _resume(file: IO[bytes], begin: int, damaged: int, size: int) -> int | None:
+    """Return where the next sound chunk or channel note begins: after `begin`, other than at `damaged`."""
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at = begin
+        while (match := _RESUME.search(data, at)) is not None:
+            offset = match.start()
+            del match
+            try:
+                _, found, _ = _record_at(file, offset, size)
+            except MalformedError:
+                pass
+            else:
+                if offset > damaged or not isinstance(found, Metadata):
+                    return offset
+            at = offset + 1
+    return None

@@ -1,0 +1,88 @@
+"""`buddyline backfill`: the union of a topside recording and the nodes' logs, each message once, by time."""
+
+import pytest
+
+from protocol.divelog import DiveLogReader, DiveLogWriter
+from protocol.messages import CompressedImage, FoxgloveTime, Mark, encode
+from protocol.topics import key_of
+from tests.solver_service.conftest import dive_messages
+from tools.cli import main
+
+S_NS = 1_000_000_000
+LATENCY_NS = 40_000_000
+
+
+def image(stamp_ns, data):
+    time = FoxgloveTime(sec=stamp_ns // S_NS, nsec=stamp_ns % S_NS)
+    return CompressedImage(timestamp=time, frame_id="a_camera", data=data, format="jpeg")
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    """Two nodes' logs, and a topside recording without 2 s of node b, with some of a late, twice, and its own."""
+    directory = tmp_path_factory.mktemp("dive")
+    messages, _ = dive_messages(seconds=5.0, seed=7)
+    begin_ns = min(message.stamp_ns for message in messages)
+    for node in ("a", "b"):
+        with DiveLogWriter(directory / f"{node}.mcap") as writer:
+            for message in messages:
+                if message.node == node:
+                    writer.write_message(message)
+            if node == "a":
+                writer.write_message(image(begin_ns + S_NS, b"whole picture"))
+    with DiveLogWriter(directory / "topside.mcap", metadata={"command": "record"}) as writer:
+        for i, message in enumerate(messages):
+            passed_ns = message.stamp_ns - begin_ns
+            if message.node == "b" and S_NS <= passed_ns < 3 * S_NS:
+                continue
+            late_ns = 20 * S_NS if message.node == "a" and passed_ns < S_NS // 2 else LATENCY_NS
+            for _ in range(2 if i % 50 == 0 else 1):
+                writer.write(key_of(message), encode(message), message.stamp_ns + late_ns, message.stamp_ns)
+        writer.write_message(image(begin_ns + S_NS, b"preview"), begin_ns + S_NS + LATENCY_NS)
+        mark = Mark(node="a", stamp_ns=begin_ns + S_NS, name="1")
+        writer.write_message(mark, mark.stamp_ns + LATENCY_NS)
+    out = directory / "out.mcap"
+    words = [str(directory / name) for name in ("topside.mcap", "a.mcap", "b.mcap")]
+    assert main(["backfill", *words, "-o", str(out)]) == 0
+    return directory, messages, mark
+
+
+def read(path):
+    with DiveLogReader(path) as reader:
+        return list(reader.records())
+
+
+def test_everything_is_there_once_and_in_order(dive):
+    directory, messages, mark = dive
+    records = read(directory / "out.mcap")
+    found = sorted((record.key, record.publish_time_ns) for record in records)
+    picture = ("buddyline/node/a/image", mark.stamp_ns)
+    assert found == sorted([*((key_of(m), m.stamp_ns) for m in messages), (key_of(mark), mark.stamp_ns), picture])
+    times = [record.log_time_ns for record in records]
+    assert times == sorted(times)
+
+
+def test_the_nodes_own_copy_is_kept_and_the_difference_said(dive, tmp_path, capsys):
+    directory, _, _ = dive
+    (picture,) = [record for record in read(directory / "out.mcap") if record.key.endswith("/image")]
+    assert picture.decode().data == b"whole picture"
+    again = [str(directory / name) for name in ("out.mcap", "b.mcap", "a.mcap")]
+    assert main(["backfill", *again, "-o", str(tmp_path / "again.mcap")]) == 0
+    assert len(read(tmp_path / "again.mcap")) == len(read(directory / "out.mcap"))
+    assert "differ" not in capsys.readouterr().err
+    words = [str(directory / name) for name in ("topside.mcap", "a.mcap")]
+    assert main(["backfill", *words, "-o", str(tmp_path / "one.mcap")]) == 0
+    assert "image: 1 topside, 1 now, 1 differ" in capsys.readouterr().err
+
+
+def test_it_is_solved_as_the_nodes_own_logs_are(dive, tmp_path):
+    directory, _, _ = dive
+    own = [str(directory / name) for name in ("a.mcap", "b.mcap")]
+    assert main(["solve", *own, "-o", str(tmp_path / "own.mcap")]) == 0
+    assert main(["solve", str(directory / "out.mcap"), "-o", str(tmp_path / "filled.mcap")]) == 0
+
+    def results(path):
+        return [record.payload for record in read(path) if record.key.startswith("buddyline/pair/")]
+
+    assert results(tmp_path / "own.mcap")
+    assert results(tmp_path / "filled.mcap") == results(tmp_path / "own.mcap")

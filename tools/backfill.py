@@ -1,0 +1,101 @@
+"""`buddyline backfill`: a topside recording completed out of the nodes' own logs."""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import sys
+import zlib
+from array import array
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from protocol.divelog import DiveLogReader, DiveLogWriter, Record
+from protocol.errors import BuddylineError
+from tools.dives import Dive
+
+Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns), sorted, and their payloads' CRC-32
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("topside", metavar="TOPSIDE.mcap", help="what `buddyline record` wrote")
+    parser.add_argument("nodes", nargs="+", metavar="NODE.mcap", help="the nodes' own logs, all of the dive")
+    parser.add_argument("-o", "--output", required=True, metavar="OUT.mcap", help="must not exist yet")
+
+
+class Union:
+    """Tells which messages of several logs go into their union, each key and stamp once, the first log's first."""
+
+    def __init__(self) -> None:
+        self.differing: Counter[str] = Counter()
+        self._known: Stamps = {}
+
+    def choose(self, reader: DiveLogReader) -> dict[str, np.ndarray]:
+        """Read a log once; return for each key, which of its messages in their order are new: (n,) bool."""
+        stamps: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
+        sums: defaultdict[str, array[int]] = defaultdict(lambda: array("L"))
+        for record in reader.records():
+            stamps[record.key].append(_stamp_ns(record))
+            sums[record.key].append(zlib.crc32(record.payload))
+        return {key: self._choose(key, np.array(stamps[key]), np.array(sums[key])) for key in stamps}
+
+    def _choose(self, key: str, stamps: np.ndarray, sums: np.ndarray) -> np.ndarray:
+        known, known_sums = self._known.get(key, (np.empty(0, stamps.dtype), np.empty(0, sums.dtype)))
+        every, every_sum = np.concatenate([known, stamps]), np.concatenate([known_sums, sums])
+        kept, first, which = np.unique(every, return_index=True, return_inverse=True)
+        self.differing[key] += int(np.count_nonzero(every_sum[first][which] != every_sum))
+        self._known[key] = (kept, every_sum[first])
+        new = np.zeros(len(every), bool)
+        new[first] = True
+        return new[len(known) :]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the union of the logs; say what the topside recording had missed."""
+    with Dive([args.topside, *args.nodes]) as dive:
+        topside, *own = dive.readers
+        union = Union()
+        # A node's own log goes first: its times are those of the measurement, and its pictures are whole.
+        ordered = [*own, topside]
+        chosen = [union.choose(reader) for reader in ordered]
+        before = {key: len(new) for key, new in chosen[-1].items()}
+        added: Counter[str] = Counter()
+        streams = [_new(reader, new) for reader, new in zip(ordered, chosen, strict=True)]
+        metadata = {
+            **topside.metadata(),
+            "backfilled_from": ", ".join(reader.path.name for reader in ordered),
+        }
+        with DiveLogWriter(args.output, metadata=metadata) as writer:
+            for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):
+                writer.write(
+                    record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
+                )
+                added[record.key] += 1
+        for line in dive.damage:
+            print(line, file=sys.stderr)
+    if not added:
+        Path(args.output).unlink()
+        raise BuddylineError(f"{dive.name}: no message can be read")
+    for key, count in sorted(added.items()):
+        differing = f", {union.differing[key]} differ (the node's own are kept)" if union.differing[key] else ""
+        print(f"  {key}: {before.get(key, 0)} topside, {count} now{differing}", file=sys.stderr)
+    print(f"{args.output}: {sum(added.values())} messages, {sum(before.values())} of them topside", file=sys.stderr)
+    return 0
+
+
+def _new(reader: DiveLogReader, new: dict[str, np.ndarray]) -> Iterator[Record]:
+    at: Counter[str] = Counter()
+    for record in reader.records():
+        if new[record.key][at[record.key]]:
+            yield record
+        at[record.key] += 1
+
+
+def _stamp_ns(record: Record) -> int:
+    """Return what tells a message of its key from others: its stamp; where it has none, its time in the log."""
+    return min(record.publish_time_ns, 2**63 - 1)
