@@ -7,6 +7,7 @@ leaves of its iron, slow wander and noise, at some stations disturbed; a gauge t
 from __future__ import annotations
 
 import math
+import subprocess
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,8 @@ from node.sim.rig import Q_BODY_CAMERA, R_BODY_CAMERA
 from protocol.messages import Attitude, Blob, Candidates, Depth, Imu, Mark, NodeInfo
 from solver_service.config import SolveConfig
 from solver_service.core import SolverCore
+from tools.survey.derive import Derived
+from tools.survey.project import About, AdjustSettings, Leg, Project
 
 PERIOD_NS = 500_000_000
 START_NS = 1_777_629_600_000_000_000  # 2026-05-01T10:00:00Z
@@ -130,10 +133,10 @@ class _Node:
             depth_port_m=tuple(self.port.tolist()),
         )
 
-    def arrive(self):
-        """Be held anew, at what may be a bad place for a compass."""
-        self.disturbance = 0.0
-        if self.rng.random() < self.flaws.disturbed_share:
+    def arrive(self, disturbance):
+        """Be held anew, at what may be a bad place for a compass (degrees, None: by chance)."""
+        self.disturbance = disturbance or 0.0
+        if disturbance is None and self.rng.random() < self.flaws.disturbed_share:
             self.disturbance = float(self.rng.choice([-1, 1]) * self.rng.uniform(6, 20))
 
     def sensors(self, stamp_ns, place, R_ned_body):
@@ -194,7 +197,7 @@ class _Node:
         )
 
 
-def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0):
+def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None):
     """Return all messages of a leapfrog survey along a course, poses and rejections of the true solver included."""
     flaws = flaws or Flaws()
     nodes = [_Node(rng, 0, flaws), _Node(rng, 1, flaws)]
@@ -215,7 +218,7 @@ def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0):
         for index, station in ((rear, start), (front, end)):
             if stands[index] != station:
                 stands[index] = station
-                nodes[index].arrive()
+                nodes[index].arrive(disturb and disturb(index, station))
         held = {i: course.stations_m[stands[i]] + rng.normal(0, flaws.centering_m, 3) for i in (0, 1)}
         way = held[1] - held[0]
         facing = {}
@@ -266,3 +269,78 @@ def by_hand(course, rng, compass_deg=1.5, tape_m=0.086, depth_m=0.1):
         run = math.sqrt(max(tape**2 - rise**2, 0))
         place += (run * math.cos(azimuth), run * math.sin(azimuth), rise)
     return place
+
+
+def readings_of(course, rng, compass_deg=1.0, tape_m=0.02, depth_m=0.02):
+    """Return a course's legs as Leg rows with normal errors of exactly these sds, without cameras or solver."""
+    legs = []
+    for number, (start, end, rear) in enumerate(course.legs):
+        way = course.stations_m[end] - course.stations_m[start]
+        azimuth = math.degrees(math.atan2(way[1], way[0]))
+        distance = float(np.linalg.norm(way))
+        slope = math.degrees(math.asin(-way[2] / distance))
+        legs.append(
+            Leg(
+                from_=course.names[start],
+                to=course.names[end],
+                from_node=NODES[rear],
+                to_node=NODES[1 - rear],
+                start_ns=START_NS + number * 60 * 10**9,
+                end_ns=START_NS + number * 60 * 10**9 + 10**10,
+                distance_m=float(distance + tape_m * rng.normal()),
+                distance_sigma_m=max(tape_m, 1e-4),
+                azimuth_deg=float(azimuth + compass_deg * rng.normal()) % 360,
+                azimuth_sigma_deg=max(compass_deg, 0.01),
+                back_azimuth_deg=float(azimuth + 180 + compass_deg * rng.normal()) % 360,
+                back_azimuth_sigma_deg=max(compass_deg, 0.01),
+                inclination_deg=slope + 0.5 * (compass_deg > 0) * rng.normal(),
+                inclination_sigma_deg=0.5,
+                back_inclination_deg=-slope + 0.5 * (compass_deg > 0) * rng.normal(),
+                back_inclination_sigma_deg=0.5,
+                depth_from_m=float(course.stations_m[start][2] + depth_m * rng.normal()),
+                depth_from_sigma_m=max(depth_m, 1e-4),
+                depth_to_m=float(course.stations_m[end][2] + depth_m * rng.normal()),
+                depth_to_sigma_m=max(depth_m, 1e-4),
+                fixes=30,
+            )
+        )
+    return legs
+
+
+def project_of(legs, depth="absolute", points=(), **tables):
+    """Return a project of these legs, its stations with them."""
+    derived = Derived()
+    derived.legs = list(legs)
+    tables.setdefault("survey", About(name="demo", title="Demo cave", team=["A. Diver", "B. Diver"]))
+    return Project(
+        leg=list(legs), point=list(points), station=derived.stations(), adjust=AdjustSettings(depth=depth), **tables
+    )
+
+
+def enu(vector_ned):
+    """Return east, north, up of north, east, down."""
+    return np.array([vector_ned[1], vector_ned[0], -vector_ned[2]])
+
+
+def cavern(directory, text, name="survey.svx"):
+    """Run the real cavern: its warnings, (H, V) of its loop or None, and coordinates by station."""
+    (directory / name).write_text(text, newline="")
+    done = subprocess.run(
+        ["cavern", "-w", "-q", name], cwd=directory, capture_output=True, text=True, timeout=60, check=False
+    )
+    said = [row for row in (done.stdout + done.stderr).splitlines() if "warning" in row or "error" in row]
+    stem = name.rpartition(".")[0]
+    words = (directory / f"{stem}.err").read_text().split() if done.returncode == 0 else []
+    ratios = [(float(words[i + 1]), float(words[i + 3])) for i, word in enumerate(words) if word == "H:"]
+    return said, ratios, coordinates(directory / f"{stem}.3d") if done.returncode == 0 else {}
+
+
+def coordinates(file):
+    """Return the stations of a .3d file by their last name (survex writes them to the centimetre)."""
+    dump = subprocess.run(["dump3d", str(file)], capture_output=True, text=True, timeout=60, check=True).stdout
+    found = {}
+    for row in dump.splitlines():
+        if row.startswith("NODE"):
+            name = row.partition("[")[2].partition("]")[0].partition("@")[0].rpartition(".")[2]
+            found[name] = np.array([float(word) for word in row.split()[1:4]])
+    return found

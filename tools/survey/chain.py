@@ -39,13 +39,21 @@ def stand(stops: list[Stop], procedure: Literal["leapfrog", "stay"], first: Who)
     result: list[Standing] = []
     arrived: dict[Who, int] = {first: 0, _other(first): 1}
     station: dict[Who, str] = {}
+    marked: set[str] = set()
     for k, stop in enumerate(stops):
         problem = ""
         names.taken |= set(stop.named.values())
         if k == 0:
             moved = set(BOTH)
         else:
-            moved, problem = _moved(stops[k - 1], stop, station, procedure, first, arrived)
+            guessed = _guessed(stops[k - 1], stop, procedure, first, arrived)
+            for who, name in stop.named.items():
+                if station[who] not in marked and name != station[who] and who not in guessed:
+                    # It has stood there since before, under a number: now it has a name.
+                    result = [_renamed(standing, station[who], name) for standing in result]
+                    station[who] = name
+            moved, problem = _moved(stops[k - 1], stop, station, guessed)
+        marked |= set(stop.named.values())
         for who in sorted(moved, key=lambda one: arrived[one]):
             station[who] = stop.named.get(who) or names.next()
             if k:
@@ -77,34 +85,44 @@ def _other(who: Who) -> Who:
     return "b" if who == "a" else "a"
 
 
-def _moved(
-    before: Stop,
-    stop: Stop,
-    station: dict[Who, str],
-    procedure: Literal["leapfrog", "stay"],
-    first: Who,
-    arrived: dict[Who, int],
-) -> tuple[set[Who], str]:
-    """Return who moved between two stops, and what is wrong with that."""
-    said: dict[Who, bool] = {who: stop.named[who] != station[who] for who in BOTH if who in stop.named}
-    levels: dict[Who, bool] = {}
+def _renamed(standing: Standing, old: str, new: str) -> Standing:
+    station = {who: new if name == old else name for who, name in standing.station.items()}
+    return Standing(station, standing.rear, standing.problem)
+
+
+def _levels(before: Stop, stop: Stop) -> dict[Who, bool]:
+    """Tell for each node whether its depth has changed by more than turning about does."""
+    changed: dict[Who, bool] = {}
     for who in BOTH:
         old_m, new_m = before.depth_m[who], stop.depth_m[who]
-        levels[who] = old_m is not None and new_m is not None and abs(new_m - old_m) > LEVEL_M
-    same = same_line(before.line_m, stop.line_m)
-    if same and not any(said.values()):
-        return set(), ""
+        changed[who] = old_m is not None and new_m is not None and abs(new_m - old_m) > LEVEL_M
+    return changed
+
+
+def _guessed(
+    before: Stop, stop: Stop, procedure: Literal["leapfrog", "stay"], first: Who, arrived: dict[Who, int]
+) -> set[Who]:
+    """Return who moved between two stops as far as line, depths and procedure tell."""
+    if same_line(before.line_m, stop.line_m):
+        return set()
+    moved: set[Who] = {who for who, changed in _levels(before, stop).items() if changed}
+    if moved:
+        return moved
+    rear: Who = "a" if arrived["a"] < arrived["b"] else "b"
+    return {rear if procedure == "leapfrog" else _other(first)}
+
+
+def _moved(before: Stop, stop: Stop, station: dict[Who, str], guessed: set[Who]) -> tuple[set[Who], str]:
+    """Return who moved by marks and guess, and what is wrong with that."""
+    said: dict[Who, bool] = {who: stop.named[who] != station[who] for who in BOTH if who in stop.named}
+    levels = _levels(before, stop)
     moved: set[Who] = {who for who, has in said.items() if has}
-    open_: list[Who] = [who for who in BOTH if who not in said]
-    if len(open_) == 1:
-        (who,) = open_
-        if levels[who] or not moved:
-            moved.add(who)
-    elif len(open_) == 2:
-        moved = {who for who in BOTH if levels[who]}
-        if not moved:
-            rear: Who = "a" if arrived["a"] < arrived["b"] else "b"
-            moved = {rear if procedure == "leapfrog" else _other(first)}
+    silent: list[Who] = [who for who in BOTH if who not in said]
+    if len(silent) == 2:
+        moved = guessed
+    elif len(silent) == 1 and guessed and (levels[silent[0]] or not moved):
+        # One of them must have moved, and it is not the one that is said to stand where it stood.
+        moved.add(silent[0])
     problem = ""
     for who, has in said.items():
         if not has and levels[who]:

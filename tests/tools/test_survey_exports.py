@@ -1,0 +1,202 @@
+"""Exports against the programs that read them: Survex and Therion."""
+
+import csv
+import io
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from protocol.errors import BuddylineError
+from tests.tools import survey_world as world
+from tools.survey import compass, drawing, report, survex, tables, therion
+from tools.survey.network import adjust
+from tools.survey.project import Edit, FixedPoint, Place
+
+CAVERN = pytest.mark.skipif(shutil.which("cavern") is None, reason="survex is not installed")
+THERION = pytest.mark.skipif(shutil.which("therion") is None, reason="therion is not installed")
+# Survex writes coordinates to the centimetre, so half of one is lost there.
+SAME_M = 0.01
+PLACES = {
+    "nowhere": {},
+    "declination": {"place": Place(declination_deg=-12.3, declination_source="chart")},
+    "utm": {
+        "place": Place(declination_deg=3.65, utm_zone="32N", latitude_deg=45.5, longitude_deg=9.2, water_level_m=97.0),
+        "fix": [FixedPoint(station="0", latitude_deg=45.5, longitude_deg=9.2, entrance=True)],
+    },
+}
+
+
+def survey(make=world.loop, legs=14, depth="absolute", seed=1, **tables_):
+    course = make(np.random.default_rng(seed), legs)
+    rows = world.readings_of(course, np.random.default_rng(seed))
+    rows[3] = replace(rows[3], disturbed=["b"], alarms=["field: at node b the magnetic field is not the usual one"])
+    project = world.project_of(rows, depth, **tables_)
+    return project, adjust(project)
+
+
+def differences(adjusted, found, *, shift=False):
+    start = adjusted.positions["0"].position_m - found["0"] if shift else 0.0
+    return [np.abs(p.position_m - found[name] - start).max() for name, p in adjusted.positions.items()]
+
+
+@CAVERN
+@pytest.mark.parametrize("depth", ["absolute", "readings"])
+@pytest.mark.parametrize("place", list(PLACES))
+@pytest.mark.parametrize("make", [world.line, world.loop])
+def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
+    project, adjusted = survey(make, depth=depth, **PLACES[place])
+    said, ratios, found = world.cavern(tmp_path, survex.diving(project, adjusted))
+    assert not said
+    assert max(differences(adjusted, found)) <= SAME_M
+    assert len(ratios) == len(adjusted.loops)
+    for (h, v), loop in zip(ratios, adjusted.loops, strict=True):
+        assert h == pytest.approx(loop.horizontal_ratio, rel=0.05, abs=0.02)
+        assert v == pytest.approx(loop.vertical_ratio, rel=0.1, abs=0.05)
+
+
+@CAVERN
+def test_cavern_agrees_on_crossing_loops_side_shots_and_steep_legs(tmp_path):
+    course = world.loop(np.random.default_rng(6), 12)
+    course.stations_m = np.vstack([course.stations_m, course.stations_m[4] + (1.0, 0.5, 6.0), course.stations_m[2] - 2])
+    course.names += ["pit", "side"]
+    course.legs += [(2, 8, 0), (4, 12, 0), (2, 13, 1), (4, 5, 0)]
+    project = world.project_of(world.readings_of(course, np.random.default_rng(2)))
+    adjusted = adjust(project)
+    text = survex.diving(project, adjusted)
+    assert survex.NORMAL in text
+    assert survex.DIVING in text
+    said, _, found = world.cavern(tmp_path, text)
+    assert not said
+    assert max(differences(adjusted, found)) <= SAME_M
+
+
+@CAVERN
+def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
+    course = world.line(np.random.default_rng(6), 4)
+    legs = world.readings_of(course, np.random.default_rng(2))
+    legs[1] = replace(legs[1], back_azimuth_deg=(legs[1].back_azimuth_deg + 15) % 360)
+    project = world.project_of(legs)
+    said, _, found = world.cavern(tmp_path, survex.diving(project, adjust(project)))
+    assert not said
+    assert found
+
+
+@CAVERN
+@pytest.mark.parametrize("place", list(PLACES))
+def test_cavern_takes_cartesian_vectors(tmp_path, place):
+    project, adjusted = survey(world.line, **PLACES[place])
+    said, _, found = world.cavern(tmp_path, survex.cartesian(project, adjusted))
+    assert not said
+    assert max(differences(adjusted, found)) <= SAME_M
+
+
+@CAVERN
+def test_cavern_reads_compass_data(tmp_path):
+    project, adjusted = survey(world.line, place=Place(declination_deg=5.25, declination_source="chart"))
+    # Of a .dat file cavern 1.4 reads foresights alone.
+    project = replace(project, edit=[Edit(leg=leg.name, compass="fore") for leg in project.leg], leg=project.leg)
+    adjusted = adjust(replace(project, leg=[replace(leg, disturbed=[]) for leg in project.leg]))
+    said, _, found = world.cavern(tmp_path, compass.dat(project, adjusted), "survey.dat")
+    assert not said
+    assert max(differences(adjusted, found, shift=True)) <= 2 * SAME_M
+
+
+@THERION
+@pytest.mark.parametrize("place", ["nowhere", "declination"])
+def test_therion_compiles(tmp_path, place):
+    project, adjusted = survey(world.line, **PLACES[place])
+    (tmp_path / "survey.th").write_text(therion.centreline(project, adjusted))
+    (tmp_path / "thconfig").write_text("source survey.th\nexport model -o survey.3d -fmt survex\n")
+    done = subprocess.run(["therion", "-q"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stdout[-500:]
+    found = world.coordinates(tmp_path / "survey.3d")
+    assert max(differences(adjusted, found)) <= SAME_M
+
+
+def test_an_unknown_declination_is_never_written():
+    project, adjusted = survey(place=Place())
+    text = survex.diving(project, adjusted)
+    assert "*declination" not in text
+    assert "declination not known" in text
+    assert "\n    declination" not in therion.centreline(project, adjusted)
+    with pytest.raises(BuddylineError, match="declination"):
+        compass.dat(project, adjusted)
+    with pytest.raises(BuddylineError, match="declination"):
+        tables.geojson(project, adjusted)
+
+
+def test_readings_people_instruments_and_notes_are_in_the_export():
+    project, adjusted = survey(**PLACES["declination"])
+    project = replace(
+        project,
+        survey=replace(project.survey, notes="silt at 4", instruments={"depth": "MS5837"}),
+        edit=[Edit(leg="0-1", note="second try")],
+    )
+    text = survex.diving(project, adjusted)
+    for words in ('*team "A. Diver"', '*instrument depth "MS5837"', "; silt at 4", "second try", "*date 2026.05.01"):
+        assert words in text
+    assert "*declination -12.3000 degrees" in text
+    rows = [row.split("\t") for row in text.splitlines() if row.count("\t") >= 6]
+    assert [(row[0], row[1]) for row in rows] == [(leg.from_, leg.to) for leg in project.leg]
+    for row, leg in zip(rows, project.leg, strict=True):
+        assert float(row[2]) == pytest.approx(leg.distance_m, abs=1e-4)
+        for word, angle, node in (
+            (row[3], leg.azimuth_deg, leg.from_node),
+            (row[4], leg.back_azimuth_deg, leg.to_node),
+        ):
+            if node in leg.disturbed:
+                assert word == "-"
+            else:
+                assert float(word) == pytest.approx(angle, abs=1e-3)
+
+
+def test_tables():
+    point = replace(survey()[0].leg[0], to="amphora", note="neck up")
+    project, adjusted = survey(points=[point], **PLACES["utm"])
+    legs = list(csv.DictReader(io.StringIO(tables.legs_csv(project, adjusted))))
+    assert [row["from"] for row in legs] == [leg.from_ for leg in [*project.leg, point]]
+    assert legs[3]["alarms"].startswith("field")
+    stations = {row["name"]: row for row in csv.DictReader(io.StringIO(tables.stations_csv(project, adjusted)))}
+    assert stations["amphora"]["kind"] == "point"
+    assert float(stations["0"]["latitude_deg"]) == pytest.approx(45.5, abs=1e-7)
+    assert float(stations["amphora"]["ellipse_major_m"]) > 0
+    collection = json.loads(tables.geojson(project, adjusted))
+    kinds = [feature["properties"]["kind"] for feature in collection["features"]]
+    assert (kinds.count("station"), kinds.count("point"), kinds.count("leg")) == (14, 1, 14)
+    longitude, latitude, _ = collection["features"][0]["geometry"]["coordinates"]
+    assert (longitude, latitude) == pytest.approx((9.2, 45.5), abs=1e-6)
+
+
+def test_geojson_of_a_local_grid_is_where_the_survey_is():
+    fix = FixedPoint(station="0", latitude_deg=45.5, longitude_deg=9.2)
+    project, adjusted = survey(fix=[fix], place=Place(declination_deg=3.65, declination_source="chart"))
+    utm, _ = survey(**PLACES["utm"])
+    one = json.loads(tables.geojson(project, adjusted))["features"]
+    other = json.loads(tables.geojson(utm, adjust(utm)))["features"]
+    for a, b in zip(one, other, strict=True):
+        if a["geometry"]["type"] == "Point":
+            # A ten-millionth of a degree is a centimetre; the grids differ by UTM's scale.
+            np.testing.assert_allclose(a["geometry"]["coordinates"][:2], b["geometry"]["coordinates"][:2], atol=3e-7)
+
+
+def test_drawings_and_report_hold_every_station():
+    project, adjusted = survey(points=[replace(survey()[0].leg[0], to="amphora<1>")], **PLACES["utm"])
+    svg = drawing.plan(adjusted, "Demo").svg()
+    assert svg.startswith("<svg")
+    assert "amphora&lt;1&gt;" in svg
+    for name in adjusted.positions:
+        assert f">{name}</text>" in svg
+    pdf = drawing.pdf([drawing.plan(adjusted, "Demo"), drawing.profile(adjusted, "Demo (1)")])
+    assert pdf.startswith(b"%PDF-1.4")
+    assert pdf.rstrip().endswith(b"%%EOF")
+    start = int(pdf.split(b"startxref\n")[1].split()[0])
+    assert pdf[start:].startswith(b"xref")
+    page = report.page(project, adjusted)
+    assert page.count("<svg") == 2
+    assert "misclosure" in page
+    assert "ALARM: leg 3-4" in page
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")

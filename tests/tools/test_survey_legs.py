@@ -1,0 +1,265 @@
+"""From messages to legs, through the true solver: rests, stations, sigmas, alarms, points."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from protocol.messages import Imu, Mark, RelativePose
+from tests.tools import survey_world as world
+from tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
+from tools.survey.chain import Stop, stand
+from tools.survey.derive import Derived, ranges
+from tools.survey.live import LiveAlarms
+from tools.survey.network import adjust
+from tools.survey.project import Leg
+from tools.survey.readings import of_messages
+from tools.survey.rests import rests
+from tools.survey.settings import AlarmSettings, SurveySettings
+from tools.survey.sights import sights
+
+COURSE = world.line(np.random.default_rng(2), 5)
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return world.dive(COURSE, np.random.default_rng(7), rest_s=8.0, swim_s=2.0)
+
+
+def derived(messages, **settings):
+    result = Derived()
+    result.add(of_messages(messages), SurveySettings(**settings), AlarmSettings())
+    return result
+
+
+def test_legs_of_a_leapfrog(messages):
+    found = derived(messages)
+    assert [(leg.from_, leg.to) for leg in found.legs] == [(str(k), str(k + 1)) for k in range(5)]
+    assert [leg.from_node for leg in found.legs] == ["a", "b", "a", "b", "a"]
+    assert not found.problems
+    for leg, (start, end, _) in zip(found.legs, COURSE.legs, strict=True):
+        way = COURSE.stations_m[end] - COURSE.stations_m[start]
+        azimuth = math.degrees(math.atan2(way[1], way[0]))
+        assert abs(leg.distance_m - np.linalg.norm(way)) < 4 * leg.distance_sigma_m
+        assert abs(leg.distance_m - np.linalg.norm(way)) < 0.15
+        for angle, turn in ((leg.azimuth_deg, 0), (leg.back_azimuth_deg, 180)):
+            assert abs((angle - azimuth - turn + 180) % 360 - 180) < 4 * leg.azimuth_sigma_deg
+        assert abs(leg.depth_from_m - COURSE.stations_m[start][2]) < 4 * leg.depth_from_sigma_m
+        assert abs(leg.depth_to_m - COURSE.stations_m[end][2]) < 4 * leg.depth_to_sigma_m
+        # A compass of 1.5 degrees that errs slowly is not made better by averaging.
+        assert 1.2 < leg.azimuth_sigma_deg < 1.8
+        assert leg.fixes >= 8
+        assert leg.fixes_used
+    assert [station.name for station in found.stations()] == [str(k) for k in range(6)]
+
+
+def test_every_fix_of_a_rest_is_used_or_its_reason_is_given(messages):
+    readings = of_messages(messages)
+    for leg in derived(messages).legs:
+        within = [
+            m.trigger for m in messages if isinstance(m, RelativePose) and leg.start_ns <= m.stamp_ns <= leg.end_ns
+        ]
+        named = set()
+        for text in [leg.fixes_used, *leg.unused.values()]:
+            for part in text.split():
+                first, _, last = part.partition("-")
+                named |= set(range(int(first), int(last or first) + 1))
+        assert set(within) <= named
+    assert len(readings.triggers) > 0
+
+
+def test_marks_name_stations_and_keep_their_notes(messages):
+    second = derived(messages).legs[1]
+    mark = Mark(node=second.from_node, stamp_ns=second.start_ns + 10**9, name="T1", note="big flake")
+    found = derived([*messages, mark])
+    assert [(leg.from_, leg.to) for leg in found.legs][:3] == [("0", "T1"), ("T1", "2"), ("2", "3")]
+    assert next(station for station in found.stations() if station.name == "T1").notes == ["big flake"]
+
+
+def test_a_mark_of_an_earlier_station_closes_the_loop(messages):
+    last = derived(messages).legs[-1]
+    mark = Mark(node=last.to_node, stamp_ns=last.start_ns, name="0")
+    assert derived([*messages, mark]).legs[-1].to == "0"
+
+
+def test_a_mark_that_is_no_name_is_said_and_changes_nothing(messages):
+    mark = Mark(node="a", stamp_ns=world.START_NS, name="not a name!")
+    found = derived([*messages, mark])
+    assert found.legs == derived(messages).legs
+    assert "no station's name" in found.problems[0].text
+
+
+def test_a_point_of_interest_hangs_on_the_station_of_the_other(messages):
+    leg = derived(messages).legs[2]
+    mark = Mark(node=leg.to_node, stamp_ns=leg.end_ns - 10**9, kind="point", name="amphora", note="neck up")
+    found = derived([*messages, mark])
+    (point,) = found.points
+    assert (point.from_, point.to, point.note) == (leg.from_, "amphora", "neck up")
+    project = world.project_of(found.legs, points=found.points)
+    adjusted = adjust(project)
+    station = adjusted.positions[leg.to]
+    assert np.linalg.norm(adjusted.points[0].position_m - station.position_m) < 0.3
+    assert adjusted.points[0].ellipse[0] > 0.02
+
+
+def test_a_point_without_fixes_is_said(messages):
+    mark = Mark(node="b", stamp_ns=world.START_NS - 10**12, kind="point", name="wreck")
+    found = derived([*messages, mark])
+    assert not found.points
+    assert "wreck" in found.problems[0].text
+
+
+def test_walking_about_a_fixed_node_keeps_its_station():
+    rng = np.random.default_rng(4)
+    places = np.array([[0.0, 0, 10], [5, 1, 9.0], [4, -3, 11.0], [6, 2, 10.2]])
+    course = world.Course(places, [(0, 1, 0), (0, 2, 0), (0, 3, 0)], ["0", "1", "2", "3"])
+    found = derived(world.dive(course, rng, rest_s=6.0, swim_s=2.0), procedure="stay")
+    assert [(leg.from_, leg.to) for leg in found.legs] == [("0", "1"), ("0", "2"), ("0", "3")]
+
+
+def test_a_handled_node_is_not_at_rest(messages):
+    third = derived(messages).legs[2]
+    shaken = [
+        replace(m, gyro_radps=(2.0, 0.0, 0.0))
+        if isinstance(m, Imu) and m.node == "a" and third.start_ns <= m.stamp_ns <= third.end_ns
+        else m
+        for m in messages
+    ]
+    assert len(derived(shaken).legs) == 4
+
+
+def test_swimming_is_not_rest(messages):
+    readings = of_messages(messages)
+    for rest in rests(readings, sights(readings, SurveySettings()), SurveySettings()):
+        assert (rest.end_ns - rest.start_ns) / 1e9 < 10.5
+
+
+def test_true_headings_give_the_same_magnetic_legs(messages):
+    turn = math.radians(10)
+    half = np.array([0, 0, math.sin(turn / 2), math.cos(turn / 2)])
+
+    def turned(message):
+        if hasattr(message, "q_ned_body_xyzw"):
+            x, y, z, w = message.q_ned_body_xyzw
+            s, c = half[2], half[3]
+            q = (c * x - s * y, c * y + s * x, c * z + s * w, c * w - s * z)
+            return replace(message, q_ned_body_xyzw=tuple(float(v) for v in q))
+        if hasattr(message, "declination_rad"):
+            return replace(message, declination_rad=turn)
+        return message
+
+    for one, other in zip(derived(messages).legs, derived(map(turned, messages)).legs, strict=True):
+        assert one.azimuth_deg == pytest.approx(other.azimuth_deg, abs=2e-3)
+
+
+def test_disturbed_field_is_seen_and_its_compass_left():
+    rng = np.random.default_rng(11)
+    course = world.line(rng, 5)
+    flaws = world.Flaws(compass_deg=0.5)
+
+    def disturb(index, number):
+        return 15.0 if (index, number) == (1, 3) else 0.0
+
+    found = derived(world.dive(course, rng, flaws, rest_s=7.0, swim_s=1.0, disturb=disturb))
+    # Node b stands at station 3 in legs 2-3 and 3-4.
+    assert [leg.disturbed for leg in found.legs] == [[], [], ["b"], ["b"], []]
+    leg = found.legs[2]
+    assert any(alarm.startswith("sights") for alarm in leg.alarms)
+    assert any(alarm.startswith("field: at node b") for alarm in leg.alarms)
+    assert leg.grade == 2
+    adjusted = adjust(world.project_of(found.legs))
+    end = world.enu(course.stations_m[-1] - course.stations_m[0])
+    assert np.linalg.norm((adjusted.positions["5"].position_m - adjusted.positions["0"].position_m - end)[:2]) < 1.0
+
+
+def test_the_same_alarms_come_live():
+    rng = np.random.default_rng(11)
+    course = world.line(rng, 3)
+
+    def disturb(index, number):
+        return 20.0 if (index, number) == (0, 2) else 0.0
+
+    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=8.0, swim_s=2.0, disturb=disturb)
+    live = LiveAlarms(SurveySettings(), AlarmSettings())
+    said = [mark for message in messages for mark in live.handle(message)]
+    assert {mark.kind for mark in said} == {"alarm"}
+    assert {"sights", "field"} <= {mark.name for mark in said}
+    assert {mark.node for mark in said if mark.name == "field"} == {"a"}
+    assert len(said) < 12
+
+
+def stop(line, a=10.0, b=10.0):
+    return Stop(np.array(line, dtype=float), {"a": a, "b": b})
+
+
+def test_depths_tell_who_has_moved():
+    stops = [stop((5, 0, 0)), stop((4, 2, 0), b=12.0), stop((-4, 1, 0), a=14.0, b=12.0), stop((3, 3, 1), a=9, b=9)]
+    standings = stand(stops, "leapfrog", "a")
+    assert [s.station["a"] + s.station["b"] for s in standings] == ["01", "02", "32", "54"]
+    assert [bool(s.problem) for s in standings] == [False, False, False, True]
+
+
+def test_without_other_evidence_the_procedure_tells():
+    level = [stop((5, 0, 0)), stop((-5, 0, 0)), stop((5, 1, 0))]
+    assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "a")] == ["01", "21", "23"]
+    assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "b")] == ["10", "12", "32"]
+    assert [s.station["a"] + s.station["b"] for s in stand(level, "stay", "a")] == ["01", "02", "03"]
+    again = [stop((5, 0, 0)), stop((5.02, 0, 0))]
+    assert [s.station["a"] + s.station["b"] for s in stand(again, "leapfrog", "a")] == ["01", "01"]
+
+
+def test_marks_go_before_depths():
+    moved = Stop(np.array([-4.0, 0.0, 0.0]), {"a": 13.0, "b": 10.0}, {"b": "X"})
+    standing = stand([stop((5, 0, 0)), moved], "leapfrog", "a")[1]
+    assert standing.station == {"a": "2", "b": "X"}
+
+
+@given(st.floats(-50, 50))
+def test_wrapping_keeps_the_direction(angle):
+    assert math.cos(wrap(angle)) == pytest.approx(math.cos(angle), abs=1e-9)
+    assert -math.pi <= wrap(angle) <= math.pi
+    turned = unwrapped(np.array([angle, angle + 0.1, angle - 0.1]))
+    assert np.ptp(turned) == pytest.approx(0.2, abs=1e-9)
+
+
+def test_outliers_are_left_out_and_a_lone_step_is_not():
+    values = np.array([1.0, 1.01, 0.99, 1.0, 5.0])
+    assert inliers(values, 0.01).tolist() == [True, True, True, True, False]
+    assert inliers(np.array([1.0, 1.0, 1.0, 1.001]), 0.01).all()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_sigma_of_slow_readings_is_the_error_of_their_mean(share):
+    rng = np.random.default_rng(0)
+    stamps = np.arange(40) * 0.5
+    chi = []
+    for _ in range(300):
+        values = math.sqrt(share) * rng.normal() + math.sqrt(1 - share) * rng.normal(size=40)
+        mean = mean_of_slow(stamps, values, 1.0, 0.0)
+        chi.append(mean.value / mean.sigma)
+    # Never too sure; where all noise is new the sample's own variance still leaves something unseen.
+    assert 0.3 < np.std(chi) < 1.1
+    if share == 1.0:
+        assert np.std(chi) > 0.9
+
+
+def test_correlated_readings_count_for_less():
+    rng = np.random.default_rng(1)
+    stamps = np.arange(200) * 2.0
+    white = rng.normal(size=200)
+    slow = np.convolve(rng.normal(size=219), np.ones(20) / math.sqrt(20), "valid")
+    assert effective_count(stamps, white) > 100
+    assert effective_count(stamps, slow) < 40
+    assert mean_of_white(stamps, slow, 0.1, 0.0).sigma > mean_of_white(stamps, white, 0.1, 0.0).sigma
+
+
+def test_ranges():
+    assert ranges([3, 4, 5, 9, 7, 4]) == "3-5 7 9"
+    assert ranges([]) == ""
+
+
+def test_a_leg_is_named_by_its_ends():
+    assert "from" in Leg.__struct_encode_fields__

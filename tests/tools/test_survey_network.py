@@ -1,0 +1,185 @@
+"""The network: exact where readings are, honest where they are not, and it names who is wrong."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from protocol.errors import BuddylineError
+from tests.tools import survey_world as world
+from tools.survey.geodesy import convergence_rad, declination, from_utm, grid_of, to_utm
+from tools.survey.lines import bearing_of, line_of
+from tools.survey.network import adjust
+from tools.survey.project import Edit, FixedPoint, Place, Project
+
+EXACT = {"compass_deg": 0.0, "tape_m": 0.0, "depth_m": 0.0}
+
+
+@pytest.mark.parametrize("depth", ["absolute", "readings"])
+@pytest.mark.parametrize("make", [world.line, world.loop])
+def test_exact_readings_give_the_true_stations(make, depth):
+    course = make(np.random.default_rng(3), 14)
+    project = world.project_of(world.readings_of(course, np.random.default_rng(0), **EXACT), depth)
+    adjusted = adjust(project)
+    start = course.stations_m[0]
+    for name, place in zip(course.names, course.stations_m, strict=True):
+        expected = world.enu(place - start) - (0, 0, start[2])
+        np.testing.assert_allclose(adjusted.positions[name].position_m, expected, atol=2e-3)
+    assert all(loop.error_m < 2e-3 for loop in adjusted.loops)
+    assert not adjusted.blunders
+    assert len(adjusted.loops) == (make is world.loop)
+
+
+@pytest.mark.parametrize("depth", ["absolute", "readings"])
+def test_stated_covariance_is_the_scatter(depth):
+    course = world.loop(np.random.default_rng(5), 12)
+    far = "6"
+    errors, chi2, loop_h, loop_v = [], [], [], []
+    for seed in range(25):
+        legs = world.readings_of(course, np.random.default_rng(seed), depth_m=0.03)
+        project = world.project_of(legs, depth)
+        project = replace(project, settings=replace(project.settings, compass_common_deg=0.0))
+        adjusted = adjust(project)
+        position = adjusted.positions[far]
+        error = position.position_m - adjusted.positions["0"].position_m
+        error = (error - world.enu(course.stations_m[6] - course.stations_m[0]))[:2]
+        errors.append(error)
+        chi2.append(error @ np.linalg.solve(position.covariance[:2, :2], error))
+        loop_h.append(adjusted.loops[0].horizontal_ratio ** 2)
+        loop_v.append(adjusted.loops[0].vertical_ratio ** 2)
+    # A chi^2 of 2 degrees of freedom has mean 2 and sd 2; of 25 of them the mean's sd is 0.4.
+    assert 0.8 < np.mean(chi2) < 3.4
+    assert 0.45 < np.mean(loop_h) < 1.7
+    if depth == "readings":
+        assert 0.35 < np.mean(loop_v) < 1.9
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.05
+
+
+def test_common_compass_error_turns_the_far_end_and_is_in_its_ellipse():
+    course = world.line(np.random.default_rng(2), 20)
+    legs = world.readings_of(course, np.random.default_rng(0), compass_deg=0.0, tape_m=0.0, depth_m=0.0)
+    project = world.project_of(legs)
+    far = adjust(project).positions["20"]
+    away = np.linalg.norm((course.stations_m[20] - course.stations_m[0])[:2])
+    assert far.ellipse[0] == pytest.approx(math.radians(0.5) * away, rel=0.1)
+    # The ellipse lies across the way to the station.
+    way = world.enu(course.stations_m[20] - course.stations_m[0])
+    across = math.atan2(way[0], way[1]) + math.pi / 2
+    assert abs(math.cos(far.ellipse[2] - across)) > 0.99
+
+
+def test_a_blunder_is_named():
+    course = world.loop(np.random.default_rng(8), 12)
+    # Cross-legs make the network stiff enough to tell which of them is wrong.
+    course.legs += [(2, 8, 0), (5, 11, 0), (3, 10, 0), (0, 6, 0)]
+    legs = world.readings_of(course, np.random.default_rng(1))
+    sound = adjust(world.project_of(legs))
+    assert not sound.blunders
+    legs[12] = replace(legs[12], distance_m=legs[12].distance_m + 1.5)
+    adjusted = adjust(world.project_of(legs))
+    assert adjusted.blunders[0].legs == ("2-8",)
+    assert adjusted.blunders[0].off_m == pytest.approx(1.5, abs=0.5)
+    taken_out = replace(world.project_of(legs), edit=[Edit(leg="2-8", use=False, note="line slack")])
+    again = adjust(taken_out)
+    assert not again.blunders
+    assert again.left_out[0][1] == "taken out: line slack"
+
+
+def test_legs_in_a_row_share_the_blame():
+    course = world.loop(np.random.default_rng(8), 12)
+    course.legs += [(2, 8, 0), (5, 11, 0), (3, 10, 0), (0, 6, 0)]
+    legs = world.readings_of(course, np.random.default_rng(1))
+    legs[4] = replace(legs[4], distance_m=legs[4].distance_m + 1.5)
+    # Between stations 3 and 5, where others meet them, nothing tells the two legs apart.
+    assert {"3-4", "4-5"} <= set(adjust(world.project_of(legs)).blunders[0].legs[:3])
+    one_loop = adjust(world.project_of(legs[:12]))
+    assert one_loop.blunders
+    assert len(one_loop.blunders[0].legs) > 1
+
+
+def test_nothing_checks_an_open_traverse_and_that_is_said():
+    course = world.line(np.random.default_rng(1), 12)
+    adjusted = adjust(world.project_of(world.readings_of(course, np.random.default_rng(1))))
+    assert all(one.chi2 is None for one in adjusted.residuals)
+    assert not adjusted.loops
+
+
+def test_two_fixed_points_close_a_loop():
+    course = world.line(np.random.default_rng(4), 12)
+    legs = world.readings_of(course, np.random.default_rng(1), **EXACT)
+    ends = [world.enu(course.stations_m[i]) for i in (0, 12)]
+    fixes = [FixedPoint(station=n, east_m=e[0], north_m=e[1]) for n, e in zip(("0", "12"), ends, strict=True)]
+    adjusted = adjust(world.project_of(legs, fix=fixes, place=Place(declination_deg=0.0, declination_source="test")))
+    assert len(adjusted.loops) == 1
+    assert adjusted.loops[0].error_m < 0.01
+    shifted = [fixes[0], replace(fixes[1], east_m=fixes[1].east_m + 3.0)]
+    off = adjust(world.project_of(legs, fix=shifted, place=Place(declination_deg=0.0, declination_source="test")))
+    assert off.loops[0].error_m == pytest.approx(3.0, abs=0.01)
+
+
+def test_legs_that_hang_in_the_air_are_left_out():
+    course = world.line(np.random.default_rng(4), 6)
+    legs = world.readings_of(course, np.random.default_rng(1))
+    del legs[2]
+    adjusted = adjust(world.project_of(legs))
+    assert [(leg.name, why) for leg, why in adjusted.left_out] == [
+        (f"{k}-{k + 1}", "not connected to a fixed point") for k in (3, 4, 5)
+    ]
+    assert "4" not in adjusted.positions
+
+
+def test_a_project_without_legs_is_an_error():
+    with pytest.raises(BuddylineError, match="no legs"):
+        adjust(Project())
+
+
+def test_the_undisturbed_compass_is_taken_and_an_edit_goes_before():
+    course = world.line(np.random.default_rng(4), 1)
+    (leg,) = world.readings_of(course, np.random.default_rng(1))
+    project = Project()
+    assert bearing_of(leg, project).sigma == pytest.approx(math.radians(1.0) / math.sqrt(2))
+    at_far = bearing_of(replace(leg, disturbed=["b"]), project)
+    assert at_far.back is None
+    assert at_far.sigma == pytest.approx(math.radians(1.0))
+    edited = replace(project, edit=[Edit(leg="0-1", compass="back")])
+    assert bearing_of(replace(leg, disturbed=["b"]), edited).fore is None
+    # Two compasses that contradict each other are not better than either.
+    apart = bearing_of(replace(leg, back_azimuth_deg=(leg.azimuth_deg + 190) % 360), project)
+    assert apart.sigma > math.radians(4.0)
+
+
+def test_steep_legs_follow_the_clinometers():
+    course = world.line(np.random.default_rng(4), 1)
+    course.stations_m[1] = course.stations_m[0] + (0.5, 0.2, 4.0)
+    (leg,) = world.readings_of(course, np.random.default_rng(1), **EXACT)
+    line = line_of(leg, Project(), 0.0, {})
+    assert line.by_clino
+    np.testing.assert_allclose(line.vector_m, world.enu(course.stations_m[1] - course.stations_m[0]), atol=1e-9)
+    assert line_of(replace(leg, distance_m=3.0, inclination_deg=-80.0, back_inclination_deg=80.0), Project(), 0.0, {})
+
+
+def test_utm_known_place_and_back():
+    # The CN Tower, as given in the literature on UTM: zone 17N, 630084 m east, 4833438 m north.
+    latitude, longitude = 43 + 38 / 60 + 33.24 / 3600, -(79 + 23 / 60 + 13.7 / 3600)
+    east, north = to_utm(latitude, longitude, "17N")
+    assert (round(east), round(north)) == (630084, 4833439)
+    for zone, place in (("17N", (latitude, longitude)), ("55S", (-33.2, 149.9)), ("32N", (0.1, 6.5))):
+        np.testing.assert_allclose(from_utm(*to_utm(*place, zone), zone), place, atol=1e-9)
+    # Convergence is about the longitude from the central meridian times the latitude's sine.
+    assert convergence_rad(latitude, longitude, "17N") == pytest.approx(
+        math.radians(longitude + 81) * math.sin(math.radians(latitude)), rel=1e-3
+    )
+
+
+def test_declination_is_stated_modelled_or_unknown():
+    pytest.importorskip("pygeomag")
+    legs = world.readings_of(world.line(np.random.default_rng(4), 2), np.random.default_rng(1))
+    assert declination(world.project_of(legs)) is None
+    assert grid_of(world.project_of(legs)).north == "magnetic"
+    modelled = declination(world.project_of(legs, place=Place(latitude_deg=45.5, longitude_deg=9.2)))
+    # NOAA's calculator gives 3.6 degrees east for northern Italy in May 2026.
+    assert math.degrees(modelled.rad) == pytest.approx(3.6, abs=0.3)
+    assert "2026-05-01" in modelled.source
+    stated = declination(world.project_of(legs, place=Place(declination_deg=-2.0)))
+    assert math.degrees(stated.rad) == pytest.approx(-2.0)
