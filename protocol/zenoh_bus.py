@@ -108,7 +108,21 @@ def connect(
     Raises RefusedError where a hub is there and the two do not accept each other.
     """
     config = _config(client_settings(endpoint, namespace, tls))
-    session = _open_when_there(
+    session = _session(config, endpoint, tls, stop, on_wait)
+    return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
+
+
+def open_session(
+    endpoint: str, *, stop: threading.Event, on_wait: Callable[[str], None], tls: Tls | None = None
+) -> zenoh.Session | None:
+    """Connect as `connect` does, for what speaks keys and payloads that are not ours; the caller closes it."""
+    return _session(_config(client_settings(endpoint, None, tls)), endpoint, tls, stop, on_wait)
+
+
+def _session(
+    config: zenoh.Config, endpoint: str, tls: Tls | None, stop: threading.Event, on_wait: Callable[[str], None]
+) -> zenoh.Session | None:
+    return _open_when_there(
         config,
         stop,
         lambda: on_wait(
@@ -116,7 +130,6 @@ def connect(
         ),
         lambda: refusal(endpoint, tls),
     )
-    return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
 
 
 def _open_when_there(

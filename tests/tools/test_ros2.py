@@ -1,0 +1,158 @@
+"""The bridge to ROS 2: values in ROS's frames and types, keys and attachments as rmw_zenoh has them."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from protocol.clock import S_NS, ManualClock
+from protocol.messages import Message
+from solver_service.geometry.rotation import matrix_of
+from tests.tools.evaluated import INFOS, pose
+from tests.tools.watched import at, attitude, depth
+from tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
+
+pytest.importorskip("rosbags", reason="rosbags is not installed")
+
+HALF = math.sqrt(0.5)
+EAST = (0.0, 0.0, HALF, HALF)
+
+
+@pytest.fixture(scope="module")
+def store() -> Any:
+    return type_store()
+
+
+def translated(store: Any, *messages: Message) -> list[RosMessage]:
+    translation = Translation(store.types)
+    return [out for message in messages for out in translation.messages(message)]
+
+
+def of(messages: list[RosMessage], topic: str) -> Any:
+    return [message.value for message in messages if message.topic == topic][-1]
+
+
+def turned(q: Any, vector: tuple[float, float, float]) -> np.ndarray[Any, Any]:
+    result: np.ndarray[Any, Any] = matrix_of(np.array([q.x, q.y, q.z, q.w])) @ vector
+    return result
+
+
+def test_a_body_that_heads_east_points_along_x_with_its_left_to_the_north(store: Any) -> None:
+    value = of(translated(store, attitude("a", at(0), EAST)), "/buddyline/a/attitude")
+    np.testing.assert_allclose(turned(value.orientation, (1.0, 0.0, 0.0)), (1.0, 0.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(turned(value.orientation, (0.0, 1.0, 0.0)), (0.0, 1.0, 0.0), atol=1e-9)
+    assert value.header.stamp.sec * S_NS + value.header.stamp.nanosec == at(0)
+    assert value.orientation_covariance[8] == pytest.approx(0.05**2)
+    assert value.angular_velocity_covariance[0] == -1.0
+
+
+def test_depth_is_height_under_the_surface(store: Any) -> None:
+    value = of(translated(store, depth("a", at(0), 12.5)), "/buddyline/a/depth")
+    assert value.pose.pose.position.z == -12.5
+    assert value.pose.covariance[14] == pytest.approx(0.02**2)
+    assert value.pose.covariance[0] == 1e6
+
+
+def test_a_pose_goes_over_as_it_is_with_its_covariance(store: Any) -> None:
+    value = of(translated(store, pose(0)), "/buddyline/a/b/pose")
+    assert value.header.frame_id == "a_camera"
+    assert value.pose.pose.position.z == 3.0
+    np.testing.assert_array_equal(value.pose.covariance, pose(0).covariance)
+
+
+def test_transforms_lead_from_the_map_to_b(store: Any) -> None:
+    said = translated(
+        store, INFOS["a"], INFOS["b"], pose(0), depth("a", at(0)), attitude("a", at(1), EAST), attitude("b", at(1))
+    )
+    chain = {
+        (t.header.frame_id, t.child_frame_id): t.transform
+        for message in said
+        if message.topic == "/tf"
+        for t in message.value.transforms
+    }
+    assert set(chain) == {("map", "a_camera"), ("a_camera", "b_camera")}
+    in_map, in_a = chain["map", "a_camera"], chain["a_camera", "b_camera"].translation
+    origin_m = np.array([0.0, 0.0, in_map.translation.z])
+    b_m = origin_m + turned(in_map.rotation, (in_a.x, in_a.y, in_a.z))
+    np.testing.assert_allclose(b_m, (3.0, 0.0, -12.5), atol=1e-9)
+
+
+def test_transforms_of_a_fast_sensor_are_thinned(store: Any) -> None:
+    fast = [attitude("a", at(0) + k * 10_000_000) for k in range(100)]
+    said = translated(store, INFOS["a"], pose(0), *fast)
+    assert sum(message.topic == "/buddyline/a/attitude" for message in said) == 100
+    assert sum(message.topic == "/tf" for message in said) == 1 + 20
+
+
+def test_everything_can_be_encoded_and_read_back(store: Any) -> None:
+    for message in translated(store, INFOS["a"], pose(0), depth("a", at(0)), attitude("a", at(1))):
+        payload = store.serialize_cdr(message.value, message.type_name)
+        again = store.deserialize_cdr(payload, message.type_name)
+        assert bytes(store.serialize_cdr(again, message.type_name)) == bytes(payload)
+
+
+def test_names_of_ros_begin_with_a_letter() -> None:
+    assert (name_of("a"), name_of("1a")) == ("a", "node_1a")
+    assert dds_type("sensor_msgs/msg/Imu") == "sensor_msgs::msg::dds_::Imu_"
+
+
+def test_an_attachment_is_33_bytes() -> None:
+    gid = bytes(range(16))
+    data = attachment(7, 11, gid)
+    assert len(data) == 33
+    assert struct.unpack("<qqB16s", data) == (7, 11, 16, gid)
+
+
+def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any) -> None:
+    from protocol.zenoh_bus import open_hub, open_session
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    came: list[Any] = []
+    enough = threading.Event()
+
+    def take(sample: Any) -> None:
+        came.append((str(sample.key_expr), sample.payload.to_bytes(), sample.attachment.to_bytes()))
+        if len(came) == 2:
+            enough.set()
+
+    stop = threading.Event()
+    with open_hub(endpoint):
+        sender: Any = open_session(endpoint, stop=stop, on_wait=lambda _: None)
+        receiver: Any = open_session(endpoint, stop=stop, on_wait=lambda _: None)
+        try:
+            graph = RosGraph(sender, store, ManualClock(5), domain=3)
+            (first,) = translated(store, depth("a", at(0), 12.5))
+            graph.declare(first)
+            subscriber = receiver.declare_subscriber("3/**", take)
+            # What is sent before the sender knows of the receiver goes nowhere, as in ROS.
+            sent = 0
+            while not enough.wait(0.02) and sent < 500:
+                graph.publish(first)
+                sent += 1
+            assert enough.is_set()
+            tokens = sorted(str(reply.ok.key_expr) for reply in receiver.liveliness().get("@ros2_lv/**", timeout=5.0))
+            subscriber.undeclare()
+        finally:
+            sender.close()
+            receiver.close()
+    key, payload, beside = came[1]
+    kind = "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"
+    hashed = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
+    assert key == f"3/buddyline/a/depth/{kind}/{hashed}"
+    assert store.deserialize_cdr(payload, "geometry_msgs/msg/PoseWithCovarianceStamped").pose.pose.position.z == -12.5
+    sequence, stamp_ns, gid_length = struct.unpack_from("<qqB", beside)
+    assert (stamp_ns, gid_length) == (5, 16)
+    assert sequence == struct.unpack_from("<q", came[0][2])[0] + 1
+    zid = tokens[0].split("/")[2]
+    assert tokens == [
+        f"@ros2_lv/3/{zid}/0/0/NN/%/%/buddyline",
+        f"@ros2_lv/3/{zid}/0/1/MP/%/%/buddyline/%buddyline%a%depth/{kind}/{hashed}/::,10:,:,:,,",
+    ]

@@ -1,0 +1,304 @@
+"""`buddyline ros2`: attitudes, depths and poses for ROS 2, laid on the bus as its middleware rmw_zenoh lays them.
+
+ROS 2 machines with RMW_IMPLEMENTATION=rmw_zenoh_cpp whose router is our hub see them as any other topic. Frames
+follow REP 103: the world `map` is east, north, up, with the surface at zero; bodies are forward, left, up; cameras
+are right, down, forward, as ours are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import struct
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from protocol.clock import S_NS, Clock, SystemClock
+from protocol.errors import BuddylineError
+from protocol.messages import Attitude, Depth, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.service import Service
+from protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
+from solver_service.geometry.rotation import matrix_of, quaternion_of
+from tools.client import add_client_arguments, client_config
+
+if TYPE_CHECKING:
+    from protocol.bus import Received
+
+log = logging.getLogger(__name__)
+
+MAP: Final = "map"
+NODE_NAME: Final = "buddyline"
+# Reliable, volatile, the last 10 kept; the rest as it is by default (rmw_zenoh's liveliness tokens).
+QOS: Final = "::,10:,:,:,,"
+TRANSFORM_SPACING_NS: Final = S_NS // 20
+R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Forward, left, up seen from forward, right, down: its own inverse.
+R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
+# A quantity that a message has room for and nobody measured: so uncertain that filters leave it alone.
+UNKNOWN_VARIANCE: Final = 1e6
+
+POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+IMU_TYPE: Final = "sensor_msgs/msg/Imu"
+TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    add_client_arguments(parser)
+    parser.add_argument("--domain", type=int, default=0, metavar="ID", help="ROS_DOMAIN_ID; default: 0")
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
+
+
+@dataclass(frozen=True)
+class RosMessage:
+    """One message for ROS: its topic, its type as ROS names it, and the value as rosbags' type of that name."""
+
+    topic: str
+    type_name: str
+    value: Any
+
+
+def name_of(node: str) -> str:
+    """Return a node's id as a part of ROS names, which begin with a letter."""
+    return node if node[0].isalpha() else f"node_{node}"
+
+
+class Translation:
+    """Turns our messages into ROS's; pure but for what it has heard before. types: of a rosbags type store."""
+
+    def __init__(self, types: dict[str, Any]) -> None:
+        self._types = types
+        self._infos: dict[str, NodeInfo] = {}
+        self._depth_m: dict[str, float] = {}
+        self._transform_ns: dict[str, int] = {}
+        self._base: str | None = None
+
+    def messages(self, message: Message) -> Iterator[RosMessage]:
+        """Yield what one of our messages is in ROS."""
+        if isinstance(message, NodeInfo):
+            self._infos[message.node] = message
+        elif isinstance(message, Attitude):
+            yield self._imu(message)
+            yield from self._camera_in_map(message)
+        elif isinstance(message, Depth):
+            self._depth_m[message.node] = message.depth_m
+            yield self._depth(message)
+        elif isinstance(message, RelativePose):
+            self._base = message.node_a
+            yield from self._pose(message)
+
+    def _imu(self, attitude: Attitude) -> RosMessage:
+        R_enu_flu = R_ENU_NED @ matrix_of(np.array(attitude.q_ned_body_xyzw)) @ R_FRD_FLU
+        unknown = np.array([-1.0] + [0.0] * 8)
+        nothing = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        value = self._new(
+            IMU_TYPE,
+            header=self._header(attitude.stamp_ns, f"{name_of(attitude.node)}_body"),
+            orientation=self._quaternion(R_enu_flu),
+            orientation_covariance=np.diag(np.array(attitude.sigma_rad) ** 2).ravel(),
+            # sensor_msgs/Imu: -1 says that a quantity is not given.
+            angular_velocity=nothing,
+            angular_velocity_covariance=unknown,
+            linear_acceleration=nothing,
+            linear_acceleration_covariance=unknown,
+        )
+        return RosMessage(f"/buddyline/{name_of(attitude.node)}/attitude", IMU_TYPE, value)
+
+    def _camera_in_map(self, attitude: Attitude) -> Iterator[RosMessage]:
+        """Yield where A's camera stands; B's follows from the pose, and a frame has one parent."""
+        node, stamp_ns = attitude.node, attitude.stamp_ns
+        info, before_ns = self._infos.get(node), self._transform_ns.get(node)
+        if node != self._base or info is None:
+            return
+        if before_ns is not None and 0 <= stamp_ns - before_ns < TRANSFORM_SPACING_NS:
+            return
+        self._transform_ns[node] = stamp_ns
+        R_ned_camera = matrix_of(np.array(attitude.q_ned_body_xyzw)) @ matrix_of(np.array(info.q_body_camera_xyzw))
+        above_m = (0.0, 0.0, -self._depth_m.get(node, 0.0))
+        yield self._transform(stamp_ns, MAP, f"{name_of(node)}_camera", above_m, R_ENU_NED @ R_ned_camera)
+
+    def _depth(self, depth: Depth) -> RosMessage:
+        variances = np.full(6, UNKNOWN_VARIANCE)
+        variances[2] = depth.sigma_m**2
+        value = self._posed(depth.stamp_ns, MAP, (0.0, 0.0, -depth.depth_m), np.eye(3), np.diag(variances).ravel())
+        return RosMessage(f"/buddyline/{name_of(depth.node)}/depth", POSE_TYPE, value)
+
+    def _pose(self, pose: RelativePose) -> Iterator[RosMessage]:
+        a, b = name_of(pose.node_a), name_of(pose.node_b)
+        R_a_b = matrix_of(np.array(pose.q_a_b_xyzw))
+        # Position, then rotation about A's fixed axes: ROS's order and meaning are ours.
+        value = self._posed(pose.stamp_ns, f"{a}_camera", pose.t_a_b_m, R_a_b, np.array(pose.covariance))
+        yield RosMessage(f"/buddyline/{a}/{b}/pose", POSE_TYPE, value)
+        yield self._transform(pose.stamp_ns, f"{a}_camera", f"{b}_camera", pose.t_a_b_m, R_a_b)
+
+    def _posed(self, stamp_ns: int, frame_id: str, t_m: tuple[float, float, float], R: Any, covariance: Any) -> Any:
+        x, y, z = t_m
+        pose = self._new(
+            "geometry_msgs/msg/Pose",
+            position=self._new("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=self._quaternion(R),
+        )
+        with_covariance = self._new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
+        return self._new(POSE_TYPE, header=self._header(stamp_ns, frame_id), pose=with_covariance)
+
+    def _transform(self, stamp_ns: int, parent: str, child: str, t_m: tuple[float, float, float], R: Any) -> RosMessage:
+        x, y, z = t_m
+        stamped = self._new(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=self._new(
+                "geometry_msgs/msg/Transform",
+                translation=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                rotation=self._quaternion(R),
+            ),
+        )
+        return RosMessage("/tf", TF_TYPE, self._new(TF_TYPE, transforms=[stamped]))
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        time = self._new("builtin_interfaces/msg/Time", sec=stamp_ns // S_NS, nanosec=stamp_ns % S_NS)
+        return self._new("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+
+    def _quaternion(self, R: Any) -> Any:
+        x, y, z, w = (float(value) for value in quaternion_of(R))
+        return self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+    def _new(self, type_name: str, **fields: Any) -> Any:
+        return self._types[type_name](**fields)
+
+
+class RosGraph:
+    """One ROS node with its publishers, as rmw_zenoh shows them to others: keys, liveliness tokens, attachments."""
+
+    def __init__(self, session: Any, store: Any, clock: Clock, domain: int) -> None:
+        self._session = session
+        self._store = store
+        self._clock = clock
+        self._domain = domain
+        self._zid = str(session.zid())
+        self._endpoints: dict[str, RosEndpoint] = {}
+        self._tokens = [session.liveliness().declare_token(self._token(0, "NN"))]
+
+    def _token(self, entity: int, kind: str) -> str:
+        # Empty enclave and the root namespace are both written %.
+        return f"@ros2_lv/{self._domain}/{self._zid}/0/{entity}/{kind}/%/%/{NODE_NAME}"
+
+    def publish(self, message: RosMessage) -> None:
+        """Send one message; its topic is declared when it first comes."""
+        self.declare(message)
+        endpoint = self._endpoints[message.topic]
+        payload = bytes(self._store.serialize_cdr(message.value, message.type_name))
+        endpoint.sequence += 1
+        endpoint.publisher.put(payload, attachment=attachment(endpoint.sequence, self._clock.now_ns(), endpoint.gid))
+
+    def declare(self, message: RosMessage) -> None:
+        """Let others see the topic of a message, where they do not yet."""
+        if message.topic in self._endpoints:
+            return
+        entity = len(self._endpoints) + 1
+        type_key = f"{dds_type(message.type_name)}/{self._store.hash_rihs01(message.type_name)}"
+        mangled = message.topic.replace("/", "%")
+        publisher = self._session.declare_publisher(f"{self._domain}/{message.topic.lstrip('/')}/{type_key}")
+        token = f"{self._token(entity, 'MP')}/{mangled}/{type_key}/{QOS}"
+        self._tokens.append(self._session.liveliness().declare_token(token))
+        log.info("ros2: %s (%s)", message.topic, message.type_name)
+        self._endpoints[message.topic] = RosEndpoint(publisher, os.urandom(16))
+
+
+@dataclass
+class RosEndpoint:
+    """One publisher of a ROS topic. gid: its id in every sample."""
+
+    publisher: Any
+    gid: bytes
+    sequence: int = 0
+
+
+def dds_type(type_name: str) -> str:
+    """Return `package/msg/Type` as DDS writes it: `package::msg::dds_::Type_`."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
+    """Return what rmw_zenoh sends beside each sample: two int64, then the gid with its length before it."""
+    return struct.pack("<qqB", sequence, stamp_ns, len(gid)) + gid
+
+
+def type_store() -> Any:
+    """Return ROS 2 Jazzy's types; raise BuddylineError where rosbags is not installed."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise BuddylineError("ros2 needs rosbags, which is not installed: pip install 'buddyline[ros2]'") from error
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Translate until stopped."""
+    store = type_store()
+    config = client_config(args)
+    service = Service("ros2")
+    service.handle_signals()
+
+    def follow() -> None:
+        from protocol.zenoh_bus import connect, open_session
+
+        def waits(text: str) -> None:
+            log.info("ros2: %s", text)
+
+        session: Any = open_session(config.connect, stop=service.stop, on_wait=waits, tls=config.tls)
+        if session is None:
+            return
+        namespace = config.namespace or None
+        bus = connect(config.connect, namespace=namespace, stop=service.stop, on_wait=waits, tls=config.tls)
+        if bus is None:
+            session.close()
+            return
+        try:
+            with bus:
+                bus.on_failure(lambda error: service.fail("bus", error))
+                graph = RosGraph(session, store, SystemClock(), args.domain)
+                bridge = Bridge(Translation(store.types), graph)
+                bus.subscribe(INFO.key_any(), bridge.receive, capacity=64)
+                for topic in (ATTITUDE, DEPTH, POSE):
+                    bus.subscribe(topic.key_any(), bridge.receive, capacity=256, history=False)
+                service.stop.wait()
+        finally:
+            session.close()
+
+    service.spawn("bus", follow)
+    service.wait(args.seconds)
+    return service.join()
+
+
+class Bridge:
+    """Takes our messages off the bus and gives them to ROS; a bad one is counted and left out."""
+
+    def __init__(self, translation: Translation, graph: RosGraph) -> None:
+        self.bad = 0
+        self._translation = translation
+        self._graph = graph
+        self._lock = threading.Lock()
+
+    def receive(self, received: Received) -> None:
+        """Translate one message."""
+        parsed = parse_key(received.key)
+        if parsed is None:
+            return
+        try:
+            message = decode(received.payload, parsed[0].schema)
+        except MessageError as error:
+            self.bad += 1
+            if self.bad.bit_count() == 1:
+                log.warning("ros2: bad message on %s: %s (%d so far)", received.key, error, self.bad)
+            return
+        # Each subscription has a thread of its own; sequence numbers must rise one by one.
+        with self._lock:
+            for translated in self._translation.messages(message):
+                self._graph.publish(translated)
