@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from msgspec import Meta, field
+from msgspec import UNSET, Meta, field
 from msgspec.structs import replace
 
 from node.geomagnetism import EarthField, earth_field
 from protocol.config import Config, ConfigError, load_config
-from protocol.messages import CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
+from protocol.messages import ArTag, CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
 from protocol.security import Tls
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
@@ -65,6 +65,7 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
     q_body_camera_xyzw: Quaternion = (0.5, 0.5, 0.5, 0.5)
     depth_port_m: Vector3 = (0.0, 0.0, 0.0)
     declination_rad: float = 0.0
+    tags: list[ArTag] = field(default_factory=list)
 
 
 class RecordConfig(Config, frozen=True, kw_only=True):
@@ -151,6 +152,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             declination_rad=self.declination_rad(stamp_ns),
             software=software,
             config_sha256=sha256,
+            tags=calibration.tags or UNSET,
         )
 
 

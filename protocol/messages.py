@@ -81,12 +81,29 @@ class CameraModel(Struct, frozen=True, kw_only=True):
         _check_finite("distortion", tuple(self.distortion))
 
 
+class ArTag(Struct, frozen=True, kw_only=True):
+    """An AR tag on a node. corners_m: of its black square, in the node's camera frame.
+
+    In the order in which one who faces the tag sees it upright: top left, top right, bottom right, bottom left.
+    family: "36h11", "16h5", ...
+    """
+
+    id: Count
+    corners_m: tuple[Vector3, Vector3, Vector3, Vector3]
+    family: str = "36h11"
+
+    def __post_init__(self) -> None:
+        """Check that the corners are apart."""
+        if min(math.dist(self.corners_m[i], self.corners_m[i - 1]) for i in range(4)) < 1e-3:
+            raise ValueError("corners_m: two corners less than 1 mm apart")
+
+
 class NodeInfo(Message, frozen=True, kw_only=True):
     """Calibration and identity of a node.
 
     light_left_m, light_right_m, depth_port_m: in the node's camera frame. sigma_px: candidate noise, 1 sd.
     row_time_ns: 0 for a global shutter. q_body_camera_xyzw: camera to body. declination_rad: 0 where headings
-    are magnetic.
+    are magnetic. tags: AR tags that the node carries, to compare with.
     """
 
     node: NodeId
@@ -104,6 +121,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     declination_rad: float = 0.0
     software: str = ""
     config_sha256: str = ""
+    tags: list[ArTag] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check the mount's quaternion and that the two lights are apart."""

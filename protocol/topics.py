@@ -128,6 +128,10 @@ POSE: Final = Topic(
     express=True,
     stale_s=1.0,
 )
+# After POSE, which carries the same schema: topic_of gives the first.
+ARTAG: Final = Topic(
+    "artag", "buddyline/pair/{a}/{b}/artag", messages.RelativePose, "buddyline.RelativePose", 10.0, "data"
+)
 REJECTED: Final = Topic(
     "rejected",
     "buddyline/pair/{a}/{b}/rejected",
@@ -160,6 +164,7 @@ TOPICS: Final = (
     LIGHT_TRUTH,
     MARK,
     POSE,
+    ARTAG,
     REJECTED,
     TRUTH,
     SOLVER_STATUS,

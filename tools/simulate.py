@@ -9,7 +9,6 @@ from dataclasses import asdict, fields
 
 import cv2
 
-from node.sim import tags
 from node.sim.dive import Plan, messages
 from node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
 from node.sim.world import World
@@ -82,8 +81,6 @@ def run(args: argparse.Namespace) -> int:
     )
     plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
-    if scenario.tags:
-        metadata |= {f"tags_{node}": tags.describe(scenario.index(node)) for node in (scenario.node_a, scenario.node_b)}
     with (
         DiveLogWriter(args.output, metadata=metadata) as writer,
         Progress("simulate", plan.seconds) as progress,

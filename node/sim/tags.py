@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -54,12 +53,6 @@ def layout(index: int) -> tuple[Tag, ...]:
     """Return the two tags of A (0) or B (1); they face along the camera's axis."""
     corners_m = np.array([(0.5, -0.5, 0.0), (-0.5, -0.5, 0.0), (-0.5, 0.5, 0.0), (0.5, 0.5, 0.0)]) * SIDE_M
     return tuple(Tag(2 * index + i, corners_m + place_m) for i, place_m in enumerate(PLACES_M))
-
-
-def describe(index: int) -> str:
-    """Return the layout of a node's tags as JSON."""
-    tags = [{"id": tag.id, "family": FAMILY, "corners_m": tag.corners_m.tolist()} for tag in layout(index)]
-    return json.dumps(tags)
 
 
 def board(corners_m: Vector) -> Vector:

@@ -6,9 +6,10 @@ Stamps are on the asking node's own clock (B's may be off by Scenario.clock_offs
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from node.sim import candidates, rotation, tags
@@ -21,6 +22,7 @@ from node.sim.scene import Lamp, Scene
 from node.sim.sensors import Sensors
 from node.sim.tags import Tag
 from protocol.messages import (
+    ArTag,
     Attitude,
     Candidates,
     Depth,
@@ -30,6 +32,8 @@ from protocol.messages import (
     TrueLight,
     Truth,
 )
+
+Triple: TypeAlias = tuple[float, float, float]
 
 SOFTWARE = "buddyline simulator"
 
@@ -47,6 +51,7 @@ class World:
         """Return a node's description; its lights are where they truly are."""
         s, index = self.scenario, self.scenario.index(node)
         rig = self._scene.rigs[index]
+        carried = [ArTag(id=tag.id, corners_m=_corners(tag.corners_m), family=tags.FAMILY) for tag in self.tags(node)]
         return NodeInfo(
             node=node,
             stamp_ns=stamp_ns,
@@ -61,6 +66,7 @@ class World:
             q_body_camera_xyzw=Q_BODY_CAMERA,
             depth_port_m=_triple(rig.depth_port_m),
             software=SOFTWARE,
+            tags=carried or UNSET,
         )
 
     def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:
@@ -164,5 +170,10 @@ class World:
         return self._painters[index]
 
 
-def _triple(vector: Vector) -> tuple[float, float, float]:
+def _corners(corners_m: Vector) -> tuple[Triple, Triple, Triple, Triple]:
+    top_left, top_right, bottom_right, bottom_left = map(_triple, corners_m)
+    return top_left, top_right, bottom_right, bottom_left
+
+
+def _triple(vector: Vector) -> Triple:
     return float(vector[0]), float(vector[1]), float(vector[2])

@@ -1,10 +1,9 @@
 """AR tags in simulated pictures, found by OpenCV where the truth says that they are."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
+from msgspec import UNSET
 
 from node.sim import rotation, tags
 from node.sim.camera import project
@@ -46,12 +45,15 @@ def test_tags_have_one_size_and_an_id_each():
     for tag in everything:
         sides_m = np.linalg.norm(np.roll(tag.corners_m, -1, axis=0) - tag.corners_m, axis=1)
         np.testing.assert_allclose(sides_m, tags.SIDE_M)
-    assert json.loads(tags.describe(1))[0]["corners_m"] == everything[2].corners_m.tolist()
+    infos = [World(Scenario(tags=True)).info(node, 0, S_NS) for node in "ab"]
+    assert [tag.id for info in infos for tag in info.tags] == [0, 1, 2, 3]
+    np.testing.assert_allclose(infos[1].tags[0].corners_m, everything[2].corners_m)
 
 
 def test_a_node_without_tags_has_none():
     world = World(Scenario(environment="basin", seed=12, interruptions=False))
     assert world.tags("a") == ()
+    assert world.info("a", 0, S_NS).tags is UNSET
     assert not _found(world.render("a", 4 * S_NS))
 
 
