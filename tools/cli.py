@@ -115,6 +115,12 @@ COMMANDS: Final = (
         ("buddyline report poses.mcap -o report.html",),
     ),
     Command(
+        "ros2",
+        "tools.ros2",
+        "let ROS 2 (rmw_zenoh) see attitudes, depths, poses and transforms",
+        ("buddyline ros2", "buddyline ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
+    ),
+    Command(
         "export",
         "tools.export",
         "write poses for other programs",
