@@ -17,22 +17,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from node.detect.rings import RAY_COS, RAY_SIN, RAYS, geometric, sample_rings
+from node.detect.rings import (
+    RAY_HARMONICS,
+    RAYS,
+    Floats,
+    geometric_radii,
+    sample_rings,
+)
 
-Floats: TypeAlias = NDArray[np.floating[Any]]
-
-_RINGS = 20
-_ROUNDS = 3
+_RINGS = 16
+_ROUNDS = 2
 _CLIPPED = 249.0
 _FLOOR_PX = 0.05
-_FIRST_HARMONICS = np.stack(
-    [np.ones(RAYS), RAY_COS, RAY_SIN, RAY_COS**2, RAY_COS * RAY_SIN, RAY_SIN**2], axis=1
-).astype(np.float32)
+_ROBUST_SD = 3.0
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
 MODEL: Mapping[str, float] = {
@@ -76,157 +77,156 @@ def locate_sources(
     shows there. weakest: (N,) whether the weakest channel is used, which clips last, or the luminance, which is
     sharper (JPEG halves the resolution of colour).
     """
-    n = len(start_px)
     prior_sd = model["core_share"] * radius_px + 0.5
-    centre = start_px.astype(np.float64)
-    covariance = np.eye(2) * (prior_sd**2)[:, None, None]
-    lean = np.zeros((n, 2))
-    if n == 0:
-        return Centres(centre.astype(np.float32), covariance.astype(np.float32), lean.astype(np.float32))
-    radius = geometric(
-        np.maximum(model["inner"] * radius_px, 0.7).astype(np.float32),
-        np.maximum(model["outer"] * radius_px, model["outer_min_px"]).astype(np.float32),
+    by_prior = np.eye(2, dtype=np.float32) * (prior_sd**2)[:, None, None]
+    centre = start_px.astype(np.float32)
+    covariance, lean = by_prior, np.zeros_like(centre)
+    radius = geometric_radii(
+        np.maximum(model["inner"] * radius_px, 0.7),
+        np.maximum(model["outer"] * radius_px, model["outer_min_px"]),
         _RINGS,
     )
     log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
-    scale = model.get("scale", image.shape[1] / 820.0)
-    growth = (
-        model["growth"]
-        - model["growth_veil"] * np.minimum(ground / 60.0, 1.0)
-        - model["growth_size"] * np.log(np.maximum(radius_px / scale, 3.0) / 12.0)
-    )
-    alive = np.ones(n, bool)
-    for _ in range(_ROUNDS):
-        rings = sample_rings(image, centre.astype(np.float32), radius)
-        level = _one_channel(rings.pixels, weakest)
-        step, step_covariance, step_lean, solved = _solve(
-            level, rings.inside, radius, log_step, ground, growth, prior_sd, start_px - centre, model
-        )
-        length = np.hypot(step[:, 0], step[:, 1])
-        step *= np.minimum(1.0, (0.6 * radius_px + 1.0) / np.maximum(length, 1e-9))[:, None]
+    growth = _growth(radius_px * 820.0 / model.get("width_px", image.shape[1]), ground, model)
+    alive = np.ones(len(centre), bool)
+    for i in range(_ROUNDS):
+        rings = sample_rings(image, centre, radius)
+        system = _Equations(_one_channel(rings.pixels, weakest), rings.inside, radius, log_step, ground, growth, model)
+        x, precision = system.solve(prior_sd, start_px - centre, robust=i == _ROUNDS - 1)
+        step = x[:, :2]
+        step *= np.minimum(1.0, (0.6 * radius_px + 1.0) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-6))[:, None]
         moved = centre + step
-        strayed = np.hypot(*(moved - start_px).T) > radius_px + 3.0
-        alive &= solved & ~strayed
+        away = moved - start_px
+        strayed = np.hypot(away[:, 0], away[:, 1]) > radius_px + 3.0
+        alive &= system.solvable & ~strayed
         centre = np.where(alive[:, None], moved, np.where(strayed[:, None], start_px, centre))
-        covariance = np.where(alive[:, None, None], step_covariance, covariance)
-        lean = np.where(alive[:, None], step_lean, lean)
+        covariance, lean = precision, x[:, 2:]
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
-    covariance = np.where(alive[:, None, None], covariance, np.eye(2) * (prior_sd**2)[:, None, None])
-    covariance = covariance + np.eye(2) * _FLOOR_PX**2
-    return Centres(centre.astype(np.float32), covariance.astype(np.float32), lean.astype(np.float32))
+    covariance = np.where(alive[:, None, None], covariance, by_prior) + np.eye(2) * _FLOOR_PX**2
+    return Centres(centre, covariance, np.where(alive[:, None], lean, 0.0))
+
+
+def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
+    """Give d ln w / d ln rho of a plain glow, (N,): less in veiled water, and less for larger discs.
+
+    radius_px: at a picture 820 px wide. A veil (bright ground in the weakest channel) tells turbid water, where
+    light scattered far from the beam hides the core's own, and large discs are mostly glow already.
+    """
+    veil = np.minimum(ground / 60.0, 1.0)
+    growth = (
+        model["growth"] - model["growth_veil"] * veil - model["growth_size"] * np.log(np.maximum(radius_px, 3.0) / 12.0)
+    )
+    return np.asarray(growth, np.float32)
 
 
 def _one_channel(pixels: Floats, weakest: NDArray[np.bool_]) -> Floats:
     """Give (N, M, K) levels from (N, M, K, C): the weakest channel where asked for, else the luminance."""
     if pixels.shape[3] == 1:
         return pixels[..., 0]
-    luma = pixels @ LUMA_BGR
-    weak = np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
-    return np.where(weakest[:, None, None], weak, luma)
+    luma: Floats = pixels @ LUMA_BGR
+    if weakest.any():
+        some = pixels[weakest]
+        luma[weakest] = np.minimum(np.minimum(some[..., 0], some[..., 1]), some[..., 2])
+    return luma
 
 
-def _solve(
-    level: Floats,
-    inside: NDArray[np.bool_],
-    radius: Floats,
-    log_step: Floats,
-    ground: Floats,
-    growth: Floats,
-    prior_sd: Floats,
-    prior_px: Floats,
-    model: Mapping[str, float],
-) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Solve for the step to the source (N, 2), its covariance (N, 2, 2), the lean (N, 2), and where that worked."""
-    above = level - ground[:, None, None]
-    usable = inside & (level < _CLIPPED) & (above > 3.0 * model["noise"])
-    above = np.maximum(above, 1.0)
-    log_level = np.log(above)
-    weight = usable / ((model["noise"] / above) ** 2 + model["model_noise"] ** 2)
+class _Equations:
+    """The linear equations of N lights, from levels on rings around their present centres."""
 
-    paired = usable[:, 2:] & usable[:, :-2]
-    count = paired.sum(axis=2)
-    slope = np.zeros(radius.shape, np.float32)
-    difference = (log_level[:, 2:] - log_level[:, :-2]) * paired
-    slope[:, 1:-1] = difference.sum(axis=2) / np.maximum(count, 1) / (2.0 * log_step[:, None])
-    seen = np.zeros(radius.shape, bool)
-    seen[:, 1:-1] = (count >= 0.4 * RAYS) & (usable[:, 1:-1].sum(axis=2) >= 0.5 * RAYS)
-    solved = seen.sum(axis=1) >= 4
-    weight *= seen[:, :, None]
+    def __init__(
+        self,
+        level: Floats,
+        inside: NDArray[np.bool_],
+        radius: Floats,
+        log_step: Floats,
+        ground: Floats,
+        growth: Floats,
+        model: Mapping[str, float],
+    ) -> None:
+        self._model = model
+        above = level - ground[:, None, None]
+        usable = inside & (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        np.maximum(above, 1.0, out=above)
+        self._y = np.log(above)
+        np.divide(model["noise"], above, out=above)
+        # Sums over rays as products with ones: many times faster than sums along the last axis.
+        ones = RAY_HARMONICS[:, 0]
+        used = usable.astype(np.float32)
+        self._weight = used / (above * above + model["model_noise"] ** 2)
+        paired = used[:, 2:] * used[:, :-2]
+        count = paired @ ones
+        difference = ((self._y[:, 2:] - self._y[:, :-2]) * paired) @ ones
+        seen = np.zeros(radius.shape, bool)
+        seen[:, 1:-1] = (count >= 0.4 * RAYS) & (used[:, 1:-1] @ ones >= 0.5 * RAYS)
+        falling = np.zeros(radius.shape, np.float32)
+        falling[:, 1:-1] = difference / np.maximum(count, 1) / (-2.0 * log_step[:, None])
+        falling[~seen] = 0.0
+        self._weight *= seen[:, :, None]
+        self._seen = seen
+        self._shift = falling / radius
+        self._log_step = log_step
+        plain = np.where(seen, np.clip(falling, 0.0, model["steep_max"]), 1.0)
+        self._growth = growth[:, None] + model["steepness"] * plain
+        self.solvable = seen.sum(axis=1) >= 4
 
-    steep = np.clip(np.where(seen, -slope, 1.0), 0.0, model["steep_max"])
-    shift = np.where(seen, -slope, 0.0) / radius
-    shares = [
-        _glow_share(growth[:, None] + k * model["growth_sd"] + model["steepness"] * steep, log_step, seen)
-        for k in (0.0, -1.0, 1.0)
-    ]
-    prior = np.zeros((len(radius), 4))
-    prior[:, :2] = (1.0 / prior_sd**2)[:, None]
-    prior[:, 2:] = 1.0 / model["lean_sd"] ** 2
-    wanted = np.zeros((len(radius), 4))
-    wanted[:, :2] = prior[:, :2] * prior_px
+    def solve(self, prior_sd: Floats, prior_px: Floats, robust: bool) -> tuple[Floats, Floats]:
+        """Solve for the step to the source and the lean, (N, 4), and the step's covariance (N, 2, 2).
 
-    sums, first = _ring_sums(weight, log_level)
-    x, _ = _least_squares(shift, shares[0], sums, first, prior, wanted, model["inflation"])
-    mean = np.where(sums[..., 0] > 0, first[..., 0] / np.maximum(sums[..., 0], 1e-9), 0.0)
-    u = shift * x[:, None, 0] + shares[0] * x[:, None, 2]
-    v = shift * x[:, None, 1] + shares[0] * x[:, None, 3]
-    residual = log_level - (mean[..., None] + u[..., None] * RAY_COS + v[..., None] * RAY_SIN).astype(np.float32)
-    weight = weight / (1.0 + weight * residual**2 / 9.0)
-    sums, first = _ring_sums(weight, log_level)
-    solutions = [_least_squares(shift, share, sums, first, prior, wanted, model["inflation"]) for share in shares]
-    middle, covariance = solutions[0]
-    apart = 0.5 * (solutions[2][0][:, :2] - solutions[1][0][:, :2])
-    total = covariance[:, :2, :2] + apart[:, :, None] * apart[:, None, :]
-    return middle[:, :2], total, middle[:, 2:], solved
+        prior_sd: (N,) and prior_px: (N, 2), where the source is expected. robust: weigh down what the model does not
+        explain (something in front, another light), and add the growth's own uncertainty.
+        """
+        share = self._glow_share(np.zeros(1, np.float32))
+        x, covariance = self._least_squares(share, prior_sd, prior_px)
+        if not robust:
+            return x[0], covariance[0]
+        u = self._shift * x[0, :, :1] + share[0] * x[0, :, 2:3]
+        v = self._shift * x[0, :, 1:2] + share[0] * x[0, :, 3:4]
+        mean = (self._weight * self._y) @ RAY_HARMONICS[:, 0]
+        mean /= np.maximum(self._weight @ RAY_HARMONICS[:, 0], 1e-6)
+        residual = self._y - np.stack([mean, u, v], axis=-1) @ RAY_HARMONICS[:, :3].T
+        self._weight /= 1.0 + self._weight * residual**2 * (1.0 / _ROBUST_SD**2)
+        sd = self._model["growth_sd"]
+        x, covariance = self._least_squares(self._glow_share(np.array([0.0, -sd, sd], np.float32)), prior_sd, prior_px)
+        apart = 0.5 * (x[2, :, :2] - x[1, :, :2])
+        return x[0], covariance[0] + apart[:, :, None] * apart[:, None, :]
+
+    def _glow_share(self, more_growth: Floats) -> Floats:
+        """Integrate d ln w / d ln rho along the rings, for S growths; w is 1 at the outermost ring seen, (S, N, M)."""
+        growth = np.maximum(self._growth + more_growth[:, None, None], -0.3)
+        log_share = np.zeros_like(growth)
+        steps = (growth[..., 1:] + growth[..., :-1]) * (0.5 * self._log_step[:, None])
+        np.cumsum(steps, axis=-1, out=log_share[..., 1:])
+        last = np.where(self._seen, log_share, -1e9).max(axis=-1, keepdims=True)
+        return np.asarray(np.exp(np.minimum(log_share - last, 0.0)), np.float32)
+
+    def _least_squares(self, share: Floats, prior_sd: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
+        """Solve for (s, k), (S, N, 4), for S shares, each ring's mean eliminated; and the covariances of s."""
+        sums = self._weight @ RAY_HARMONICS
+        first = (self._weight * self._y) @ RAY_HARMONICS[:, :3]
+        means = sums[..., 1:3] / np.maximum(sums[..., :1], 1e-6)
+        spread = sums[..., 3:]
+        spread[..., :2] -= sums[..., 1:2] * means
+        spread[..., 2] -= sums[..., 2] * means[..., 1]
+        level = first[..., 1:] - first[..., :1] * means
+        basis = np.empty((*share.shape[:2], 2, share.shape[2]), np.float32)
+        basis[:, :, 0] = self._shift
+        basis[:, :, 1] = share
+        products = np.empty((*share.shape[:2], 3, share.shape[2]), np.float32)
+        products[:, :, :2] = basis * self._shift[:, None]
+        products[:, :, 2] = share * share
+        # Neighbouring samples are correlated: the information is less than their number says.
+        less = 1.0 / self._model["inflation"]
+        g = (basis @ level).reshape(-1, 4) * less
+        a = (products @ spread).reshape(-1, 9)[:, _BLOCKS] * less
+        by_prior = np.tile(1.0 / prior_sd**2, len(share))[:, None]
+        g[:, :2] += by_prior * np.tile(prior_px, (len(share), 1))
+        a[:, (0, 1), (0, 1)] += by_prior
+        a[:, (2, 3), (2, 3)] += 1.0 / self._model["lean_sd"] ** 2
+        covariance = np.linalg.inv(a.astype(np.float64))
+        x = (covariance @ g[:, :, None])[:, :, 0].astype(np.float32)
+        shape = share.shape[:2]
+        return x.reshape(*shape, 4), covariance[:, :2, :2].reshape(*shape, 2, 2)
 
 
-def _glow_share(growth: Floats, log_step: Floats, seen: NDArray[np.bool_]) -> Floats:
-    """Integrate d ln w / d ln rho along the rings; w is 1 at the outermost ring that is seen, (N, M)."""
-    growth = np.maximum(growth, -0.3)
-    log_share = np.zeros_like(growth)
-    log_share[:, 1:] = np.cumsum(0.5 * (growth[:, 1:] + growth[:, :-1]), axis=1) * log_step[:, None]
-    last = np.where(seen, log_share, -np.inf).max(axis=1, keepdims=True)
-    last = np.where(np.isfinite(last), last, 0.0)
-    return np.exp(np.minimum(log_share - last, 0.0))
-
-
-def _ring_sums(weight: Floats, log_level: Floats) -> tuple[Floats, Floats]:
-    """Sum weights times 1, c, s, cc, cs, ss, and weighted levels times 1, c, s, over each ring's rays."""
-    sums = (weight @ _FIRST_HARMONICS).astype(np.float64)
-    first = ((weight * log_level) @ _FIRST_HARMONICS[:, :3]).astype(np.float64)
-    return sums, first
-
-
-def _least_squares(
-    shift: Floats,
-    share: Floats,
-    sums: Floats,
-    first: Floats,
-    prior: Floats,
-    wanted: Floats,
-    inflation: float,
-) -> tuple[Floats, Floats]:
-    """Solve for (s, k), (N, 4), with each ring's mean eliminated; neighbouring samples are correlated (inflation)."""
-    total = np.maximum(sums[..., 0], 1e-9)
-    c, s = sums[..., 1], sums[..., 2]
-    cc = sums[..., 3] - c * c / total
-    cs = sums[..., 4] - c * s / total
-    ss = sums[..., 5] - s * s / total
-    yc = first[..., 1] - first[..., 0] * c / total
-    ys = first[..., 2] - first[..., 0] * s / total
-    a = np.zeros((len(shift), 4, 4))
-    g = np.zeros((len(shift), 4))
-    basis = (shift.astype(np.float64), share.astype(np.float64))
-    for i in (0, 1):
-        g[:, 2 * i] = (basis[i] * yc).sum(axis=1)
-        g[:, 2 * i + 1] = (basis[i] * ys).sum(axis=1)
-        for j in (0, 1):
-            both = basis[i] * basis[j]
-            a[:, 2 * i, 2 * j] = (both * cc).sum(axis=1)
-            a[:, 2 * i, 2 * j + 1] = a[:, 2 * i + 1, 2 * j] = (both * cs).sum(axis=1)
-            a[:, 2 * i + 1, 2 * j + 1] = (both * ss).sum(axis=1)
-    a /= inflation
-    a[:, range(4), range(4)] += prior
-    covariance = np.linalg.inv(a)
-    x = (covariance @ (g / inflation + wanted)[:, :, None])[:, :, 0]
-    return x, covariance
+_BLOCKS = np.array([[0, 1, 3, 4], [1, 2, 4, 5], [3, 4, 6, 7], [4, 5, 7, 8]])
+"""Where the 4x4 normal matrix of (s_u, s_v, k_u, k_v) finds its entries in (ss, sw, ww) x (cc, cs, ss)."""

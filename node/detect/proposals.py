@@ -8,19 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_OCTAVES = 6
+_OCTAVES = 5
 _BASE_WIDTH_PX = 512
 _SMALLEST_PX = 5
 _CLUTTER_CELL = 4
+_WORD = 8
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
+_NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
 class Proposals:
     """Places to look at, the most outstanding first; arrays of length N.
 
-    u_px, v_px: in the whole picture. step_px: pixels of the picture per pixel of the octave it was found in.
+    centre_px: (N, 2) in the whole picture. step_px: pixels of the picture per pixel of the octave it was found in.
     contrast: centre minus surround, grey levels. clutter: mean contrast of the neighbourhood.
     """
 
@@ -29,103 +31,139 @@ class Proposals:
     contrast: NDArray[np.float32]
     clutter: NDArray[np.float32]
 
+    def at(self, index: NDArray[np.intp]) -> Proposals:
+        """Give some of them."""
+        return Proposals(self.centre_px[index], self.step_px[index], self.contrast[index], self.clutter[index])
+
+
+@dataclass(frozen=True, slots=True)
+class _Octave:
+    """Working memory of one octave. contrast and marks are parts of arrays that hold all octaves, end to end."""
+
+    level: NDArray[np.uint8]
+    centre: NDArray[np.uint8]
+    surround: NDArray[np.uint8]
+    contrast: NDArray[np.uint8]
+    marks: NDArray[np.uint8]
+    clutter: NDArray[np.uint8]
+
+    def mark_maxima(self, contrast_min: float) -> None:
+        """Mark the local maxima of centre minus surround, and measure the neighbourhoods' mean contrast."""
+        cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.centre)
+        cv2.blur(self.level, (9, 9), dst=self.surround)
+        cv2.subtract(self.centre, self.surround, dst=self.contrast)
+        coarse = halve(halve(self.contrast))
+        cv2.blur(coarse, (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
+        cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.centre)
+        cv2.compare(self.contrast, self.centre, cv2.CMP_EQ, dst=self.centre)
+        cv2.threshold(self.contrast, contrast_min - 0.5, 255, cv2.THRESH_BINARY, dst=self.surround)
+        cv2.bitwise_and(self.centre, self.surround, dst=self.marks)
+
 
 class ProposalFinder:
     """Local maxima of centre minus surround in a pyramid of the grey picture.
 
     A lamp stands alone, while caustics, glitter and texture come in fields: what the neighbourhood's mean contrast
-    explains does not count. The working memory is kept from picture to picture.
+    explains does not count.
     """
 
     def __init__(self) -> None:
         self._shape: tuple[int, ...] = ()
-        self._levels: list[dict[str, NDArray[np.uint8]]] = []
+        self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
+        self._marks = np.zeros(0, np.uint8)
+        self._contrast = np.zeros(0, np.uint8)
+        self._clutter = np.zeros(0, np.uint8)
+        self._table = np.zeros((0, 5), np.int64)
+        self._base_step_px = 1.0
 
     def find(self, image: NDArray[np.uint8], contrast_min: float, clutter_gain: float, limit: int) -> Proposals:
         """Find at most `limit` places in a (H, W, 3) BGR or (H, W) grey picture."""
         if image.shape != self._shape:
             self._allocate(image.shape)
-        level, step = self._base(image)
-        found = []
-        for buffers in self._levels:
-            if buffers["level"].shape != level.shape:
-                size = (buffers["level"].shape[1], buffers["level"].shape[0])
-                level = _u8(cv2.resize(level, size, dst=buffers["level"], interpolation=cv2.INTER_AREA))
-                step *= 2.0
-            found.append(_maxima(level, step, contrast_min, clutter_gain, buffers))
-        if not found:
-            empty = np.zeros(0, np.float32)
-            return Proposals(np.zeros((0, 2), np.float32), empty, empty, empty)
-        table = np.concatenate(found)
-        table = table[np.argsort(-table[:, 3] / (_NOISE + table[:, 4]), kind="stable")[:limit]]
-        return Proposals(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
+        above: NDArray[np.uint8] | None = None
+        for octave in self._octaves:
+            if above is None:
+                self._fill_base(image, octave.level)
+            else:
+                halve(above, octave.level)
+            above = octave.level
+            octave.mark_maxima(contrast_min)
+
+        # Empty places are passed over a machine word at a time.
+        places = (np.flatnonzero(self._marks.view(np.uint64))[:, None] * _WORD + np.arange(_WORD)).ravel()
+        places = places[self._marks[places] > 0]
+        which = np.searchsorted(self._table[:, 0], places, side="right") - 1
+        start, width, cell_start, cell_rows, cell_columns = self._table[which].T
+        rows, columns = np.divmod(places - start, width)
+        cells = (
+            cell_start
+            + np.minimum(rows // _CLUTTER_CELL, cell_rows - 1) * cell_columns
+            + np.minimum(columns // _CLUTTER_CELL, cell_columns - 1)
+        )
+        contrast = self._contrast[places].astype(np.float32)
+        clutter = self._clutter[cells].astype(np.float32)
+        order = np.argsort(-contrast / (_NOISE + clutter), kind="stable")
+        order = order[contrast[order] >= contrast_min + clutter_gain * clutter[order]][:limit]
+        step = np.float32(self._base_step_px) * np.exp2(which[order]).astype(np.float32)
+        at = np.stack([columns[order], rows[order]], axis=1).astype(np.float32)
+        return Proposals((at + 0.5) * step[:, None] - 0.5, step, contrast[order], clutter[order])
+
+    @property
+    def base(self) -> tuple[NDArray[np.uint8], float]:
+        """The last picture's grey at the pyramid's base, and its step in px; only where proposals were found."""
+        return self._octaves[0].level, self._base_step_px
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
         self._shape = shape
         self._halves = []
         height, width = shape[:2]
-        if min(height, width) >= 2 * _SMALLEST_PX:
-            while width > _BASE_WIDTH_PX:
-                height, width = height // 2, width // 2
-                colours = shape[2:] if not self._halves else ()
-                self._halves.append(np.empty((height, width, *colours), np.uint8))
-        self._levels = []
-        while min(height, width) >= _SMALLEST_PX and len(self._levels) < _OCTAVES:
-            names = ("level", "centre", "surround", "contrast", "expected", "top", "mask")
-            self._levels.append({name: np.empty((height, width), np.uint8) for name in names})
+        self._base_step_px = 1.0
+        while width > _BASE_WIDTH_PX and height >= 2 * _SMALLEST_PX:
             height, width = height // 2, width // 2
+            self._base_step_px *= 2.0
+            colours = shape[2:] if not self._halves else ()
+            self._halves.append(np.empty((height, width, *colours), np.uint8))
+        sizes: list[tuple[int, int]] = []
+        while min(height, width) >= _SMALLEST_PX and len(sizes) < _OCTAVES:
+            sizes.append((height, width))
+            height, width = height // 2, width // 2
+        cells = [(max(h // 2 // 2, 1), max(w // 2 // 2, 1)) for h, w in sizes]
+        starts = np.cumsum([0, *(h * w for h, w in sizes)])
+        cell_starts = np.cumsum([0, *(h * w for h, w in cells)])
+        self._marks = np.zeros(-(-int(starts[-1]) // _WORD) * _WORD, np.uint8)
+        self._contrast = np.zeros(int(starts[-1]), np.uint8)
+        self._clutter = np.zeros(int(cell_starts[-1]), np.uint8)
+        self._table = np.array(
+            [(s, w, cs, *c) for s, (_, w), cs, c in zip(starts, sizes, cell_starts, cells, strict=False)], np.int64
+        ).reshape(-1, 5)
+        self._octaves = [
+            _Octave(
+                np.empty(size, np.uint8),
+                np.empty(size, np.uint8),
+                np.empty(size, np.uint8),
+                self._contrast[start : start + size[0] * size[1]].reshape(size),
+                self._marks[start : start + size[0] * size[1]].reshape(size),
+                self._clutter[cell_start : cell_start + cell[0] * cell[1]].reshape(cell),
+            )
+            for start, size, cell_start, cell in zip(starts, sizes, cell_starts, cells, strict=False)
+        ]
 
-    def _base(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-        """Give the grey picture at the pyramid's base; its step in px. Colours are merged after the first halving."""
+    def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
+        """Halve down to the pyramid's base; colours merge after the first halving."""
         level = image
-        step = 1.0
         for half in self._halves:
-            level = _u8(cv2.resize(level, half.shape[1::-1], dst=half, interpolation=cv2.INTER_AREA))
-            step *= 2.0
+            level = halve(level, half)
             if level.ndim == 3:
-                level = _u8(cv2.cvtColor(level, cv2.COLOR_BGR2GRAY))
+                level = np.asarray(cv2.cvtColor(level, cv2.COLOR_BGR2GRAY), np.uint8)
         if level.ndim == 3:
-            level = _u8(cv2.cvtColor(level, cv2.COLOR_BGR2GRAY))
-        return level, step
+            cv2.cvtColor(level, cv2.COLOR_BGR2GRAY, dst=base)
+        else:
+            base[...] = level
 
 
-def _u8(array: object) -> NDArray[np.uint8]:
-    return np.asarray(array, np.uint8)
-
-
-def _maxima(
-    level: NDArray[np.uint8],
-    step: float,
-    contrast_min: float,
-    clutter_gain: float,
-    buffers: dict[str, NDArray[np.uint8]],
-) -> NDArray[np.float32]:
-    """Give (N, 5): u_px, v_px, step_px, contrast, clutter of one octave's local maxima."""
-    height, width = level.shape
-    centre = cv2.GaussianBlur(level, (3, 3), 0, dst=buffers["centre"])
-    surround = cv2.blur(level, (9, 9), dst=buffers["surround"])
-    contrast = _u8(cv2.subtract(centre, surround, dst=buffers["contrast"]))
-    cells = (max(1, width // _CLUTTER_CELL), max(1, height // _CLUTTER_CELL))
-    coarse = cv2.resize(contrast, cells, interpolation=cv2.INTER_AREA)
-    clutter = _u8(cv2.blur(coarse, (_CLUTTER_CELLS, _CLUTTER_CELLS)))
-    expected = cv2.resize(
-        cv2.convertScaleAbs(clutter, alpha=clutter_gain),
-        (width, height),
-        dst=buffers["expected"],
-        interpolation=cv2.INTER_LINEAR,
-    )
-    excess = cv2.subtract(contrast, expected, dst=buffers["centre"])
-    top = cv2.dilate(excess, np.ones((5, 5), np.uint8), dst=buffers["top"])
-    mask = cv2.compare(excess, top, cv2.CMP_EQ, dst=buffers["mask"])
-    _, strong = cv2.threshold(excess, contrast_min - 0.5, 255, cv2.THRESH_BINARY, dst=buffers["surround"])
-    rows, columns = np.nonzero(cv2.bitwise_and(mask, strong, dst=mask))
-    cell_rows = np.minimum(rows // _CLUTTER_CELL, clutter.shape[0] - 1)
-    cell_columns = np.minimum(columns // _CLUTTER_CELL, clutter.shape[1] - 1)
-    table = np.empty((len(rows), 5), np.float32)
-    table[:, 0] = (columns + 0.5) * step - 0.5
-    table[:, 1] = (rows + 0.5) * step - 0.5
-    table[:, 2] = step
-    table[:, 3] = contrast[rows, columns]
-    table[:, 4] = clutter[cell_rows, cell_columns]
-    return table
+def halve(image: NDArray[np.uint8], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
+    """Average 2x2 pixels; an odd last row or column is left out, which keeps to OpenCV's fast path."""
+    height, width = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
+    even = image[: 2 * height, : 2 * width]
+    return np.asarray(cv2.resize(even, (width, height), dst=into, interpolation=cv2.INTER_AREA), np.uint8)

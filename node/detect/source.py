@@ -14,10 +14,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from node.detect.centre import LUMA_BGR, MODEL, Centres, locate_sources
+from node.detect.centre import LUMA_BGR, Centres, locate_sources
 from node.detect.detection import Detection, check_image
 from node.detect.proposals import ProposalFinder, Proposals
-from node.detect.rings import RAY_COS, RAY_SIN, Regions, find_regions, geometric, sample_rings
+from node.detect.rings import (
+    RAY_COS,
+    RAY_SIN,
+    Floats,
+    follow_edges,
+    geometric_radii,
+    measure_shapes,
+    sample_rings,
+)
 from protocol.messages import Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
@@ -29,25 +37,33 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     }
 )
 _AUTO: Final = {"contrast_min": 5.0, "clutter_gain": 2.0}
-_MAX_PROPOSALS: Final = 20
-_MAX_LOCATED: Final = 10
+_MAX_PROPOSALS: Final = 24
+_MAX_MEASURED: Final = 12
 _MAX_FOUND: Final = 8
+_CORE_RINGS: Final = 7
 _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
 
 
 @dataclass(frozen=True, slots=True)
 class _Lights:
-    """What the rings tell about N proposals; arrays of length N."""
+    """What the rings tell about N proposals.
 
-    centre_px: NDArray[np.float32]
-    core_px: NDArray[np.float32]
-    ground: NDArray[np.float32]
+    centre_px: (N, 2) and core_px: (N,) of the brightest region in the channel that locates; ground: (N,) what the
+    water itself shows in that channel; weakest: (N,) whether that is the weakest one. peak: (N,) luminance. edge_px:
+    (N, K) outline at half height around edge_at_px (N, 2). features: (N, F), see _FEATURES.
+    """
+
+    centre_px: Floats
+    core_px: Floats
+    ground: Floats
     weakest: NDArray[np.bool_]
-    peak: NDArray[np.float32]
-    outline: Regions
-    outline_at_px: NDArray[np.float32]
-    features: NDArray[np.float32]
+    peak: Floats
+    edge_px: Floats
+    edge_at_px: Floats
+    area_px: Floats
+    elongation: Floats
+    features: Floats
 
 
 class SourceDetector:
@@ -63,142 +79,160 @@ class SourceDetector:
         proposals = self._finder.find(image, self._values["contrast_min"], self._values["clutter_gain"], _MAX_PROPOSALS)
         if len(proposals.step_px) == 0:
             return []
-        lights = _measure(image, proposals)
+        centre, radius_px, kept = _settle(*self._finder.base, proposals)
+        lights = _measure(image, centre, radius_px, proposals.at(kept))
         score = _score(lights.features)
-        chosen = _distinct(lights, score)[:_MAX_LOCATED]
+        order = np.argsort(-score, kind="stable")
+        chosen = order[_distinct(lights.centre_px[order], lights.core_px[order])][:_MAX_FOUND]
         found = locate_sources(
             image,
             lights.centre_px[chosen],
             lights.core_px[chosen],
             lights.ground[chosen],
             lights.weakest[chosen],
-            MODEL,
         )
-        height, width = image.shape[:2]
-        detections = [
-            _detection(lights, found, score, i, j)
-            for i, j in enumerate(chosen)
-            if -0.5 <= found.centre_px[i, 0] <= width - 0.5 and -0.5 <= found.centre_px[i, 1] <= height - 0.5
-        ]
-        return detections[:_MAX_FOUND]
+        return _detections(lights, found, score, chosen, image.shape)
 
 
-def _measure(image: NDArray[np.uint8], proposals: Proposals) -> _Lights:
-    """Follow each proposal's outline, first around where it was found, then around its own centre."""
-    step = proposals.step_px
-    radius = geometric(0.35 * step, 7.0 * step, 14)
-    rings = sample_rings(image, proposals.centre_px, radius)
-    level = _luma(rings.pixels)
-    peak = level[:, :8].max(axis=(1, 2))
+def _settle(base: NDArray[np.uint8], base_step: float, proposals: Proposals) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Move each proposal to the middle of its bright region, and leave out those that end up in one.
+
+    base: the pyramid's grey base, of base_step px a pixel. Returns centres (N, 2) and radii (N,) in px of the whole
+    picture, and which proposals they are.
+    """
+    step = proposals.step_px / np.float32(base_step)
+    at = (proposals.centre_px + 0.5) / np.float32(base_step) - 0.5
+    radius = geometric_radii(0.35 * step, 7.0 * step, 12)
+    level = sample_rings(base, at, radius).pixels[..., 0]
+    peak = level[:, :7].max(axis=(1, 2))
     ground = _low(level[:, -4:], 0.2)
-    region = find_regions(level, radius, ground + 0.8 * (np.minimum(peak, _CLIPPED) - ground))
-    centre = proposals.centre_px + region.centre_px
+    edge, _ = follow_edges(level, radius, ground + 0.8 * (np.minimum(peak, _CLIPPED) - ground))
+    shape = measure_shapes(edge)
+    centre = (at + shape.centre_px + 0.5) * np.float32(base_step) - 0.5
+    radius_px = shape.radius_px * np.float32(base_step)
+    kept = _distinct(centre, radius_px)[:_MAX_MEASURED]
+    return centre[kept], radius_px[kept], kept
 
-    radius = geometric(np.maximum(0.3 * region.radius_px, 0.5), np.maximum(5.0 * region.radius_px, 12.0), 20)
-    rings = sample_rings(image, centre, radius)
-    level = _luma(rings.pixels)
-    core = radius <= np.maximum(1.5 * region.radius_px, 1.5)[:, None]
-    peak = np.where(core[:, :, None], level, 0.0).max(axis=(1, 2))
-    ground = _low(level[:, -5:], 0.2)
-    top = np.minimum(peak, _CLIPPED)
-    bright = find_regions(level, radius, ground + 0.8 * (top - ground))
-    half = find_regions(level, radius, ground + 0.5 * (top - ground))
-    low = find_regions(level, radius, ground + 0.25 * (top - ground))
-    weakest = np.zeros(len(step), bool)
-    start, core_px, below = centre + bright.centre_px, bright.radius_px, ground
+
+def _distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
+    """Leave out what lies inside an earlier one; give the indices of the rest."""
+    apart = np.hypot(centre_px[:, None, 0] - centre_px[:, 0], centre_px[:, None, 1] - centre_px[:, 1])
+    same = (apart < np.maximum(0.7 * np.maximum(radius_px[:, None], radius_px), 2.0)).tolist()
+    kept: list[int] = []
+    for i, row in enumerate(same):
+        if not any(row[k] for k in kept):
+            kept.append(i)
+    return np.array(kept, np.intp)
+
+
+def _measure(image: NDArray[np.uint8], centre: Floats, radius_px: Floats, proposals: Proposals) -> _Lights:
+    """Follow the outlines of N bright regions, given roughly by centre_px (N, 2) and radius_px (N,)."""
+    radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), 16)
+    pixels = sample_rings(image, centre, radius).pixels
+    level = _luma(pixels)
+    peak = level[:, :_CORE_RINGS].max(axis=(1, 2))
+    ground = _low(level[:, -4:], 0.2)
+    height = np.minimum(peak, _CLIPPED) - ground
+    levels, thresholds = [level] * 3, [ground + share * height for share in (0.8, 0.5, 0.25)]
+    weak_ground = ground
     if image.ndim == 3:
-        weak = rings.pixels.min(axis=3)
-        water = float(np.percentile(image[::16, ::16].min(axis=2), 20))
-        weak_peak = np.where(core[:, :, None], weak, 0.0).max(axis=(1, 2))
-        weak_ground = np.minimum(_low(weak[:, -5:], 0.15), water)
-        weak_region = find_regions(weak, radius, weak_ground + 0.8 * (np.minimum(weak_peak, _CLIPPED) - weak_ground))
-        weakest = weak_region.radius_px >= _WEAKEST_FROM_PX
-        start = np.where(weakest[:, None], centre + weak_region.centre_px, start)
-        core_px = np.where(weakest, weak_region.radius_px, core_px)
-        below = np.where(weakest, weak_ground, ground)
-    features = np.stack(
-        [
-            np.log(proposals.contrast / (4.0 + proposals.clutter)),
-            np.log(np.maximum(peak - ground, 1.0) / 50.0),
-            half.elongation - 1.0,
-            half.open_share,
-            np.log(half.radius_px / bright.radius_px),
-            np.log(low.radius_px / half.radius_px),
-            np.log(half.radius_px * 820.0 / image.shape[1]),
-            np.log(1.0 + proposals.clutter),
-            low.elongation - 1.0,
-            low.open_share,
-            peak / 255.0,
-            ground / 255.0,
-        ],
-        axis=1,
+        weak = np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
+        weak_ground = np.minimum(_low(weak[:, -4:], 0.15), _water_level(image))
+        weak_peak = np.minimum(weak[:, :_CORE_RINGS].max(axis=(1, 2)), _CLIPPED)
+        levels.append(weak)
+        thresholds.append(weak_ground + 0.8 * (weak_peak - weak_ground))
+    edge, open_share = follow_edges(
+        np.concatenate(levels), np.concatenate([radius] * len(levels)), np.concatenate(thresholds)
     )
+    shapes = measure_shapes(edge)
+    n = len(radius_px)
+    bright, half, low, last = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), slice(-n, None)
+    weakest = shapes.radius_px[last] >= _WEAKEST_FROM_PX if image.ndim == 3 else np.zeros(n, bool)
+    start = centre + np.where(weakest[:, None], shapes.centre_px[last], shapes.centre_px[bright])
+    elongation = shapes.elongation[half]
+    features = np.empty((n, 12), np.float32)
+    features[:, 0] = np.log(proposals.contrast / (4.0 + proposals.clutter))
+    features[:, 1] = np.log(np.maximum(height, 1.0) / 50.0)
+    features[:, 2] = elongation - 1.0
+    features[:, 3] = open_share[half]
+    features[:, 4] = np.log(shapes.radius_px[half] / shapes.radius_px[bright])
+    features[:, 5] = np.log(shapes.radius_px[low] / shapes.radius_px[half])
+    features[:, 6] = np.log(shapes.radius_px[half] * (820.0 / image.shape[1]))
+    features[:, 7] = np.log(1.0 + proposals.clutter)
+    features[:, 8] = shapes.elongation[low] - 1.0
+    features[:, 9] = open_share[low]
+    features[:, 10] = peak / 255.0
+    features[:, 11] = ground / 255.0
     return _Lights(
-        start.astype(np.float32),
-        core_px.astype(np.float32),
-        below.astype(np.float32),
+        start,
+        np.where(weakest, shapes.radius_px[last], shapes.radius_px[bright]),
+        np.where(weakest, weak_ground, ground),
         weakest,
         peak,
-        half,
-        centre.astype(np.float32),
-        features.astype(np.float32),
+        edge[half],
+        centre,
+        np.pi * shapes.radius_px[half] ** 2,
+        elongation,
+        features,
     )
 
 
-def _luma(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    luma: NDArray[np.float32] = pixels[..., 0] if pixels.shape[3] == 1 else pixels @ LUMA_BGR
+def _water_level(image: NDArray[np.uint8]) -> Floats:
+    """Give what a fifth of a BGR picture lies below, in the weakest channel."""
+    coarse = image[::16, ::16]
+    weak = np.minimum(np.minimum(coarse[..., 0], coarse[..., 1]), coarse[..., 2]).ravel()
+    k = len(weak) // 5
+    return np.asarray(np.partition(weak, k)[k], np.float32)
+
+
+def _luma(pixels: Floats) -> Floats:
+    luma: Floats = pixels[..., 0] if pixels.shape[3] == 1 else pixels @ LUMA_BGR
     return luma
 
 
-def _low(level: NDArray[np.float32], share: float) -> NDArray[np.float32]:
+def _low(level: Floats, share: float) -> Floats:
     """Give the level that a share of each place's samples lies below, (N,)."""
     flat = level.reshape(len(level), -1)
     k = int(share * flat.shape[1])
     return np.partition(flat, k, axis=1)[:, k]
 
 
-def _score(features: NDArray[np.float32]) -> NDArray[np.float32]:
+def _score(features: Floats) -> Floats:
     """Give each proposal's probability of being a lamp, (N,)."""
     logit = -2.0 + 1.5 * features[:, 0] + 1.0 * features[:, 1] - 1.0 * features[:, 2] - 2.0 * features[:, 3]
-    score: NDArray[np.float32] = 1.0 / (1.0 + np.exp(-logit))
+    score: Floats = 1.0 / (1.0 + np.exp(-logit))
     return score
 
 
-def _distinct(lights: _Lights, score: NDArray[np.float32]) -> NDArray[np.intp]:
-    """Order by score and leave out what lies inside a likelier light."""
-    order = np.argsort(-score, kind="stable")
-    kept: list[int] = []
-    for i in order:
-        apart = np.hypot(*(lights.centre_px[kept] - lights.centre_px[i]).T)
-        inside = np.maximum(0.7 * np.maximum(lights.core_px[kept], lights.core_px[i]), 2.0)
-        if not (apart < inside).any():
-            kept.append(int(i))
-    return np.array(kept, np.intp)
-
-
-def _detection(lights: _Lights, found: Centres, score: NDArray[np.float32], i: int, j: int) -> Detection:
-    centre = found.centre_px[i].astype(np.float64)
-    edge = lights.outline.edge_px[j]
-    outline = np.stack([edge * RAY_COS, edge * RAY_SIN], axis=1) + lights.outline_at_px[j]
-    lean = found.lean[i]
-    ahead = (outline - centre) @ lean
-    far = outline[int(ahead.argmax())]
-    f = lights.features[j]
-    sigma = float(np.sqrt(0.5 * np.trace(found.covariance_px2[i])))
-    return Detection(
-        blob=Blob(
-            u_px=float(centre[0]),
-            v_px=float(centre[1]),
-            sigma_px=sigma,
-            area_px=float(np.pi * lights.outline.radius_px[j] ** 2),
-            peak=float(min(lights.peak[j], 255.0)),
-            elongation=float(lights.outline.elongation[j]),
-            score=float(score[j]),
-        ),
-        outline_px=outline.astype(np.float64),
-        axis_px=np.array([centre, far], np.float64),
-        why=(
-            f"stands out {float(np.exp(f[0])):.1f}x, +{50 * float(np.exp(f[1])):.0f} grey levels, "
-            f"core {float(lights.core_px[j]):.1f} px, lean {float(np.hypot(*lean)):.1f}"
-        ),
-    )
+def _detections(
+    lights: _Lights, found: Centres, score: Floats, chosen: NDArray[np.intp], shape: tuple[int, ...]
+) -> list[Detection]:
+    """Put the findings into words and figures; what lies outside the picture is dropped."""
+    centre = found.centre_px.astype(np.float64)
+    edge = lights.edge_px[chosen]
+    outline = np.stack([edge * RAY_COS, edge * RAY_SIN], axis=2) + lights.edge_at_px[chosen][:, None]
+    ahead = np.matmul(outline - centre[:, None], found.lean[:, :, None])[:, :, 0]
+    far = outline[np.arange(len(chosen)), ahead.argmax(axis=1)]
+    sigma = np.sqrt(0.5 * np.trace(found.covariance_px2, axis1=1, axis2=2)).tolist()
+    lean = np.hypot(found.lean[:, 0], found.lean[:, 1]).tolist()
+    table = np.stack(
+        [
+            lights.area_px,
+            np.minimum(lights.peak, 255.0),
+            lights.elongation,
+            score,
+            np.exp(lights.features[:, 0]),
+            50.0 * np.exp(lights.features[:, 1]),
+            lights.core_px,
+        ],
+        axis=1,
+    )[chosen].tolist()
+    detections = []
+    for i, (u, v) in enumerate(centre.tolist()):
+        if not (-0.5 <= u <= shape[1] - 0.5 and -0.5 <= v <= shape[0] - 0.5):
+            continue
+        area, peak, elongation, likely, stands_out, height, core = table[i]
+        blob = Blob(u_px=u, v_px=v, sigma_px=sigma[i], area_px=area, peak=peak, elongation=elongation, score=likely)
+        why = f"stands out {stands_out:.1f}x, +{height:.0f} levels, core {core:.1f} px, lean {lean[i]:.1f}"
+        detections.append(Detection(blob, outline[i], np.array([centre[i], far[i]]), why))
+    return detections
