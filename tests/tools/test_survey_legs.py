@@ -131,6 +131,19 @@ def test_a_handled_node_is_not_at_rest(messages):
     assert len(derived(shaken).legs) == 4
 
 
+def test_a_rest_too_short_for_a_leg_is_said(messages):
+    third = derived(messages).legs[2]
+    middle = (third.start_ns + third.end_ns) // 2
+    cut = [
+        message
+        for message in messages
+        if not (isinstance(message, RelativePose) and middle <= message.stamp_ns <= third.end_ns)
+    ]
+    found = derived(cut)
+    assert len(found.legs) == 4
+    assert any("makes no leg" in problem.text for problem in found.problems)
+
+
 def test_swimming_is_not_rest(messages):
     readings = of_messages(messages)
     for rest in rests(readings, sights(readings, SurveySettings()), SurveySettings()):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from protocol.messages import Mark
 from tools.survey import alarms
 from tools.survey.averages import Mean
 from tools.survey.chain import BOTH, Standing, Stop, Who, stand
@@ -22,7 +22,7 @@ from tools.survey.shots import Shot, Sight, shoot
 from tools.survey.sights import Sights, sights
 
 # A mark this far from any rest says nothing of one.
-MARK_NEAR_NS: Final = 60_000_000_000
+MARK_NEAR_NS: Final = 20_000_000_000
 
 
 class Derived:
@@ -77,7 +77,11 @@ class _OneDive:
         self.first: Who = self.who.get(settings.first, "a")
 
     def derive(self) -> None:
-        found = rests(self.readings, self.seen, self.settings)
+        every = rests(self.readings, self.seen, self.settings)
+        found = [one for one in every if not one.too_short]
+        for one in every:
+            if one.too_short:
+                self._say(f"rest at {_time_text(one.start_ns)} makes no leg: {one.too_short}")
         shots = [shoot(self.readings, self.seen, one.chosen, self.settings, one.unused) for one in found]
         named = self._named(found)
         stops = [
@@ -104,18 +108,20 @@ class _OneDive:
         named: list[dict[Who, str]] = [{} for _ in found]
         for mark in self.readings.marks:
             if mark.kind == "note" and mark.note:
-                self._say(f"note at {_time_text(mark)}: {mark.note}")
+                self._say(f"note at {_time_text(mark.stamp_ns)}: {mark.note}")
             if mark.kind != "station" or mark.node not in self.who:
                 continue
             if not STATION_NAME.match(mark.name):
-                self._say(f"mark at {_time_text(mark)}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -")
+                self._say(
+                    f"mark at {_time_text(mark.stamp_ns)}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -"
+                )
                 continue
             if mark.note and mark.note not in self.out.notes[mark.name]:
                 self.out.notes[mark.name].append(mark.note)
             gaps = [max(one.start_ns - mark.stamp_ns, mark.stamp_ns - one.end_ns, 0) for one in found]
             if not gaps or min(gaps) > MARK_NEAR_NS:
                 if not any(other.kind == "point" for other in self.readings.marks):
-                    self._say(f"mark {mark.name} at {_time_text(mark)}: no rest near it")
+                    self._say(f"mark {mark.name} at {_time_text(mark.stamp_ns)}: no rest near it")
                 continue
             named[gaps.index(min(gaps))][self.who[mark.node]] = mark.name
         return named
@@ -213,10 +219,8 @@ def _value(mean: Mean | None) -> float | None:
     return mean.value if mean else None
 
 
-def _time_text(mark: Mark) -> str:
-    from datetime import UTC, datetime
-
-    return datetime.fromtimestamp(mark.stamp_ns // 1_000_000_000, UTC).isoformat().replace("+00:00", "Z")
+def _time_text(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).isoformat().replace("+00:00", "Z")
 
 
 def ranges(triggers: list[int]) -> str:

@@ -78,7 +78,7 @@ class LiveAlarms:
         readings = of_messages(self._messages())
         found = self._field_alarms(readings, pose.stamp_ns)
         seen = sights(readings, self._settings)
-        resting = rests(readings, seen, self._settings)
+        resting = [one for one in rests(readings, seen, self._settings) if not one.too_short]
         if resting:
             shot = shoot(readings, seen, resting[-1].chosen, self._settings)
             leg = one_leg(shot, readings.nodes)
@@ -109,14 +109,20 @@ class LiveAlarms:
         return Mark(node=node, stamp_ns=stamp_ns, kind="alarm", name=check, note=what)
 
 
-class _Watch:
-    """The alarms on a bus."""
+class Watch:
+    """The alarms on a bus: attached, it listens to the pair and publishes marks."""
 
     def __init__(self, bus: Bus) -> None:
         self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
         self._bus = bus
         self._publishers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
+
+    def attach(self) -> None:
+        """Subscribe."""
+        self._bus.subscribe(INFO.key_any(), self.receive)
+        for topic in (ATTITUDE, DEPTH, IMU, POSE):
+            self._bus.subscribe(topic.key_any(), self.receive, capacity=4096, history=False)
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus."""
@@ -156,9 +162,6 @@ def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
         return service.join()
     with bus:
         bus.on_failure(lambda error: service.fail("bus", error))
-        watch = _Watch(bus)
-        bus.subscribe(INFO.key_any(), watch.receive)
-        for topic in (ATTITUDE, DEPTH, IMU, POSE):
-            bus.subscribe(topic.key_any(), watch.receive, capacity=4096, history=False)
+        Watch(bus).attach()
         service.wait(seconds)
     return service.join()

@@ -283,7 +283,7 @@ logs = {logs}
 
 def _toml(tables: dict[str, list[Any]]) -> str:
     """Write arrays of tables, of structs or dicts whose values are scalars, lists of them, or flat dicts."""
-    lines: list[str] = field(default_factory=list)
+    lines: list[str] = []
     for name, rows in tables.items():
         for row in rows:
             lines.append(f"\n[[{name}]]")

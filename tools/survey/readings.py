@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -167,9 +168,14 @@ def _node(info: NodeInfo, attitude: dict[int, Attitude], depth: dict[int, Depth]
 
 
 def of_logs(paths: list[str]) -> Readings:
-    """Read a solved dive: its poses, and the nodes' own logs for what those lack (IMU, marks)."""
-    with Dive(paths) as dive:
-        return of_messages(_messages(dive), dive.name)
+    """Read a solved dive: its poses, and the nodes' own logs for what those lack (IMU, marks).
+
+    The solved log goes first: where it was solved with another calibration than the nodes', its own holds.
+    """
+    with ExitStack() as stack:
+        dives = [stack.enter_context(Dive([path])) for path in paths]
+        dives.sort(key=lambda dive: not dive.nodes("pose"))
+        return of_messages((message for dive in dives for message in _messages(dive)), ", ".join(map(str, paths)))
 
 
 def _messages(dive: Dive) -> Iterator[Message]:

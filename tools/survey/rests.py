@@ -27,25 +27,36 @@ GRAVITY_MPS2: Final = 9.80665
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Fixes at one rest of the pair: chosen (n,) of the dive's; unused: triggers in its time, by reason."""
+    """Fixes at one rest of the pair: chosen (n,) of the dive's; unused: triggers in its time, by reason.
+
+    too_short: what it lacks to make a leg, in words; empty where it makes one.
+    """
 
     chosen: Bools
     start_ns: int
     end_ns: int
     line_m: Floats
+    too_short: str = ""
     unused: dict[str, list[int]] = field(default_factory=dict)
 
 
 def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Rest]:
-    """Return the rests of a dive in their order: at least rest_s long, with at least rest_fixes fixes."""
+    """Return the rests of a dive in their order; too_short where not rest_s long with rest_fixes fixes.
+
+    What is shorter than half of that is no rest, but a swimmer's pause.
+    """
     held = handled(readings.a, seen.stamps_ns, settings), handled(readings.b, seen.stamps_ns, settings)
     still = (speeds_mps(seen) < settings.rest_speed_mps + WANDER_RADPS * seen.range_m) & ~held[0] & ~held[1]
     runs = _merged(_runs(seen.stamps_ns, still), seen)
     found = []
     for run in runs:
         start_ns, end_ns = int(seen.stamps_ns[run[0]]), int(seen.stamps_ns[run[-1]])
-        if len(run) < settings.rest_fixes or end_ns - start_ns < settings.rest_s * 1e9:
+        seconds = (end_ns - start_ns) / 1e9
+        if len(run) < settings.rest_fixes / 2 or seconds < settings.rest_s / 2:
             continue
+        too_short = ""
+        if len(run) < settings.rest_fixes or seconds < settings.rest_s:
+            too_short = f"{seconds:.0f} s with {len(run)} fixes"
         chosen = np.zeros(len(seen.stamps_ns), dtype=bool)
         chosen[run] = True
         inside = (seen.stamps_ns >= start_ns) & (seen.stamps_ns <= end_ns) & ~chosen
@@ -53,7 +64,7 @@ def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Re
         for one in readings.rejected:
             if start_ns <= one.stamp_ns <= end_ns:
                 unused.setdefault(one.reason, []).append(one.trigger)
-        found.append(Rest(chosen, start_ns, end_ns, _line_m(seen, run), unused))
+        found.append(Rest(chosen, start_ns, end_ns, _line_m(seen, run), too_short, unused))
     return found
 
 

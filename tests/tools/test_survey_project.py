@@ -1,0 +1,222 @@
+"""The project file and the commands: what people write stays, what dives give is made anew."""
+
+import argparse
+import csv
+import json
+import threading
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from protocol.config import ConfigError
+from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.local_bus import LocalNetwork
+from protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose, decode
+from protocol.topics import MARK, key_of, parse_key
+from tests.tools import survey_world as world
+from tools.survey import command, mark
+from tools.survey.live import Watch
+from tools.survey.project import MARKER, load_project
+
+COURSE = world.line(np.random.default_rng(2), 3)
+
+
+@pytest.fixture(scope="module")
+def messages():
+    return world.dive(COURSE, np.random.default_rng(7), rest_s=9.0, swim_s=1.0)
+
+
+@pytest.fixture
+def logs(tmp_path, messages):
+    """Return a solved log and a node's own, as names; the IMU and a mark are in the node's alone."""
+    with DiveLogWriter(tmp_path / "solved.mcap") as writer:
+        for message in messages:
+            if not isinstance(message, Imu):
+                writer.write_message(message)
+    with DiveLogWriter(tmp_path / "a.mcap") as writer:
+        for message in messages:
+            if isinstance(message, Imu):
+                writer.write_message(message)
+        writer.write_message(Mark(node="a", stamp_ns=world.START_NS + 6 * 10**9, name="entry", note="chain"))
+    return [str(tmp_path / name) for name in ("a.mcap", "solved.mcap")]
+
+
+def run(*words):
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args([str(word) for word in words]))
+
+
+def test_a_project_from_dive_to_exports(tmp_path, logs, capsys):
+    path = tmp_path / "cave.toml"
+    assert run("legs", path, "--dive", *logs) == 0
+    project = load_project(path)
+    assert project.leg[0].from_ == "entry"
+    assert [leg.to for leg in project.leg][:-1] == [leg.from_ for leg in project.leg][1:]
+    assert project.station[0].notes == ["chain"]
+    assert all(leg.field_from_ut for leg in project.leg)
+    assert run("adjust", path) == 0
+    assert "3 legs" in capsys.readouterr().out
+    assert run("adjust", path, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert len(answer["stations"]) == 4
+    path.write_text(path.read_text().replace("# latitude_deg = 45.5\n# longitude", "latitude_deg = 45.5\nlongitude", 1))
+    path.write_text(path.read_text().replace("[place]", "[place]\ndeclination_deg = 3.5", 1))
+    for kind in command.FORMATS:
+        assert run("export", path, "--format", kind, "-o", tmp_path / f"out.{kind}") == 0
+        assert (tmp_path / f"out.{kind}").stat().st_size > 100
+    assert run("report", path) == 0
+    assert "<svg" in (tmp_path / "cave.html").read_text()
+
+
+def test_what_people_write_stays_and_the_old_file_is_kept(tmp_path, logs):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    first = path.read_text()
+    run("legs", path)
+    assert path.read_text() == first
+    assert not list(tmp_path.glob("cave.toml.*"))
+    edited = first.replace('title = ""', 'title = "Ours"  # with a comment', 1)
+    edited = edited.replace(
+        MARKER, f'[settings]\nrange_share = 0.02\n\n[[edit]]\nleg = "entry-1"\nuse = false\n\n{MARKER}'
+    )
+    edited = edited.replace("entry-1", load_project(path).leg[0].name)
+    path.write_text(edited)
+    run("legs", path)
+    assert (tmp_path / "cave.toml.1").read_text() == edited
+    again = path.read_text()
+    assert again.split(MARKER)[0].rstrip() == edited.split(MARKER)[0].rstrip()
+    before = {leg.name: leg for leg in load_project(tmp_path / "cave.toml.1").leg}
+    for leg in load_project(path).leg:
+        assert leg.distance_m == before[leg.name].distance_m
+        assert leg.distance_sigma_m > before[leg.name].distance_sigma_m
+    assert run("adjust", path) == 0
+
+
+def test_a_better_calibration_updates_the_survey(tmp_path, logs, messages):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    before = load_project(path)
+    with DiveLogWriter(tmp_path / "again.mcap") as writer:
+        for message in messages:
+            if isinstance(message, RelativePose):
+                x, y, z = message.t_a_b_m
+                writer.write_message(replace(message, t_a_b_m=(1.01 * x, 1.01 * y, 1.01 * z)))
+            elif isinstance(message, NodeInfo):
+                writer.write_message(replace(message, sigma_px=0.5))
+            elif not isinstance(message, Imu):
+                writer.write_message(message)
+    path.write_text(path.read_text().replace("solved.mcap", "again.mcap"))
+    run("legs", path)
+    for old, new in zip(before.leg, load_project(path).leg, strict=True):
+        assert new.name == old.name
+        assert new.distance_m == pytest.approx(1.01 * old.distance_m, rel=1e-3)
+
+
+def test_marks_from_a_table_and_from_the_project(tmp_path, logs):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    last = load_project(path).leg[-1]
+    start = load_project(path).leg[0]
+    table = tmp_path / "times.csv"
+    with open(table, "w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["time", "node", "name", "note"])
+        rows.writerow([last.moment.isoformat(), last.to_node, "END", "blue arrow"])
+    run("legs", path, "--marks", table)
+    assert load_project(path).leg[-1].to == "END"
+    seconds = (last.start_ns - start.start_ns) / 1e9 + 4
+    by_hand = f'[[mark]]\nnode = "{last.to_node}"\nseconds = {seconds}\nname = "TIP"\n\n{MARKER}'
+    path.write_text(path.read_text().replace(MARKER, by_hand))
+    run("legs", path)
+    assert load_project(path).leg[-1].to == "TIP"
+    table.write_text("time,node,name\nyesterday,a,X\n")
+    with pytest.raises(ConfigError, match="line 2"):
+        run("legs", path, "--marks", table)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[survey]\nnmae = 'x'\n", "did you mean `name`"),
+        ("[[fix]]\nstation = '0'\neast_m = 1.0\n", "east_m and north_m"),
+        ("[settings]\nrest_s = -1.0\n", "rest_s"),
+        ("[[leg]]\n", "leg"),
+        ("[place]\nutm_zone = 'abc'\n", "utm_zone"),
+    ],
+)
+def test_a_bad_project_is_refused_and_named(tmp_path, text, said):
+    path = tmp_path / "bad.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        load_project(path)
+
+
+def test_known_errors_are_said(tmp_path, logs):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    with pytest.raises(BuddylineError, match="exists"):
+        run("legs", path, "--dive", *logs)
+    path.write_text(path.read_text().replace(MARKER, f'[[edit]]\nleg = "7-8"\nuse = false\n\n{MARKER}'))
+    with pytest.raises(ConfigError, match="no such leg"):
+        run("adjust", path)
+    empty = tmp_path / "empty.toml"
+    empty.write_text("[survey]\n")
+    with pytest.raises(BuddylineError, match="names no dive"):
+        run("legs", empty)
+    with pytest.raises(BuddylineError, match="no poses"):
+        run("legs", tmp_path / "new.toml", "--dive", logs[0])
+
+
+def test_notes_survive_any_character(tmp_path, logs, messages):
+    path = tmp_path / "cave.toml"
+    note = 'a "quoted" \\ note\nof two lines\t\x07é'
+    with DiveLogWriter(tmp_path / "m.mcap") as writer:
+        writer.write_message(Mark(node="a", stamp_ns=world.START_NS + 6 * 10**9, name="entry", note=note))
+    run("legs", path, "--dive", *logs, tmp_path / "m.mcap")
+    assert note in load_project(path).station[0].notes
+
+
+def mark_arguments(*words):
+    parser = argparse.ArgumentParser()
+    mark.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def test_a_mark_by_command():
+    said = mark.mark_of(mark_arguments("T1", "--node", "a", "--note", "x"), 5)
+    assert said == Mark(node="a", stamp_ns=5, name="T1", note="x")
+    later = mark.mark_of(mark_arguments("T1", "--node", "a", "--at", "2026-05-01T10:00:00Z"), 5)
+    assert later.stamp_ns == world.START_NS
+    assert parse_key(key_of(said))[0] is MARK
+    for words in (("T 1", "--node", "a"), ("--node", "a", "--kind", "note"), ("T1", "--node", "A")):
+        with pytest.raises(BuddylineError):
+            mark.mark_of(mark_arguments(*words), 5)
+
+
+def test_live_alarms_go_out_on_the_bus(messages):
+    network = LocalNetwork()
+    heard, came = [], threading.Event()
+
+    def hear(received):
+        heard.append(decode(received.payload, Mark))
+        came.set()
+
+    with network.connect() as nodes, network.connect() as topside, network.connect() as listener:
+        listener.subscribe(MARK.key_any(), hear)
+        Watch(topside).attach()
+        publishers = {}
+        for message in messages:
+            parsed = parse_key(key_of(message)) if not isinstance(message, Rejected) else None
+            if parsed is None or parsed[0].name not in ("info", "attitude", "depth", "imu", "pose"):
+                continue
+            topic, ids = parsed
+            if (topic, ids) not in publishers:
+                publishers[topic, ids] = nodes.publisher(topic, *ids)
+            off = isinstance(message, Depth) and message.node == "b"
+            publishers[topic, ids].put(replace(message, depth_m=message.depth_m + 3.0) if off else message)
+        assert came.wait(20)
+    assert heard[0].kind == "alarm"
+    assert "depth" in {one.name for one in heard}
