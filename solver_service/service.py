@@ -14,9 +14,10 @@ from msgspec import UNSET
 
 from protocol import __version__
 from protocol.clock import S_NS, Clock, SystemClock
-from protocol.messages import Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
+from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
 from protocol.service import Service
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, parse_key
+from solver_service.alignment import ClockOffset
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
 
@@ -33,6 +34,7 @@ LIVE_WITHIN_NS: Final = 60 * S_NS
 # The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 TOLERATED_OFFSET_S: Final = 0.005
+ALIGN_EVERY_S: Final = 10.0
 BUFFERED_BEFORE_PAIR: Final = 4096
 
 
@@ -54,6 +56,8 @@ class SolverService(Service):
         self._latencies_s: deque[float] = deque(maxlen=2000)
         self._last_frame_s: dict[str, float] = {}
         self._reported_bad = ""
+        self._offset: ClockOffset | None = None
+        self._aligned_s = time.monotonic()
         if config.nodes:
             self._pair(*config.nodes)
 
@@ -119,7 +123,7 @@ class SolverService(Service):
         if self._core is not None:
             return self._core.handle(message)
         self._before_pair.append(message)
-        if isinstance(message, NodeInfo) and node not in self._seen:
+        if isinstance(message, NodeInfo | Candidates) and node not in self._seen:
             self._seen.append(node)
         if len(self._seen) < 2:
             return []
@@ -173,9 +177,12 @@ class SolverService(Service):
         if self._reported_bad:
             problems.append(self._reported_bad)
             self._reported_bad = ""
-        offset = core.alignment.estimate()
-        aligned = offset is not None and offset.sigma_s < REPORTED_OFFSET_SIGMA_S
-        if offset is not None and aligned and abs(offset.offset_s) > max(TOLERATED_OFFSET_S, 4 * offset.sigma_s):
+        if now_s - self._aligned_s > ALIGN_EVERY_S:
+            found = core.alignment.estimate()
+            self._offset = found if found is not None and found.sigma_s < REPORTED_OFFSET_SIGMA_S else None
+            self._aligned_s = now_s
+        offset = self._offset
+        if offset is not None and abs(offset.offset_s) > max(TOLERATED_OFFSET_S, 4 * offset.sigma_s):
             problems.append(f"clock of {core.node_b} is {offset.offset_s * 1e3:+.1f} ms from that of {core.node_a}")
         latencies_s = sorted(self._latencies_s)
         self._latencies_s.clear()
@@ -198,6 +205,6 @@ class SolverService(Service):
             latency_p99_s=latencies_s[min(len(latencies_s) * 99 // 100, len(latencies_s) - 1)]
             if latencies_s
             else UNSET,
-            clock_skew_s=offset.offset_s if offset is not None and aligned else UNSET,
+            clock_skew_s=UNSET if offset is None else offset.offset_s,
             problem="; ".join(problems),
         )
