@@ -235,7 +235,7 @@ def test_a_stored_dive_is_played_and_scrubbed(chromium: Any, processes: Processe
         seen.page.goto(address)
         seen.wait_for("green: poses")
         seen.wait_for("0:00.0 of 0:59.9")
-        seen.page.get_by_label("Seconds").last.fill("22")
+        seen.page.locator("input[inputmode=decimal]").last.fill("22")
         seen.page.keyboard.press("Enter")
         seen.wait_for("0:22.0 of 0:59.9")
         seen.wait_for("No pose: more than one arrangement fits")

@@ -39,7 +39,8 @@ CSS: Final = (
     "2px 0;text-align:left;vertical-align:top;overflow-wrap:break-word}td.n{text-align:right;white-space:nowrap}"
     "@media(min-width:700px){td:first-child{white-space:nowrap}}"
     ".dim{color:#5b6670;font-size:.87em}.two{display:grid;grid-template-columns:repeat(auto-fit,minmax(300px,1fr));"
-    "gap:12px}.scroll{overflow-x:auto}.warn{background:#fff3d6;border-left:4px solid #d9a520;padding:4px 10px}"
+    "gap:12px}.scroll{overflow-x:auto}.wide{min-width:640px}"
+    ".warn{background:#fff3d6;border-left:4px solid #d9a520;padding:4px 10px}"
     ".strip{width:100%;height:26px;display:block;border-radius:3px}.cam svg{width:100%;height:auto;background:#05080c}"
     ".replay canvas{width:100%;height:min(62vh,480px);display:block;touch-action:none;border-radius:4px;cursor:grab}"
     ".bar{display:flex;gap:8px;align-items:center;flex-wrap:wrap;margin:6px 0}.bar input{flex:1;min-width:120px}"
@@ -93,7 +94,7 @@ def report_html(dive: Dive) -> str:
         "<h2>Plan and profile</h2>",
         _maps(summary),
         "<h2>Over time</h2>",
-        *_plots(summary),
+        f'<div class="scroll"><div class="wide">{"".join(_plots(summary))}</div></div>',
         "<h2>Coverage: where there is a pose, and where and why not</h2>",
         _coverage(summary),
         _pictures(summary),
