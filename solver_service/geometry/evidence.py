@@ -26,7 +26,7 @@ from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, sk
 GROSS_PROBABILITY: Final = 0.1
 GROSS_SCALE: Final = 5.0
 # A tilt that contradicts the pictures is a broken sensor this often, a heading more often: steel stands beside it.
-_TILT_BROKEN: Final = 1e-3
+_TILT_BROKEN: Final = 1e-5
 _HEADING_BROKEN: Final = 0.15
 _DEPTH_BROKEN: Final = 0.02
 # Added to what the sensors say of themselves: mount, and a heading's slow bias.
@@ -38,12 +38,12 @@ _DEPTH_SIGMA_M: Final = 0.02
 # A diver who is not known to lie otherwise is upright to about this (1 sd).
 _UPRIGHT_SIGMA_RAD: Final = 0.45
 # How often one light is missing, to being seen; and chance alone, to all four being seen.
-_MISSING_ODDS: Final = 0.2
+MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
 # What chance gives: the spread of relative pitch (rad) and heading (rad), and of depth differences (m).
-_PITCH_SPREAD: Final = 1.1
+PITCH_SPREAD: Final = 1.1
 _HEADING_SPREAD: Final = 1.5
-_DEPTH_SPREAD_M: Final = 6.0
+DEPTH_SPREAD_M: Final = 6.0
 # A prediction from earlier poses is believed this much at most, and costs at most half where it is wrong.
 _MAX_LOG_PRIOR: Final = 7.0
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
@@ -70,9 +70,13 @@ class Sensors:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Log likelihood ratios (K,) of hypotheses without their gaps, and chi^2 (K,) of tilt and depth by themselves."""
+    """Log likelihood ratios (K,) of hypotheses without their gaps.
+
+    log_prior: (K,) the prediction's part. tilt_chi2, depth_chi2: (K,) by themselves.
+    """
 
     log_ratio: Floats
+    log_prior: Floats
     tilt_chi2: Floats
     depth_chi2: Floats
 
@@ -132,14 +136,15 @@ def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
     return density
 
 
-def intruder_odds(chi2: float, freedom: Floats, per_area: Floats) -> float:
-    """Give the odds that one of four lights is missing and a false candidate stands in for it.
+def intruder_odds(chi2: Floats, freedom: Floats, per_area: Floats) -> Floats:
+    """Give the odds (K,) that one of four lights is missing and a false candidate stands in for it.
 
-    chi2: of the pose. freedom: (4,) of the sightings. per_area: (4,) candidates per variance of position (px^2).
-    The other three foretell where a light stands; a false candidate falls there by chance.
+    chi2: (K,) of the poses. freedom: (K, 4) of the sightings. per_area: (K, 4) candidates per variance of position
+    (px^2). The other three foretell where a light stands; a false candidate falls there by chance.
     """
-    foretold = math.exp(float(log_gaps(np.array(chi2), np.array(1.0), 2)))
-    return _MISSING_ODDS / foretold * float((per_area / np.sqrt(np.maximum(freedom, 1e-12))).sum())
+    foretold = np.exp(log_gaps(chi2, np.ones(1), 2))
+    odds: Floats = MISSING_ODDS / foretold * (per_area / np.sqrt(np.maximum(freedom, 1e-12))).sum(1)
+    return odds
 
 
 def log_chance(rigs: tuple[Rig, Rig], counts: tuple[int, int], settings: Settings) -> float:
@@ -171,8 +176,7 @@ def weigh(
     along = down_a @ u
     if "attitude" in settings.checks:
         log_ratio, tilt_chi2 = _weigh_tilt(down_b, u, along, variance, sensors)
-        if sensors.R_a_b is not None:
-            log_ratio += _log_heading(R_a_b, sensors.R_a_b, down_a, sensors.heading_variance + 0.25 * variance)
+        log_ratio += weigh_heading(R_a_b, sensors, 0.25 * variance)
     else:
         # The reading is upright; of half a turn nothing is known.
         tilt_chi2 = np.zeros_like(variance)
@@ -188,11 +192,12 @@ def weigh(
         spread2 = 0.25 * (sensors.tilt_variance * (dot(below, below) - square) + variance * square)
         spread2 += sensors.depth_variance
         depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
-        density = (_DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
+        density = (DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
         log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
+    log_prior = np.zeros_like(variance)
     if prediction is not None:
-        log_ratio += _log_prior(R_a_b, t_a_b_m, u, variance, prediction, rigs, settings)
-    return Support(log_ratio, tilt_chi2, depth_chi2)
+        log_prior = weigh_prediction(R_a_b, t_a_b_m, variance, prediction, rigs, settings)
+    return Support(log_ratio + log_prior, log_prior, tilt_chi2, depth_chi2)
 
 
 def _weigh_tilt(down_b: Floats, u: Floats, along: Floats, variance: Floats, sensors: Sensors) -> tuple[Floats, Floats]:
@@ -210,12 +215,15 @@ def _weigh_tilt(down_b: Floats, u: Floats, along: Floats, variance: Floats, sens
     about_sight2 = (tx * u[0] + ty * u[1] + tz * u[2]) ** 2 / np.maximum(sine2, 1e-30)
     total = s2 + across
     chi2 = angle * angle * (1.0 - about * about_sight2 / total) / s2
-    density = (_PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * chi2) / np.sqrt(s2 * total)
-    return np.log(density + _PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi)), chi2
+    density = (PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * chi2) / np.sqrt(s2 * total)
+    return np.log(density + PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi)), chi2
 
 
-def _log_heading(R_a_b: Floats, predicted: Floats, down: Floats, variance: Floats) -> Floats:
-    """Weigh the turn about down (3,) between poses and attitudes, loosely."""
+def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
+    """Weigh the turn about the vertical between poses and attitudes, loosely; variance: (K,) of the poses' own."""
+    if sensors.R_a_b is None:
+        return np.zeros(R_a_b.shape[2])
+    predicted, down, variance = sensors.R_a_b, sensors.down_a, sensors.heading_variance + variance
     flat = R_a_b.reshape(9, -1)
     sine, cosine = (skew(down) @ predicted).ravel() @ flat, 1.0 + predicted.ravel() @ flat
     turn = 2.0 * np.arctan2(sine, cosine)
@@ -226,16 +234,18 @@ def _log_heading(R_a_b: Floats, predicted: Floats, down: Floats, variance: Float
     return log_ratio
 
 
-def _log_prior(
+def weigh_prediction(
     R_a_b: Floats,
     t_a_b_m: Floats,
-    u: Floats,
     variance: Floats,
     prediction: Prediction,
     rigs: tuple[Rig, Rig],
     settings: Settings,
 ) -> Floats:
-    """Weigh K poses against a prediction from earlier ones: a bounded gain, and never more than half lost."""
+    """Weigh K poses against a prediction from earlier ones: a bounded gain, and never more than half lost.
+
+    variance: (K,) four times that of the poses' own ln range, and of their twist.
+    """
     away = t_a_b_m - prediction.t_a_b_m[:, None]
     turned = np.tensordot(prediction.R_a_b, R_a_b, (1, 1))  # [i, j] of R_a_b R_predicted^T stands at [j, i]
     e = np.empty((6, len(variance)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -205,7 +205,7 @@ def join(
 
 def search(
     candidates: Candidates, pairs: Pairs, levels: tuple[Rig, Rig], motion_variance: Floats, settings: Settings
-) -> Hypotheses | str:
+) -> Hypotheses | Literal["range_gap", "twist_gap"]:
     """Give the hypotheses whose gaps pass, read as gravity has them, or the name of the gap that none passes."""
     by_range, by_twist = "range" in settings.checks, "twist" in settings.checks
     for gate in (settings.gate_sigma * GROSS_SCALE, settings.gate_sigma):

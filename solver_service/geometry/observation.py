@@ -9,6 +9,16 @@ from typing import Final, Literal, TypeAlias
 from solver_service.geometry.rotation import Floats
 
 Method: TypeAlias = Literal["refined", "exact", "paper", "paper_midpoint", "paper_literal"]
+Reason: TypeAlias = Literal[
+    "too_few_candidates",
+    "range_gap",
+    "twist_gap",
+    "attitude",
+    "depth",
+    "out_of_range",
+    "ambiguous",
+    "degenerate",
+]
 CHECKS: Final = frozenset({"range", "twist", "attitude", "depth"})
 
 

@@ -63,14 +63,15 @@ class Refined:
     sound: NDArray[np.bool_]
     derivatives: Floats
 
-    def freedom(self, k: int) -> Floats:
-        """Give what of each sighting of pose k the other three leave open (4,): a variance ratio squared, 0 to 1.
+    @property
+    def freedom(self) -> Floats:
+        """What of each sighting the other three leave open (K, 4), 0 to 1.
 
         The determinant of its residual's covariance, where residuals are not correlated.
         """
-        J = self.derivatives[k].reshape(4, 2, 6)
-        left = np.eye(2) - J @ self.covariance[k] @ J.swapaxes(1, 2)
-        area: Floats = np.clip(left[:, 0, 0] * left[:, 1, 1] - left[:, 0, 1] * left[:, 1, 0], 0.0, 1.0)
+        J = self.derivatives.reshape(-1, 4, 2, 6)
+        left = np.eye(2) - J @ self.covariance[:, None] @ J.swapaxes(2, 3)
+        area: Floats = np.clip(left[..., 0, 0] * left[..., 1, 1] - left[..., 0, 1] * left[..., 1, 0], 0.0, 1.0)
         return area
 
 
@@ -90,9 +91,9 @@ def refine(
     weight = None
     steps = 0
     while True:
-        r, J, depth = _residuals(t, R, seen, lights, rates)
+        r, J, depth = residuals(t, R, seen, lights, rates)
         if steps == 0 and (timed or motion.skew_sigma_s > 0.0):
-            weight = _weight(J, seen.dt_s, motion)
+            weight = weight_of(J, seen.dt_s, motion)
         JtW = J.swapaxes(1, 2) if weight is None else J.swapaxes(1, 2) @ weight
         H = JtW @ J
         # Positions and rotations have their own units: scaled to a unit diagonal before solving.
@@ -118,7 +119,7 @@ def refine(
     return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound, J)
 
 
-def _residuals(
+def residuals(
     t: Floats, R: Floats, seen: Sightings, lights: tuple[Floats, Floats], rates: Floats | None
 ) -> tuple[Floats, Floats, Floats]:
     """Give residuals (K, 8), their derivatives (K, 8, 6) by the pose, and the distances along the bearings (K, 4).
@@ -153,7 +154,7 @@ def _residuals(
     return r.reshape(K, 8), J.reshape(K, 8, 6), depth
 
 
-def _weight(J: Floats, dt_s: Floats, motion: Motion) -> Floats:
+def weight_of(J: Floats, dt_s: Floats, motion: Motion) -> Floats:
     """Give the inverse covariance (K, 8, 8) of the residuals: pixel noise, and what is not known of the motion."""
     by_rate = J * np.repeat(dt_s, 2, axis=1)[:, :, None]
     total: Floats = np.eye(8) + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)

@@ -1,0 +1,139 @@
+"""All four lights seen: eight coordinates for six unknowns, the redundant two being the gaps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solver_service.geometry.closed_form import Bars, dot, solve_exact
+from solver_service.geometry.evidence import intruder_odds, log_chance, log_gaps, weigh
+from solver_service.geometry.hypotheses import Hypotheses, Pairs, search
+from solver_service.geometry.observation import Reason
+from solver_service.geometry.readings import Readings
+from solver_service.geometry.refinement import Refined, Sightings, refine
+from solver_service.geometry.rig import Rig
+from solver_service.geometry.rotation import Floats
+from solver_service.geometry.terms import Terms
+
+# So many of the best are refined; what lies further below the best (log ratio) does not matter.
+_REFINED: Final = 6
+_NEGLIGIBLE: Final = 16.0
+# Bars whose middle is nearer to the camera than this, relative to their length, need but one round.
+_SMALL_OFFSET: Final = 0.02
+# chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
+_GROSS_CHI2: Final = 11.3
+
+
+@dataclass(frozen=True, eq=False)
+class FourLights:
+    """The best readings; others: the sum of all other likelihood ratios. why: the reason where there are none."""
+
+    readings: Readings | None
+    others: float = 0.0
+    why: tuple[Reason, str] = ("ambiguous", "")
+
+
+def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
+    """Search, weigh and refine."""
+    settings = terms.settings
+    in_a, in_b = terms.candidates.counts
+    if min(in_a, in_b) < 2:
+        what = f"{in_a} candidates in A's picture, {in_b} in B's: not 2 each"
+        return FourLights(None, why=("too_few_candidates", what))
+    if not min(pairs.counts):
+        what = f"no two candidates stand as far apart as the lights would {terms.range_limits}"
+        return FourLights(None, why=("out_of_range", what))
+    found = search(terms.candidates, pairs, terms.levels, _motion_variance(terms, pairs), settings)
+    if isinstance(found, str):
+        combinations = f"{pairs.counts[0]} pairs in A's picture and {pairs.counts[1]} in B's"
+        same = "the same twist where their ranges agree" if found == "twist_gap" else "the same range"
+        return FourLights(None, why=(found, f"no two of {combinations} have {same}"))
+    solved = solve_exact(
+        found.spans, Bars.of(*terms.levels), split_rounds=3, offset_rounds=_offset_rounds(terms.levels)
+    )
+    t, variance = solved.t_a_b_m, found.variance
+    support = weigh(solved.R_a_b, t, solved.u[0], variance, terms.levels, terms.sensors, terms.prediction, settings)
+    base = support.log_ratio + found.log_weight + log_chance(terms.levels, terms.candidates.counts, settings)
+    twist_gap_rad = solved.twist_gap_rad
+    chi2 = np.zeros(len(variance))
+    if "range" in settings.checks:
+        chi2 += np.log(solved.range_m[0] / solved.range_m[1]) ** 2 / variance
+    if "twist" in settings.checks:
+        chi2 += twist_gap_rad**2 / variance
+    gaps = len(settings.checks & {"range", "twist"})
+    range2 = dot(t, t)
+    inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
+    log_ratio = np.where(inside, base + log_gaps(chi2, variance, gaps), -np.inf)
+    best = np.argsort(-log_ratio, kind="stable")[:_REFINED]
+    if log_ratio[best[0]] == -np.inf:
+        what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
+        return FourLights(None, why=("out_of_range", what))
+    best = best[log_ratio[best] > log_ratio[best[0]] - _NEGLIGIBLE]
+    ratio = np.exp(log_ratio)
+    refined = refine(
+        t[:, best].T,
+        solved.R_a_b[:, :, best].transpose(2, 0, 1),
+        _sightings(terms, found, best),
+        *terms.levels,
+        terms.motion,
+    )
+    # Without both gaps the picture's chi2 would bring in what the settings leave out.
+    chi2 = refined.chi2 if gaps == 2 else chi2[best]
+    return FourLights(
+        Readings(
+            lights=found.lights[:, best].T,
+            t_a_b_m=refined.t_a_b_m,
+            R_a_b=refined.R_a_b,
+            covariance=_inflated(refined),
+            chi2=chi2,
+            log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, variance[best], gaps), -np.inf),
+            tilt_chi2=support.tilt_chi2[best],
+            depth_chi2=support.depth_chi2[best],
+            range_m=solved.range_m[:, best].T,
+            twist_gap_rad=twist_gap_rad[best],
+            intruder=_intruder(terms, refined, found.lights[:, best].T) if gaps == 2 else np.zeros(len(best)),
+            log_prior=support.log_prior[best],
+        ),
+        others=float(ratio.sum() - ratio[best].sum()),
+    )
+
+
+def _sightings(terms: Terms, found: Hypotheses, best: NDArray[np.intp]) -> Sightings:
+    candidates, lights = terms.candidates, found.lights[:, best].T
+    return Sightings(candidates.bearings.T[lights], candidates.tangents[lights], candidates.dt_s[lights])
+
+
+def _inflated(refined: Refined) -> Floats:
+    """Widen the covariance where one light is off by more than its noise; which one, two residuals cannot tell."""
+    scale = np.where(refined.chi2 > _GROSS_CHI2, 0.5 * refined.chi2, 1.0)
+    covariance: Floats = refined.covariance * scale[:, None, None]
+    return covariance
+
+
+def _intruder(terms: Terms, refined: Refined, lights: NDArray[np.intp]) -> Floats:
+    """Give the odds that one of four lights is missing and a false candidate stands in for it."""
+    (in_a, in_b), (a, b) = terms.candidates.counts, (rig.camera.area_px2 for rig in terms.rigs)
+    per_px2 = np.array((in_a / a, in_a / a, in_b / b, in_b / b))
+    return intruder_odds(refined.chi2, refined.freedom, per_px2 * terms.candidates.sigma_px[lights] ** 2)
+
+
+def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:
+    """Give what relative motion between the exposures may add to ln range and twist of A's pairs, rad^2."""
+    dt_s, split, motion = terms.candidates.dt_s, terms.candidates.counts[0], terms.motion
+    square_s2 = float(dt_s[:split].sum() / split - dt_s[split:].sum() / (len(dt_s) - split)) ** 2
+    square_s2 += motion.skew_sigma_s**2
+    rates2 = motion.covariance.diagonal() + motion.rates**2
+    speed2, turn2 = float(rates2[:3].sum()) / 3.0, float(rates2[3:].sum()) / 3.0
+    per_range = pairs.chord[: pairs.split] / terms.levels[1].length_m
+    variance: Floats = square_s2 * (speed2 * per_range * per_range + turn2)
+    return variance
+
+
+def _offset_rounds(levels: tuple[Rig, Rig]) -> int:
+    """Give how often the closed form moves the bearings to the bars' middles before the refinement takes over."""
+    offset = max(level.offset_m / level.length_m for level in levels)
+    return 1 if offset < _SMALL_OFFSET else 4

@@ -1,0 +1,97 @@
+"""One trigger's terms: candidates, sensors, prediction and motion, all in the rigs' level frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from solver_service.geometry.candidates import Candidates, find_candidates
+from solver_service.geometry.evidence import Prediction, Sensors, combine
+from solver_service.geometry.observation import Prior, Sensed, Settings, View
+from solver_service.geometry.refinement import Motion
+from solver_service.geometry.rig import Rig
+from solver_service.geometry.rotation import Floats, matrix_of
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """What a trigger is solved from. rigs: as described; levels: the same, along their bars."""
+
+    rigs: tuple[Rig, Rig]
+    levels: tuple[Rig, Rig]
+    candidates: Candidates
+    sensors: Sensors
+    prediction: Prediction | None
+    motion: Motion
+    settings: Settings
+
+    @staticmethod
+    def of(
+        views: tuple[View, View],
+        rigs: tuple[Rig, Rig],
+        sensed: tuple[Sensed, Sensed],
+        settings: Settings,
+        prior: Prior | None,
+    ) -> Terms:
+        """Bring everything into the level frames; what is not finite is as good as not there."""
+        levels = rigs[0].level, rigs[1].level
+        return Terms(
+            rigs=rigs,
+            levels=levels,
+            candidates=find_candidates(views, rigs),
+            sensors=_sensors(levels, sensed),
+            prediction=_prediction(prior, rigs),
+            motion=_motion(prior, rigs[0], settings),
+            settings=settings,
+        )
+
+    @property
+    def range_limits(self) -> str:
+        """The range limits in words."""
+        return f"between {self.settings.range_min_m:g} and {self.settings.range_max_m:g} m"
+
+
+def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
+    """Give an array of this shape and finite numbers, None for everything else."""
+    if value is None:
+        return None
+    array = np.asarray(value, dtype=np.float64)
+    return array if array.shape == shape and np.isfinite(array).all() else None
+
+
+def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
+    attitudes = [_finite(one.q_ned_body_xyzw, (4,)) for one in sensed]
+    attitudes = [q if q is not None and q @ q > 0.25 else None for q in attitudes]
+    sigmas = [_finite(one.sigma_rad, (3,)) for one in sensed]
+    depth_m, variance = None, 0.0
+    if all(one.depth_m is not None and math.isfinite(one.depth_m) for one in sensed):
+        depth_m = float(sensed[1].depth_m or 0.0) - float(sensed[0].depth_m or 0.0)
+        for one in sensed:
+            sigma_m = one.depth_sigma_m
+            variance += sigma_m**2 if sigma_m is not None and math.isfinite(sigma_m) else 0.0
+    return combine(levels, (attitudes[0], attitudes[1]), (sigmas[0], sigmas[1]), depth_m, variance)
+
+
+def _prediction(prior: Prior | None, rigs: tuple[Rig, Rig]) -> Prediction | None:
+    if prior is None:
+        return None
+    t, q, covariance = _finite(prior.t_a_b_m, (3,)), _finite(prior.q_a_b_xyzw, (4,)), _finite(prior.covariance, (6, 6))
+    if t is None or q is None or covariance is None or not q @ q > 0.25:
+        return None
+    turn_a, turn_b, both = rigs[0].R_level_camera, rigs[1].R_level_camera, rigs[0].both_level_camera
+    # Nobody knows a moving diver to less than a millimetre and a milliradian.
+    covariance = both @ covariance @ both.T + 1e-6 * np.eye(6)
+    return Prediction(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance)
+
+
+def _motion(prior: Prior | None, rig_a: Rig, settings: Settings) -> Motion:
+    rates = _finite(prior.rates, (6,)) if prior is not None else None
+    covariance = _finite(prior.rates_covariance, (6, 6)) if prior is not None else None
+    if rates is None or covariance is None:
+        # Alike in all directions: the same in every frame.
+        sigma2 = settings.speed_mps**2, settings.turn_radps**2
+        return Motion(np.zeros(6), np.diag(np.repeat(sigma2, 3)), settings.skew_sigma_s)
+    both = rig_a.both_level_camera
+    return Motion(both @ rates, both @ covariance @ both.T, settings.skew_sigma_s)

@@ -1,0 +1,261 @@
+"""One light short: six coordinates for six unknowns, and attitude and depth to tell whether they belong together.
+
+One node, the seer, sees both lights of the other, which sees one of the seer's. The pair gives the line of sight,
+and the range once the other's bar is oriented; gravity orients it about the line of sight; the single light turns
+the other to where it sees it. Tilt (twice) and depth are then left over as checks.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solver_service.geometry.closed_form import dot, eq1_range_m
+from solver_service.geometry.evidence import (
+    DEPTH_SPREAD_M,
+    MISSING_ODDS,
+    PITCH_SPREAD,
+    Sensors,
+    weigh_heading,
+    weigh_prediction,
+)
+from solver_service.geometry.hypotheses import Pairs
+from solver_service.geometry.readings import Readings
+from solver_service.geometry.refinement import Sightings, residuals, weight_of
+from solver_service.geometry.rig import Rig
+from solver_service.geometry.rotation import Floats, rotation_near, skew
+from solver_service.geometry.terms import Terms
+
+# More combinations than this are not tried: among so many, three lights are never certain.
+_MAX_COMBINATIONS: Final = 4000
+_ROUNDS: Final = 4
+# chi^2 of tilt and depth, three degrees of freedom, before and after the refinement.
+_GATE_CHI2: Final = 40.0
+_FITS_CHI2: Final = 16.0
+_REFINED: Final = 6
+_STEPS: Final = 6
+# A pose whose position is known worse than this, relative to the range (1 sd), is not worth its risk.
+_MAX_SIGMA: Final = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class _Guesses:
+    """M poses T_a_b between the level frames: lights (M, 4), t (M, 3), R (M, 3, 3), chi2 (M,) of the sensors."""
+
+    lights: NDArray[np.intp]
+    t_a_b_m: Floats
+    R_a_b: Floats
+    chi2: Floats
+
+
+def read_three_lights(terms: Terms, pairs: Pairs) -> Readings | None:
+    """Give the best readings of three lights; None where there are none, or the sensors do not support any."""
+    sensors, checks = terms.sensors, terms.settings.checks
+    supported = sensors.R_a_b is not None and sensors.depth_m is not None and checks >= {"attitude", "depth"}
+    in_a, in_b = terms.candidates.counts
+    if not supported or 2 * (pairs.counts[0] * in_b + pairs.counts[1] * in_a) > _MAX_COMBINATIONS:
+        return None
+    both = [_guess(terms, pairs, seer) for seer in (0, 1)]
+    lights = np.concatenate([guesses.lights for guesses in both])
+    t = np.concatenate([guesses.t_a_b_m for guesses in both])
+    R = np.concatenate([guesses.R_a_b for guesses in both])
+    chi2 = np.concatenate([guesses.chi2 for guesses in both])
+    best = np.argsort(chi2, kind="stable")[:_REFINED]
+    best = best[chi2[best] < _GATE_CHI2]
+    return _refined(terms, lights[best], t[best], R[best]) if len(best) else None
+
+
+def _guess(terms: Terms, pairs: Pairs, seer: int) -> _Guesses:
+    """Try all pairs of the seer's picture with all candidates of the other's, each as left and as right light."""
+    candidates, sensors = terms.candidates, terms.sensors
+    split, in_a = pairs.split, candidates.counts[0]
+    of_seer = np.arange(split) if seer == 0 else np.arange(split, len(pairs.key))
+    of_other = np.arange(in_a, len(candidates.index)) if seer == 0 else np.arange(in_a)
+    pair, single, side = (grid.ravel() for grid in np.meshgrid(of_seer, of_other, (0, 1), indexing="ij"))
+    own, other = terms.levels[seer], terms.levels[1 - seer]
+    down_own, down_other = (sensors.down_a, sensors.down_b)[:: 1 - 2 * seer]
+    c, w, chord = pairs.c[:, pair], pairs.w[:, pair], pairs.chord[pair]
+    seen = candidates.bearings[:, single]
+    cos_alpha, sin_alpha = 1.0 - 0.5 * chord * chord, chord * np.sqrt(1.0 - 0.25 * chord * chord)
+    light = own.lights_m[side].T
+    u_other = seen
+    for _ in range(_ROUNDS):
+        sin_beta = u_other[0]
+        half = 0.5 * (np.arcsin(sin_beta) - np.arcsin(sin_beta * cos_alpha))
+        R = _triad(c, down_own, -u_other, down_other)
+        # Gravity tells which end of the pair is the right light.
+        w = np.where(dot(w, R[:, 0]) < 0.0, -w, w)
+        u = c * np.cos(half) - w * np.sin(half)
+        R = _triad(u, down_own, -u_other, down_other)
+        range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.array(other.length_m))
+        t = own.middle_m[:, None] + u * range_m - (R * other.middle_m[:, None]).sum(1)
+        q = (R * (light - t)[:, None]).sum(0)
+        u_other = u_other + seen - q / np.sqrt(dot(q, q))
+        u_other = u_other / np.sqrt(dot(u_other, u_other))
+    # Both components of the tilt that remain: along the line of sight, and about it.
+    rise = np.arcsin(down_own @ u) - np.arcsin(-(down_other @ u_other))
+    across = R[:, 0] - u * dot(u, R[:, 0])
+    about = np.arcsin(np.clip(dot(u, _cross(across / np.sqrt(dot(across, across)), w)), -1.0, 1.0))
+    fall = _fall(own, other, t, R, down_own)
+    sign = 1.0 - 2.0 * seer
+    level2 = dot(t, t) - fall * fall
+    spread2 = sensors.depth_variance + 0.5 * sensors.tilt_variance * level2 + pairs.variance[pair] * fall * fall
+    chi2 = (rise * rise + about * about) / (sensors.tilt_variance + pairs.variance[pair])
+    chi2 = chi2 + (sign * fall - (sensors.depth_m or 0.0)) ** 2 / spread2
+    settings = terms.settings
+    inside = (range_m > settings.range_min_m) & (range_m < settings.range_max_m)
+    swapped = dot(w, pairs.w[:, pair]) < 0.0
+    first, second = pairs.first[pair], pairs.second[pair]
+    lights = np.full((len(pair), 4), -1)
+    lights[:, 2 * seer] = np.where(swapped, second, first)
+    lights[:, 2 * seer + 1] = np.where(swapped, first, second)
+    lights[np.arange(len(pair)), 2 - 2 * seer + side] = single
+    R, t = R.transpose(2, 0, 1), t.T
+    if seer == 1:
+        R = R.swapaxes(1, 2)
+        t = -(R @ t[:, :, None])[:, :, 0]
+    return _Guesses(lights, t, R, np.where(inside & np.isfinite(chi2), chi2, np.inf))
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+
+
+def _triad(u: Floats, down_u: Floats, v: Floats, down_v: Floats) -> Floats:
+    """Give the rotations (3, 3, M) that take v to u, and down_v as near to down_u as that leaves it."""
+    frames = []
+    for sight, down in ((u, down_u), (v, down_v)):
+        level = down[:, None] - sight * (down @ sight)
+        level = level / np.sqrt(dot(level, level))
+        frames.append((sight, level, _cross(sight, level)))
+    R: Floats = sum(a[:, None] * b[None] for a, b in zip(*frames, strict=True))
+    return R
+
+
+def _fall(own: Rig, other: Rig, t: Floats, R: Floats, down: Floats) -> Floats:
+    """Give how far the other's depth port lies below one's own (M,)."""
+    below = t - own.depth_port_m[:, None] + (R * other.depth_port_m[:, None]).sum(1)
+    fall: Floats = down @ below
+    return fall
+
+
+def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Readings | None:
+    """Fit the three lights with tilt and depth, and weigh what comes of it."""
+    candidates, sensors, levels = terms.candidates, terms.sensors, terms.levels
+    absent = lights < 0
+    # The missing light has no weight; its bearing only keeps the arithmetic finite.
+    bearings = candidates.bearings.T[lights]
+    q = np.concatenate(
+        (levels[1].lights_m @ R.swapaxes(1, 2) + t[:, None], (levels[0].lights_m - t[:, None]) @ R), axis=1
+    )
+    bearings[absent] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
+    tangents = candidates.tangents[lights] * ~absent[:, :, None, None]
+    seen = Sightings(bearings, tangents, candidates.dt_s[lights] * ~absent)
+    rates = terms.motion.rates if terms.motion.rates.any() else None
+    bodies = levels[0].lights_m, levels[1].lights_m
+    weight = np.eye(8)
+    for step in range(_STEPS):
+        r, J, along = residuals(t, R, seen, bodies, rates)
+        r_s, J_s, sigma = _sensor_rows(sensors, levels, t, R)
+        if step == 0:
+            weight = weight_of(J, seen.dt_s, terms.motion)
+        JtW, JtW_s = J.swapaxes(1, 2) @ weight, J_s.swapaxes(1, 2)
+        H = JtW @ J + JtW_s @ J_s
+        unit = 1.0 / np.sqrt(H[:, range(6), range(6)])
+        scale = unit[:, :, None] * unit[:, None, :]
+        covariance = np.linalg.inv(H * scale + 1e-13 * np.eye(6)) * scale
+        if step + 1 < _STEPS:
+            move = (covariance @ (JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]))[:, :, 0]
+            t, R = t - move[:, :3], rotation_near(-move[:, 3:]) @ R
+    column = r[:, :, None]
+    chi2 = (column * (weight @ column)).sum((1, 2)) + (r_s * r_s).sum(1)
+    range2 = (t * t).sum(1)
+    position = np.linalg.eigvalsh(np.where(np.isfinite(covariance), covariance, 0.0)[:, :3, :3])[:, 2]
+    settings = terms.settings
+    sound = np.isfinite(chi2) & (chi2 < _FITS_CHI2) & (along > 0.0).all(1)
+    sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
+    sound &= (position > 0.0) & (position < _MAX_SIGMA**2 * range2)
+    if not sound.any():
+        return None
+    log_ratio, log_prior = _log_ratio(terms, lights, t, R, covariance, chi2, sigma)
+    range_m = np.sqrt(range2)
+    none = np.zeros(len(chi2))
+    return Readings(
+        lights=lights,
+        t_a_b_m=t,
+        R_a_b=R,
+        covariance=covariance,
+        chi2=chi2,
+        log_ratio=np.where(sound & np.isfinite(log_ratio), log_ratio, -np.inf),
+        tilt_chi2=none,
+        depth_chi2=none,
+        range_m=np.stack((range_m, range_m), axis=1),
+        twist_gap_rad=none,
+        intruder=none,
+        log_prior=log_prior,
+    )
+
+
+def _sensor_rows(sensors: Sensors, levels: tuple[Rig, Rig], t: Floats, R: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give whitened residuals (K, 3) of tilt and depth, their derivatives (K, 3, 6), and the product of their sds."""
+    down_a = sensors.down_a
+    across = _basis(down_a)
+    down_b = R @ sensors.down_b
+    port_b = R @ levels[1].depth_port_m
+    below = t - levels[0].depth_port_m + port_b
+    down = down_a + down_b
+    down = down / np.sqrt((down * down).sum(1, keepdims=True))
+    fall = (down * below).sum(1)
+    sigma_m = np.sqrt(sensors.depth_variance + 0.25 * sensors.tilt_variance * ((below * below).sum(1) - fall * fall))
+    sigma_rad = math.sqrt(sensors.tilt_variance)
+    r, J = np.empty((len(t), 3)), np.zeros((len(t), 3, 6))
+    r[:, :2] = down_b @ across.T / sigma_rad
+    J[:, :2, 3:] = -across @ skew(down_b) / sigma_rad
+    r[:, 2] = (fall - (sensors.depth_m or 0.0)) / sigma_m
+    J[:, 2, :3] = down / sigma_m[:, None]
+    J[:, 2, 3:] = (-(down[:, None] @ skew(port_b))[:, 0]) / sigma_m[:, None]
+    return r, J, sigma_rad**2 * sigma_m
+
+
+def _basis(down: Floats) -> Floats:
+    """Give two unit vectors (2, 3) across a third."""
+    first = np.array((0.0, -down[2], down[1])) if abs(down[0]) < 0.9 else np.array((down[1], -down[0], 0.0))
+    first = first / math.sqrt(float(first @ first))
+    return np.array((first, np.cross(down, first)))
+
+
+def _log_ratio(
+    terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats, covariance: Floats, chi2: Floats, sigma: Floats
+) -> tuple[Floats, Floats]:
+    """Give the log likelihood ratio against chance, by Laplace's approximation about the pose, and the prior's part."""
+    settings, candidates = terms.settings, terms.candidates
+    range_m = np.sqrt((t * t).sum(1))
+    views_sr = [rig.camera.solid_angle_sr for rig in terms.rigs]
+    # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
+    prior = -3.0 * np.log(range_m)
+    prior -= math.log(views_sr[0] * views_sr[1] * math.log(settings.range_max_m / settings.range_min_m))
+    # Chance puts candidates evenly on the pictures, per px^2.
+    chance = np.zeros(len(t))
+    for node in (0, 1):
+        count, area_px2 = candidates.counts[node], terms.rigs[node].camera.area_px2
+        seen = (lights[:, 2 * node : 2 * node + 2] >= 0).sum(1)
+        chance += math.log(count / area_px2) + np.where(seen == 2, math.log(max(count - 1, 1) / area_px2), 0.0)
+    sigma2_px = np.where(lights < 0, 1.0, candidates.sigma_px[lights] ** 2).prod(1)
+    fit = 0.5 * np.log(np.linalg.det(covariance)) - 0.5 * chi2 - np.log(sigma2_px)
+    # Nine residuals and six unknowns leave three factors of a normal density.
+    fit -= np.log(sigma) + 1.5 * math.log(2.0 * math.pi)
+    total = prior + fit - chance + math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS)
+    R_last, t_last, u = R.transpose(1, 2, 0), t.T, (t / range_m[:, None]).T
+    turn_variance = np.einsum("ik,kij,jk->k", u, covariance[:, 3:, 3:], u)
+    total += weigh_heading(R_last, terms.sensors, turn_variance)
+    log_prior = np.zeros(len(t))
+    if terms.prediction is not None:
+        variance = 4.0 * np.maximum(turn_variance, np.einsum("ik,kij,jk->k", u, covariance[:, :3, :3], u) / range_m**2)
+        log_prior = weigh_prediction(R_last, t_last, variance, terms.prediction, terms.levels, settings)
+    if candidates.log_score is not None:
+        total += np.where(lights < 0, 0.0, candidates.log_score[lights]).sum(1)
+    return total + log_prior, log_prior
