@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="triggers a second; default: 10")
     parser.add_argument("--record", metavar="DIR", help="keep the nodes' dive logs here; default: they are removed")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.add_argument("--monitor", action="store_true", help="watch it on the monitor's page, in the browser")
 
 
 class Processes:
@@ -143,6 +144,10 @@ def run(args: argparse.Namespace) -> int:
         processes.start("node a", "node", "--config", str(work / "a.toml"))
         processes.start("node b", "node", "--config", str(work / "b.toml"))
         processes.start("solver", "solver", "--connect", endpoint)
+        if args.monitor:
+            port = _free_port()
+            processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port), "--open")
+            log.info("demo: the page is http://127.0.0.1:%d", port)
         bus = connect(endpoint, stop=service.stop, on_wait=lambda _: None)
         if bus is None:
             return service.join()

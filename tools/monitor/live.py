@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     service.spawn("page", lambda: _draw(service, page, inbox, clock))
     service.wait(args.seconds)
     status = service.join()
-    page.server.stop()
+    page.close()
     return status
 
 

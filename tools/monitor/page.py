@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import logging
+from contextlib import redirect_stdout
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
@@ -46,7 +48,9 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
         ) from error
     logging.getLogger("websockets").setLevel(logging.WARNING)
     try:
-        server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        # Its banner would go to standard output, which is for data.
+        with redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     except (OSError, RuntimeError, OverflowError) as error:
         raise BuddylineError(f"--host {host} --port {port}: cannot be served: {error}") from error
     if port not in (0, server.get_port()):
@@ -286,6 +290,11 @@ class Page:
         with gui.add_folder("Last two minutes"):
             self._plots = gui.add_html("")
         self._content: dict[int, str] = {}
+
+    def close(self) -> None:
+        """Serve no longer."""
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
 
     def viewers(self) -> frozenset[int]:
         """Return the ids of those who look at the page now."""

@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         service.spawn("page", lambda: _play(service, page, playback, controls, coverage, SystemClock()))
         service.wait(args.seconds)
         status = service.join()
-        page.server.stop()
+        page.close()
     return status
 
 
