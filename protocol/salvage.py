@@ -17,6 +17,7 @@ from typing import IO, Final, TypeAlias
 
 import zstandard
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
@@ -36,7 +37,7 @@ _RESUME: Final = re.compile(
 )
 _IN_CHUNKS: Final = (McapMessage, Schema, Channel)
 _KNOWN: Final = frozenset(Opcode)
-_MALFORMED: Final = (struct.error, ValueError, EOFError, MemoryError, RuntimeError)
+_MALFORMED: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, RuntimeError)
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,7 +64,8 @@ def load_solver_config(path: Path | str | None) -> SolverConfig:
     if path is None:
         return SolverConfig()
     config = load_config(path, SolverConfig)
-    if config.tls is not None:
-        config = replace(config, tls=config.tls.beside(path))
-        check_identity(config.tls, SOLVER)
-    return config
+    if config.tls is None:
+        return config
+    tls = config.tls.beside(path)
+    check_identity(tls, SOLVER)
+    return replace(config, tls=tls)

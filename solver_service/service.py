@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import statistics
 import threading
 import time
@@ -20,6 +19,7 @@ from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, S
 from solver_service.alignment import ClockOffset
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
+from solver_service.health import NodeHealth
 
 if TYPE_CHECKING:
     from protocol.bus import Bus, Publisher, Received
@@ -28,7 +28,6 @@ log = logging.getLogger(__name__)
 
 # A dive that pauses this long is taken as ended: what waits is resolved with what there is.
 PAUSE_S: Final = 2.5
-STALE_S: Final = 2.0
 # Poses of live dives have latencies; those of stored ones do not.
 LIVE_WITHIN_NS: Final = 60 * S_NS
 # The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
@@ -54,7 +53,8 @@ class SolverService(Service):
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
         self._latencies_s: deque[float] = deque(maxlen=2000)
-        self._last_frame_s: dict[str, float] = {}
+        self._alive: set[str] = set()
+        self._health: NodeHealth | None = None
         self._reported_bad = ""
         self._offset: ClockOffset | None = None
         self._aligned_s = time.monotonic()
@@ -80,6 +80,7 @@ class SolverService(Service):
         with bus:
             bus.on_failure(lambda error: self.fail("bus", error))
             self.attach(bus)
+            bus.watch_alive(self._watch)
             bus.declare_alive(f"solver/{'_'.join(self.config.nodes) or 'any'}")
             log.info("solver: connected to %s", self.config.connect)
             while not self.stop.wait(1.0):
@@ -115,9 +116,19 @@ class SolverService(Service):
                 log.warning("solver: %s (%d so far)", self._reported_bad, self.bad_messages)
             return
         with self._lock:
-            if topic is CANDIDATES:
-                self._last_frame_s[node] = time.monotonic()
             self._publish(self._handle(message, node))
+            if self._health is not None and isinstance(message, Candidates):
+                self._health.saw_frame(node, message.stamp_ns, time.monotonic())
+            elif self._health is not None and isinstance(message, NodeInfo):
+                self._health.saw_period(node, message.trigger_period_ns)
+
+    def _watch(self, name: str, alive: bool) -> None:
+        """Say at once that a node has come or gone."""
+        with self._lock:
+            (self._alive.add if alive else self._alive.discard)(name)
+            if self._health is not None:
+                self._health.saw_process(name, alive)
+        self._report()
 
     def _handle(self, message: Message, node: str) -> list[RelativePose | Rejected]:
         if self._core is not None:
@@ -134,6 +145,9 @@ class SolverService(Service):
 
     def _pair(self, node_a: str, node_b: str) -> SolverCore:
         self._core = SolverCore(node_a, node_b, self._settings)
+        self._health = NodeHealth(node_a, node_b)
+        for name in self._alive:
+            self._health.saw_process(name, True)
         log.info("solver: pair %s, %s", node_a, node_b)
         if self._bus is not None:
             self._declare(self._core)
@@ -159,21 +173,15 @@ class SolverService(Service):
             core = self._core
             if core is None:
                 return
-            newest_s = max(self._last_frame_s.values(), default=-math.inf)
-            if core.pending and time.monotonic() - newest_s > PAUSE_S:
+            newest_s = self._health.newest_frame_s() if self._health is not None else None
+            if core.pending and (newest_s is None or time.monotonic() - newest_s > PAUSE_S):
                 self._publish(core.flush())
             self._publishers[SOLVER_STATUS.name].put(self.status(core))
 
     def status(self, core: SolverCore) -> SolverStatus:
         """Return the solver's health."""
         now_s = time.monotonic()
-        problems = []
-        for node in (core.node_a, core.node_b):
-            last_s = self._last_frame_s.get(node)
-            if last_s is None:
-                problems.append(f"no frame of node {node} yet")
-            elif now_s - last_s > STALE_S:
-                problems.append(f"no frame of node {node} for {now_s - last_s:.0f} s")
+        problems = self._health.problems(now_s) if self._health is not None else []
         if self._reported_bad:
             problems.append(self._reported_bad)
             self._reported_bad = ""

@@ -1,0 +1,1 @@
+"""Broken and hostile input: whatever comes, it is refused or taken, and nothing else happens."""

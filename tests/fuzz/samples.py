@@ -1,0 +1,101 @@
+"""A sound message of every kind, which the fuzzer spoils."""
+
+from __future__ import annotations
+
+from protocol import messages as m
+
+STAMP_NS = 1_764_000_000_000_000_000
+PERIOD_NS = 100_000_000
+
+_PAIR = {"node_a": "a", "node_b": "b", "stamp_ns": STAMP_NS}
+_NODE = {"node": "a", "stamp_ns": STAMP_NS}
+_UNIT = (0.0, 0.0, 0.0, 1.0)
+
+INFO = m.NodeInfo(
+    **_NODE,
+    width_px=820,
+    height_px=616,
+    camera=m.CameraModel(model="pinhole", fx_px=600.0, fy_px=600.0, cx_px=409.5, cy_px=307.5, distortion=[0.0] * 5),
+    light_left_m=(-0.4, 0.0, 0.0),
+    light_right_m=(0.4, 0.0, 0.0),
+    sigma_px=0.7,
+    trigger_period_ns=PERIOD_NS,
+)
+
+
+def candidates(node: str, k: int, *uv: tuple[float, float], **more: object) -> m.Candidates:
+    """Return the candidates of trigger k, by default of a node that sees the other's two lights ahead."""
+    blobs = [
+        m.Blob(u_px=u, v_px=v, sigma_px=0.7, area_px=9.0, peak=250.0, elongation=1.0)
+        for u, v in uv or ((450.0, 307.0), (369.0, 308.0), (100.0, 50.0))
+    ]
+    fields = {
+        "node": node,
+        "stamp_ns": STAMP_NS + k * PERIOD_NS,
+        "trigger": STAMP_NS // PERIOD_NS + k,
+        "seq": k,
+        "boot": "fuzz",
+        "width_px": 820,
+        "height_px": 616,
+        "blobs": blobs,
+    }
+    return m.Candidates(**{**fields, **more})
+
+
+SOUND: tuple[m.Message, ...] = (
+    INFO,
+    candidates("a", 1),
+    m.Imu(**_NODE, accel_mps2=(0.0, 0.0, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, 4e-5)),
+    m.Attitude(**_NODE, q_ned_body_xyzw=_UNIT, sigma_rad=(0.02, 0.02, 0.1)),
+    m.Depth(**_NODE, depth_m=5.0, sigma_m=0.02, pressure_pa=150000.0, temperature_degc=8.0),
+    m.CompressedImage(
+        timestamp=m.FoxgloveTime(sec=1_764_000_000, nsec=0), frame_id="a_camera", data=b"\xff\xd8\xff", format="jpeg"
+    ),
+    m.NodeStatus(
+        **_NODE,
+        boot="x",
+        software="x",
+        uptime_s=1.0,
+        rates_hz={"candidates": 10.0},
+        drops={"frame": 0},
+        ages_s={"camera": 0.1},
+        clock_offset_s=0.001,
+    ),
+    m.LightTruth(**_NODE, trigger=3, lights=[m.TrueLight(name="left", u_px=1.0, v_px=2.0, visible=True, merged=False)]),
+    m.Mark(**_NODE, name="12"),
+    m.RelativePose(
+        **_PAIR,
+        trigger=3,
+        t_a_b_m=(0.0, 0.0, 5.0),
+        q_a_b_xyzw=_UNIT,
+        covariance=[0.0] * 36,
+        range_m=5.0,
+        range_a_m=5.0,
+        range_b_m=5.0,
+        range_gap_m=0.0,
+        twist_gap_rad=0.0,
+        chi2=1.0,
+        hypotheses=2,
+        blobs_a=(0, 1),
+        blobs_b=(1, 0),
+        method="refined",
+        checks=["range"],
+        skew_ns=0,
+        azimuth_rad=0.1,
+    ),
+    m.Rejected(**_PAIR, trigger=3, reason="ambiguous", detail="two poses"),
+    m.Truth(stamp_ns=STAMP_NS, t_a_b_m=(0.0, 0.0, 5.0), q_a_b_xyzw=_UNIT),
+    m.SolverStatus(
+        **_PAIR,
+        software="x",
+        received_a=1,
+        received_b=1,
+        matched=1,
+        solved=1,
+        rejected={"late": 1},
+        late=0,
+        duplicates=0,
+        bad_messages=0,
+        pending=0,
+    ),
+)
