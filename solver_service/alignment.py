@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.clock import S_NS
 from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.rotation import matrix_of, rotation_exp, rotation_log
+from solver_service.geometry.rotation import matrix_of, rotation_exp
 from solver_service.geometry.trigger import Fix, Rig
 
 Floats = NDArray[np.float64]
@@ -31,6 +31,8 @@ MIN_NEIGHBOURS: Final = 2
 HUBER: Final = 2.0
 ROUNDS: Final = 8
 MAX_EQUATIONS: Final = 20_000
+# Fixes are turned into equations so many at a time: arrays cost little more than one of them.
+BATCH: Final = 256
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,6 @@ class _Sighting:
     time_s: float
     fix: Fix
     R_a_b: Floats
-    rigs: tuple[Rig, Rig]
     known_s: float
     sigma_rad: tuple[float, float]
 
@@ -58,9 +59,11 @@ class ClockAlignment:
     """Collects the equations of a dive; bounded, the oldest are forgotten."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, float, float, float]] = []  # gap kind, slope, value, sd
+        self._rows: deque[Floats] = deque()  # batches (4, N) of gap kind, slope, value, sd
         self._window: deque[_Sighting] = deque()
-        self._next = 0  # the first of the window whose equations are still to be made
+        self._next = 0  # the first of the window whose motion is still to be found
+        self._moving: list[tuple[_Sighting, Floats]] = []  # with their rates (6,)
+        self._rigs: tuple[Rig, Rig] | None = None
 
     def add(
         self, stamp_ns: int, fix: Fix, rigs: tuple[Rig, Rig], known_s: float, sigma_rad: tuple[float, float]
@@ -71,17 +74,25 @@ class ClockAlignment:
         """
         if min(fix.pair_a + fix.pair_b) < 0:
             return
+        if self._rigs is None or self._rigs[0] is not rigs[0] or self._rigs[1] is not rigs[1]:
+            self._make_equations()
+            self._rigs = rigs
         time_s = stamp_ns / S_NS
         if self._window and not 0 < time_s - self._window[-1].time_s <= HALF_WINDOW_S:
             self._window.clear()
             self._next = 0
-        self._window.append(_Sighting(time_s, fix, matrix_of(fix.q_a_b_xyzw), rigs, known_s, sigma_rad))
+        self._window.append(_Sighting(time_s, fix, matrix_of(fix.q_a_b_xyzw), known_s, sigma_rad))
         while self._window[self._next].time_s <= time_s - HALF_WINDOW_S:
-            self._add_equations(self._window[self._next])
+            centre = self._window[self._next]
+            rates = self._rates(centre)
+            if rates is not None:
+                self._moving.append((centre, rates))
             self._next += 1
             while self._window[0].time_s < self._window[self._next].time_s - HALF_WINDOW_S:
                 self._window.popleft()
                 self._next -= 1
+        if len(self._moving) >= BATCH:
+            self._make_equations()
 
     def _rates(self, centre: _Sighting) -> Floats | None:
         """Velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,): the slope through its neighbours."""
@@ -89,29 +100,52 @@ class ClockAlignment:
         times_s = np.array([s.time_s - centre.time_s for s in near])
         if (times_s < 0).sum() < MIN_NEIGHBOURS or (times_s > 0).sum() < MIN_NEIGHBOURS:
             return None
-        moved = np.array([np.concatenate((s.fix.t_a_b_m, rotation_log(s.R_a_b @ centre.R_a_b.T))) for s in near])
+        turned = np.array([s.R_a_b for s in near]) @ centre.R_a_b.T
+        # Within the window a pair turns by some tenths of a radian: the sine of the angle over the angle matters.
+        sine = (
+            np.stack(
+                (
+                    turned[:, 2, 1] - turned[:, 1, 2],
+                    turned[:, 0, 2] - turned[:, 2, 0],
+                    turned[:, 1, 0] - turned[:, 0, 1],
+                ),
+                axis=1,
+            )
+            / 2
+        )
+        angle = np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
+        moved = np.hstack((np.array([s.fix.t_a_b_m for s in near]), sine / np.sinc(angle / np.pi)[:, None]))
         times_s -= times_s.mean()
         return np.asarray(times_s @ (moved - moved.mean(0)) / (times_s @ times_s))
 
-    def _add_equations(self, sighting: _Sighting) -> None:
-        rates = self._rates(sighting)
-        if rates is None:
+    def _make_equations(self) -> None:
+        """Turn the fixes whose motion is known into rows."""
+        if not self._moving or self._rigs is None:
             return
-        expected, slopes, apart_rad = gap_slopes(sighting.fix, rates, sighting.rigs)
-        sigma_a, sigma_b = sighting.sigma_rad
-        sd = math.sqrt(2.0) * math.hypot(sigma_a / apart_rad[0], sigma_b / apart_rad[1])
-        seen = math.log(sighting.fix.range_a_m / sighting.fix.range_b_m), sighting.fix.twist_gap_rad
-        for kind in range(2):
-            value = math.remainder(seen[kind] - expected[kind], 2 * math.pi)
-            self._rows.append((float(kind), slopes[kind], value - slopes[kind] * sighting.known_s, sd))
-        if len(self._rows) > MAX_EQUATIONS:
-            del self._rows[: MAX_EQUATIONS // 10]
+        sightings = [sighting for sighting, _ in self._moving]
+        t = np.array([s.fix.t_a_b_m for s in sightings])
+        R = np.array([s.R_a_b for s in sightings])
+        rates = np.array([rates for _, rates in self._moving])
+        self._moving.clear()
+        expected, slopes, apart_rad = gap_slopes(t, R, rates, self._rigs)
+        sigma_rad = np.array([s.sigma_rad for s in sightings]).T
+        sd = math.sqrt(2.0) * np.hypot(sigma_rad[0] / apart_rad[0], sigma_rad[1] / apart_rad[1])
+        seen = np.array(
+            [[math.log(s.fix.range_a_m / s.fix.range_b_m) for s in sightings], [s.fix.twist_gap_rad for s in sightings]]
+        )
+        known_s = np.array([s.known_s for s in sightings])
+        value = _wrapped(seen - expected) - slopes * known_s
+        kind = np.repeat([[0.0], [1.0]], len(sightings), axis=1)
+        self._rows.append(np.stack((kind, slopes, value, np.stack((sd, sd)))).reshape(4, -1))
+        while sum(batch.shape[1] for batch in self._rows) > MAX_EQUATIONS:
+            self._rows.popleft()
 
     def estimate(self) -> ClockOffset | None:
         """Return the offset, None where the fixes are too few or the pair did not move."""
-        if len(self._rows) < 2 * MIN_FIXES:
+        self._make_equations()
+        if sum(batch.shape[1] for batch in self._rows) < 2 * MIN_FIXES:
             return None
-        kind, slope, value, sd = np.array(self._rows).T
+        kind, slope, value, sd = np.hstack(self._rows)
         design = np.stack((-slope, kind == 0, kind == 1), axis=1) / sd[:, None]
         target = value / sd
         weight = np.ones_like(target)
@@ -125,36 +159,34 @@ class ClockAlignment:
             scale = max(1.4826 * float(np.median(off)), 0.1)
             weight = np.minimum(1.0, HUBER * scale / np.maximum(off, 1e-12))
         sigma_s = scale * math.sqrt(float(np.linalg.inv(normal)[0, 0]))
-        return ClockOffset(float(solution[0]), sigma_s, len(self._rows) // 2)
+        return ClockOffset(float(solution[0]), sigma_s, len(kind) // 2)
 
 
-def gap_slopes(
-    fix: Fix, rates: Floats, rigs: tuple[Rig, Rig]
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+def gap_slopes(t_a_b_m: Floats, R_a_b: Floats, rates: Floats, rigs: tuple[Rig, Rig]) -> tuple[Floats, Floats, Floats]:
     """Return both gaps of noise-free views, their slopes by the time B's view is later (1/s), and both alphas (rad).
 
-    The gaps: log of the ratio of both ranges, and the twist gap.
+    t_a_b_m: (K, 3), R_a_b: (K, 3, 3), rates: (K, 6). All three results are (2, K). The gaps: log of the ratio of
+    both ranges, and the twist gap.
     """
-    R = matrix_of(fix.q_a_b_xyzw)
-    shifts_s = np.array([0.0, -STEP_S, STEP_S])
-    seen_by_a = _bearings(rigs[1].lights_m @ R.T + fix.t_a_b_m)
-    in_a = np.repeat(seen_by_a[:, :, None], 3, axis=2)
-    in_b = np.empty((2, 3, 3))
-    for i, shift_s in enumerate(shifts_s):
-        t_later = fix.t_a_b_m + shift_s * rates[:3]
-        R_later = rotation_exp(shift_s * rates[3:]) @ R
-        in_b[:, :, i] = _bearings((rigs[0].lights_m - t_later) @ R_later)
-    left, right = np.stack((in_a[0], in_b[0])), np.stack((in_a[1], in_b[1]))
-    solved = closed_form(left, right, *rigs)
-    log_ratio = np.log(solved.range_m[0] / solved.range_m[1])
-    twist = solved.twist_gap_rad
-    slopes = (
-        (log_ratio[2] - log_ratio[1]) / (2 * STEP_S),
-        math.remainder(twist[2] - twist[1], 2 * math.pi) / (2 * STEP_S),
-    )
-    apart = tuple(math.acos(min(max(float(v[0] @ v[1]), -1.0), 1.0)) for v in (seen_by_a, in_b[:, :, 0]))
-    return (float(log_ratio[0]), float(twist[0])), (float(slopes[0]), float(slopes[1])), (apart[0], apart[1])
+    count = len(t_a_b_m)
+    shifts_s = np.repeat([0.0, -STEP_S, STEP_S], count)[:, None]
+    in_a = np.tile(_bearings(rigs[1].lights_m @ R_a_b.swapaxes(1, 2) + t_a_b_m[:, None]), (3, 1, 1))
+    turned, moved = np.tile(rates[:, 3:], (3, 1)), np.tile(rates[:, :3], (3, 1))
+    R_later = rotation_exp(shifts_s * turned) @ np.tile(R_a_b, (3, 1, 1))
+    t_later = np.tile(t_a_b_m, (3, 1)) + shifts_s * moved
+    in_b = _bearings((rigs[0].lights_m - t_later[:, None]) @ R_later)
+    # (3 K, 2 lights, 3) of each view into the closed form's (2 views, 3, 3 K) of each light.
+    views = np.stack((in_a, in_b)).transpose(2, 0, 3, 1)
+    solved = closed_form(views[0], views[1], *rigs)
+    gaps = np.stack((np.log(solved.range_m[0] / solved.range_m[1]), solved.twist_gap_rad)).reshape(2, 3, count)
+    slopes = _wrapped(gaps[:, 2] - gaps[:, 1]) / (2 * STEP_S)
+    apart = [np.arccos(np.clip((v[:count, 0] * v[:count, 1]).sum(1), -1.0, 1.0)) for v in (in_a, in_b)]
+    return gaps[:, 0], slopes, np.array(apart)
 
 
 def _bearings(points: Floats) -> Floats:
-    return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
+    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
+
+
+def _wrapped(angle_rad: Floats) -> Floats:
+    return np.asarray(angle_rad - 2 * np.pi * np.rint(angle_rad / (2 * np.pi)))

@@ -1,11 +1,14 @@
 """The clocks' offset out of the motion: found where the pair moves, not made up where it rests."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from solver_service.alignment import ClockAlignment, gap_slopes
+from solver_service.alignment import ClockAlignment
 from solver_service.core import SolverCore
 from solver_service.geometry.camera import Camera
+from solver_service.geometry.closed_form import closed_form
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import rotation_exp
 from solver_service.geometry.trigger import Settings
@@ -21,31 +24,37 @@ def rig(left_m=(-0.44, 0.0, 0.0), right_m=(0.44, 0.0, 0.0)):
     return Rig(camera=camera, lights_m=np.array([left_m, right_m]))
 
 
+def pose(s, moving):
+    """Where a pair in a swell is at times s (K,): t (K, 3), R (K, 3, 3)."""
+    s = s * moving
+    t = np.stack((0.5 * np.sin(0.4 * s), 0.3 * np.cos(0.3 * s), 3.0 + np.sin(0.2 * s)), axis=1)
+    w = np.stack((0.15 * np.sin(0.9 * s), 0.3 * np.cos(0.6 * s), 0.2 * np.sin(0.8 * s)), axis=1)
+    return t, rotation_exp(w) @ FACING
+
+
+def bearings(points):
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
 def seen(offset_s, rng, rigs, fixes=250, moving=1.0, noise=1.0):
-    """Fixes of a pair whose gaps are those of a B seen offset_s earlier than said; noise: in units of the sd."""
+    """Fixes of a pair that B sees offset_s before its stamp says; noise: in units of the gaps' own."""
     sigma_rad = 0.7 / 904
+    s = np.arange(fixes) * STEP_S
+    t, R = pose(s, moving)
+    t_then, R_then = pose(s - offset_s, moving)
+    in_a = bearings(rigs[1].lights_m @ R.swapaxes(1, 2) + t[:, None])
+    in_b = bearings((rigs[0].lights_m - t_then[:, None]) @ R_then)
+    views = np.stack((in_a, in_b)).transpose(2, 0, 3, 1)
+    solved = closed_form(views[0], views[1], *rigs)
+    alpha = np.arccos((views[0] * views[1]).sum(1))
+    sd = np.sqrt(2.0) * np.hypot(sigma_rad / alpha[0], sigma_rad / alpha[1])
+    log_ratio = np.log(solved.range_m[0] / solved.range_m[1]) + noise * sd * rng.normal(size=fixes)
+    twist_gap = solved.twist_gap_rad + noise * sd * rng.normal(size=fixes)
     rows = []
     for k in range(fixes):
-        s = k * STEP_S
-        t = np.array([0.5 * np.sin(0.4 * s), 0.3 * np.cos(0.3 * s), 3.0 + np.sin(0.2 * s)])
-        w = moving * np.array([0.15 * np.sin(0.9 * s), 0.3 * np.cos(0.6 * s), 0.2 * np.sin(0.8 * s)])
-        rates = np.array([0.2 * np.cos(0.4 * s), -0.09 * np.sin(0.3 * s), 0.2 * np.cos(0.2 * s), 0, 0, 0]) * moving
-        t = t if moving else np.array([0.1, 0.0, 3.0])
-        now = fix(t, rotation_exp(w) @ FACING, np.eye(6) * 1e-6)
-        after = rotation_exp(
-            moving
-            * np.array(
-                [0.15 * np.sin(0.9 * (s + 1e-4)), 0.3 * np.cos(0.6 * (s + 1e-4)), 0.2 * np.sin(0.8 * (s + 1e-4))]
-            )
-        )
-        turn = after @ rotation_exp(w).T
-        rates[3:] = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2e-4
-        expected, slopes, apart = gap_slopes(now, rates, rigs)
-        sd = np.sqrt(2.0) * np.hypot(sigma_rad / apart[0], sigma_rad / apart[1])
-        gaps = np.array(expected) - np.array(slopes) * offset_s + noise * sd * rng.normal(size=2)
-        object.__setattr__(now, "range_a_m", 3.0 * np.exp(gaps[0]))
-        object.__setattr__(now, "twist_gap_rad", float(gaps[1]))
-        rows.append((round(s * 1e9), now, (sigma_rad, sigma_rad)))
+        now = fix(t[k], R[k], np.eye(6) * 1e-6)
+        now = replace(now, range_a_m=3.0 * np.exp(log_ratio[k]), twist_gap_rad=float(twist_gap[k]))
+        rows.append((round(s[k] * 1e9), now, (sigma_rad, sigma_rad)))
     return rows
 
 
