@@ -37,8 +37,8 @@ _ROBUST_SD = 3.0
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
 MODEL: Mapping[str, float] = {
-    "growth": 0.7,
-    "growth_veil": 0.45,
+    "growth": 0.65,
+    "growth_veil": 0.4,
     "growth_size": 0.45,
     "growth_sd": 0.35,
     "steepness": 0.75,

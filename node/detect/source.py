@@ -45,6 +45,13 @@ _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
 
 
+_SCORE_AT_ZERO: Final = -5.2
+_SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
+_SCORE_LIMIT: Final = np.array([9.0, 9.0, 2.0, 1.0], np.float32)
+"""Log odds of a lamp: for standing out of its neighbourhood, for its height, against being long, against having no
+edge. Fitted to the places found in rendered dives of five environments, in colour and grey, and in real caustics."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Lights:
     """What the rings tell about N proposals.
@@ -198,10 +205,9 @@ def _low(level: Floats, share: float) -> Floats:
 
 
 def _score(features: Floats) -> Floats:
-    """Give each proposal's probability of being a lamp, (N,)."""
-    logit = -2.0 + 1.5 * features[:, 0] + 1.0 * features[:, 1] - 1.0 * features[:, 2] - 2.0 * features[:, 3]
-    score: Floats = 1.0 / (1.0 + np.exp(-logit))
-    return score
+    """Give each proposal's probability of being a lamp, (N,): logistic in the first of the features."""
+    logit = _SCORE_AT_ZERO + np.minimum(features[:, : len(_SCORE_WEIGHTS)], _SCORE_LIMIT) @ _SCORE_WEIGHTS
+    return np.asarray(1.0 / (1.0 + np.exp(-logit)), np.float32)
 
 
 def _detections(
