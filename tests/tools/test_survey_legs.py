@@ -142,6 +142,7 @@ def test_a_rest_too_short_for_a_leg_is_said(messages):
     found = derived(cut)
     assert len(found.legs) == 4
     assert any("makes no leg" in problem.text for problem in found.problems)
+    assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
 
 
 def test_swimming_is_not_rest(messages):

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from tools.survey.averages import wrap
 from tools.survey.magnetism import Field
@@ -64,7 +65,7 @@ def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tupl
     A field beyond its limits condemns. Where the sights contradict each other, so does less: what is clearly
     further off its usual field than the other node's.
     """
-    off = [_off(shot.field_a, usual.a, limits), _off(shot.field_b, usual.b, limits)]
+    off = off_fields(shot, usual, limits)
     found = [node for node, far in zip(nodes, off, strict=True) if far > 1]
     if found or shot.sight_a is None or shot.sight_b is None:
         return found
@@ -73,6 +74,32 @@ def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tupl
         return []
     worse = 0 if off[0] > off[1] else 1
     return [nodes[worse]] if off[worse] > max(SUSPECT_SHARE, 2 * off[1 - worse]) else []
+
+
+def off_fields(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> tuple[float, float]:
+    """Return how far each node's field is from its usual one, as a share of what is tolerated."""
+    return _off(shot.field_a, usual.a, limits), _off(shot.field_b, usual.b, limits)
+
+
+def disturbed_alike(legs: list[Leg], off: list[dict[str, float]]) -> list[Leg]:
+    """Return legs in which a node that was disturbed at a station is so in the leg before and after as well.
+
+    off: each leg's off_fields by node. A node that turns about at its station stays beside what disturbs it.
+    """
+
+    def at(leg: Leg, node: str) -> str:
+        return leg.from_ if leg.from_node == node else leg.to
+
+    result = list(legs)
+    for k, leg in enumerate(legs):
+        for other in (k - 1, k + 1):
+            if not 0 <= other < len(legs):
+                continue
+            for node in legs[other].disturbed:
+                same = at(leg, node) == at(legs[other], node)
+                if same and node not in result[k].disturbed and off[k][node] > SUSPECT_SHARE:
+                    result[k] = replace(result[k], disturbed=sorted([*result[k].disturbed, node]))
+    return result
 
 
 def _off(field: Field | None, usual: Field | None, limits: AlarmSettings) -> float:

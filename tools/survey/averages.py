@@ -21,11 +21,15 @@ CORRELATION_S: Final = 1.0
 
 @dataclass(frozen=True)
 class Mean:
-    """A value with its standard deviation, in one unit; count: how many readings it is of."""
+    """A value with its standard deviation, in one unit; count: how many readings it is of.
+
+    noise: the part of sigma that another series would have anew; what is slow stays the same for a while.
+    """
 
     value: float
     sigma: float
     count: int
+    noise: float
 
 
 def inliers(values: Floats, least_sigma: float) -> Bools:
@@ -69,7 +73,7 @@ def mean_of_white(stamps_s: Floats, values: Floats, stated_sigma: float, floor: 
     scatter = float(values.std(ddof=1)) if len(values) > 1 else 0.0
     count = effective_count(stamps_s, values)
     sigma = math.hypot(max(scatter, stated_sigma) / math.sqrt(count), floor)
-    return Mean(float(values.mean()), sigma, len(values))
+    return Mean(float(values.mean()), sigma, len(values), sigma)
 
 
 def mean_of_slow(stamps_s: Floats, values: Floats, stated_sigma: float, floor: float) -> Mean:
@@ -80,8 +84,8 @@ def mean_of_slow(stamps_s: Floats, values: Floats, stated_sigma: float, floor: f
     """
     variance = float(values.var(ddof=1)) if len(values) > 1 else 0.0
     unseen = max(stated_sigma**2 - variance, 0.0)
-    averaged = variance / effective_count(stamps_s, values)
-    return Mean(float(values.mean()), math.sqrt(unseen + averaged + floor**2), len(values))
+    noise = math.sqrt(variance / effective_count(stamps_s, values) + floor**2)
+    return Mean(float(values.mean()), math.hypot(math.sqrt(unseen), noise), len(values), noise)
 
 
 def unwrapped(angles_rad: Floats) -> Floats:

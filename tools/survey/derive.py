@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from datetime import UTC, datetime
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -90,11 +91,20 @@ class _OneDive:
         ]
         standings = stand(stops, self.settings.procedure, self.first) if stops else []
         usual = alarms.usual_fields(shots)
-        for shot, standing in zip(shots, standings, strict=True):
+        legs: list[Leg] = []
+        doubtful = _after_lost(every)
+        for one, shot, standing in zip(found, shots, standings, strict=True):
             leg = self._leg(shot, standing.station["a"], standing.station["b"], standing.rear, usual)
             if standing.problem:
                 leg = replace(leg, alarms=[*leg.alarms, f"stations: {standing.problem}"])
-            self.out.legs.append(leg)
+            if one.start_ns in doubtful and len(named[len(legs)]) < 2:
+                said = "stations: a rest before this one makes no leg; mark both nodes' stations, or they may be wrong"
+                leg = replace(leg, alarms=[*leg.alarms, said])
+            legs.append(leg)
+        off = [
+            dict(zip(self.readings.nodes, alarms.off_fields(shot, usual, self.limits), strict=True)) for shot in shots
+        ]
+        self.out.legs += alarms.disturbed_alike(legs, off)
         self._points(found, standings, usual)
         if not found:
             least = f"{self.settings.rest_s:g} s with {self.settings.rest_fixes} fixes"
@@ -198,6 +208,11 @@ def one_leg(shot: Shot, nodes: tuple[str, str], at: tuple[str, str] = ("a", "b")
     )
 
 
+def _after_lost(every: list[Rest]) -> set[int]:
+    """Return the starts of the rests that follow one which makes no leg: who moved since is a guess."""
+    return {rest.start_ns for before, rest in pairwise(every) if before.too_short and not rest.too_short}
+
+
 def _angles(prefix: str, sight: Sight | None) -> dict[str, Any]:
     if sight is None:
         return {}
@@ -212,7 +227,11 @@ def _angles(prefix: str, sight: Sight | None) -> dict[str, Any]:
 def _depth(end: str, depth: Mean | None) -> dict[str, Any]:
     if depth is None:
         return {}
-    return {f"depth_{end}_m": round(depth.value, 4), f"depth_{end}_sigma_m": round(depth.sigma, 4)}
+    return {
+        f"depth_{end}_m": round(depth.value, 4),
+        f"depth_{end}_sigma_m": round(depth.sigma, 4),
+        f"depth_{end}_noise_m": round(depth.noise, 4),
+    }
 
 
 def _value(mean: Mean | None) -> float | None:

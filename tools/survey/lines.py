@@ -55,14 +55,17 @@ def bearing_of(leg: Leg, project: Project) -> Sights | None:
     fore_sigma = _radians(leg.azimuth_sigma_deg) or 0.0
     back_sigma = _radians(leg.back_azimuth_sigma_deg) or 0.0
     gap = None if fore is None or back is None else wrap(fore - back - math.pi)
+    bad_fore, bad_back = leg.from_node in leg.disturbed, leg.to_node in leg.disturbed
+    if bad_fore:
+        fore_sigma = math.hypot(fore_sigma, math.radians(project.settings.disturbed_deg))
+    if bad_back:
+        back_sigma = math.hypot(back_sigma, math.radians(project.settings.disturbed_deg))
     edit = project.edit_of(leg)
     if edit is not None and edit.compass is not UNSET:
         fore = None if edit.compass == "back" else fore
         back = None if edit.compass == "fore" else back
-    elif fore is not None and back is not None:
-        bad_fore, bad_back = leg.from_node in leg.disturbed, leg.to_node in leg.disturbed
-        if bad_fore != bad_back:
-            fore, back = (None, back) if bad_fore else (fore, None)
+    elif fore is not None and back is not None and bad_fore != bad_back:
+        fore, back = (None, back) if bad_fore else (fore, None)
     return _weighed(fore, back, fore_sigma, back_sigma, gap)
 
 
@@ -117,10 +120,13 @@ class Line:
         return float(np.linalg.norm(self.vector_m))
 
 
-def line_of(leg: Leg, project: Project, to_grid_rad: float, depths_m: dict[str, float]) -> Line | None:
+def line_of(
+    leg: Leg, project: Project, to_grid_rad: float, depths_m: dict[str, float], *, alone: bool = False
+) -> Line | None:
     """Return a leg as a vector; None where it has no bearing or nothing that gives its rise.
 
     to_grid_rad: grid azimuth minus magnetic. depths_m: stations held at these depths; others by their readings.
+    alone: the leg is not one of many in which the gauges err alike, so its rise has all of their error.
     Distance, bearing and rise are independent; the run along follows from distance and rise, except for steep
     legs, where the clinometers give both.
     """
@@ -132,7 +138,7 @@ def line_of(leg: Leg, project: Project, to_grid_rad: float, depths_m: dict[str, 
     magnetic = known[0] if len(known) == 1 else known[0] + 0.5 * wrap(known[1] - known[0])
     azimuth = magnetic + to_grid_rad
     distance_m, distance_sigma_m = leg.distance_m, leg.distance_sigma_m
-    rise = _rise(leg, depths_m)
+    rise = _rise(leg, depths_m, alone)
     clino = clino_of(leg)
     steep = rise is None or abs(rise[0]) > distance_m * math.sin(STEEP_RAD)
     if steep and clino is not None:
@@ -172,12 +178,16 @@ def line_of(leg: Leg, project: Project, to_grid_rad: float, depths_m: dict[str, 
     )
 
 
-def _rise(leg: Leg, depths_m: dict[str, float]) -> tuple[float, float] | None:
+def _rise(leg: Leg, depths_m: dict[str, float], alone: bool) -> tuple[float, float] | None:
     if leg.from_ in depths_m and leg.to in depths_m:
         return depths_m[leg.from_] - depths_m[leg.to], math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
     if leg.depth_from_m is UNSET or leg.depth_to_m is UNSET:
         return None
-    return leg.depth_from_m - leg.depth_to_m, _depth_sigma_m(leg)
+    noises = leg.depth_from_noise_m, leg.depth_to_noise_m
+    if alone or UNSET in noises:
+        return leg.depth_from_m - leg.depth_to_m, _depth_sigma_m(leg)
+    # A node keeps its gauge, and mostly its place, from leg to leg: what errs slowly cancels along the line.
+    return leg.depth_from_m - leg.depth_to_m, math.hypot(*(float(s) for s in noises if s is not UNSET))
 
 
 def _depth_sigma_m(leg: Leg) -> float:

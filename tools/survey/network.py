@@ -158,13 +158,13 @@ def adjust(project: Project) -> Adjusted:
     lines = [line for line in lines if line.leg.from_ in reached]
     solution = _Solution(lines, fixed)
     positions = solution.positions(math.radians(project.settings.compass_common_deg))
-    for held in project.station if depths else []:
-        # Held at its depth, a station's altitude is as good as its gauge.
+    for held in project.station:
+        # An altitude is as good as the gauge: what that errs slowly is in no leg's noise.
         if held.name in positions and held.depth_sigma_m is not UNSET:
             positions[held.name].covariance[2, 2] += held.depth_sigma_m**2
     points = []
     for leg in project.used(project.point):
-        line = line_of(leg, project, grid.to_grid_rad, {})
+        line = line_of(leg, project, grid.to_grid_rad, {}, alone=True)
         station = positions.get(leg.from_)
         if line is None or station is None:
             left_out.append((leg, "no bearing or no slope" if line is None else f"station {leg.from_} has no position"))

@@ -104,7 +104,8 @@ class Leg(Config, frozen=True, kw_only=True):
     """[[leg]] and [[point]]: one shot from a station to a station or point, as read; angles magnetic, in degrees.
 
     azimuth_deg, inclination_deg: by the node at `from`, towards `to`; back_*: by the node at `to`, towards
-    `from`. *_sigma_*: 1 sd. fixes_used, unused: triggers, as ranges; unused: by reason.
+    `from`. *_sigma_*: 1 sd; *_noise_*: its part that is new in each leg, not the gauge's own. fixes_used, unused:
+    triggers, as ranges; unused: by reason.
     """
 
     from_: str = field(name="from")
@@ -126,8 +127,10 @@ class Leg(Config, frozen=True, kw_only=True):
     back_inclination_sigma_deg: float | UnsetType = UNSET
     depth_from_m: float | UnsetType = UNSET
     depth_from_sigma_m: float | UnsetType = UNSET
+    depth_from_noise_m: float | UnsetType = UNSET
     depth_to_m: float | UnsetType = UNSET
     depth_to_sigma_m: float | UnsetType = UNSET
+    depth_to_noise_m: float | UnsetType = UNSET
     field_from_ut: float | UnsetType = UNSET
     field_to_ut: float | UnsetType = UNSET
     dip_from_deg: float | UnsetType = UNSET

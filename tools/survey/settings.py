@@ -20,6 +20,7 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     centering_m: 1 sd, how well a node is held at its station, each axis. range_share: 1 sd, error of the ranges'
     scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging a rest does not take away.
     compass_common_deg: 1 sd, error of every azimuth alike (declination, mount): it turns the survey as a whole.
+    disturbed_deg: 1 sd of a compass in a disturbed field, where there is no other.
     reference_m: node id to its station's point ([x, y, z], camera frame), where that is not the camera's centre.
     """
 
@@ -34,8 +35,9 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     range_share: NonNegative = 0.0015
     compass_floor_deg: NonNegative = 0.3
     tilt_floor_deg: NonNegative = 0.2
-    depth_floor_m: NonNegative = 0.01
+    depth_floor_m: NonNegative = 0.005
     compass_common_deg: NonNegative = 0.5
+    disturbed_deg: Positive = 10.0
     point_s: Positive = 2.0
     reference_m: dict[str, Vector3] = field(default_factory=dict)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,8 +125,7 @@ def _sight(
         math.hypot(tilt_rad, across_m / range_m),
         math.hypot(math.radians(settings.tilt_floor_deg), held_m / range_m),
     )
-    turned = Mean(azimuth_mean.value % (2 * math.pi), azimuth_mean.sigma, azimuth_mean.count)
-    return Sight(turned, inclination_mean)
+    return Sight(replace(azimuth_mean, value=azimuth_mean.value % (2 * math.pi)), inclination_mean)
 
 
 def _depth(node: Node, below_port_m: Floats, start_ns: int, end_ns: int, settings: SurveySettings) -> Mean | None:
@@ -143,4 +142,4 @@ def _depth(node: Node, below_port_m: Floats, start_ns: int, end_ns: int, setting
         float(np.median(node.depth_sigma_m[part])),
         math.hypot(settings.depth_floor_m, settings.centering_m),
     )
-    return Mean(mean.value + below_m, mean.sigma, mean.count)
+    return replace(mean, value=mean.value + below_m)
