@@ -44,7 +44,8 @@ CHANCE_ODDS: Final = 0.3
 PITCH_SPREAD: Final = 1.1
 _HEADING_SPREAD: Final = 1.5
 DEPTH_SPREAD_M: Final = 6.0
-# A prediction from earlier poses is believed this much at most, and costs at most half where it is wrong.
+# A prediction from earlier poses is wrong this often, and where it is right it is believed this much at most (log).
+_PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
 AGREES: Final = 20.0
@@ -242,7 +243,7 @@ def weigh_prediction(
     rigs: tuple[Rig, Rig],
     settings: Settings,
 ) -> Floats:
-    """Weigh K poses against a prediction from earlier ones: a bounded gain, and never more than half lost.
+    """Weigh K poses against a prediction from earlier ones: a bounded gain and a bounded loss.
 
     variance: (K,) four times that of the poses' own ln range, and of their twist.
     """
@@ -274,5 +275,5 @@ def weigh_prediction(
     spread = math.log(settings.range_max_m / settings.range_min_m) * views_sr * 2.0 * math.pi
     log_chance = -1.5 * np.log(range2) - math.log(spread)
     log_gain = np.where(near, np.minimum(-0.5 * chi2 - log_area - log_chance, _MAX_LOG_PRIOR), -np.inf)
-    gain: Floats = np.log(0.5 + 0.5 * np.exp(log_gain))
+    gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
     return gain

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from solver_service.geometry.closed_form import dot, eq1_range_m
 from solver_service.geometry.evidence import (
     DEPTH_SPREAD_M,
+    GROSS_PROBABILITY,
+    GROSS_SCALE,
     MISSING_ODDS,
     PITCH_SPREAD,
     Sensors,
@@ -36,10 +38,10 @@ _ROUNDS: Final = 4
 # chi^2 of tilt and depth, three degrees of freedom, before and after the refinement.
 _GATE_CHI2: Final = 40.0
 _FITS_CHI2: Final = 16.0
+# No gap tells a gross error of the pair: the covariance has its share of them.
+_UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 _REFINED: Final = 6
 _STEPS: Final = 6
-# A pose whose position is known worse than this, relative to the range (1 sd), is not worth its risk.
-_MAX_SIGMA: Final = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,11 +176,10 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     column = r[:, :, None]
     chi2 = (column * (weight @ column)).sum((1, 2)) + (r_s * r_s).sum(1)
     range2 = (t * t).sum(1)
-    position = np.linalg.eigvalsh(np.where(np.isfinite(covariance), covariance, 0.0)[:, :3, :3])[:, 2]
     settings = terms.settings
     sound = np.isfinite(chi2) & (chi2 < _FITS_CHI2) & (along > 0.0).all(1)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    sound &= (position > 0.0) & (position < _MAX_SIGMA**2 * range2)
+    sound &= np.isfinite(covariance.sum((1, 2)))
     if not sound.any():
         return None
     log_ratio, log_prior = _log_ratio(terms, lights, t, R, covariance, chi2, sigma)
@@ -188,7 +189,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         lights=lights,
         t_a_b_m=t,
         R_a_b=R,
-        covariance=covariance,
+        covariance=_UNCHECKED * covariance,
         chi2=chi2,
         log_ratio=np.where(sound & np.isfinite(log_ratio), log_ratio, -np.inf),
         tilt_chi2=none,

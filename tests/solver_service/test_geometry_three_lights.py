@@ -1,0 +1,113 @@
+"""One light short: a pose where the sensors support it, its own covariance, and no pose where they do not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from solver_service.geometry.rotation import matrix_of, rotation_log
+from solver_service.geometry.trigger import Fix, NoFix, Sensed, Settings, solve_trigger
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, random_scene, view
+
+SETTINGS = Settings()
+
+
+def without(scene, missing, rng, sigma_px=1.0):
+    """Both views, of four lights all but one: 0, 1 are B's left and right in A's view."""
+    views = [v for v, _ in scene.views(rng, sigma_px)]
+    node, light = divmod(missing, 2)
+    views[node] = view(np.delete(views[node].pixels, light, axis=0), sigma_px)
+    return views
+
+
+def solve(scene, views, sensed, settings=SETTINGS):
+    return solve_trigger(*views, scene.rig_a, scene.rig_b, *sensed, settings)
+
+
+def error(fix, scene):
+    return np.concatenate((scene.t - fix.t_a_b_m, rotation_log(scene.R @ matrix_of(fix.q_a_b_xyzw).T)))
+
+
+@pytest.mark.parametrize("missing", range(4))
+@pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
+def test_three_lights_and_perfect_sensors_give_the_pose(missing, rigs):
+    rng = np.random.default_rng(missing)
+    solved = 0
+    for _ in range(8):
+        scene = random_scene(rng, (1.5, 3.0), *rigs)
+        fix = solve(scene, without(scene, missing, rng, 0.1), scene.sensed())
+        if isinstance(fix, NoFix):
+            continue
+        solved += 1
+        assert fix.method == "three_lights"
+        expected = [0, 0, 0, 0]
+        expected[missing] = -1
+        expected[missing ^ 1] = 0
+        expected[2 - 2 * (missing // 2) + 1] = 1
+        assert (*fix.pair_a, *fix.pair_b) == tuple(expected)
+        assert np.linalg.norm(error(fix, scene)[:3]) < 0.01 * np.linalg.norm(scene.t)
+        assert fix.checks == ("attitude", "depth")
+    # Which of its two lights the other saw, heading alone cannot always tell.
+    assert solved >= 4
+
+
+def test_the_error_is_within_the_covariance_which_is_larger_than_that_of_four():
+    rng = np.random.default_rng(4)
+    squares, larger = [], []
+    for _ in range(60):
+        scene = random_scene(rng, (1.5, 4.0))
+        sensed = scene.sensed(rng)
+        views = [v for v, _ in scene.views(rng, 0.7)]
+        four = solve(scene, views, sensed)
+        three = solve(scene, [views[0], view(views[1].pixels[:1], 0.7)], sensed)
+        if isinstance(three, Fix) and isinstance(four, Fix):
+            e = error(three, scene)
+            squares.append(e @ np.linalg.solve(three.covariance, e) / 6)
+            larger.append(np.trace(three.covariance[:3, :3]) / np.trace(four.covariance[:3, :3]))
+    assert len(squares) >= 30
+    # Widened for gross errors that no gap tells, which these pictures have none of.
+    assert 0.15 < np.mean(squares) < 1.1
+    assert min(larger) > 1.0
+
+
+def test_without_attitude_or_depth_three_lights_are_no_pose():
+    rng = np.random.default_rng(5)
+    scene = random_scene(rng, 2.0)
+    views = without(scene, 2, rng, 0.1)
+    sensed = scene.sensed()
+    poor = (
+        (Sensed(), Sensed()),
+        (sensed[0], Sensed()),
+        tuple(replace(s, depth_m=None) for s in sensed),
+        tuple(replace(s, q_ned_body_xyzw=None) for s in sensed),
+    )
+    for lacking in poor:
+        found = solve(scene, views, lacking)
+        assert isinstance(found, NoFix)
+        assert found.reason == "too_few_candidates"
+    assert isinstance(solve(scene, views, sensed, Settings(checks=frozenset({"range", "twist"}))), NoFix)
+    assert isinstance(solve(scene, views, sensed, Settings(method="exact")), NoFix)
+
+
+def test_a_false_candidate_does_not_pass_for_the_missing_light():
+    rng = np.random.default_rng(6)
+    wrong = poses = 0
+    for _ in range(80):
+        scene = random_scene(rng, (1.5, 8.0))
+        views = without(scene, int(rng.integers(4)), rng, 1.0)
+        views = [view(np.concatenate((v.pixels, rng.uniform((0, 0), (1640, 1232), (3, 2))))) for v in views]
+        fix = solve(scene, views, scene.sensed(rng))
+        if isinstance(fix, Fix):
+            poses += 1
+            wrong += np.linalg.norm(fix.t_a_b_m - scene.t) > 0.1 * np.linalg.norm(scene.t)
+    assert poses >= 5
+    assert wrong <= 1
+
+
+def test_two_lights_are_no_pose():
+    rng = np.random.default_rng(7)
+    scene = random_scene(rng, 3.0)
+    views = [v for v, _ in scene.views(rng, 0.5)]
+    for kept in (([0], [1]), ([0, 1], [])):
+        found = solve(scene, [view(v.pixels[k]) for v, k in zip(views, kept, strict=True)], scene.sensed())
+        assert isinstance(found, NoFix)
