@@ -129,6 +129,12 @@ def test_legs_that_hang_in_the_air_are_left_out():
     assert "4" not in adjusted.positions
 
 
+def test_a_fix_of_no_station_is_an_error():
+    legs = world.readings_of(world.line(np.random.default_rng(4), 3), np.random.default_rng(1))
+    with pytest.raises(BuddylineError, match="no leg has this station"):
+        adjust(world.project_of(legs, fix=[FixedPoint(station="entrance", east_m=0.0, north_m=0.0)]))
+
+
 def test_a_project_without_legs_is_an_error():
     with pytest.raises(BuddylineError, match="no legs"):
         adjust(Project())

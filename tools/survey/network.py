@@ -141,6 +141,10 @@ def adjust(project: Project) -> Adjusted:
     grid = grid_of(project)
     depths = held_depths(project)
     fixed = fixed_points(project, grid)
+    stations = {name for leg in project.leg for name in (leg.from_, leg.to)}
+    for name in fixed:
+        if name not in stations:
+            raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
     lines: list[Line] = []
     left_out: list[tuple[Leg, str]] = []
     for leg in project.leg:
