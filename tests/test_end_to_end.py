@@ -81,6 +81,29 @@ def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
         assert reader.damage == []
 
 
+def wait_until_gone(pids, seconds):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if not [pid for pid in pids if Path(f"/proc/{pid}").exists()]:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+def test_demo_that_is_gone_leaves_nothing_running(number):
+    demo = Process("demo", "--environment", "basin", "--rate", "4")
+    try:
+        demo.wait_for(" s  ", timeout=40.0)
+        children = children_of(demo.pid)
+        assert len(children) == 4
+        demo.send(number)
+        assert demo.wait(timeout=10.0) in (0, -signal.SIGKILL)
+        assert wait_until_gone(children, 5.0)
+    finally:
+        demo.end()
+
+
 def test_demo_shows_poses_and_leaves_nothing_running(tmp_path):
     demo = Process("demo", "--environment", "basin", "--rate", "4", "--record", tmp_path)
     try:

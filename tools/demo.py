@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import logging
 import shutil
@@ -36,6 +37,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--monitor", action="store_true", help="watch it on the monitor's page, in the browser")
 
 
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG: Final = 1
+
+
+def _end_with_parent() -> None:
+    """In a child, before it becomes the command: have the kernel end it if the demo dies without a word."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 class Processes:
     """The demo's child processes, each with its log; ended together, by their own ids."""
 
@@ -53,6 +64,7 @@ class Processes:
                 stderr=errors,
                 # Ctrl-C reaches this process alone, which ends the others in order.
                 start_new_session=True,
+                preexec_fn=_end_with_parent,  # noqa: PLW1509  (no other thread runs yet, and it only calls prctl)
             )
 
     def _log_of(self, name: str) -> Path:
