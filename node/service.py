@@ -117,12 +117,16 @@ class NodeService(Service):
         return status
 
     def _capture(self) -> None:
+        # Stored pictures may be far apart.
+        watched = self.config.camera.name != "stored" and self.config.rate_hz >= 1.0
         try:
             while not self.stop.is_set():
                 frame = self.camera.next_frame(self.stop)
                 if frame is None:
                     break
                 self._last_s["camera"] = time.monotonic()
+                if watched:
+                    self.going_on()
                 with self._frame_ready:
                     self._frames.append(frame)
                     while len(self._frames) > FRAME_QUEUE:
@@ -139,9 +143,11 @@ class NodeService(Service):
     def _detect_frames(self) -> None:
         cv2.setNumThreads(1)
         while True:
+            self.going_on()
             with self._frame_ready:
                 while not self._frames and self._capturing and not self.stop.is_set():
                     self._frame_ready.wait(0.5)
+                    self.going_on()
                 if not self._frames:
                     return
                 frame = self._frames.popleft()
@@ -232,6 +238,7 @@ class NodeService(Service):
     def _report(self) -> None:
         while not self.stop.wait(1.0):
             self.outlet.send(self.status())
+            self.going_on()
 
     def status(self) -> NodeStatus:
         """Return the node's health; rates are over the time since the last call."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
+import os
 import signal
 import threading
 import time
@@ -14,13 +16,22 @@ from protocol.errors import BuddylineError
 log = logging.getLogger(__name__)
 
 JOIN_TIMEOUT_S: Final = 1.5
+STUCK_S: Final = 15.0
+# A stuck thread may hold what the process needs to end in good order.
+END_ANYWAY_S: Final = 10.0
+WATCH_S: Final = 0.2
+
+
+class StuckError(RuntimeError):
+    """A thread that neither goes on nor ends."""
 
 
 class Service:
     """Runs until `stop` is set or one of its threads fails.
 
     A thread that ends with an exception ends the service: exit status 2 for a BuddylineError (one line), 1
-    for a bug (with its traceback). A thread that returns only ends itself.
+    for a bug (with its traceback). A thread that returns only ends itself. One that has said `going_on` and
+    then does not say so for STUCK_S ends the process with its name and status 1.
     """
 
     def __init__(self, name: str) -> None:
@@ -29,6 +40,7 @@ class Service:
         self.interrupted = False
         self.failure: tuple[str, BaseException] | None = None
         self._threads: list[threading.Thread] = []
+        self._went_on_s: dict[str, float] = {}
 
     def spawn(self, name: str, target: Callable[[], None]) -> None:
         """Start a thread of this service."""
@@ -38,10 +50,16 @@ class Service:
                 target()
             except Exception as error:  # a dead thread is named, whatever ended it
                 self.fail(name, error)
+            finally:
+                self._went_on_s.pop(name, None)
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
+
+    def going_on(self) -> None:
+        """Say that the calling thread is not stuck; from the first time on it is watched."""
+        self._went_on_s[threading.current_thread().name] = time.monotonic()
 
     def fail(self, where: str, error: BaseException) -> None:
         """End the service because of error."""
@@ -50,7 +68,7 @@ class Service:
         self.stop.set()
 
     def handle_signals(self) -> None:
-        """Stop on SIGINT and SIGTERM; for the main thread of a process."""
+        """Stop on SIGINT, SIGTERM and a terminal that closes; for the main thread of a process."""
 
         def interrupt(number: int, _frame: object) -> None:
             self.interrupted = number == signal.SIGINT
@@ -58,15 +76,37 @@ class Service:
 
         signal.signal(signal.SIGINT, interrupt)
         signal.signal(signal.SIGTERM, interrupt)
+        signal.signal(signal.SIGHUP, interrupt)
 
     def wait(self, seconds: float | None = None) -> None:
         """Wait until the service stops, or for this long."""
         ends_s = None if seconds is None else time.monotonic() + seconds
         # In slices: an Event.wait without an end keeps Python from handling signals on some platforms.
-        while not self.stop.wait(0.2):
-            if ends_s is not None and time.monotonic() >= ends_s:
+        looked_s = time.monotonic()
+        while not self.stop.wait(WATCH_S):
+            now_s = time.monotonic()
+            if ends_s is not None and now_s >= ends_s:
                 break
+            self._look_for_stuck(now_s, now_s - looked_s - WATCH_S)
+            looked_s = now_s
         self.stop.set()
+
+    def _look_for_stuck(self, now_s: float, stood_s: float) -> None:
+        """Fail where a thread has not gone on; stood_s: for how long this one did not either."""
+        for name, went_on_s in list(self._went_on_s.items()):
+            # A process that was frozen, or a machine that was, is not stuck: its threads get their time again.
+            if stood_s > WATCH_S:
+                self._went_on_s[name] = max(went_on_s + stood_s, self._went_on_s.get(name, 0.0))
+            elif now_s - went_on_s > STUCK_S:
+                self.fail(name, StuckError(f"thread {name} is stuck: nothing for {now_s - went_on_s:.0f} s"))
+                faulthandler.dump_traceback(2)
+                self._end_anyway()
+                return
+
+    def _end_anyway(self) -> None:
+        timer = threading.Timer(END_ANYWAY_S, os._exit, (1,))
+        timer.daemon = True
+        timer.start()
 
     def join(self) -> int:
         """Join all threads, name those that do not end; return the exit status."""
@@ -82,6 +122,9 @@ class Service:
         if isinstance(error, BuddylineError):
             log.error("%s: %s", self.name, error)
             return 2
+        if isinstance(error, StuckError):
+            log.error("%s: %s", self.name, error)
+            return 1
         log.error("%s: thread %s failed", self.name, where, exc_info=error)
         return 1
 

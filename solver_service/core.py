@@ -117,6 +117,9 @@ class SolverCore:
             self._resolved = OrderedDict.fromkeys(self._far)
             self._newest_resolved = -1
             self._prior.lose()
+            if frame.trigger in self._resolved:
+                stream.frames.pop(frame.trigger, None)
+                self.late += 1
             return []
         if arrival is Arrival.FAR:
             self.late += 1

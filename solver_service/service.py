@@ -85,6 +85,7 @@ class SolverService(Service):
             log.info("solver: connected to %s", self.config.connect)
             while not self.stop.wait(1.0):
                 self._report()
+                self.going_on()
             self._publish(self._core.flush() if self._core else [])
 
     def attach(self, bus: Bus) -> None:

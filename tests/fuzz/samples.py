@@ -11,7 +11,7 @@ _PAIR = {"node_a": "a", "node_b": "b", "stamp_ns": STAMP_NS}
 _NODE = {"node": "a", "stamp_ns": STAMP_NS}
 _UNIT = (0.0, 0.0, 0.0, 1.0)
 
-INFO = m.NodeInfo(
+_INFO = m.NodeInfo(
     **_NODE,
     width_px=820,
     height_px=616,
@@ -23,28 +23,17 @@ INFO = m.NodeInfo(
 )
 
 
-def candidates(node: str, k: int, *uv: tuple[float, float], **more: object) -> m.Candidates:
-    """Return the candidates of trigger k, by default of a node that sees the other's two lights ahead."""
-    blobs = [
-        m.Blob(u_px=u, v_px=v, sigma_px=0.7, area_px=9.0, peak=250.0, elongation=1.0)
-        for u, v in uv or ((450.0, 307.0), (369.0, 308.0), (100.0, 50.0))
-    ]
-    fields = {
-        "node": node,
-        "stamp_ns": STAMP_NS + k * PERIOD_NS,
-        "trigger": STAMP_NS // PERIOD_NS + k,
-        "seq": k,
-        "boot": "fuzz",
-        "width_px": 820,
-        "height_px": 616,
-        "blobs": blobs,
-    }
-    return m.Candidates(**{**fields, **more})
-
-
 SOUND: tuple[m.Message, ...] = (
-    INFO,
-    candidates("a", 1),
+    _INFO,
+    m.Candidates(
+        **_NODE,
+        trigger=STAMP_NS // PERIOD_NS,
+        seq=1,
+        boot="x",
+        width_px=820,
+        height_px=616,
+        blobs=[m.Blob(u_px=450.0, v_px=307.0, sigma_px=0.7, area_px=9.0, peak=250.0, elongation=1.0, score=0.5)],
+    ),
     m.Imu(**_NODE, accel_mps2=(0.0, 0.0, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, 4e-5)),
     m.Attitude(**_NODE, q_ned_body_xyzw=_UNIT, sigma_rad=(0.02, 0.02, 0.1)),
     m.Depth(**_NODE, depth_m=5.0, sigma_m=0.02, pressure_pa=150000.0, temperature_degc=8.0),

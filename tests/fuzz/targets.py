@@ -25,6 +25,7 @@ from protocol.messages import (
     Candidates,
     Message,
     MessageError,
+    NodeInfo,
     Rejected,
     RelativePose,
     decode,
@@ -34,7 +35,8 @@ from protocol.messages import (
 from protocol.topics import TOPICS, Topic, key_of
 from solver_service.config import SolverConfig
 from solver_service.service import SolverService
-from tests.fuzz.samples import INFO, SOUND, STAMP_NS, candidates
+from tests.fuzz.samples import SOUND, STAMP_NS
+from tests.solver_service.conftest import dive_messages
 from tools.client import ClientConfig
 from tools.hub import HubConfig
 from tools.repair import run as repair
@@ -243,18 +245,31 @@ def fuzz_configuration(data: st.DataObject) -> None:
             config.solve.settings("fuzz.toml")
 
 
+@functools.cache
+def _dive() -> tuple[Message, ...]:
+    return tuple(dive_messages(seconds=0.6, seed=7)[0])
+
+
 @st.composite
 def hostile_streams(draw: st.DrawFn) -> list[tuple[str, bytes]]:
-    """Messages on the nodes' keys: sound ones, and ones that decode but are of no world there is."""
-    stream = [(key_of(i), encode(i)) for i in (INFO, msgspec.structs.replace(INFO, node="b"))]
-    for k in range(draw(st.integers(1, 5))):
-        for node in ("a", "b"):
-            frame = candidates(node, max(k + draw(st.sampled_from([0, 0, 0, 0, 36_000, -2])), 0))
-            stream.append((key_of(frame), encode(frame)))
-            if draw(st.booleans()):
-                message = draw(st.sampled_from([msgspec.structs.replace(INFO, node=node), frame, SOUND[3], SOUND[4]]))
-                payload = draw(_extreme(message))
-                stream.insert(draw(st.integers(0, len(stream))), (key_of(message), payload))
+    """A short dive on the nodes' keys, some of it twice, late, an hour ahead, or in numbers of no world there is."""
+    stream = [(key_of(message), encode(message)) for message in _dive()]
+    big = [i for i, message in enumerate(_dive()) if isinstance(message, Candidates | NodeInfo)]
+    for _ in range(draw(st.integers(1, 6))):
+        at = draw(st.sampled_from(big) | st.integers(0, len(_dive()) - 1))
+        message = _dive()[at]
+        how = draw(st.sampled_from(["extreme", "extreme", "again", "ahead"]))
+        payload = encode(message)
+        if how == "extreme":
+            payload = draw(_extreme(message))
+        elif how == "ahead":
+            more = {"trigger": message.trigger + 36_000} if isinstance(message, Candidates) else {}
+            payload = encode(msgspec.structs.replace(message, stamp_ns=message.stamp_ns + 3_600_000_000_000, **more))
+        if how == "extreme" and draw(st.booleans()):
+            stream[at] = (key_of(message), payload)
+        else:
+            stream.append((key_of(message), payload))
+            stream.insert(draw(st.integers(0, len(stream) - 1)), stream.pop())
     return stream
 
 

@@ -185,3 +185,15 @@ def test_a_stream_of_unknown_nodes_is_bounded_and_takes_no_ones_place(messages, 
     assert [encode(result) for result in solver.results()] == healthy
     assert solver.service._core.foreign == 2000
     assert solver.status().problem == ""
+
+
+def test_the_frame_that_tells_of_a_new_time_does_not_end_its_trigger_again(messages):
+    """A node's first frame is of another time; of its true ones, one comes twice and makes up their number."""
+    frames = [m for m in messages if isinstance(m, Candidates) and m.node == "b"][:4]
+    far = replace(frames[0], stamp_ns=frames[0].stamp_ns + HOUR_NS, trigger=frames[0].trigger + 36_000)
+    solver = Solver()
+    for frame in [far, *frames, frames[0]]:
+        solver.take(frame)
+    triggers = [result.trigger for result in solver.results()]
+    assert len(triggers) == len(set(triggers))
+    assert {frame.trigger for frame in frames} <= set(triggers)

@@ -1,0 +1,93 @@
+"""A service's threads: a stuck one ends its process, with its name; a frozen process is not stuck."""
+
+import subprocess
+import sys
+import textwrap
+import threading
+
+import pytest
+
+from protocol import service as module
+from protocol.service import STUCK_S, Service, StuckError
+from tests.processes import REPOSITORY
+
+
+def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
+    program = textwrap.dedent(
+        """
+        import sys, threading
+        from protocol import service as module
+        module.STUCK_S, module.WATCH_S, module.JOIN_TIMEOUT_S = 0.2, 0.05, 0.1
+        module.start_logging()
+        service = module.Service("node a")
+
+        def detect():
+            service.going_on()
+            threading.Event().wait()
+
+        def status():
+            while not service.stop.wait(0.05):
+                service.going_on()
+
+        service.spawn("detect", detect)
+        service.spawn("status", status)
+        service.wait()
+        sys.exit(service.join())
+        """
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False, cwd=REPOSITORY
+    )
+    assert ended.returncode == 1
+    assert "node a: thread detect is stuck" in ended.stderr
+    assert "in detect" in ended.stderr
+
+
+def test_a_process_that_holds_on_when_stuck_is_ended_anyway():
+    program = textwrap.dedent(
+        """
+        import threading
+        from protocol import service as module
+        module.STUCK_S, module.WATCH_S, module.END_ANYWAY_S = 0.2, 0.05, 0.2
+        service = module.Service("node a")
+        service.spawn("camera", lambda: (service.going_on(), threading.Event().wait()))
+        service.wait()
+        threading.Event().wait()  # as a device does that cannot be closed
+        """
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], timeout=30, check=False, cwd=REPOSITORY, capture_output=True
+    )
+    assert ended.returncode == 1
+
+
+@pytest.fixture
+def watched(monkeypatch):
+    """A service with one thread that went on once, at 100 s, and never again."""
+    now = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    service = Service("test")
+    monkeypatch.setattr(service, "_end_anyway", lambda: None)
+    monkeypatch.setattr(module.faulthandler, "dump_traceback", lambda _: None)
+    said, stop = threading.Event(), threading.Event()
+    service.spawn("w", lambda: (service.going_on(), said.set(), stop.wait()))
+    assert said.wait(10.0)
+    yield service
+    stop.set()
+
+
+def test_a_thread_has_its_time(watched):
+    watched._look_for_stuck(100.0 + STUCK_S - 0.1, 0.0)
+    assert watched.failure is None
+    watched._look_for_stuck(100.0 + STUCK_S + 0.1, 0.0)
+    name, error = watched.failure
+    assert (name, type(error)) == ("w", StuckError)
+
+
+def test_a_process_that_was_frozen_is_not_stuck(watched):
+    watched._look_for_stuck(101.0, 0.0)
+    watched._look_for_stuck(1001.0, 900.0)
+    watched._look_for_stuck(1001.2, 0.0)
+    assert watched.failure is None
+    watched._look_for_stuck(1002.0 + STUCK_S, 0.0)
+    assert watched.failure is not None
