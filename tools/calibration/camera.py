@@ -1,0 +1,260 @@
+"""A camera's intrinsics out of pictures of the board, and whether they are good enough to dive with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import BuddylineError
+from protocol.messages import CameraModel
+from tools.calibration.board import Board
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEAST_CORNERS: Final = 8
+LEAST_VIEWS: Final = 8
+MOST_VIEWS: Final = 60
+MOVED_SHARE: Final = 0.03
+GRID: Final = (8, 6)
+LEAST_COVERAGE: Final = 0.6
+MOST_RMS_PX: Final = 1.0
+LEAST_TILT_RAD: Final = np.radians(7.0)
+MOST_FOCAL_SIGMA: Final = 0.005
+OUTLIER_VIEWS: Final = 2.5
+
+
+class PoorCalibration(BuddylineError):  # noqa: N818
+    """Pictures that do not tell the camera; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The board's corners in one picture: name, ids (n,), points_px (n, 2)."""
+
+    name: str
+    ids: NDArray[np.int32]
+    points_px: Floats
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """Intrinsics, and how good they are.
+
+    rms_px: of all reprojections. sigma_px: fx, fy, cx, cy, 1 sd. coverage: share of the picture's cells with a
+    corner. tilt_rad: how much the board was tilted, 1 sd. residuals_px: (n, 2) of points_px (n, 2). dropped: names
+    of views left out.
+    """
+
+    camera: CameraModel
+    size: tuple[int, int]
+    rms_px: float
+    sigma_px: tuple[float, float, float, float]
+    coverage: float
+    tilt_rad: float
+    views: int
+    points_px: Floats
+    residuals_px: Floats
+    dropped: tuple[str, ...]
+
+
+class CornerFinder:
+    """Finds the board in pictures of one size."""
+
+    def __init__(self, board: Board) -> None:
+        self._detector: Any = cv2.aruco.CharucoDetector(board.charuco())
+        self.size: tuple[int, int] | None = None
+
+    def find(self, name: str, image: Image) -> View | None:
+        """Return the corners, None where too few are seen; raise PoorCalibration for another picture size."""
+        size = (image.shape[1], image.shape[0])
+        if self.size is not None and size != self.size:
+            raise PoorCalibration(f"{name}: {size[0]}x{size[1]}, the others are {self.size[0]}x{self.size[1]}")
+        self.size = size
+        grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        corners, ids, _, _ = self._detector.detectBoard(grey)
+        if ids is None or len(ids) < LEAST_CORNERS:
+            return None
+        # OpenCV 4 has a dimension more here than OpenCV 5.
+        points = np.asarray(corners, np.float32).reshape(-1, 2)
+        return View(name, np.asarray(ids, np.int32).reshape(-1), _refined(grey, points))
+
+
+def _refined(grey: Image, points: NDArray[np.float32]) -> Floats:
+    """Return corners (n, 2) to a tenth of a pixel; the detector's own are good to half of one.
+
+    The window stays clear of the markers' edges, which begin 0.15 of a square away.
+    """
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    half = int(np.clip(0.07 * np.median(apart.min(axis=1)), 2, 10))
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+    refined = cv2.cornerSubPix(grey, points.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), criteria)
+    return np.asarray(refined, np.float64).reshape(-1, 2)
+
+
+def distinct(views: Iterable[View], width_px: int) -> list[View]:
+    """Return the views in which the board has moved since the one kept before, evenly thinned to a maximum."""
+    kept: list[View] = []
+    for view in views:
+        if not kept or _moved_px(kept[-1], view) > MOVED_SHARE * width_px:
+            kept.append(view)
+    if len(kept) > MOST_VIEWS:
+        kept = [kept[i] for i in np.linspace(0, len(kept) - 1, MOST_VIEWS).astype(int)]
+    return kept
+
+
+def _moved_px(one: View, other: View) -> float:
+    _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
+    if len(i) < LEAST_CORNERS // 2:
+        return float("inf")
+    return float(np.linalg.norm(one.points_px[i] - other.points_px[j], axis=1).mean())
+
+
+def calibrate(views: list[View], size: tuple[int, int], board: Board) -> CameraFit:
+    """Fit a pinhole with OpenCV's k1 k2 p1 p2 k3; raise PoorCalibration where the views do not tell it."""
+    if len(views) < LEAST_VIEWS:
+        raise PoorCalibration(
+            f"the board is found in {len(views)} different views, {LEAST_VIEWS} are needed: "
+            "move and tilt it between pictures, with all of it sharp and lit"
+        )
+    corners = np.asarray(board.charuco().getChessboardCorners(), np.float32)
+    dropped: list[str] = []
+    while True:
+        solution = _solve(views, size, corners)
+        per_view = solution.per_view_px
+        worst = int(per_view.argmax())
+        if per_view[worst] < OUTLIER_VIEWS * np.median(per_view) or len(views) <= LEAST_VIEWS:
+            break
+        dropped.append(views[worst].name)
+        views = views[:worst] + views[worst + 1 :]
+    points = np.vstack([view.points_px for view in views])
+    found = CameraFit(
+        camera=solution.camera,
+        size=size,
+        rms_px=solution.rms_px,
+        sigma_px=solution.sigma_px,
+        coverage=coverage(points, size),
+        tilt_rad=solution.tilt_rad,
+        views=len(views),
+        points_px=points,
+        residuals_px=solution.residuals_px,
+        dropped=tuple(dropped),
+    )
+    _check(found)
+    return found
+
+
+def coverage(points_px: Floats, size: tuple[int, int]) -> float:
+    """Return the share of the picture's cells that have a corner."""
+    return float((cells(points_px, size) > 0).mean())
+
+
+def cells(points_px: Floats, size: tuple[int, int]) -> NDArray[np.int64]:
+    """Return how many corners are in each cell of the picture, (rows, columns)."""
+    columns, rows = GRID
+    column = np.clip((points_px[:, 0] + 0.5) / size[0] * columns, 0, columns - 1).astype(int)
+    row = np.clip((points_px[:, 1] + 0.5) / size[1] * rows, 0, rows - 1).astype(int)
+    counts = np.zeros((rows, columns), np.int64)
+    np.add.at(counts, (row, column), 1)
+    return counts
+
+
+@dataclass(frozen=True)
+class _Solution:
+    camera: CameraModel
+    rms_px: float
+    sigma_px: tuple[float, float, float, float]
+    tilt_rad: float
+    per_view_px: Floats
+    residuals_px: Floats
+
+
+def _solve(views: list[View], size: tuple[int, int], corners: NDArray[np.float32]) -> _Solution:
+    objects = [corners[view.ids] for view in views]
+    images = [view.points_px.astype(np.float32) for view in views]
+    try:
+        rms, K, distortion, turns, shifts, deviations, _, per_view = cv2.calibrateCameraExtended(
+            objects, images, size, np.eye(3), np.zeros(5)
+        )
+    except cv2.error as error:
+        raise PoorCalibration(f"the views do not tell the camera: {error.err}") from error
+    residuals = [
+        image - cv2.projectPoints(points, turn, shift, K, distortion)[0].reshape(-1, 2)
+        for points, image, turn, shift in zip(objects, images, turns, shifts, strict=True)
+    ]
+    sigma = np.asarray(deviations, np.float64).reshape(-1)
+    return _Solution(
+        CameraModel(
+            model="pinhole",
+            fx_px=float(K[0, 0]),
+            fy_px=float(K[1, 1]),
+            cx_px=float(K[0, 2]),
+            cy_px=float(K[1, 2]),
+            distortion=[float(v) for v in np.asarray(distortion).reshape(-1)[:5]],
+        ),
+        float(rms),
+        (float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
+        _tilt(turns),
+        np.asarray(per_view, np.float64).reshape(-1),
+        np.vstack(residuals).astype(np.float64),
+    )
+
+
+def _tilt(turns: Any) -> float:
+    """Return how much the board's normal varied (rad, 1 sd), in the direction in which it varied least."""
+    normals = np.array([cv2.Rodrigues(turn)[0][:2, 2] for turn in turns])
+    return float(np.sqrt(max(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0], 0.0)))
+
+
+def _check(found: CameraFit) -> None:
+    if found.rms_px > MOST_RMS_PX:
+        raise PoorCalibration(
+            f"reprojection error {found.rms_px:.2f} px, {MOST_RMS_PX:.1f} px at most: "
+            "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?"
+        )
+    if found.coverage < LEAST_COVERAGE:
+        raise PoorCalibration(
+            f"corners in {found.coverage:.0%} of the picture, {LEAST_COVERAGE:.0%} are needed: "
+            "bring the board into all edges and corners"
+        )
+    if found.tilt_rad < LEAST_TILT_RAD:
+        raise PoorCalibration(
+            f"the board was tilted by {np.degrees(found.tilt_rad):.0f} deg, {np.degrees(LEAST_TILT_RAD):.0f} deg at "
+            "least: tilt the board more, both ways"
+        )
+    share = max(found.sigma_px[0] / found.camera.fx_px, found.sigma_px[1] / found.camera.fy_px)
+    if share > MOST_FOCAL_SIGMA:
+        raise PoorCalibration(
+            f"focal length known to {share:.1%} only, {MOST_FOCAL_SIGMA:.1%} at most: tilt the board more"
+        )
+
+
+def draw(found: CameraFit, enlarged: float = 20.0) -> Image:
+    """Return a picture of the corners used, each with its residual enlarged; cells without any are dark."""
+    width, height = found.size
+    picture = np.full((height, width, 3), 255, np.uint8)
+    counts = cells(found.points_px, found.size)
+    rows, columns = counts.shape
+    for row in range(rows):
+        for column in range(columns):
+            x0, x1 = column * width // columns, (column + 1) * width // columns
+            y0, y1 = row * height // rows, (row + 1) * height // rows
+            if counts[row, column] == 0:
+                picture[y0:y1, x0:x1] = 150
+    for point, residual in zip(found.points_px, found.residuals_px, strict=True):
+        begin = (round(float(point[0])), round(float(point[1])))
+        end = tuple(round(float(v)) for v in point + enlarged * residual)
+        cv2.line(picture, begin, (end[0], end[1]), (0, 0, 200), 1, cv2.LINE_AA)
+        cv2.circle(picture, begin, 2, (160, 90, 0), cv2.FILLED, cv2.LINE_AA)
+    text = (
+        f"rms {found.rms_px:.2f} px (lines x{enlarged:g}), {found.views} views, {found.coverage:.0%} covered, "
+        f"f {found.camera.fx_px:.1f} +- {found.sigma_px[0]:.1f}"
+    )
+    cv2.putText(picture, text, (8, height - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return picture

@@ -1,0 +1,226 @@
+"""A magnetometer's hard and soft iron: the ellipsoid that its readings lie on, made a sphere.
+
+Readings of a rig turned every way lie on an ellipsoid: shifted by the rig's own magnetism, squeezed by its soft
+iron and by unequal axes. Nine numbers tell it. What the sphere does not tell, a turn of the whole, follows from
+the accelerometer: the Earth's field keeps its angle to gravity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import BuddylineError
+
+Floats = NDArray[np.float64]
+
+APART_RAD: Final = np.radians(4.0)
+ROUNDS: Final = 15
+OUTLIER_SIGMAS: Final = 4.0
+GRAVITY_MPS2: Final = 9.80665
+STILL_MPS2: Final = 0.5
+LEAST_READINGS: Final = 60
+LEAST_COVERAGE: Final = 0.5
+MOST_RESIDUAL: Final = 0.04
+MOST_HEADING_SIGMA_RAD: Final = np.radians(1.0)
+CELLS: Final = 72
+CELL_RAD: Final = np.radians(20.0)
+
+
+class CoverageError(BuddylineError):
+    """Readings that do not tell the ellipsoid; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class EllipsoidFit:
+    """field_t = matrix @ (reading - offset_t), body frame.
+
+    residual: rms of the field's strength, as a share of it. coverage: share of all directions that were seen.
+    heading_sigma_rad: how far the fit itself can turn the heading of a level rig (1 sd, the worst heading).
+    directions: (n, 3) unit vectors of the readings used; errors: (n,) of their strength, as a share.
+    """
+
+    offset_t: Floats
+    matrix: Floats
+    norm_t: float
+    residual: float
+    coverage: float
+    heading_sigma_rad: float
+    directions: Floats
+    errors: Floats
+    turned: bool
+
+
+def spread_out(readings_t: Floats) -> NDArray[np.intp]:
+    """Return the indices of readings that are each a few degrees from the one kept before."""
+    middle_t = (readings_t.max(axis=0) + readings_t.min(axis=0)) / 2
+    arms = readings_t - middle_t
+    arms /= np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-12)
+    kept = [0]
+    limit = np.cos(APART_RAD)
+    for i in range(1, len(arms)):
+        if arms[i] @ arms[kept[-1]] < limit:
+            kept.append(i)
+    return np.array(kept)
+
+
+def fit(readings_t: Floats, accels_mps2: Floats, norm_t: float | None = None) -> EllipsoidFit:
+    """Fit (n, 3) readings in T, with the accelerometer's (n, 3) of the same moments.
+
+    norm_t: strength of the Earth's field where it is known; None keeps the readings' mean scale.
+    Raises CoverageError where the readings do not tell the ellipsoid, or not well enough.
+    """
+    kept = spread_out(readings_t)
+    readings_t, accels_mps2 = readings_t[kept], accels_mps2[kept]
+    if len(readings_t) < LEAST_READINGS:
+        raise CoverageError(
+            f"only {len(readings_t)} readings a few degrees apart, {LEAST_READINGS} are needed: "
+            "turn the rig slowly through all directions"
+        )
+    unit_t = float(np.linalg.norm(readings_t - readings_t.mean(axis=0), axis=1).mean()) or 1.0
+    x = readings_t / unit_t
+    used = np.ones(len(x), dtype=bool)
+    for _ in range(3):
+        offset, shape = _refined(x[used], *_algebraic(x[used]))
+        errors = np.linalg.norm((x - offset) @ shape.T, axis=1) - 1.0
+        spread = 1.4826 * np.median(np.abs(errors[used])) + 1e-9
+        used = np.abs(errors) < OUTLIER_SIGMAS * spread
+        if used.sum() < LEAST_READINGS:
+            raise CoverageError("the readings lie on no ellipsoid: iron moved beside the rig, or the field is not one")
+    field = (x[used] - offset) @ shape.T
+    residual = float(np.sqrt((errors[used] ** 2).mean()))
+    covariance = _covariance(x[used], offset, shape, residual)
+    turn = _turn(field, accels_mps2[used])
+    if turn is not None:
+        shape, field = turn @ shape, field @ turn.T
+    scale_t = norm_t if norm_t is not None else unit_t / float(np.linalg.det(shape)) ** (1 / 3)
+    directions = field / np.linalg.norm(field, axis=1, keepdims=True)
+    found = EllipsoidFit(
+        offset_t=offset * unit_t,
+        matrix=shape * scale_t / unit_t,
+        norm_t=scale_t,
+        residual=residual,
+        coverage=coverage(directions),
+        heading_sigma_rad=_heading_sigma(directions, accels_mps2[used], offset, shape, covariance),
+        directions=directions,
+        errors=errors[used],
+        turned=turn is not None,
+    )
+    _check(found)
+    return found
+
+
+def _check(found: EllipsoidFit) -> None:
+    if found.coverage < LEAST_COVERAGE:
+        raise CoverageError(
+            f"only {found.coverage:.0%} of all directions were seen, {LEAST_COVERAGE:.0%} are needed: "
+            "turn the rig on its sides and upside down as well"
+        )
+    if found.residual > MOST_RESIDUAL:
+        raise CoverageError(
+            f"the field's strength varies by {found.residual:.1%}, {MOST_RESIDUAL:.0%} at most: "
+            "turn the rig away from steel, cars and buildings, with everything on it fixed"
+        )
+    if found.heading_sigma_rad > MOST_HEADING_SIGMA_RAD:
+        raise CoverageError(
+            f"headings would be known to {np.degrees(found.heading_sigma_rad):.1f} deg only, "
+            f"{np.degrees(MOST_HEADING_SIGMA_RAD):.0f} deg at most: turn for longer, through all directions"
+        )
+
+
+def coverage(directions: Floats) -> float:
+    """Return which share of evenly spread cells has a direction, of (n, 3), within 20 degrees of its centre."""
+    i = np.arange(CELLS) + 0.5
+    z, around = 1 - 2 * i / CELLS, np.pi * (1 + 5**0.5) * i
+    flat = np.sqrt(1 - z * z)
+    centres = np.column_stack([flat * np.cos(around), flat * np.sin(around), z])
+    nearest = (centres @ directions.T).max(axis=1)
+    return float((nearest > np.cos(CELL_RAD)).mean())
+
+
+def _algebraic(x: Floats) -> tuple[Floats, Floats]:
+    """Return a first centre (3,) and shape (3, 3) by linear least squares of the quadric."""
+    a, b, c = x.T
+    design = np.column_stack([a * a, b * b, c * c, 2 * a * b, 2 * a * c, 2 * b * c, 2 * a, 2 * b, 2 * c])
+    solution = np.linalg.lstsq(design, np.ones(len(x)), rcond=None)[0]
+    A = np.array(
+        [
+            [solution[0], solution[3], solution[4]],
+            [solution[3], solution[1], solution[5]],
+            [solution[4], solution[5], solution[2]],
+        ]
+    )
+    try:
+        offset: Floats = -np.linalg.solve(A, solution[6:])
+    except np.linalg.LinAlgError:
+        raise CoverageError("the readings lie in a plane: turn the rig upside down as well") from None
+    size = 1.0 + offset @ A @ offset
+    values, axes = np.linalg.eigh(A / size) if abs(size) > 1e-12 else (np.full(3, -1.0), np.eye(3))
+    if (values <= 0).any():
+        raise CoverageError("the readings tell no ellipsoid: turn the rig through all directions, upside down as well")
+    return offset, (axes * np.sqrt(values)) @ axes.T
+
+
+def _jacobian(x: Floats, offset: Floats, shape: Floats) -> tuple[Floats, Floats]:
+    """Return the errors of the radius (n,) and their derivatives (n, 9): offset, then xx yy zz xy xz yz."""
+    arm = x - offset
+    y = arm @ shape.T
+    radius = np.linalg.norm(y, axis=1)
+    u = y / radius[:, None]
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    by_shape = [u[:, i] * arm[:, j] + (u[:, j] * arm[:, i] if i != j else 0.0) for i, j in pairs]
+    return radius - 1.0, np.column_stack([-(u @ shape), *by_shape])
+
+
+def _refined(x: Floats, offset: Floats, shape: Floats) -> tuple[Floats, Floats]:
+    for _ in range(ROUNDS):
+        errors, J = _jacobian(x, offset, shape)
+        step = np.linalg.lstsq(J, -errors, rcond=None)[0]
+        offset = offset + step[:3]
+        dxx, dyy, dzz, dxy, dxz, dyz = step[3:]
+        shape = shape + np.array([[dxx, dxy, dxz], [dxy, dyy, dyz], [dxz, dyz, dzz]])
+        if np.abs(step).max() < 1e-10:
+            break
+    if not np.isfinite(shape).all() or (np.linalg.eigvalsh(shape) <= 0).any():
+        raise CoverageError("the readings tell no ellipsoid: turn the rig through all directions, upside down as well")
+    return offset, shape
+
+
+def _covariance(x: Floats, offset: Floats, shape: Floats, residual: float) -> Floats:
+    _, J = _jacobian(x, offset, shape)
+    return np.asarray(np.linalg.pinv(J.T @ J) * max(residual, 1e-6) ** 2, dtype=np.float64)
+
+
+def _turn(field: Floats, accels_mps2: Floats) -> Floats | None:
+    """Return the small rotation (3, 3) that lets the field keep its angle to gravity; None where it is not told."""
+    strength = np.linalg.norm(accels_mps2, axis=1)
+    still = np.abs(strength - GRAVITY_MPS2) < STILL_MPS2
+    if still.sum() < LEAST_READINGS:
+        return None
+    up, u = accels_mps2[still] / strength[still, None], field[still]
+    # up . (u + r x u) = const, linear in r and the constant.
+    design = np.column_stack([np.cross(u, up), -np.ones(len(u))])
+    solution, _, _, singular = np.linalg.lstsq(design, -(up * u).sum(axis=1), rcond=None)
+    if singular[-1] < 0.1 * singular[0]:
+        return None
+    x, y, z = solution[:3]
+    q, _ = np.linalg.qr(np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]]))
+    return np.asarray(q * np.sign(np.diag(q)), dtype=np.float64)
+
+
+def _heading_sigma(directions: Floats, accels_mps2: Floats, offset: Floats, shape: Floats, covariance: Floats) -> float:
+    """Return the heading's 1 sd out of the fit's own covariance, of a level rig, for the worst heading."""
+    up = accels_mps2 / np.maximum(np.linalg.norm(accels_mps2, axis=1, keepdims=True), 1e-9)
+    sine = float(np.clip(np.median(-(directions * up).sum(axis=1)), -0.99, 0.99))
+    cosine = np.sqrt(1 - sine * sine)
+    heading = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    u = np.column_stack([cosine * np.cos(heading), -cosine * np.sin(heading), np.full(24, sine)])
+    arm = np.linalg.solve(shape, u.T).T
+    sides = np.column_stack([np.sin(heading), np.cos(heading), np.zeros(24)])
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    by_shape = [sides[:, i] * arm[:, j] + (sides[:, j] * arm[:, i] if i != j else 0.0) for i, j in pairs]
+    J = np.column_stack([-(sides @ shape), *by_shape]) / cosine
+    return float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).max()))

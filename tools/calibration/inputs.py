@@ -1,0 +1,127 @@
+"""What calibrations are made of, out of dive logs and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from node.drivers.stored import decode_picture, picture_files
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import Candidates, CompressedImage, Imu, MessageError, NodeInfo, RelativePose
+from solver_service.geometry.rotation import matrix_of
+from tools.calibration.lights import Station
+from tools.dives import Dive
+
+Floats = NDArray[np.float64]
+
+REST_PX: Final = 2.0
+LEAST_FIXES: Final = 5
+
+
+def pictures(paths: list[str], node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    """Yield (name, picture) of folders, pictures and dive logs; raise BuddylineError for what is none."""
+    for text in paths:
+        path = Path(text)
+        if path.suffix == ".mcap":
+            yield from _dive_pictures(path, node)
+            continue
+        if not path.exists():
+            raise BuddylineError(f"{path}: no such picture, folder or dive log")
+        for file in picture_files(path):
+            yield str(file), decode_picture(file.read_bytes(), str(file))
+
+
+def _dive_pictures(path: Path, node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:
+    with Dive([path]) as dive:
+        wanted = _one_node(dive, node, "image")
+        for record in dive.records("image"):
+            message = record.decode()
+            if isinstance(message, CompressedImage) and message.frame_id == f"{wanted}_camera":
+                name = f"{path} at {(record.log_time_ns - dive.start_ns) / S_NS:.1f} s"
+                yield name, decode_picture(message.data, name)
+
+
+def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
+    """Return the node, its magnetometer's readings (n, 3) in T and the accelerometer's (n, 3) in m/s2."""
+    mags, accels = [], []
+    with Dive(paths) as dive:
+        wanted = _one_node(dive, node, "imu")
+        for record in dive.records("imu"):
+            try:
+                message = record.decode()
+            except MessageError:
+                continue
+            if isinstance(message, Imu) and message.node == wanted and message.mag_t is not UNSET:
+                mags.append(message.mag_t)
+                accels.append(message.accel_mps2)
+        if not mags:
+            raise BuddylineError(f"{dive.name}: no magnetometer readings of node {wanted}")
+    return wanted, np.array(mags), np.array(accels)
+
+
+def _one_node(dive: Dive, node: str | None, topic: str) -> str:
+    present = dive.nodes(topic)
+    if node is None and len(present) == 1:
+        return present[0]
+    if node in present:
+        return str(node)
+    raise BuddylineError(f"{dive.name}: {topic} of nodes {', '.join(present) or 'none'}; choose one with --node")
+
+
+def stations(
+    paths: list[str], tapes: list[tuple[float, float, float]]
+) -> tuple[list[Station], tuple[NodeInfo, NodeInfo]]:
+    """Return a place for each tape (begin s, end s, distance m) of a solved dive, and both nodes' calibrations."""
+    with Dive(paths) as dive:
+        infos = dive.infos()
+        frames: dict[tuple[str, int], Candidates] = {}
+        poses: list[tuple[float, RelativePose]] = []
+        for record in dive.records("candidates", "pose"):
+            try:
+                message = record.decode()
+            except MessageError:
+                continue
+            if isinstance(message, Candidates):
+                frames[message.node, message.trigger] = message
+            elif isinstance(message, RelativePose):
+                poses.append(((message.stamp_ns - dive.start_ns) / S_NS, message))
+        if not poses:
+            raise BuddylineError(f"{dive.name}: holds no poses; solve it first: buddyline solve ... -o solved.mcap")
+    pair = poses[0][1].node_a, poses[0][1].node_b
+    missing = [node for node in pair if node not in infos]
+    if missing:
+        raise BuddylineError(f"no calibration of node {missing[0]} in the log")
+    found = [
+        _station(f"{begin:g}-{end:g} s", [pose for t, pose in poses if begin <= t <= end], frames, distance_m)
+        for begin, end, distance_m in tapes
+    ]
+    return found, (infos[pair[0]], infos[pair[1]])
+
+
+def _station(
+    name: str, poses: list[RelativePose], frames: dict[tuple[str, int], Candidates], distance_m: float
+) -> Station:
+    seen = []
+    for pose in poses:
+        a, b = frames.get((pose.node_a, pose.trigger)), frames.get((pose.node_b, pose.trigger))
+        if a is None or b is None or min(*pose.blobs_a, *pose.blobs_b) < 0:
+            continue
+        seen.append([[a.blobs[i].u_px, a.blobs[i].v_px] for i in pose.blobs_a])
+        seen[-1] += [[b.blobs[i].u_px, b.blobs[i].v_px] for i in pose.blobs_b]
+    if len(seen) < LEAST_FIXES:
+        raise BuddylineError(f"{name}: {len(seen)} fixes with all four lights, {LEAST_FIXES} are needed")
+    pixels = np.array(seen)
+    moved_px = float(np.abs(pixels - np.median(pixels, axis=0)).mean())
+    if moved_px > REST_PX:
+        raise BuddylineError(f"{name}: the lights moved by {moved_px:.1f} px; both nodes must be at rest")
+    middle = np.median(pixels, axis=0)
+    pose = poses[len(poses) // 2]
+    return Station(
+        name, middle[:2], middle[2:], np.array(pose.t_a_b_m), matrix_of(np.array(pose.q_a_b_xyzw)), distance_m
+    )
