@@ -80,7 +80,7 @@ def table(figures):
     rows = [f"{'':26}{'n':>6}{'median':>9}{'p95':>9}{'rms':>9}"]
     for name, values in figures.items():
         if values:
-            size = np.abs(values)
+            size = np.abs(np.array(values, dtype=float))
             rms = math.sqrt(float((size**2).mean()))
             rows.append(f"{name:26}{len(size):6}{np.median(size):9.3f}{np.percentile(size, 95):9.3f}{rms:9.3f}")
     return rows
