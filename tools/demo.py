@@ -167,17 +167,18 @@ def run(args: argparse.Namespace) -> int:
             bus.on_failure(lambda error: service.fail("bus", error))
             dashboard = Dashboard(args.environment, args.seed, start_ns, args.rate)
             dashboard.subscribe(bus)
-            _watch(service, processes, dashboard, args.seconds)
+            over = _watch(service, processes, dashboard, args.seconds)
         summary = dashboard.summary(processes.cpu_seconds())
     finally:
         processes.end()
         shutil.rmtree(work, ignore_errors=True)
     print(json.dumps(summary) if args.json else dashboard.summary_text(summary))
     status = service.join()
-    return 1 if status == 0 and not summary["poses"] else status
+    return 1 if over and not summary["poses"] else status
 
 
-def _watch(service: Service, processes: Processes, dashboard: Dashboard, seconds: float | None) -> None:
+def _watch(service: Service, processes: Processes, dashboard: Dashboard, seconds: float | None) -> bool:
+    """Show what goes on; return whether the time was over, and not stopped from outside."""
     ends_s = None if seconds is None else time.monotonic() + seconds
     interactive = sys.stderr.isatty()
     while not service.stop.wait(0.25 if interactive else 1.0):
@@ -186,4 +187,5 @@ def _watch(service: Service, processes: Processes, dashboard: Dashboard, seconds
             service.fail("processes", BuddylineError(dead))
         print(dashboard.screen() if interactive else dashboard.line(), file=sys.stderr, flush=True)
         if ends_s is not None and time.monotonic() >= ends_s:
-            break
+            return True
+    return False
