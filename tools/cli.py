@@ -121,6 +121,12 @@ COMMANDS: Final = (
         ("buddyline ros2", "buddyline ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
     ),
     Command(
+        "artag",
+        "tools.artag",
+        "poses from AR tags in a dive's pictures, to compare the lights with",
+        ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
+    ),
+    Command(
         "export",
         "tools.export",
         "write poses for other programs",

@@ -83,6 +83,13 @@ class Dive:
 
         return read_logs(self.readers, wanted)
 
+    def metadata(self) -> dict[str, str]:
+        """Return what the logs say about themselves; the first named prevails."""
+        noted: dict[str, str] = {}
+        for reader in reversed(self.readers):
+            noted |= reader.metadata()
+        return noted
+
     def infos(self) -> dict[str, NodeInfo]:
         """Return the first sound NodeInfo of each node."""
         infos: dict[str, NodeInfo] = {}

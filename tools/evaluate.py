@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
         recorded.infos,
         recorded.attitudes_a,
         nodes=recorded.nodes,
+        environment=recorded.environment,
     )
     if result.poses and result.without_truth == result.poses:
         raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")

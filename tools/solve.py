@@ -76,7 +76,8 @@ def run(args: argparse.Namespace) -> int:
         core = SolverCore(node_a, node_b, settings, round(args.clock_offset * 1e9))
         bad = 0
         began_s = time.monotonic()
-        with DiveLogWriter(args.output, metadata={"command": "solve", "method": args.method}) as writer:
+        metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
+        with DiveLogWriter(args.output, metadata=metadata) as writer:
             for info in replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)

@@ -20,19 +20,24 @@ from protocol.messages import (
     RelativePose,
     Truth,
 )
-from protocol.topics import ATTITUDE, CANDIDATES, INFO, LIGHT_TRUTH, POSE, REJECTED, TRUTH, Topic, parse_key
+from protocol.topics import ARTAG, ATTITUDE, CANDIDATES, INFO, LIGHT_TRUTH, POSE, REJECTED, TRUTH, Topic, parse_key
 from tools.evaluation.truth import inverted
 from tools.progress import Progress
 
 Pair = tuple[str, str]
 
 _RESULTS: Final = (POSE, REJECTED)
+# Where a log has no result of the solver's: poses from tags are measured as any others.
+_TAGS: Final = (ARTAG,)
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH)
 
 
 @dataclass
 class Recorded:
-    """One pair's messages; truths are of T_a_b whichever way the log has them. problems: for a person, a line each."""
+    """One pair's messages; truths are of T_a_b whichever way the log has them. problems: for a person, a line each.
+
+    environment: the water, where a log names it.
+    """
 
     nodes: Pair
     poses: list[RelativePose] = field(default_factory=list)
@@ -43,6 +48,7 @@ class Recorded:
     attitudes_a: list[Attitude] = field(default_factory=list)
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    environment: str = ""
 
 
 def parse_pair(text: str) -> Pair:
@@ -62,8 +68,12 @@ def _ids(readers: Sequence[DiveLogReader], *topics: Topic) -> list[tuple[str, ..
     return sorted({found[1] for found in parsed if found is not None and found[0] in topics})
 
 
+def _results(readers: Sequence[DiveLogReader]) -> tuple[Topic, ...]:
+    return _RESULTS if _ids(readers, *_RESULTS) else _TAGS
+
+
 def _choose_pair(readers: Sequence[DiveLogReader], wanted: Pair | None) -> Pair:
-    pairs = [(ids[0], ids[1]) for ids in _ids(readers, *_RESULTS) or _ids(readers, TRUTH)]
+    pairs = [(ids[0], ids[1]) for ids in _ids(readers, *_results(readers)) or _ids(readers, TRUTH)]
     if not pairs:
         nodes = [ids[0] for ids in _ids(readers, CANDIDATES)]
         pairs = [(nodes[0], nodes[-1])] if nodes else []
@@ -146,14 +156,16 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
         logs = [stack.enter_context(DiveLogReader(path)) for path in paths]
         truth_logs = [stack.enter_context(DiveLogReader(path)) for path in truth_paths]
         recorded = Recorded(_choose_pair([*logs, *truth_logs], pair))
-        answering = [log for log in logs if _ids([log], *_RESULTS)]
+        results = _results(logs)
+        answering = [log for log in logs if _ids([log], *results)]
+        recorded.environment = next((log.metadata().get("environment", "") for log in [*logs, *truth_logs]), "")
         for log in answering[1:]:
             recorded.problems.append(f"{log.path}: its poses are left out, those of {answering[0].path} are taken")
         sighted = {topic.name for topic in _TRUTHS if _ids(truth_logs, topic)}
         for log in [*logs, *truth_logs]:
             topics: list[Topic] = [INFO, CANDIDATES]
             if log in answering[:1]:
-                topics += _RESULTS
+                topics += results
             if answering:
                 topics += [ATTITUDE]
             topics += [topic for topic in _TRUTHS if log in truth_logs or topic.name not in sighted]

@@ -73,8 +73,9 @@ def _counts(counts: dict[str, int]) -> str:
 
 def _triggers_text(result: Result) -> str:
     triggers, skew = result.triggers, result.skew
+    where = f" in {result.environment}" if result.environment else ""
     lines = [
-        f"pair {result.node_a}/{result.node_b}: {result.poses} poses of {triggers.total} triggers"
+        f"pair {result.node_a}/{result.node_b}{where}: {result.poses} poses of {triggers.total} triggers"
         f" in {triggers.span_s:.1f} s ({_number(triggers.poses_hz, 2)} of {_number(triggers.triggers_hz, 2)} Hz,"
         f" longest time without a pose {_number(triggers.gap_s, 2)} s)",
         f"rejected: {_counts(triggers.rejected)}",

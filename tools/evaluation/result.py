@@ -75,7 +75,10 @@ class RangeBin:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that is measured of one pair. without_truth: poses that could not be compared."""
+    """All that is measured of one pair. without_truth: poses that could not be compared.
+
+    environment: the water, empty where the logs do not name it.
+    """
 
     node_a: str
     node_b: str
@@ -88,6 +91,7 @@ class Result:
     pairing: Pairing | None
     detection: Detection | None
     errors: PoseErrors
+    environment: str = ""
 
 
 def _bins(errors: PoseErrors, sightings: Sequence[Sighting]) -> list[RangeBin]:
@@ -110,6 +114,7 @@ def evaluate(
     attitudes_a: Iterable[Attitude] = (),
     *,
     nodes: tuple[str, str],
+    environment: str = "",
 ) -> Result:
     """Measure one pair's poses, rejections and candidates.
 
@@ -146,6 +151,7 @@ def evaluate(
         pairing=pairing_figures(sightings),
         detection=detection_figures(lights, blobs),
         errors=errors,
+        environment=environment,
     )
 
 

@@ -1,0 +1,211 @@
+"""`buddyline artag`: poses from AR tags in a dive's pictures, to compare the lights with."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from msgspec import UNSET
+
+from node.drivers.stored import PictureError, decode_picture
+from protocol.clock import trigger_index
+from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.messages import Attitude, CompressedImage, MessageError, NodeInfo, RelativePose, encode
+from protocol.topics import ARTAG, check_node_id, parse_key
+from tools.dives import Dive
+from tools.evaluation.rotation import Floats, multiply, normalized, rotate
+from tools.evaluation.truth import Track
+from tools.progress import Progress
+from tools.solve import COPIED, pair_of
+from tools.tags.detection import TagFinder
+from tools.tags.layout import Layout, layout_of, load_layout
+from tools.tags.pose import TagPose, readings_of, tag_pose
+
+log = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive of pictures: its log, or each node's")
+    parser.add_argument("-o", "--output", required=True, metavar="TAGS.mcap", help="poses from tags, and the truth")
+    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
+    parser.add_argument(
+        "--tags",
+        action="append",
+        default=[],
+        metavar="NODE=FILE",
+        help="the tags that a node carries, in place of its NodeInfo's: JSON, a list of {id, corners_m, family}",
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+@dataclass
+class TagSolver:
+    """Finds tags picture by picture, and gives the poses of all triggers when the pictures are through."""
+
+    node_a: str
+    node_b: str
+    infos: dict[str, NodeInfo]
+    layouts: dict[str, Layout]
+    pictures: int = 0
+    with_tags: int = 0
+    left_out: int = 0
+    _seen: dict[int, dict[str, tuple[int, dict[int, list[Floats]]]]] = field(default_factory=dict)
+    _finders: dict[str, TagFinder] = field(default_factory=dict)
+
+    def look(self, image: CompressedImage) -> None:
+        """Take one picture; raise PictureError where it cannot be used."""
+        node = image.frame_id.removesuffix("_camera")
+        info = self.infos[node]
+        picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
+        if picture.shape[:2] != (info.height_px, info.width_px):
+            raise PictureError(
+                f"picture of node {node} at {image.stamp_ns}: {picture.shape[1]}x{picture.shape[0]} px, its NodeInfo "
+                f"says {info.width_px}x{info.height_px}"
+            )
+        other = self.node_b if node == self.node_a else self.node_a
+        if node not in self._finders:
+            self._finders[node] = TagFinder(self.layouts[other])
+        found = self._finders[node].find(picture)
+        self.pictures += 1
+        self.with_tags += bool(found)
+        trigger = trigger_index(image.stamp_ns, info.trigger_period_ns)
+        self._seen.setdefault(trigger, {})[node] = (image.stamp_ns, found)
+
+    def poses(self, attitudes_a: Track) -> list[RelativePose]:
+        """Return the poses of all triggers with tags that tell one, in order of time."""
+        poses = []
+        for trigger, views in sorted(self._seen.items()):
+            readings = [
+                reading
+                for node, (_, found) in views.items()
+                for reading in readings_of(
+                    found,
+                    self.layouts[self.node_b if node == self.node_a else self.node_a],
+                    self.infos[node].camera,
+                    by_a=node == self.node_a,
+                )
+            ]
+            solved = tag_pose(readings, self.layouts[self.node_a].family)
+            if solved is not None:
+                self.left_out += solved.left_out
+                poses.append(
+                    self._message(trigger, {node: view[0] for node, view in views.items()}, solved, attitudes_a)
+                )
+        return poses
+
+    def _message(self, trigger: int, stamps_ns: dict[str, int], solved: TagPose, attitudes_a: Track) -> RelativePose:
+        # A node whose picture is missing says nothing: the other's stamp stands for both.
+        stamp_a_ns = stamps_ns.get(self.node_a, stamps_ns.get(self.node_b, 0))
+        stamp_b_ns = stamps_ns.get(self.node_b, stamp_a_ns)
+        t_ned_m = None
+        attitude = attitudes_a.at(stamp_a_ns)
+        if attitude is not None:
+            q_body_camera = normalized(np.array(self.infos[self.node_a].q_body_camera_xyzw))
+            t_ned_m = rotate(multiply(attitude[1], q_body_camera), solved.t_a_b_m).tolist()
+        return RelativePose(
+            node_a=self.node_a,
+            node_b=self.node_b,
+            stamp_ns=(stamp_a_ns + stamp_b_ns) // 2,
+            trigger=trigger,
+            t_a_b_m=tuple(solved.t_a_b_m.tolist()),
+            q_a_b_xyzw=tuple(solved.q_a_b_xyzw.tolist()),
+            covariance=solved.covariance.ravel().tolist(),
+            range_m=float(np.linalg.norm(solved.t_a_b_m)),
+            range_a_m=solved.range_a_m,
+            range_b_m=solved.range_b_m,
+            range_gap_m=solved.range_a_m - solved.range_b_m,
+            twist_gap_rad=solved.twist_gap_rad,
+            chi2=solved.chi2,
+            hypotheses=solved.readings + solved.left_out,
+            blobs_a=(-1, -1),
+            blobs_b=(-1, -1),
+            method="artag",
+            checks=[],
+            skew_ns=stamp_a_ns - stamp_b_ns,
+            t_ned_m=UNSET if t_ned_m is None else tuple(t_ned_m),
+            azimuth_rad=UNSET if t_ned_m is None else math.atan2(t_ned_m[1], t_ned_m[0]) % (2 * math.pi),
+            inclination_rad=UNSET if t_ned_m is None else -math.atan2(t_ned_m[2], math.hypot(t_ned_m[0], t_ned_m[1])),
+        )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Find the tags of a dive's pictures; return 0, or 1 where no picture shows one."""
+    cv2.setNumThreads(1)
+    with Dive(args.dives) as dive:
+        nodes = pair_of(dive, args.nodes)
+        infos = dive.infos()
+        solver = TagSolver(*nodes, infos, layouts(dive.name, infos, nodes, args.tags))
+        attitudes: list[Attitude] = []
+        skipped = 0
+        topics = [topic for topic in COPIED if topic != "candidates"]
+        with (
+            DiveLogWriter(args.output, metadata=dive.metadata() | {"command": "artag", "method": "artag"}) as writer,
+            Progress("artag", (dive.end_ns - dive.start_ns) / 1e9) as progress,
+        ):
+            for record in dive.records(*topics, "image"):
+                progress.show((record.log_time_ns - dive.start_ns) / 1e9)
+                parsed = parse_key(record.key)
+                if parsed is None or not set(parsed[1]) <= set(nodes):
+                    continue
+                try:
+                    message = record.decode()
+                    if isinstance(message, CompressedImage):
+                        solver.look(message)
+                    elif message is not None:
+                        writer.write(record.key, encode(message), record.log_time_ns)
+                except (MessageError, PictureError) as error:
+                    skipped += 1
+                    log.warning("skipped: %s", error)
+                    continue
+                if isinstance(message, Attitude) and message.node == nodes[0]:
+                    attitudes.append(message)
+            poses = solver.poses(Track.of_attitudes(attitudes))
+            for pose in poses:
+                writer.write_message(pose, key=ARTAG.key(*nodes))
+        for text in dive.damage:
+            log.warning("%s", text)
+    summary = {
+        "output": args.output,
+        "poses": len(poses),
+        "pictures": solver.pictures,
+        "with_tags": solver.with_tags,
+        "left_out": solver.left_out,
+        "skipped": skipped,
+    }
+    if args.json:
+        print(json.dumps(summary))
+    else:
+        print(
+            f"{args.output}: {len(poses)} poses from tags; {solver.with_tags} of {solver.pictures} pictures show any, "
+            f"{solver.left_out} readings did not fit the layout"
+        )
+    return 0 if poses else 1
+
+
+def layouts(name: str, infos: dict[str, NodeInfo], nodes: tuple[str, str], given: list[str]) -> dict[str, Layout]:
+    """Return the tags of both nodes: of `--tags NODE=FILE`, else of NodeInfo; raise where there are none."""
+    chosen: dict[str, Layout] = {}
+    for text in given:
+        node, equals, path = text.partition("=")
+        if not equals or check_node_id(node) not in nodes:
+            raise BuddylineError(f"--tags {text}: give NODE=FILE, a node of {' and '.join(nodes)}")
+        chosen[node] = load_layout(path)
+    for node in nodes:
+        info = infos.get(node)
+        if info is None:
+            raise BuddylineError(f"{name}: no NodeInfo of node {node}")
+        if node not in chosen:
+            if info.tags is UNSET:
+                raise BuddylineError(f"{name}: NodeInfo of node {node} names no tags; give them: --tags {node}=FILE")
+            chosen[node] = layout_of(info.tags, f"{name}: tags of node {node}")
+    families = {layout.family for layout in chosen.values()}
+    if len(families) > 1:
+        raise BuddylineError(f"tags of nodes {' and '.join(nodes)}: families {', '.join(sorted(families))}; use one")
+    return chosen

@@ -1,0 +1,1 @@
+"""The experiments of the paper, again, with ours beside them: one command, one report."""

@@ -1,0 +1,1 @@
+"""Poses from AR tags: the yardstick beside the lights."""
