@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import cv2
+import msgspec
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
@@ -76,7 +77,7 @@ class NodeService(Service):
                 self.config.detector.method, self.config.detector.environment, self.config.detector.overrides
             ),
         )
-        self.recorder = Recorder(self._log_path(), metadata={"node": self.config.node, "software": self._software})
+        self.recorder = Recorder(self._log_path(), metadata=self._log_metadata())
         self.outlet = Outlet(self.config.node, self.recorder, self.clock)
         self.outlet.send(info)
 
@@ -87,6 +88,16 @@ class NodeService(Service):
         if own.node != self.config.node:
             raise ConfigError(f"node {self.config.node}: the camera's pictures are those of node {own.node}")
         return own
+
+    def _log_metadata(self) -> dict[str, str]:
+        """Return what a log is to be understood by later: the configuration in force goes with it, in full."""
+        return {
+            "node": self.config.node,
+            "software": self._software,
+            "boot": self.boot,
+            "config": msgspec.json.encode(self.config, order="sorted").decode(),
+            "config_sha256": self._sha256,
+        }
 
     def _log_path(self) -> Path:
         directory = Path(self.config.record.directory)

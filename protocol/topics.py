@@ -203,6 +203,16 @@ def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
     return None
 
 
+def check_sender(key: str, message: Message) -> None:
+    """Raise MessageError where a message says that it is of another node, or pair, than its key."""
+    parsed = parse_key(key)
+    fields = ("node",) if parsed is None or "{node}" in parsed[0].template else ("node_a", "node_b")
+    said = tuple(getattr(message, field, None) for field in fields)
+    if parsed is not None and said[0] is not None and said != parsed[1]:
+        words = ", ".join(f"{field} {value!r}" for field, value in zip(fields, said, strict=True))
+        raise messages.MessageError(f"{parsed[0].schema_name}: {words} on key {key}")
+
+
 def topic_of(message: Message) -> Topic:
     """Return the topic of a message by its type."""
     for topic in TOPICS:

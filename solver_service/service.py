@@ -15,7 +15,7 @@ from protocol import __version__
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
 from protocol.service import Service
-from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, parse_key
+from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key
 from solver_service.alignment import ClockOffset
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
@@ -106,10 +106,7 @@ class SolverService(Service):
         topic, (node,) = parsed
         try:
             message = decode(received.payload, topic.schema)
-            if getattr(message, "node", None) != node:
-                raise MessageError(
-                    f"{topic.schema_name}: node {getattr(message, 'node', None)!r} on key {received.key}"
-                )
+            check_sender(received.key, message)
         except MessageError as error:
             self.bad_messages += 1
             self._reported_bad = f"bad message on {received.key}: {error}"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from protocol.messages import MessageError, decode
 from protocol.recorder import Recorder
 from protocol.service import Service
-from protocol.topics import EVERYTHING, parse_key
+from protocol.topics import EVERYTHING, check_sender, parse_key
 from tools.client import add_client_arguments, client_config
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class BusRecorder:
             self.bad += 1
             return
         try:
-            decode(received.payload, parsed[0].schema)
+            check_sender(received.key, decode(received.payload, parsed[0].schema))
         except MessageError as error:
             self.bad += 1
             if self.bad.bit_count() == 1:

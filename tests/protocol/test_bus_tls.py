@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import threading
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 from protocol import topics
 from protocol.access import access_rules
 from protocol.bus import Received
+from protocol.divelog import DiveLogReader
 from protocol.errors import BuddylineError
 from protocol.security import RefusedError, Tls
 from protocol.zenoh_bus import ZenohBus, connect, open_hub
@@ -190,6 +193,12 @@ def test_a_node_that_is_refused_records_all_the_same_and_says_so(keys: Path, tmp
         record.wait_for("Ctrl-C ends")
         assert node.end() == 0
     (log,) = (tmp_path / "logs").glob("*.mcap")
-    assert b"PRIVATE KEY" not in log.read_bytes()
+    with DiveLogReader(log) as reader:
+        noted = reader.metadata()
+        assert not any(b"PRIVATE KEY" in record.payload for record in reader.records())
+    # The log says by what configuration it was made.
+    assert json.loads(noted["config"])["node"] == "a"
+    assert hashlib.sha256(noted["config"].encode()).hexdigest() == noted["config_sha256"]
+    assert "PRIVATE KEY" not in noted["config"]
     for process in (hub, node, record):
         assert not any("PRIVATE KEY" in line for line in process.lines)
