@@ -26,7 +26,7 @@ class Candidates:
     bearings: (3, N), each in its own rig's level frame. tangents: (N, 2, 3), px per rad over sigma_px, likewise.
     variance: (N,) of the bearing, rad^2 per axis. index: (N,) into the view. shares: (2, N) position over the
     picture's width and height. sigma_px: (N,). dt_s: (N,) after the instant that the pose is for. log_score: (N,)
-    weak evidence for a light, None where no candidate has a score. area_px: (N,).
+    weak evidence for a light, None where no candidate has a score. log_area: (N,).
     """
 
     counts: tuple[int, int]
@@ -38,7 +38,7 @@ class Candidates:
     sigma_px: Floats
     dt_s: Floats
     log_score: Floats | None
-    area_px: Floats
+    log_area: Floats
 
 
 def find_candidates(views: tuple[View, View], rigs: tuple[Rig, Rig]) -> Candidates:
@@ -72,7 +72,7 @@ def find_candidates(views: tuple[View, View], rigs: tuple[Rig, Rig]) -> Candidat
         sigma_px=sigma_px,
         dt_s=table[5],
         log_score=log_score,
-        area_px=table[8],
+        log_area=np.log(np.fmax(table[8], 1.0)),
     )
 
 

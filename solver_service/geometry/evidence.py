@@ -40,6 +40,9 @@ _UPRIGHT_SIGMA_RAD: Final = 0.45
 # How often one light is missing, to being seen; and chance alone, to all four being seen.
 MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
+# Eight coordinates leave two residuals: of a light's two, the other three leave a quarter of the variance open each.
+# Seen from there, the position foretold has four times the light's own variance.
+_FORETOLD_VARIANCE: Final = np.array(4.0)
 # What chance gives: the spread of relative pitch (rad) and heading (rad), and of depth differences (m).
 PITCH_SPREAD: Final = 1.1
 _HEADING_SPREAD: Final = 1.5
@@ -84,11 +87,40 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Where earlier poses put this one: t_a_b_m (3,), R_a_b (3, 3), covariance (6, 6) like a pose's."""
+    """Where earlier poses put this one: t_a_b_m (3,), R_a_b (3, 3), and the information (6, 6) of a pose against it.
+
+    log_gain: of a pose that is exactly there, against chance.
+    """
 
     t_a_b_m: Floats
     R_a_b: Floats
-    covariance: Floats
+    information: Floats
+    log_gain: float
+
+    @staticmethod
+    def of(
+        t_a_b_m: Floats,
+        R_a_b: Floats,
+        covariance: Floats,
+        bearing_variance: float,
+        levels: tuple[Rig, Rig],
+        settings: Settings,
+    ) -> Prediction:
+        """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
+        range2 = float(t_a_b_m @ t_a_b_m) + 1e-6
+        sight = np.outer(t_a_b_m, t_a_b_m) / range2
+        # Of ln range and of the twist, by both pictures.
+        relative = bearing_variance * range2 * 0.5 * (1.0 / levels[0].length_m ** 2 + 1.0 / levels[1].length_m ** 2)
+        total = covariance.copy()
+        total[:3, :3] += relative * range2 * sight
+        total[3:, 3:] += relative * sight
+        views_sr = levels[0].camera.solid_angle_sr * levels[1].camera.solid_angle_sr
+        spread = math.log(settings.range_max_m / settings.range_min_m)
+        # Chance puts a pose anywhere in both pictures, at any range and twist.
+        log_chance = -math.log(range2 * math.sqrt(range2) * spread * views_sr * 2.0 * math.pi)
+        log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
+        information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        return Prediction(t_a_b_m, R_a_b, information, -log_area - log_chance)
 
 
 def combine(
@@ -137,14 +169,14 @@ def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
     return density
 
 
-def intruder_odds(chi2: Floats, freedom: Floats, per_area: Floats) -> Floats:
+def intruder_odds(chi2: Floats, per_area: Floats) -> Floats:
     """Give the odds (K,) that one of four lights is missing and a false candidate stands in for it.
 
-    chi2: (K,) of the poses. freedom: (K, 4) of the sightings. per_area: (K, 4) candidates per variance of position
-    (px^2). The other three foretell where a light stands; a false candidate falls there by chance.
+    chi2: (K,) of the poses. per_area: (K, 4) candidates per variance of position (px^2). The other three foretell
+    where a light stands; a false candidate falls there by chance.
     """
-    foretold = np.exp(log_gaps(chi2, np.ones(1), 2))
-    odds: Floats = MISSING_ODDS / foretold * (per_area / np.sqrt(np.maximum(freedom, 1e-12))).sum(1)
+    foretold = np.exp(log_gaps(chi2, _FORETOLD_VARIANCE, 2))
+    odds: Floats = MISSING_ODDS / foretold * per_area.sum(1)
     return odds
 
 
@@ -197,7 +229,7 @@ def weigh(
         log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
     log_prior = np.zeros_like(variance)
     if prediction is not None:
-        log_prior = weigh_prediction(R_a_b, t_a_b_m, variance, prediction, rigs, settings)
+        log_prior = weigh_prediction(R_a_b, t_a_b_m, prediction)
     return Support(log_ratio + log_prior, log_prior, tilt_chi2, depth_chi2)
 
 
@@ -235,45 +267,17 @@ def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
     return log_ratio
 
 
-def weigh_prediction(
-    R_a_b: Floats,
-    t_a_b_m: Floats,
-    variance: Floats,
-    prediction: Prediction,
-    rigs: tuple[Rig, Rig],
-    settings: Settings,
-) -> Floats:
-    """Weigh K poses against a prediction from earlier ones: a bounded gain and a bounded loss.
-
-    variance: (K,) four times that of the poses' own ln range, and of their twist.
-    """
-    away = t_a_b_m - prediction.t_a_b_m[:, None]
-    turned = np.tensordot(prediction.R_a_b, R_a_b, (1, 1))  # [i, j] of R_a_b R_predicted^T stands at [j, i]
-    e = np.empty((6, len(variance)))
-    e[:3] = away
+def weigh_prediction(R_a_b: Floats, t_a_b_m: Floats, prediction: Prediction) -> Floats:
+    """Weigh K poses against a prediction from earlier ones: a bounded gain and a bounded loss."""
+    # [j, i] holds R_a_b R_predicted^T [i, j].
+    turned = np.tensordot(prediction.R_a_b, R_a_b, (1, 1))
+    e = np.empty((6, t_a_b_m.shape[1]))
+    e[:3] = t_a_b_m - prediction.t_a_b_m[:, None]
     e[3], e[4], e[5] = turned[1, 2] - turned[2, 1], turned[2, 0] - turned[0, 2], turned[0, 1] - turned[1, 0]
     e[3:] *= 0.5
-    range2 = dot(t_a_b_m, t_a_b_m)
-    # Along the line of sight a pose scatters with its range, about it with its twist: on top of the prediction.
-    sight = prediction.t_a_b_m / math.sqrt(float(prediction.t_a_b_m @ prediction.t_a_b_m) + 1e-12)
-    along = np.zeros((6, 2))
-    along[:3, 0] = sight
-    along[3:, 1] = sight
-    inverse = np.linalg.inv(prediction.covariance)
-    weighted = inverse @ e
-    chi2 = (e * weighted).sum(0)
-    log_area = 0.5 * math.log(max(float(np.linalg.det(prediction.covariance)), 1e-60)) + 3.0 * math.log(2.0 * math.pi)
-    reduced = along.T @ inverse @ along
-    for k, own in enumerate((0.25 * variance * range2, 0.25 * variance)):
-        # One direction's variance at a time (Sherman-Morrison); the two hardly share any.
-        grown = 1.0 + own * reduced[k, k]
-        chi2 = chi2 - own * (along[:, k] @ weighted) ** 2 / grown
-        log_area = log_area + 0.5 * np.log(grown)
+    chi2 = (e * (prediction.information @ e)).sum(0)
     # Half a turn away the vector is short again.
     near = turned[0, 0] + turned[1, 1] + turned[2, 2] > 1.0
-    views_sr = rigs[0].camera.solid_angle_sr * rigs[1].camera.solid_angle_sr
-    spread = math.log(settings.range_max_m / settings.range_min_m) * views_sr * 2.0 * math.pi
-    log_chance = -1.5 * np.log(range2) - math.log(spread)
-    log_gain = np.where(near, np.minimum(-0.5 * chi2 - log_area - log_chance, _MAX_LOG_PRIOR), -np.inf)
+    log_gain = np.where(near, np.minimum(prediction.log_gain - 0.5 * chi2, _MAX_LOG_PRIOR), -np.inf)
     gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
     return gain

@@ -95,7 +95,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             depth_chi2=support.depth_chi2[best],
             range_m=solved.range_m[:, best].T,
             twist_gap_rad=twist_gap_rad[best],
-            intruder=_intruder(terms, refined, found.lights[:, best].T) if gaps == 2 else np.zeros(len(best)),
+            intruder=_intruder(terms, chi2, found.lights[:, best].T) if gaps == 2 else np.zeros(len(best)),
             log_prior=support.log_prior[best],
         ),
         others=float(ratio.sum() - ratio[best].sum()),
@@ -114,11 +114,11 @@ def _inflated(refined: Refined) -> Floats:
     return covariance
 
 
-def _intruder(terms: Terms, refined: Refined, lights: NDArray[np.intp]) -> Floats:
+def _intruder(terms: Terms, chi2: Floats, lights: NDArray[np.intp]) -> Floats:
     """Give the odds that one of four lights is missing and a false candidate stands in for it."""
     (in_a, in_b), (a, b) = terms.candidates.counts, (rig.camera.area_px2 for rig in terms.rigs)
     per_px2 = np.array((in_a / a, in_a / a, in_b / b, in_b / b))
-    return intruder_odds(refined.chi2, refined.freedom, per_px2 * terms.candidates.sigma_px[lights] ** 2)
+    return intruder_odds(chi2, per_px2 * terms.candidates.sigma_px[lights] ** 2)
 
 
 def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:

@@ -40,13 +40,16 @@ _MAX_CHORD2: Final = 3.9
 _LEAST_IN_VIEW: Final = 0.02
 # How the log ratio of two areas scatters (1 sd): of two lamps of a kind, and of any two candidates; and the most
 # that areas may speak against two lamps.
-_LIKE_LOG_AREA: Final = 0.8
-_ANY_LOG_AREA: Final = 1.2
+_LIKE_LOG_AREA, _ANY_LOG_AREA = 0.8, 1.2
+_LIKE_GAIN: Final = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA)
+_LIKE_SLOPE: Final = 0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2
 _MAX_UNLIKE: Final = 1.0
-# How many hypotheses may pass gates that are widened for gross errors; beyond, chance hides the right one.
-_MAX_WIDE: Final = 1000
+# Of so many combinations of pairs the gates are widened for gross errors; beyond, chance hides the right one.
+_MAX_WIDE: Final = 60_000
 # Gravity across the line of sight (product of both) below which both readings of left and right are weighed.
 _UNDECIDED: Final = 0.3
+# Twists reach no further than this, so that none is met twice.
+_NEARLY_HALF_PI: Final = 1.57
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,11 +160,12 @@ def find_pairs(
     )
 
 
-def _alike(area_px: Floats, one: NDArray[np.intp], two: NDArray[np.intp]) -> Floats:
-    """Give the log likelihood ratio of two areas for lamps of a kind, against any two candidates."""
-    square = np.log(area_px[one] / area_px[two]) ** 2
-    weight = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA) - square * (0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2)
-    return np.where(np.isfinite(weight), np.maximum(weight, -_MAX_UNLIKE), 0.0)
+def _alike(log_area: Floats) -> Floats:
+    """Give the log likelihood ratio (K,) of the areas (4, K) for lamps of a kind, against any candidates."""
+    square = (log_area[::2] - log_area[1::2]) ** 2
+    weight = np.maximum(_LIKE_GAIN - _LIKE_SLOPE * square, -_MAX_UNLIKE)
+    total: Floats = weight[0] + weight[1]
+    return total
 
 
 def join(
@@ -172,33 +176,44 @@ def join(
     motion_variance: of A's pairs, what relative motion between the exposures adds to both gaps, rad^2.
     swap: the twists agree where one of the two pairs is read second -> first.
     """
-    split, other = pairs.split, pairs.counts[1]
+    split, in_b = pairs.counts
     chord, variance = pairs.chord[:split], pairs.variance[:split] + motion_variance
+    key_a, key_b = pairs.key[:split], pairs.key[split:]
     slack = (_OFFSET_SLOPE * (levels[0].offset_m + levels[1].offset_m) / levels[1].length_m) * chord
     chord2 = (max(1.0, levels[0].length_m / levels[1].length_m) * chord) ** 2
+    slack_range = (_KEY_TERM + _KEY_SLOPE * pairs.tan2_beta) * chord2 + slack
+    slack_twist = _TWIST_TERM * chord2 + slack
     if by_range:
-        key_a, key_b = pairs.key[:split], pairs.key[split:]
         # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
         least2 = np.exp(2.0 * key_a) / levels[1].length_m ** 2
-        worst = (pairs.variance[split:] * pairs.chord[split:] ** 2).max()
-        term = _KEY_TERM + _KEY_SLOPE * pairs.tan2_beta
-        reach = gate_sigma * np.sqrt(variance + worst / least2) + term * chord2 + slack
-        order = np.argsort(key_b, kind="stable")
-        keys = key_b[order]
-        low = keys.searchsorted(key_a - reach)
-        count = keys.searchsorted(key_a + reach, side="right") - low
-        ia = np.arange(split).repeat(count)
-        ib = order[np.arange(len(ia)) - (count.cumsum() - count - low).repeat(count)] + split
+        worst = variance + (pairs.variance[split:] * pairs.chord[split:] ** 2).max() / least2
     else:
-        ia = np.repeat(np.arange(split), other)
-        ib = np.tile(np.arange(split, split + other), split)
-    # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
+        worst = variance + pairs.variance[split:].max()
+    if by_twist:
+        # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
+        of_a, of_b = pairs.twist_rad[:split] % np.pi, pairs.twist_rad[split:] % np.pi
+        reach = np.minimum(gate_sigma * np.sqrt(worst) + slack_twist, _NEARLY_HALF_PI)
+    else:
+        of_a, of_b = key_a, key_b
+        reach = gate_sigma * np.sqrt(worst) + slack_range if by_range else np.full(split, np.inf)
+    order = of_b.argsort(kind="stable")
+    values = of_b[order]
+    if by_twist:
+        values = np.concatenate((values - np.pi, values, values + np.pi))
+    low = values.searchsorted(of_a - reach)
+    count = values.searchsorted(of_a + reach, side="right") - low
+    ia = np.arange(split).repeat(count)
+    ib = np.arange(len(ia)) - (count.cumsum() - count - low).repeat(count)
+    ib = order[ib % in_b if by_twist else ib] + split
+    if by_range and by_twist:
+        off = np.abs(pairs.key[ia] - pairs.key[ib])
+        keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_range[ia]
+        ia, ib = ia[keep], ib[keep]
     off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - np.pi)
     swap = off_half_turn < 0.5 * np.pi
     if by_twist:
-        gap = np.where(swap, off_half_turn, np.pi - off_half_turn)
-        spread = np.sqrt(variance[ia] + pairs.variance[ib])
-        keep = gap < gate_sigma * spread + (_TWIST_TERM * chord2 + slack)[ia]
+        off = np.where(swap, off_half_turn, np.pi - off_half_turn)
+        keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_twist[ia]
         ia, ib, swap = ia[keep], ib[keep], swap[keep]
     return ia, ib, swap
 
@@ -208,10 +223,10 @@ def search(
 ) -> Hypotheses | Literal["range_gap", "twist_gap"]:
     """Give the hypotheses whose gaps pass, read as gravity has them, or the name of the gap that none passes."""
     by_range, by_twist = "range" in settings.checks, "twist" in settings.checks
-    for gate in (settings.gate_sigma * GROSS_SCALE, settings.gate_sigma):
-        ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=by_range, by_twist=by_twist)
-        if len(ia) <= _MAX_WIDE:
-            break
+    gate = settings.gate_sigma
+    if math.prod(pairs.counts) <= _MAX_WIDE:
+        gate *= GROSS_SCALE
+    ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=by_range, by_twist=by_twist)
     if not len(ia):
         if not (by_range and by_twist):
             return "range_gap" if by_range else "twist_gap"
@@ -234,11 +249,9 @@ def search(
     lights[0], lights[1] = np.where(flip, second_a, first_a), np.where(flip, first_a, second_a)
     lights[2], lights[3] = np.where(swap, second_b, first_b), np.where(swap, first_b, second_b)
     both = np.array((ia, ib))
-    w = pairs.w.take(both, axis=1)
-    w[:, 0] *= 1.0 - 2.0 * flip
-    w[:, 1] *= 1.0 - 2.0 * swap
+    w = pairs.w.take(both, axis=1) * (1.0 - 2.0 * np.array((flip, swap)))
     log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
-    log_weight += _alike(candidates.area_px, lights[::2], lights[1::2]).sum(0)
+    log_weight += _alike(candidates.log_area[lights])
     if candidates.log_score is not None:
         log_weight += candidates.log_score[lights].sum(0)
     return Hypotheses(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, rotation_exp, rotation_near, skew
+from solver_service.geometry.rotation import Floats, rotation_near, skew
 
 _MAX_STEPS: Final = 12
 # A step this small, relative to the range and in rad, leaves less than its square.
@@ -61,18 +61,6 @@ class Refined:
     covariance: Floats
     chi2: Floats
     sound: NDArray[np.bool_]
-    derivatives: Floats
-
-    @property
-    def freedom(self) -> Floats:
-        """What of each sighting the other three leave open (K, 4), 0 to 1.
-
-        The determinant of its residual's covariance, where residuals are not correlated.
-        """
-        J = self.derivatives.reshape(-1, 4, 2, 6)
-        left = np.eye(2) - J @ self.covariance[:, None] @ J.swapaxes(2, 3)
-        area: Floats = np.clip(left[..., 0, 0] * left[..., 1, 1] - left[..., 0, 1] * left[..., 1, 0], 0.0, 1.0)
-        return area
 
 
 def refine(
@@ -116,7 +104,7 @@ def refine(
             break
     determined = inverse[:, _DIAGONAL, _DIAGONAL].max(1) < _UNDETERMINED
     sound = determined & (depth > 0.0).all(1) & np.isfinite(covariance.sum((1, 2)) + chi2 + t.sum(1))
-    return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound, J)
+    return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
 
 
 def residuals(
@@ -134,7 +122,7 @@ def residuals(
     y[:, :2] = lights[1] @ Rt
     y[:, 2:] = lights[0] - t[:, None]
     if rates is not None:
-        turn = rotation_exp(seen.dt_s[:, :, None] * rates[3:])
+        turn = rotation_near(seen.dt_s[:, :, None] * rates[3:])
         shift = seen.dt_s[:, :, None] * rates[:3]
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
         y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]

@@ -68,11 +68,11 @@ def rotation_exp(w_rad: Floats) -> Floats:
 
 
 def rotation_near(w_rad: Floats) -> Floats:
-    """Turn small rotation vectors (K, 3) into matrices (K, 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
+    """Turn small rotation vectors (..., 3) into matrices (..., 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
     half = 0.5 * w_rad
     K = skew(half)
-    scale = 2.0 / (1.0 + (half * half).sum(1))
-    R: Floats = _EYE + scale[:, None, None] * (K + K @ K)
+    scale = 2.0 / (1.0 + (half * half).sum(-1))
+    R: Floats = _EYE + scale[..., None, None] * (K + K @ K)
     return R
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -37,12 +38,13 @@ class Terms:
     ) -> Terms:
         """Bring everything into the level frames; what is not finite is as good as not there."""
         levels = rigs[0].level, rigs[1].level
+        candidates = find_candidates(views, rigs)
         return Terms(
             rigs=rigs,
             levels=levels,
-            candidates=find_candidates(views, rigs),
+            candidates=candidates,
             sensors=_sensors(levels, sensed),
-            prediction=_prediction(prior, rigs),
+            prediction=_prediction(prior, rigs, candidates, settings),
             motion=_motion(prior, rigs[0], settings),
             settings=settings,
         )
@@ -74,8 +76,10 @@ def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
     return combine(levels, (attitudes[0], attitudes[1]), (sigmas[0], sigmas[1]), depth_m, variance)
 
 
-def _prediction(prior: Prior | None, rigs: tuple[Rig, Rig]) -> Prediction | None:
-    if prior is None:
+def _prediction(
+    prior: Prior | None, rigs: tuple[Rig, Rig], candidates: Candidates, settings: Settings
+) -> Prediction | None:
+    if prior is None or not candidates.variance.size:
         return None
     t, q, covariance = _finite(prior.t_a_b_m, (3,)), _finite(prior.q_a_b_xyzw, (4,)), _finite(prior.covariance, (6, 6))
     if t is None or q is None or covariance is None or not q @ q > 0.25:
@@ -83,15 +87,22 @@ def _prediction(prior: Prior | None, rigs: tuple[Rig, Rig]) -> Prediction | None
     turn_a, turn_b, both = rigs[0].R_level_camera, rigs[1].R_level_camera, rigs[0].both_level_camera
     # Nobody knows a moving diver to less than a millimetre and a milliradian.
     covariance = both @ covariance @ both.T + 1e-6 * np.eye(6)
-    return Prediction(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance)
+    noise, levels = float(candidates.variance.mean()), (rigs[0].level, rigs[1].level)
+    return Prediction.of(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance, noise, levels, settings)
 
 
 def _motion(prior: Prior | None, rig_a: Rig, settings: Settings) -> Motion:
     rates = _finite(prior.rates, (6,)) if prior is not None else None
     covariance = _finite(prior.rates_covariance, (6, 6)) if prior is not None else None
     if rates is None or covariance is None:
-        # Alike in all directions: the same in every frame.
-        sigma2 = settings.speed_mps**2, settings.turn_radps**2
-        return Motion(np.zeros(6), np.diag(np.repeat(sigma2, 3)), settings.skew_sigma_s)
+        return _unknown_motion(settings.speed_mps, settings.turn_radps, settings.skew_sigma_s)
     both = rig_a.both_level_camera
     return Motion(both @ rates, both @ covariance @ both.T, settings.skew_sigma_s)
+
+
+@lru_cache(maxsize=16)
+def _unknown_motion(speed_mps: float, turn_radps: float, skew_sigma_s: float) -> Motion:
+    """Alike in all directions: the same in every frame."""
+    motion = Motion(np.zeros(6), np.diag(np.repeat((speed_mps**2, turn_radps**2), 3)), skew_sigma_s)
+    motion.rates.flags.writeable = motion.covariance.flags.writeable = False
+    return motion

@@ -250,13 +250,12 @@ def _log_ratio(
     # Nine residuals and six unknowns leave three factors of a normal density.
     fit -= np.log(sigma) + 1.5 * math.log(2.0 * math.pi)
     total = prior + fit - chance + math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS)
-    R_last, t_last, u = R.transpose(1, 2, 0), t.T, (t / range_m[:, None]).T
+    R_last, u = R.transpose(1, 2, 0), (t / range_m[:, None]).T
     turn_variance = np.einsum("ik,kij,jk->k", u, covariance[:, 3:, 3:], u)
     total += weigh_heading(R_last, terms.sensors, turn_variance)
     log_prior = np.zeros(len(t))
     if terms.prediction is not None:
-        variance = 4.0 * np.maximum(turn_variance, np.einsum("ik,kij,jk->k", u, covariance[:, :3, :3], u) / range_m**2)
-        log_prior = weigh_prediction(R_last, t_last, variance, terms.prediction, terms.levels, settings)
+        log_prior = weigh_prediction(R_last, t.T, terms.prediction)
     if candidates.log_score is not None:
         total += np.where(lights < 0, 0.0, candidates.log_score[lights]).sum(1)
     return total + log_prior, log_prior
