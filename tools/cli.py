@@ -127,6 +127,27 @@ COMMANDS: Final = (
         ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
     ),
     Command(
+        "plan",
+        "tools.plan",
+        "how far a pair will measure well, by camera, lights and visibility",
+        ("buddyline plan --baseline 0.88 --visibility 6 --camera a.toml",),
+    ),
+    Command(
+        "mark",
+        "tools.survey.mark",
+        "name a station or a point of a running dive",
+        ('buddyline mark T4 --node b --note "flake"',),
+    ),
+    Command(
+        "survey",
+        "tools.survey.command",
+        "legs and stations out of solved dives, adjusted, and files that surveyors use",
+        (
+            "buddyline survey legs cave.toml --dive solved.mcap a.mcap b.mcap",
+            "buddyline survey export cave.toml --format svx",
+        ),
+    ),
+    Command(
         "export",
         "tools.export",
         "write poses for other programs",

@@ -30,7 +30,7 @@ from tools.progress import Progress
 log = logging.getLogger(__name__)
 
 # What the output carries beside the poses, so that it can be evaluated and solved again on its own.
-COPIED = ("info", "candidates", "attitude", "depth", "truth", "light_truth")
+COPIED = ("info", "candidates", "attitude", "depth", "mark", "truth", "light_truth")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
