@@ -1,0 +1,38 @@
+"""`python -m tools.bench solve | detect`: one benchmark each, imported when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import import_module
+from typing import Final
+
+from protocol.errors import BuddylineError
+
+BENCHMARKS: Final = {
+    "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
+    "detect": "the detector: time per picture",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one benchmark; return the exit status."""
+    listing = "\n".join(f"  {name:8} {does}" for name, does in BENCHMARKS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m tools.bench",
+        description=f"benchmarks:\n{listing}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("benchmark", choices=list(BENCHMARKS), metavar="BENCHMARK")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="its own; see BENCHMARK --help")
+    args = parser.parse_args(argv)
+    run = import_module(f"tools.bench.{args.benchmark}").main
+    try:
+        return int(run(args.arguments))
+    except BuddylineError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())
