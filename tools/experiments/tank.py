@@ -37,8 +37,8 @@ _CENTRES_M: Final = {
 
 
 def layout() -> Layout:
-    """Return the floor's tags: x and y along the floor, as stated; z down into it is never needed."""
-    corners_m = np.array([(0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]) * (_SIDE_M, -_SIDE_M)
+    """Return the floor's tags: x and y along the floor, as stated; z up."""
+    corners_m = np.array([(0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]) * _SIDE_M
     flat = {tag_id: corners_m + centre_m for tag_id, centre_m in _CENTRES_M.items()}
     return Layout(_FAMILY, {tag_id: np.column_stack([corners, np.zeros(4)]) for tag_id, corners in flat.items()})
 

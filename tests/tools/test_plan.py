@@ -1,0 +1,103 @@
+"""The plan: the bound against its known values and against dives, where tolerances end, and what is refused."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tools import plan
+from tools.bound import pose_bound
+from tools.cli import main
+from tools.evaluation.logs import load
+from tools.evaluation.result import evaluate
+from tools.plan import described, expected, light_reach_m, with_baseline
+
+FACING = np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def test_the_bound_is_that_of_the_geometrys_description():
+    info = with_baseline(described(None), 0.88)
+    camera = info.camera
+    sigma_px = 0.5 * camera.fx_px / 1800.0
+    for range_m, bound_m in ((2.0, 0.0014), (4.0, 0.005), (10.0, 0.031), (20.0, 0.125)):
+        covariance = pose_bound(np.array([0.0, 0.0, range_m]), FACING, info, info, sigma_px)
+        assert math.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(bound_m, rel=0.12)
+
+
+def test_errors_of_simulated_dives_are_those_of_the_plan(tmp_path, capsys):
+    info = with_baseline(described(None), 0.88)
+    dive, out = str(tmp_path / "d.mcap"), str(tmp_path / "p.mcap")
+    words = ["--seconds", "30", "--rate", "6", "--seed", "901", "--undisturbed", "--lost", "0", "--gross", "0"]
+    words += ["--misses", "0", "--false", "0", "--others", "0", "--range-min", "2", "--range-max", "9"]
+    assert main(["simulate", dive, *words]) == 0
+    assert main(["solve", dive, "-o", out]) == 0
+    capsys.readouterr()
+    recorded = load([out])
+    errors = evaluate(
+        recorded.poses, recorded.rejected, recorded.truths, recorded.candidates, recorded.light_truths, recorded.infos,
+        nodes=recorded.nodes,
+    ).errors  # fmt: skip
+    assert len(errors) > 80
+    planned = np.array([expected(info, 0.7, range_m) for range_m in plan.RANGES_M])
+    for measured, column in ((errors.range_m, 0), (errors.translation_m, 1)):
+        model = np.interp(errors.true_range_m, plan.RANGES_M, planned[:, column])
+        assert 0.8 < np.sqrt(np.mean((measured / model) ** 2)) < 1.25
+
+
+def test_wider_lights_measure_farther_and_visibility_ends_it(capsys):
+    assert main(["plan", "--visibility", "6", "--json"]) == 0
+    murky = json.loads(capsys.readouterr().out)
+    ends_m = [spacing["ends_m"]["position"] for spacing in murky["by_baseline"]]
+    assert ends_m == sorted(ends_m)
+    # sd(l) grows with the square of the range over the spacing: four times the lights, twice as far.
+    assert ends_m[-1] / ends_m[0] == pytest.approx(2.0, rel=0.1)
+    assert murky["limit"] == "visibility"
+    assert murky["far_m"] == murky["reach_m"] == pytest.approx(light_reach_m(6.0))
+    assert [row["within"] for row in murky["rows"]] == [
+        1.0 < row["range_m"] <= murky["reach_m"] for row in murky["rows"]
+    ]
+    assert main(["plan", "--visibility", "60", "--json"]) == 0
+    clear = json.loads(capsys.readouterr().out)
+    assert clear["limit"] in ("position", "range")
+    assert clear["reach_m"] > clear["far_m"] > 5.0
+
+
+def test_the_table_says_what_ends_it(capsys):
+    assert main(["plan", "--visibility", "3"]) == 0
+    text = capsys.readouterr().out
+    assert "visibility of 3 m ends it" in text
+    assert "too faint" in text
+
+
+def test_the_camera_may_come_from_a_configuration_of_a_node(capsys):
+    assert main(["plan", "--camera", "node/examples/pi.toml", "--json"]) == 0
+    sharp = json.loads(capsys.readouterr().out)
+    assert main(["plan", "--json"]) == 0
+    coarse = json.loads(capsys.readouterr().out)
+    # Twice the focal length in pixels, half the error.
+    ratio = coarse["rows"][4]["position_error_m"] / sharp["rows"][4]["position_error_m"]
+    assert ratio == pytest.approx(2.0, rel=0.02)
+
+
+def test_the_plot_is_written_once(tmp_path, capsys):
+    path = tmp_path / "plan.png"
+    assert main(["plan", "--plot", str(path)]) == 0
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert main(["plan", "--plot", str(path)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--baseline", "0"], "--baseline"),
+        (["--visibility", "-1"], "--visibility"),
+        (["--camera", "no.toml"], "no.toml"),
+    ],
+)
+def test_what_cannot_be_planned_is_one_line(words, named, capsys):
+    assert main(["plan", *words]) == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1

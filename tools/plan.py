@@ -1,0 +1,312 @@
+"""`buddyline plan`: how far a pair will measure well, before anyone is in the water."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from node.config import load_node_config
+from protocol.errors import BuddylineError
+from protocol.messages import CameraModel, NodeInfo
+from tools.bound import pose_bound
+from tools.dives import load_info
+from tools.evaluation.rotation import Floats, multiply, normalized
+
+RANGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
+FIELD_OF_VIEW_RAD: Final = math.radians(48.8)
+# A black object is lost at 2 % contrast (Koschmieder): visibility times the beam's attenuation is ln 50.
+_KOSCHMIEDER: Final = math.log(50.0)
+# How much brighter a dive lamp is at 1 m than the faintest light that a detector takes; see `light_reach_m`.
+LAMP_MARGIN: Final = 1e4
+# Divers hold bars and heads about this straight towards each other (1 sd).
+_TILT_RAD: Final = math.radians(12.0)
+_ATTITUDES: Final = 16
+
+
+@dataclass(frozen=True)
+class Row:
+    """What to expect at one range: RMS errors. azimuth_rad: compass and picture; in_view: all lights fit the picture.
+
+    lit: the lights are bright enough for the water. within: whether all tolerances are met, lights seen.
+    """
+
+    range_m: float
+    range_error_m: float
+    position_error_m: float
+    azimuth_error_rad: float
+    rotation_error_rad: float
+    in_view: bool
+    lit: bool
+    within: bool
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("--baseline", type=float, default=0.88, metavar="M", help="spacing of the lights (%(default)s)")
+    parser.add_argument(
+        "--visibility", type=float, metavar="M", help="how far a diver sees; default: the water ends nothing"
+    )
+    parser.add_argument(
+        "--camera", metavar="FILE", help="the node's .toml, or NodeInfo as .json or .mcap; default: 820 px, 48.8 deg"
+    )
+    parser.add_argument("--sigma-px", type=float, metavar="PX", help="noise of a light; default: the camera's, or 0.7")
+    parser.add_argument("--compass-deg", type=float, default=2.0, metavar="DEG", help="error of headings (%(default)s)")
+    tolerance = parser.add_argument_group("tolerances, RMS")
+    tolerance.add_argument("--range-tolerance", type=float, default=0.10, metavar="M", help="default: %(default)s")
+    tolerance.add_argument("--position-tolerance", type=float, default=0.10, metavar="M", help="default: %(default)s")
+    tolerance.add_argument("--azimuth-tolerance", type=float, default=3.0, metavar="DEG", help="default: %(default)s")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it; needs the extra `plots`")
+    parser.add_argument("--json", action="store_true", help="print one JSON object: metres, radians")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the plan; return 0."""
+    for name in ("baseline", "visibility", "sigma_px", "range_tolerance", "position_tolerance", "azimuth_tolerance"):
+        value = getattr(args, name)
+        if value is not None and not 0 < value < math.inf:
+            raise BuddylineError(f"--{name.replace('_', '-')} {value}: give a number above 0")
+    if args.plot is not None and args.plot.exists():
+        raise BuddylineError(f"{args.plot}: exists; name another or remove it first")
+    if not 0 <= args.compass_deg < 90:
+        raise BuddylineError(f"--compass-deg {args.compass_deg}: give 0 to 90")
+    info = described(args.camera)
+    tolerances = Tolerances(args.range_tolerance, args.position_tolerance, math.radians(args.azimuth_tolerance))
+    sigma_px = args.sigma_px or info.sigma_px
+    reach_m = math.inf if args.visibility is None else light_reach_m(args.visibility)
+    compass_rad = math.radians(args.compass_deg)
+
+    def planned(baseline_m: float) -> Plan:
+        return plan(with_baseline(info, baseline_m), sigma_px, compass_rad, reach_m, tolerances)
+
+    chosen = planned(args.baseline)
+    spacings = {round(share * args.baseline, 3): planned(share * args.baseline) for share in (0.5, 0.75, 1.0, 1.5, 2.0)}
+    if args.json:
+        print(json.dumps(as_dict(chosen, spacings), allow_nan=False))
+    else:
+        print(as_text(chosen, spacings, args.baseline, args.visibility))
+    if args.plot is not None:
+        draw(spacings, tolerances, reach_m, args.plot)
+    return 0
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """RMS errors that are still good enough."""
+
+    range_m: float
+    position_m: float
+    azimuth_rad: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Errors by range, and where each tolerance ends: None where it holds as far as was looked, 0 where nowhere.
+
+    ends_m: by "range", "position", "azimuth"; reach_m: where the water swallows the lights. near_m: nearer than
+    that the lights do not both fit the picture. far_m, limit: the first of these ends, and which.
+    """
+
+    rows: list[Row]
+    ends_m: dict[str, float | None]
+    reach_m: float
+    near_m: float
+    far_m: float | None
+    limit: str
+
+
+def described(path: str | None) -> NodeInfo:
+    """Return the camera's NodeInfo out of a node's configuration, a JSON file or a log; or the default one."""
+    if path is not None and Path(path).suffix != ".toml":
+        return load_info(path)
+    width_px, height_px = 820, 616
+    if path is not None:
+        config = load_node_config(path)
+        if config.calibration is not None:
+            return config.node_info(0, "", "", 0)
+        width_px, height_px = config.camera.width_px, config.camera.height_px
+    f_px = width_px / 2 / math.tan(FIELD_OF_VIEW_RAD / 2)
+    return NodeInfo(
+        node="a",
+        stamp_ns=0,
+        width_px=width_px,
+        height_px=height_px,
+        camera=CameraModel(
+            model="pinhole",
+            fx_px=f_px,
+            fy_px=f_px,
+            cx_px=(width_px - 1) / 2,
+            cy_px=(height_px - 1) / 2,
+            distortion=[0.0] * 5,
+        ),
+        light_left_m=(-0.44, 0.0, 0.0),
+        light_right_m=(0.44, 0.0, 0.0),
+        sigma_px=0.7,
+        trigger_period_ns=100_000_000,
+    )
+
+
+def with_baseline(info: NodeInfo, baseline_m: float) -> NodeInfo:
+    """Return the node with its lights on the camera's x axis, so far apart."""
+    half_m = baseline_m / 2
+    return msgspec.structs.replace(info, light_left_m=(-half_m, 0.0, 0.0), light_right_m=(half_m, 0.0, 0.0))
+
+
+def light_reach_m(visibility_m: float) -> float:
+    """Return where a lamp becomes too faint: its light falls as exp(-c r) / r^2 (Allard), c = ln 50 / visibility.
+
+    In clear water the square of the range dims it, in turbid water attenuation does. LAMP_MARGIN stands for lamp,
+    exposure and detector together: dives with other lamps may end a fifth nearer or farther.
+    """
+    attenuation_per_m = _KOSCHMIEDER / visibility_m
+    near_m, far_m = 0.01, 1e3
+    for _ in range(60):
+        middle_m = math.sqrt(near_m * far_m)
+        if attenuation_per_m * middle_m + 2.0 * math.log(middle_m) < math.log(LAMP_MARGIN):
+            near_m = middle_m
+        else:
+            far_m = middle_m
+    return near_m
+
+
+def expected(info: NodeInfo, sigma_px: float, range_m: float) -> Floats:
+    """Return RMS errors at a range (4,): range, position (m), bearing across, rotation (rad).
+
+    By the Cramér-Rao bound of two like nodes that look at each other, over the attitudes that divers hold.
+    """
+    rng = np.random.default_rng(7)
+    total = np.zeros(4)
+    count = 0
+    for _ in range(_ATTITUDES):
+        lateral = rng.normal(0.0, 0.06, 2)
+        direction = np.array([*lateral, 1.0])
+        t_m = direction / np.linalg.norm(direction) * range_m
+        tilt = rng.normal(0.0, _TILT_RAD, 3) * (0.5, 1.0, 0.5)
+        q = normalized(multiply(np.append(0.5 * tilt, 1.0), np.array([0.0, 1.0, 0.0, 0.0])))
+        covariance = pose_bound(t_m, q, info, info, sigma_px)
+        if not np.isfinite(covariance).all():
+            continue
+        u = t_m / range_m
+        along = float(u @ covariance[:3, :3] @ u)
+        position = float(np.trace(covariance[:3, :3]))
+        total += (along, position, (position - along) / 2.0 / range_m**2, float(np.trace(covariance[3:, 3:])))
+        count += 1
+    return np.sqrt(total / max(count, 1))
+
+
+def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, tolerances: Tolerances) -> Plan:
+    """Return the plan of two like nodes."""
+    length_m = math.dist(info.light_left_m, info.light_right_m)
+    near_m = 1.1 * length_m / 2 / math.tan(math.atan(info.width_px / 2 / info.camera.fx_px))
+    rows = []
+    for range_m in RANGES_M:
+        along_m, position_m, bearing_rad, rotation_rad = expected(info, sigma_px, range_m).tolist()
+        azimuth_rad = math.hypot(bearing_rad, compass_rad)
+        good = (
+            along_m <= tolerances.range_m
+            and position_m <= tolerances.position_m
+            and azimuth_rad <= tolerances.azimuth_rad
+        )
+        in_view, lit = range_m >= near_m, range_m <= reach_m
+        rows.append(
+            Row(range_m, along_m, position_m, azimuth_rad, rotation_rad, in_view, lit, good and in_view and lit)
+        )
+    ends_m = {
+        "range": _end_m([row.range_error_m for row in rows], tolerances.range_m),
+        "position": _end_m([row.position_error_m for row in rows], tolerances.position_m),
+        "azimuth": _end_m([row.azimuth_error_rad for row in rows], tolerances.azimuth_rad),
+    }
+    candidates = {name: end_m for name, end_m in ends_m.items() if end_m is not None}
+    if math.isfinite(reach_m):
+        candidates["visibility"] = reach_m
+    limit = min(candidates, key=lambda name: candidates[name], default="")
+    return Plan(rows, ends_m, reach_m, near_m, candidates.get(limit), limit)
+
+
+def _end_m(errors: list[float], tolerance: float) -> float | None:
+    """Return the range at which errors pass the tolerance, between RANGES_M by powers; None: beyond them."""
+    if errors[0] > tolerance:
+        return 0.0
+    for i in range(1, len(errors)):
+        if errors[i] > tolerance:
+            share = math.log(tolerance / errors[i - 1]) / math.log(errors[i] / errors[i - 1])
+            return float(RANGES_M[i - 1] * (RANGES_M[i] / RANGES_M[i - 1]) ** share)
+    return None
+
+
+def as_dict(chosen: Plan, spacings: dict[float, Plan]) -> dict[str, Any]:
+    """Return the plan as JSON takes it; no reach is null."""
+
+    def plain(one: Plan) -> dict[str, Any]:
+        return asdict(one) | {"reach_m": one.reach_m if math.isfinite(one.reach_m) else None}
+
+    return plain(chosen) | {
+        "by_baseline": [
+            {"baseline_m": spacing} | {k: v for k, v in plain(one).items() if k != "rows"}
+            for spacing, one in spacings.items()
+        ]
+    }
+
+
+def as_text(chosen: Plan, spacings: dict[float, Plan], baseline_m: float, visibility_m: float | None) -> str:
+    """Return the plan for a person."""
+    lines = [
+        f"lights {baseline_m:g} m apart, RMS errors to expect (the Cramér-Rao bound; azimuth with the compass)",
+        f"{'range, m':>9} {'range, m':>9} {'position, m':>12} {'azimuth, deg':>13} {'rotation, deg':>14}",
+    ]
+    for row in chosen.rows:
+        note = "" if row.in_view else "  the lights do not both fit the picture"
+        note = note if row.lit else "  too faint"
+        lines.append(
+            f"{row.range_m:9g} {row.range_error_m:9.3f} {row.position_error_m:12.3f}"
+            f" {math.degrees(row.azimuth_error_rad):13.2f} {math.degrees(row.rotation_error_rad):14.2f}"
+            f"  {'good' if row.within else '-'}{note}"
+        )
+    lines += ["", "where it ends, m, by the spacing of the lights", f"{'spacing':>9} {'from':>6} {'range':>7}"]
+    lines[-1] += f" {'position':>9} {'azimuth':>8} {'visibility':>11}  good up to"
+    for spacing, one in spacings.items():
+        ends = [_far(one.ends_m[name]) for name in ("range", "position", "azimuth")]
+        reach = f"{one.reach_m:.1f}" if math.isfinite(one.reach_m) else "-"
+        far = f"{one.far_m:.1f} m, by {one.limit}" if one.far_m is not None else f"more than {RANGES_M[-1]:g} m"
+        lines.append(f"{spacing:9g} {one.near_m:6.1f} {ends[0]:>7} {ends[1]:>9} {ends[2]:>8} {reach:>11}  {far}")
+    if chosen.limit == "visibility":
+        geometry = [end_m for end_m in chosen.ends_m.values() if end_m is not None]
+        beyond = f"would do up to {min(geometry):.1f} m" if geometry else f"would do beyond {RANGES_M[-1]:g} m"
+        lines += [
+            "",
+            f"visibility of {visibility_m:g} m ends it, not geometry, which {beyond}: wider lights gain nothing",
+        ]
+    return "\n".join(lines)
+
+
+def _far(end_m: float | None) -> str:
+    return f">{RANGES_M[-1]:g}" if end_m is None else f"{end_m:.1f}"
+
+
+def draw(spacings: dict[float, Plan], tolerances: Tolerances, reach_m: float, path: Path) -> None:
+    """Draw position errors by range, a line a spacing."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise BuddylineError("plots need matplotlib: pip install 'buddyline[plots]'") from None
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    axis = figure.subplots()
+    for spacing, one in spacings.items():
+        ranges_m = [row.range_m for row in one.rows if row.in_view]
+        axis.loglog(ranges_m, [row.position_error_m for row in one.rows if row.in_view], label=f"lights {spacing:g} m")
+    axis.axhline(tolerances.position_m, color="0.4", linestyle="--", label="tolerance")
+    if math.isfinite(reach_m):
+        axis.axvline(reach_m, color="tab:brown", linestyle=":", label="lights too faint")
+    axis.set(xlabel="range, m", ylabel="position error, RMS, m")
+    axis.grid(visible=True, which="both", linewidth=0.3)
+    axis.legend(fontsize=8)
+    try:
+        figure.savefig(path, dpi=100)
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
