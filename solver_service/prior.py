@@ -6,7 +6,7 @@ turn rate (rad/s), all in A's camera frame. A fix that does not fit starts it an
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,11 @@ TURN_RADPS: Final = 0.5
 GATE_CHI2: Final = 38.0
 
 
+_State: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+_DENSITY: Final = np.diag([ACCELERATION_DENSITY] * 3 + [TURN_DENSITY] * 3)
+
+
 class PosePrior:
     """Follows the fixes and predicts the next."""
 
@@ -36,6 +41,7 @@ class PosePrior:
         self._R = np.eye(3)
         self._rates = np.zeros(6)
         self._P: NDArray[np.float64] = np.zeros((12, 12))
+        self._last: tuple[tuple[int, int], _State] | None = None
 
     def lose(self) -> None:
         """Forget it."""
@@ -45,7 +51,7 @@ class PosePrior:
         """Return the prediction for stamp_ns, None where the last fix is too old, or later."""
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None
-        t, R, P = self._predict((stamp_ns - self._stamp_ns) / S_NS)
+        t, R, P = self._predicted(stamp_ns)
         return Prior(t, quaternion_of(R), P[:6, :6], self._rates.copy(), P[6:, 6:])
 
     def update(self, stamp_ns: int, fix: Fix) -> None:
@@ -54,7 +60,7 @@ class PosePrior:
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             self._start(stamp_ns, fix, R_fix)
             return
-        t, R, P = self._predict((stamp_ns - self._stamp_ns) / S_NS)
+        t, R, P = self._predicted(stamp_ns)
         innovation = np.concatenate((fix.t_a_b_m - t, rotation_log(R_fix @ R.T)))
         S = P[:6, :6] + fix.covariance
         gain = np.linalg.solve(S, P[:6]).T
@@ -76,15 +82,24 @@ class PosePrior:
         self._P[6:9, 6:9] = SPEED_MPS**2 * np.eye(3)
         self._P[9:, 9:] = TURN_RADPS**2 * np.eye(3)
 
-    def _predict(self, dt_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _predicted(self, stamp_ns: int) -> _State:
+        """Return t, R and P at stamp_ns; asked for twice a trigger, worked out once."""
+        if self._stamp_ns is None:
+            raise RuntimeError("nothing is followed")
+        asked = (self._stamp_ns, stamp_ns)
+        if self._last is None or self._last[0] != asked:
+            self._last = asked, self._predict((stamp_ns - self._stamp_ns) / S_NS)
+        return self._last[1]
+
+    def _predict(self, dt_s: float) -> _State:
         t = self._t + dt_s * self._rates[:3]
         R = rotation_exp(dt_s * self._rates[3:]) @ self._R
-        F = np.eye(12)
-        F[:6, 6:] = dt_s * np.eye(6)
-        density = np.diag([ACCELERATION_DENSITY] * 3 + [TURN_DENSITY] * 3)
-        P = F @ self._P @ F.T
-        P[:6, :6] += density * dt_s**3 / 3
-        P[:6, 6:] += density * dt_s**2 / 2
-        P[6:, :6] += density * dt_s**2 / 2
-        P[6:, 6:] += density * dt_s
+        # F P F^T with F = [[1, dt], [0, 1]] in blocks, and the noise of a white acceleration.
+        poses, both, rates = self._P[:6, :6], self._P[:6, 6:], self._P[6:, 6:]
+        P = np.empty((12, 12))
+        cross = both + dt_s * rates
+        P[:6, :6] = poses + dt_s * (cross + both.T) + _DENSITY * (dt_s**3 / 3)
+        P[:6, 6:] = cross + _DENSITY * (dt_s**2 / 2)
+        P[6:, :6] = P[:6, 6:].T
+        P[6:, 6:] = rates + _DENSITY * dt_s
         return t, R, P

@@ -103,8 +103,12 @@ class NodeStream:
         """Whether this node sent no frame for trigger: its neighbours are here, with nothing between them."""
         if trigger in self._sequence:
             return False
-        before = max((k for k in self._sequence if k < trigger), default=None)
-        after = min((k for k in self._sequence if k > trigger), default=None)
+        if trigger - 1 in self._sequence and trigger + 1 in self._sequence:
+            before: int | None = trigger - 1
+            after: int | None = trigger + 1
+        else:
+            before = max((k for k in self._sequence if k < trigger), default=None)
+            after = min((k for k in self._sequence if k > trigger), default=None)
         if before is None or after is None:
             return False
         boot_0, seq_0, _ = self._sequence[before]
