@@ -32,7 +32,17 @@ class Frame:
 
 
 class Camera(Protocol):
-    """Gives one frame per trigger; used by one thread."""
+    """Gives one frame per trigger; used by one thread.
+
+    row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" where all
+    is well.
+    """
+
+    @property
+    def row_time_ns(self) -> int: ...  # noqa: D102
+
+    @property
+    def problem(self) -> str: ...  # noqa: D102
 
     def info(self) -> NodeInfo | None:
         """Return the calibration that comes with the pictures; None: it stands in the configuration."""
@@ -48,9 +58,15 @@ class Camera(Protocol):
 
 
 class Source(Protocol):
-    """One sensor, or several that are read together; used by one thread."""
+    """One sensor, or several that are read together; used by one thread.
+
+    problem: what is wrong, "" where all is well.
+    """
 
     name: str
+
+    @property
+    def problem(self) -> str: ...  # noqa: D102
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next samples (Imu, Attitude, Depth); None where there will be none, or stop is set."""

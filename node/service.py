@@ -84,7 +84,7 @@ class NodeService(Service):
     def _info(self) -> NodeInfo:
         own = self.camera.info()
         if own is None or self.config.calibration is not None:
-            return self.config.node_info(self.clock.now_ns(), self._software, self._sha256, 0)
+            return self.config.node_info(self.clock.now_ns(), self._software, self._sha256, self.camera.row_time_ns)
         if own.node != self.config.node:
             raise ConfigError(f"node {self.config.node}: the camera's pictures are those of node {own.node}")
         return own
@@ -265,6 +265,8 @@ class NodeService(Service):
         ages_s = {name: now_s - last_s for name, last_s in self._last_s.items()}
         problems = [f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > STALE_S]
         problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
+        devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
+        problems += [f"{name}: {text}" for name, text in devices if text]
         if self.recorder.error is not None:
             problems.append(f"log: {self.recorder.error}; not recording")
         if self.recorder.dropped:

@@ -85,6 +85,12 @@ COMMANDS: Final = (
         ("buddyline align a.mcap b.mcap",),
     ),
     Command(
+        "calibrate",
+        "tools.calibrate",
+        "calibrate camera, lights or magnetometer, and say whether the result is good",
+        ("buddyline calibrate board board.pdf", "buddyline calibrate camera pictures/ -o a.camera.json"),
+    ),
+    Command(
         "simulate",
         "tools.simulate",
         "make a dive with known truth",

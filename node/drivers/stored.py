@@ -63,6 +63,9 @@ def picture_files(path: Path) -> list[Path]:
 class FolderCamera:
     """One picture of a folder a trigger; broken ones are counted and skipped."""
 
+    row_time_ns = 0
+    problem = ""
+
     def __init__(self, files: list[Path], trigger_period_ns: int, clock: Clock) -> None:
         self.skipped = 0
         self._files = iter(files)
@@ -132,6 +135,9 @@ class _Paced:
 class DiveCamera:
     """The pictures of one node in a dive log, with the log's own calibration and times."""
 
+    row_time_ns = 0  # the log's NodeInfo has it
+    problem = ""
+
     def __init__(self, path: Path, node: str, clock: Clock) -> None:
         with DiveLogReader(path) as reader:
             key = INFO.key(node)
@@ -170,6 +176,7 @@ class DiveSensors:
     """Attitude, depth and inertial samples of one node in a dive log."""
 
     name = "stored sensors"
+    problem = ""
 
     def __init__(self, path: Path, node: str, clock: Clock) -> None:
         kinds = frozenset({ATTITUDE.key(node), DEPTH.key(node), IMU.key(node)})

@@ -42,6 +42,9 @@ def next_instant_ns(after_ns: int, period_ns: int) -> int:
 class SimulatedCamera:
     """Renders what the node sees at each trigger instant."""
 
+    row_time_ns = 0
+    problem = ""
+
     def __init__(self, config: NodeConfig, clock: Clock) -> None:
         camera = config.camera
         self._world = World(scenario_of(config.simulation, camera.width_px, camera.height_px))
@@ -69,6 +72,8 @@ class SimulatedCamera:
 
 class SimulatedSensor:
     """One sensor of the simulated node at a constant rate."""
+
+    problem = ""
 
     def __init__(self, name: str, rate_hz: int, sample: Callable[[int], Message], clock: Clock) -> None:
         self.name = name
