@@ -37,8 +37,8 @@ _ROBUST_SD = 3.0
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
 MODEL: Mapping[str, float] = {
-    "growth": 0.65,
-    "growth_veil": 0.4,
+    "growth": 0.7,
+    "growth_veil": 0.45,
     "growth_size": 0.45,
     "growth_sd": 0.35,
     "steepness": 0.75,
@@ -112,7 +112,7 @@ def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Fl
     radius_px: at a picture 820 px wide. A veil (bright ground in the weakest channel) tells turbid water, where
     light scattered far from the beam hides the core's own, and large discs are mostly glow already.
     """
-    veil = np.minimum(ground / 60.0, 1.0)
+    veil = np.minimum(ground / 40.0, 1.0)
     growth = (
         model["growth"] - model["growth_veil"] * veil - model["growth_size"] * np.log(np.maximum(radius_px, 3.0) / 12.0)
     )

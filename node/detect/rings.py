@@ -59,14 +59,17 @@ def geometric_radii(first_px: Floats, last_px: Floats, count: int) -> Floats:
     return radii.astype(np.float32)
 
 
-def follow_edges(level: Floats, radius_px: Floats, threshold: Floats) -> tuple[Floats, Floats]:
+def follow_edges(
+    level: Floats, inside: NDArray[np.bool_], radius_px: Floats, threshold: Floats
+) -> tuple[Floats, Floats]:
     """Follow each ray outward to where it first falls below a threshold: the outline of a star-shaped region.
 
-    level: (N, M, K) grey levels on rings of radius_px (N, M); threshold: (N,). Returns the distance to the outline
-    along each ray, (N, K) px, and the share of rays that never fall below it, (N,).
+    level: (N, M, K) grey levels on rings of radius_px (N, M); threshold: (N,). The picture's border ends a region,
+    too: inside (N, M, K). Returns the distance to the outline along each ray, (N, K) px, and the share of rays that
+    never fall below the threshold, (N,).
     """
     n, m, rays = level.shape
-    below = level < threshold[:, None, None]
+    below = (level < threshold[:, None, None]) | ~inside
     first = below.argmax(axis=1)
     places = np.arange(n)[:, None]
     ray = np.arange(rays)[None, :]
@@ -85,19 +88,22 @@ def follow_edges(level: Floats, radius_px: Floats, threshold: Floats) -> tuple[F
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """Moments of N star-shaped regions.
+    """Outlines and moments of star-shaped regions around N places, at S levels.
 
-    centre_px: (N, 2) centroid relative to the place. radius_px: (N,) of the circle of equal area. elongation: (N,)
-    long over short axis.
+    edge_px: (S, N, K) distance to the outline along each ray; open_share: (S, N) share of rays without one.
+    centre_px: (S, N, 2) centroid relative to the place. radius_px: (S, N) of the circle of equal area. elongation:
+    (S, N) long over short axis.
     """
 
+    edge_px: Floats
+    open_share: Floats
     centre_px: Floats
     radius_px: Floats
     elongation: Floats
 
 
-def measure_shapes(edge_px: Floats) -> Shapes:
-    """Measure regions from their outlines' distances along the rays, (N, K) px."""
+def measure_shapes(edge_px: Floats, open_share: Floats, levels: int) -> Shapes:
+    """Measure regions from their outlines' distances along the rays, (S N, K) px."""
     square = edge_px * edge_px
     area = np.maximum(square @ RAY_HARMONICS[:, 0] * (0.5 / RAYS), 1e-6)
     centre = (square * edge_px) @ RAY_HARMONICS[:, 1:3] / (3.0 * RAYS * area[:, None])
@@ -108,4 +114,10 @@ def measure_shapes(edge_px: Floats) -> Shapes:
     mean = 0.5 * (uu + vv)
     spread = np.hypot(0.5 * (uu - vv), uv)
     elongation = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
-    return Shapes(centre, np.sqrt(2.0 * area), elongation)
+    return Shapes(
+        edge_px.reshape(levels, -1, RAYS),
+        open_share.reshape(levels, -1),
+        centre.reshape(levels, -1, 2),
+        np.sqrt(2.0 * area).reshape(levels, -1),
+        elongation.reshape(levels, -1),
+    )

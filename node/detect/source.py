@@ -21,6 +21,8 @@ from node.detect.rings import (
     RAY_COS,
     RAY_SIN,
     Floats,
+    Rings,
+    Shapes,
     follow_edges,
     geometric_radii,
     measure_shapes,
@@ -45,6 +47,8 @@ _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
 
 
+_LEVELS: Final = np.array([0.9, 0.7, 0.5, 0.3], np.float32)
+_HALF: Final = 2
 _SCORE_AT_ZERO: Final = -5.2
 _SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
 _SCORE_LIMIT: Final = np.array([9.0, 9.0, 2.0, 1.0], np.float32)
@@ -110,13 +114,14 @@ def _settle(base: NDArray[np.uint8], base_step: float, proposals: Proposals) -> 
     step = proposals.step_px / np.float32(base_step)
     at = (proposals.centre_px + 0.5) / np.float32(base_step) - 0.5
     radius = geometric_radii(0.35 * step, 7.0 * step, 12)
-    level = sample_rings(base, at, radius).pixels[..., 0]
+    rings = sample_rings(base, at, radius)
+    level = rings.pixels[..., 0]
     peak = level[:, :7].max(axis=(1, 2))
     ground = _low(level[:, -4:], 0.2)
-    edge, _ = follow_edges(level, radius, ground + 0.8 * (np.minimum(peak, _CLIPPED) - ground))
-    shape = measure_shapes(edge)
-    centre = (at + shape.centre_px + 0.5) * np.float32(base_step) - 0.5
-    radius_px = shape.radius_px * np.float32(base_step)
+    edge, opened = follow_edges(level, rings.inside, radius, ground + 0.8 * (np.minimum(peak, _CLIPPED) - ground))
+    shape = measure_shapes(edge, opened, 1)
+    centre = (at + shape.centre_px[0] + 0.5) * np.float32(base_step) - 0.5
+    radius_px = shape.radius_px[0] * np.float32(base_step)
     kept = _distinct(centre, radius_px)[:_MAX_MEASURED]
     return centre[kept], radius_px[kept], kept
 
@@ -133,55 +138,67 @@ def _distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
 
 
 def _measure(image: NDArray[np.uint8], centre: Floats, radius_px: Floats, proposals: Proposals) -> _Lights:
-    """Follow the outlines of N bright regions, given roughly by centre_px (N, 2) and radius_px (N,)."""
+    """Follow the outlines of N bright regions, given roughly by centre (N, 2) and radius_px (N,), at four levels."""
     radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), 16)
-    pixels = sample_rings(image, centre, radius).pixels
-    level = _luma(pixels)
-    peak = level[:, :_CORE_RINGS].max(axis=(1, 2))
+    rings = sample_rings(image, centre, radius)
+    level = _luma(rings.pixels)
+    peak = np.minimum(level[:, :_CORE_RINGS].max(axis=(1, 2)), _CLIPPED)
     ground = _low(level[:, -4:], 0.2)
-    height = np.minimum(peak, _CLIPPED) - ground
-    levels, thresholds = [level] * 3, [ground + share * height for share in (0.8, 0.5, 0.25)]
-    weak_ground = ground
+    shapes = [_follow_levels(level, rings, ground, peak)]
+    weakest = np.zeros(len(radius), bool)
+    below = ground
     if image.ndim == 3:
+        pixels = rings.pixels
         weak = np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
         weak_ground = np.minimum(_low(weak[:, -4:], 0.15), _water_level(image))
         weak_peak = np.minimum(weak[:, :_CORE_RINGS].max(axis=(1, 2)), _CLIPPED)
-        levels.append(weak)
-        thresholds.append(weak_ground + 0.8 * (weak_peak - weak_ground))
-    edge, open_share = follow_edges(
-        np.concatenate(levels), np.concatenate([radius] * len(levels)), np.concatenate(thresholds)
-    )
-    shapes = measure_shapes(edge)
-    n = len(radius_px)
-    bright, half, low, last = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), slice(-n, None)
-    weakest = shapes.radius_px[last] >= _WEAKEST_FROM_PX if image.ndim == 3 else np.zeros(n, bool)
-    start = centre + np.where(weakest[:, None], shapes.centre_px[last], shapes.centre_px[bright])
-    elongation = shapes.elongation[half]
-    features = np.empty((n, 12), np.float32)
+        shapes.append(_follow_levels(weak, rings, weak_ground, weak_peak))
+        weakest = shapes[1].radius_px[:2].mean(axis=0) >= _WEAKEST_FROM_PX
+        below = np.where(weakest, weak_ground, ground)
+    rims = [_rim(shape) for shape in shapes]
+    core_px = np.where(weakest, rims[-1][1], rims[0][1])
+    features = np.empty((len(radius), len(_SCORE_WEIGHTS)), np.float32)
     features[:, 0] = np.log(proposals.contrast / (4.0 + proposals.clutter))
-    features[:, 1] = np.log(np.maximum(height, 1.0) / 50.0)
-    features[:, 2] = elongation - 1.0
-    features[:, 3] = open_share[half]
-    features[:, 4] = np.log(shapes.radius_px[half] / shapes.radius_px[bright])
-    features[:, 5] = np.log(shapes.radius_px[low] / shapes.radius_px[half])
-    features[:, 6] = np.log(shapes.radius_px[half] * (820.0 / image.shape[1]))
-    features[:, 7] = np.log(1.0 + proposals.clutter)
-    features[:, 8] = shapes.elongation[low] - 1.0
-    features[:, 9] = open_share[low]
-    features[:, 10] = peak / 255.0
-    features[:, 11] = ground / 255.0
+    features[:, 1] = np.log(np.maximum(peak - ground, 1.0) / 50.0)
+    features[:, 2] = shapes[0].elongation[_HALF] - 1.0
+    features[:, 3] = shapes[0].open_share[_HALF]
     return _Lights(
-        start,
-        np.where(weakest, shapes.radius_px[last], shapes.radius_px[bright]),
-        np.where(weakest, weak_ground, ground),
+        centre + np.where(weakest[:, None], rims[-1][0], rims[0][0]),
+        core_px,
+        below,
         weakest,
         peak,
-        edge[half],
+        shapes[0].edge_px[_HALF],
         centre,
-        np.pi * shapes.radius_px[half] ** 2,
-        elongation,
+        np.pi * shapes[0].radius_px[_HALF] ** 2,
+        shapes[0].elongation[_HALF],
         features,
     )
+
+
+def _follow_levels(level: Floats, rings: Rings, ground: Floats, peak: Floats) -> Shapes:
+    """Follow the outlines at shares of the height of N lights: shapes of S levels, arrays (S, N, ...)."""
+    n, many = len(ground), len(_LEVELS)
+    threshold = ground + _LEVELS[:, None] * (peak - ground)
+    edge, open_share = follow_edges(
+        np.broadcast_to(level, (many, *level.shape)).reshape(-1, *level.shape[1:]),
+        np.broadcast_to(rings.inside, (many, *level.shape)).reshape(-1, *level.shape[1:]),
+        np.broadcast_to(rings.radius_px, (many, *rings.radius_px.shape)).reshape(many * n, -1),
+        threshold.ravel(),
+    )
+    return measure_shapes(edge, open_share, many)
+
+
+def _rim(shapes: Shapes) -> tuple[Floats, Floats]:
+    """Give each light's rim, where its profile falls the fastest: centre (N, 2) relative to the place, radius (N,).
+
+    It is the lamp's own face where that shows, and the edge of what is clipped where the glow is all there is.
+    """
+    radius, centre = shapes.radius_px, shapes.centre_px
+    fall = 1.0 / np.maximum(np.diff(radius, axis=0), 0.15)
+    k = fall.argmax(axis=0)
+    n = np.arange(len(k))
+    return 0.5 * (centre[k, n] + centre[k + 1, n]), 0.5 * (radius[k, n] + radius[k + 1, n])
 
 
 def _water_level(image: NDArray[np.uint8]) -> Floats:
