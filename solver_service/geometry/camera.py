@@ -46,10 +46,19 @@ class Camera:
         """Give the unit bearings (N, 3) of distorted pixels (N, 2)."""
         return self.rays(pixels)[0]
 
+    @cached_property
+    def size_px(self) -> Floats:
+        """Width and height (2, 1)."""
+        return np.array(((self.width_px,), (self.height_px,)), dtype=np.float64)
+
     @property
     def area_px2(self) -> float:
         """The picture's area."""
         return float(self.width_px * self.height_px)
+
+    @cached_property
+    def _focal_px(self) -> Floats:
+        return np.array(((self.fx_px,), (self.fy_px,)))
 
     @cached_property
     def solid_angle_sr(self) -> float:
@@ -98,8 +107,8 @@ class Camera:
         bearings = np.empty((len(x), 3))
         bearings[:, 0], bearings[:, 1], bearings[:, 2] = x, y, 1.0
         bearings /= norm[:, None]
-        tangents[:, 0] *= (self.fx_px * norm)[:, None]
-        tangents[:, 1] *= (self.fy_px * norm)[:, None]
+        tangents *= norm[:, None, None]
+        tangents *= self._focal_px
         return bearings, tangents
 
     def _fisheye_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:

@@ -47,26 +47,39 @@ def find_candidates(views: tuple[View, View], rigs: tuple[Rig, Rig]) -> Candidat
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
     """
     offset_s = 0.5e-9 * (views[0].stamp_ns - views[1].stamp_ns)
-    a = _see(views[0], rigs[0], offset_s)
-    b = _see(views[1], rigs[1], -offset_s)
-    table = np.concatenate((a[0], b[0]), axis=1)
-    tangents = np.concatenate((a[1], b[1]))
-    index = np.concatenate((a[2], b[2]))
-    in_a = a[0].shape[1]
+    in_a, in_b = (min(len(view.pixels), _MAX_CANDIDATES) for view in views)
+    table, tangents = np.empty((9, in_a + in_b)), np.empty((in_a + in_b, 2, 3))
+    index = np.empty(in_a + in_b, dtype=np.intp)
+    for view, rig, part, shift_s in (
+        (views[0], rigs[0], slice(0, in_a), offset_s),
+        (views[1], rigs[1], slice(in_a, None), -offset_s),
+    ):
+        columns = table[:, part]
+        n = columns.shape[1]
+        pixels = np.reshape(view.pixels, (-1, 2))[:n]
+        bearings, in_camera = rig.camera.rays(pixels)
+        np.matmul(rig.R_level_camera, bearings.T, out=columns[:3])
+        np.matmul(in_camera, rig.R_level_camera.T, out=tangents[part])
+        np.divide(pixels.T, rig.camera.size_px, out=columns[3:5])
+        columns[5] = view.dt_s[:n]
+        columns[5] += shift_s
+        columns[6], columns[7], columns[8] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
+        index[part] = np.arange(n)
     usable = np.isfinite(table[:7].sum(0))
     if not usable.all():
         in_a = int(usable[:in_a].sum())
         table, tangents, index = table[:, usable], tangents[usable], index[usable]
-    gram = tangents @ tangents.swapaxes(1, 2)
-    sigma_px = table[6]
+    sigma_px = np.maximum(table[6], _MIN_SIGMA_PX)
     log_score = None
-    if np.isfinite(table[7]).any():
+    if not np.isnan(table[7]).all():
         log_score = np.concatenate([_log_score(part) for part in (table[7, :in_a], table[7, in_a:])])
+    tangents /= sigma_px[:, None, None]
+    gram = tangents @ tangents.swapaxes(1, 2)
     return Candidates(
         counts=(in_a, table.shape[1] - in_a),
         bearings=table[:3],
-        tangents=tangents / sigma_px[:, None, None],
-        variance=sigma_px**2 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2),
+        tangents=tangents,
+        variance=1.0 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2),
         index=index,
         shares=table[3:5],
         sigma_px=sigma_px,
@@ -74,20 +87,6 @@ def find_candidates(views: tuple[View, View], rigs: tuple[Rig, Rig]) -> Candidat
         log_score=log_score,
         log_area=np.log(np.fmax(table[8], 1.0)),
     )
-
-
-def _see(view: View, rig: Rig, offset_s: float) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Give a table (9, N) of one view, its tangents (N, 2, 3) and its indices (N,)."""
-    pixels = np.reshape(view.pixels, (-1, 2))[:_MAX_CANDIDATES]
-    bearings, tangents = rig.camera.rays(pixels)
-    n = len(pixels)
-    table = np.empty((9, n))
-    np.matmul(rig.R_level_camera, bearings.T, out=table[:3])
-    table[3], table[4] = pixels[:, 0] / rig.camera.width_px, pixels[:, 1] / rig.camera.height_px
-    table[5] = view.dt_s[:n] + offset_s
-    table[6] = np.maximum(view.sigma_px[:n], _MIN_SIGMA_PX)
-    table[7], table[8] = view.score[:n], view.area_px[:n]
-    return table, tangents @ rig.R_level_camera.T, np.arange(n)
 
 
 def _log_score(score: Floats) -> Floats:

@@ -15,7 +15,7 @@ from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import Rig, RigPair, pair_of
 from solver_service.geometry.rotation import Floats
 
 Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"]
@@ -33,13 +33,9 @@ class Bars:
     centred: bool
 
     @staticmethod
-    def of(level_a: Rig, level_b: Rig) -> Bars:
-        """Take the bars of two level rigs."""
-        return Bars(
-            middle_m=np.array((level_a.middle_m, level_b.middle_m))[:, :, None],
-            length_m=np.array(((level_a.length_m,), (level_b.length_m,))),
-            centred=level_a.offset_m == 0.0 == level_b.offset_m,
-        )
+    def of(pair: RigPair) -> Bars:
+        """Take the bars of two rigs."""
+        return Bars(pair.middle_m[:, :, None], pair.length_m[:, None], pair.offset_m == 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +114,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
     """
     levels = np.array((rig_a.R_level_camera, rig_b.R_level_camera))
     spans = Spans.of(levels @ left, levels @ right)
-    bars = Bars.of(rig_a.level, rig_b.level)
+    bars = Bars.of(pair_of(rig_a, rig_b))
     if variant == "exact":
         solved = solve_exact(spans, bars)
     else:

@@ -19,7 +19,7 @@ import numpy as np
 
 from solver_service.geometry.closed_form import dot
 from solver_service.geometry.observation import Settings
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import Rig, RigPair
 from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
@@ -60,7 +60,7 @@ class Sensors:
 
     down_a, down_b: (3,) in each camera's frame. tilt_variance: of both together, rad^2. R_a_b: (3, 3) by the
     attitudes, None where one is missing. heading_variance: of its heading. depth_m: of B's port below A's, None
-    where unknown.
+    where unknown. attitude_a: whether A's is known; fall_variance: of the tilt of A's down, or else of B's.
     """
 
     down_a: Floats
@@ -70,6 +70,8 @@ class Sensors:
     heading_variance: float
     depth_m: float | None
     depth_variance: float
+    attitude_a: bool
+    fall_variance: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,21 +105,20 @@ class Prediction:
         R_a_b: Floats,
         covariance: Floats,
         bearing_variance: float,
-        levels: tuple[Rig, Rig],
+        rigs: RigPair,
         settings: Settings,
     ) -> Prediction:
         """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
         range2 = float(t_a_b_m @ t_a_b_m) + 1e-6
         sight = np.outer(t_a_b_m, t_a_b_m) / range2
         # Of ln range and of the twist, by both pictures.
-        relative = bearing_variance * range2 * 0.5 * (1.0 / levels[0].length_m ** 2 + 1.0 / levels[1].length_m ** 2)
+        relative = bearing_variance * range2 * 0.5 * float((rigs.length_m**-2.0).sum())
         total = covariance.copy()
         total[:3, :3] += relative * range2 * sight
         total[3:, 3:] += relative * sight
-        views_sr = levels[0].camera.solid_angle_sr * levels[1].camera.solid_angle_sr
         spread = math.log(settings.range_max_m / settings.range_min_m)
         # Chance puts a pose anywhere in both pictures, at any range and twist.
-        log_chance = -math.log(range2 * math.sqrt(range2) * spread * views_sr * 2.0 * math.pi)
+        log_chance = -math.log(range2 * math.sqrt(range2) * spread * rigs.views_sr * 2.0 * math.pi)
         log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
         information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
         return Prediction(t_a_b_m, R_a_b, information, -log_area - log_chance)
@@ -131,11 +132,11 @@ def combine(
     depth_variance: float,
 ) -> Sensors:
     """Put both nodes' attitudes (body to NED) and the difference of their depths together."""
-    down, tilt, heading, R_ned_camera = [], 0.0, 0.0, []
+    down, tilts, heading, R_ned_camera = [], [], 0.0, []
     for rig, q_ned_body, sigma_rad in zip(rigs, attitudes, sigmas_rad, strict=True):
         if q_ned_body is None:
             down.append(_UPRIGHT_DOWN)
-            tilt += _UPRIGHT_SIGMA_RAD**2
+            tilts.append(_UPRIGHT_SIGMA_RAD**2)
             continue
         R_ned_body = matrix_of(q_ned_body)
         if rig.declination_rad:
@@ -147,17 +148,19 @@ def combine(
         steep2 = float(R_ned_body[2, 0]) ** 2
         sigma = _DEFAULT_SIGMA_RAD if sigma_rad is None else sigma_rad.tolist()
         roll2, pitch2, yaw2 = (x * x for x in sigma)
-        tilt += 0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2
+        tilts.append(0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2)
         heading += yaw2 + roll2 * steep2 + _HEADING_SIGMA_RAD**2
     both = len(R_ned_camera) == 2
     return Sensors(
         down_a=down[0],
         down_b=down[1],
-        tilt_variance=tilt,
+        tilt_variance=sum(tilts),
         R_a_b=R_ned_camera[0].T @ R_ned_camera[1] if both else None,
         heading_variance=heading,
         depth_m=depth_m if R_ned_camera else None,
         depth_variance=depth_variance + _DEPTH_SIGMA_M**2,
+        attitude_a=attitudes[0] is not None,
+        fall_variance=tilts[0] if attitudes[0] is not None else tilts[1],
     )
 
 
@@ -180,50 +183,51 @@ def intruder_odds(chi2: Floats, per_area: Floats) -> Floats:
     return odds
 
 
-def log_chance(rigs: tuple[Rig, Rig], counts: tuple[int, int], settings: Settings) -> float:
+def log_chance(rigs: RigPair, counts: tuple[int, int], settings: Settings) -> float:
     """Give the part of the log ratio that all hypotheses of a trigger share; counts: candidates in each picture."""
-    views_sr = rigs[0].camera.solid_angle_sr * rigs[1].camera.solid_angle_sr
-    pairings = math.prod(n * (n - 1) for n in counts)
+    pairings = counts[0] * (counts[0] - 1) * counts[1] * (counts[1] - 1)
     unseen = 2 - len(settings.checks & {"range", "twist"})
     # A gap that nobody looks at says what chance says: about one turn, or an e-fold of range.
     spread = math.log(settings.range_max_m / settings.range_min_m) * (2.0 * math.pi) ** unseen
-    return math.log(views_sr / (pairings * spread))
+    return math.log(rigs.views_sr / (pairings * spread))
 
 
 def weigh(
     R_a_b: Floats,
     t_a_b_m: Floats,
-    u: Floats,
     variance: Floats,
-    rigs: tuple[Rig, Rig],
+    rigs: RigPair,
     sensors: Sensors,
     prediction: Prediction | None,
-    settings: Settings,
+    checks: frozenset[str],
 ) -> Support:
     """Weigh K poses R_a_b (3, 3, K), t_a_b_m (3, K) by attitude, depth and earlier poses.
 
-    u: (3, K) lines of sight in A's frame. variance: (K,) of the gaps of ln range and of twist.
+    variance: (K,) of the gaps of ln range and of twist.
     """
-    down_a = sensors.down_a
-    down_b = R_a_b[:, 0] * sensors.down_b[0] + R_a_b[:, 1] * sensors.down_b[1] + R_a_b[:, 2] * sensors.down_b[2]
-    along = down_a @ u
-    if "attitude" in settings.checks:
-        log_ratio, tilt_chi2 = _weigh_tilt(down_b, u, along, variance, sensors)
+    down_b = (R_a_b * sensors.down_b[:, None]).sum(1)
+    if "attitude" in checks:
+        # The picture's own noise turns B about the line of sight by half the twist gap's.
+        spread2 = sensors.tilt_variance + 0.125 * variance
+        off = down_b - sensors.down_a[:, None]
+        tilt_chi2 = dot(off, off) / spread2
+        density = (PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * tilt_chi2) / spread2
+        log_ratio = np.log(density + PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi))
         log_ratio += weigh_heading(R_a_b, sensors, 0.25 * variance)
     else:
         # The reading is upright; of half a turn nothing is known.
         tilt_chi2 = np.zeros_like(variance)
         log_ratio = tilt_chi2 - math.log(math.pi)
     depth_chi2 = np.zeros_like(variance)
-    if sensors.depth_m is not None and "depth" in settings.checks:
-        down = down_a[:, None] + down_b
+    if sensors.depth_m is not None and "depth" in checks:
+        level_a, level_b = rigs.levels
         below = t_a_b_m
-        if rigs[0].depth_port_m.any() or rigs[1].depth_port_m.any():
-            below = below - rigs[0].depth_port_m[:, None] + (R_a_b * rigs[1].depth_port_m[:, None]).sum(1)
-        fall = dot(down, below) / np.sqrt(dot(down, down))
+        if level_a.depth_port_m.any() or level_b.depth_port_m.any():
+            below = below - level_a.depth_port_m[:, None] + (R_a_b * level_b.depth_port_m[:, None]).sum(1)
+        fall = sensors.down_a @ below if sensors.attitude_a else dot(down_b, below)
         square = fall * fall
-        spread2 = 0.25 * (sensors.tilt_variance * (dot(below, below) - square) + variance * square)
-        spread2 += sensors.depth_variance
+        spread2 = sensors.depth_variance + sensors.fall_variance * (dot(below, below) - square)
+        spread2 += 0.25 * variance * square
         depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
         density = (DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
         log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
@@ -231,25 +235,6 @@ def weigh(
     if prediction is not None:
         log_prior = weigh_prediction(R_a_b, t_a_b_m, prediction)
     return Support(log_ratio + log_prior, log_prior, tilt_chi2, depth_chi2)
-
-
-def _weigh_tilt(down_b: Floats, u: Floats, along: Floats, variance: Floats, sensors: Sensors) -> tuple[Floats, Floats]:
-    """Weigh the angle between A's down and B's, turned into A's frame (3, K): log ratio and chi^2 (K,)."""
-    ax, ay, az = sensors.down_a.tolist()
-    bx, by, bz = down_b
-    # The rotation that brings B's down onto A's, as a vector across it.
-    tx, ty, tz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
-    sine2 = tx * tx + ty * ty + tz * tz
-    sine = np.sqrt(sine2)
-    angle = np.arctan2(sine, ax * bx + ay * by + az * bz)
-    # The picture's own noise turns B about the line of sight by half the twist gap's.
-    s2, about = sensors.tilt_variance, 0.25 * variance
-    across = about * (1.0 - along * along)
-    about_sight2 = (tx * u[0] + ty * u[1] + tz * u[2]) ** 2 / np.maximum(sine2, 1e-30)
-    total = s2 + across
-    chi2 = angle * angle * (1.0 - about * about_sight2 / total) / s2
-    density = (PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * chi2) / np.sqrt(s2 * total)
-    return np.log(density + PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi)), chi2
 
 
 def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:

@@ -15,13 +15,15 @@ from solver_service.geometry.hypotheses import Hypotheses, Pairs, search
 from solver_service.geometry.observation import Reason
 from solver_service.geometry.readings import Readings
 from solver_service.geometry.refinement import Refined, Sightings, refine
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
 from solver_service.geometry.terms import Terms
 
 # So many of the best are refined; what lies further below the best (log ratio) does not matter.
 _REFINED: Final = 6
 _NEGLIGIBLE: Final = 16.0
+# What the refinement does not have to be spared: two rounds leave less than the noise.
+_SPLIT_ROUNDS: Final = 2
 # Bars whose middle is nearer to the camera than this, relative to their length, need but one round.
 _SMALL_OFFSET: Final = 0.02
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
@@ -47,17 +49,17 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     if not min(pairs.counts):
         what = f"no two candidates stand as far apart as the lights would {terms.range_limits}"
         return FourLights(None, why=("out_of_range", what))
-    found = search(terms.candidates, pairs, terms.levels, _motion_variance(terms, pairs), settings)
+    found = search(terms.candidates, pairs, terms.rigs, _motion_variance(terms, pairs), settings)
     if isinstance(found, str):
         combinations = f"{pairs.counts[0]} pairs in A's picture and {pairs.counts[1]} in B's"
         same = "the same twist where their ranges agree" if found == "twist_gap" else "the same range"
         return FourLights(None, why=(found, f"no two of {combinations} have {same}"))
     solved = solve_exact(
-        found.spans, Bars.of(*terms.levels), split_rounds=3, offset_rounds=_offset_rounds(terms.levels)
+        found.spans, Bars.of(terms.rigs), split_rounds=_SPLIT_ROUNDS, offset_rounds=_offset_rounds(terms.rigs)
     )
     t, variance = solved.t_a_b_m, found.variance
-    support = weigh(solved.R_a_b, t, solved.u[0], variance, terms.levels, terms.sensors, terms.prediction, settings)
-    base = support.log_ratio + found.log_weight + log_chance(terms.levels, terms.candidates.counts, settings)
+    support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
+    base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
     twist_gap_rad = solved.twist_gap_rad
     chi2 = np.zeros(len(variance))
     if "range" in settings.checks:
@@ -78,7 +80,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
         t[:, best].T,
         solved.R_a_b[:, :, best].transpose(2, 0, 1),
         _sightings(terms, found, best),
-        *terms.levels,
+        *terms.rigs.levels,
         terms.motion,
     )
     # Without both gaps the picture's chi2 would bring in what the settings leave out.
@@ -116,8 +118,8 @@ def _inflated(refined: Refined) -> Floats:
 
 def _intruder(terms: Terms, chi2: Floats, lights: NDArray[np.intp]) -> Floats:
     """Give the odds that one of four lights is missing and a false candidate stands in for it."""
-    (in_a, in_b), (a, b) = terms.candidates.counts, (rig.camera.area_px2 for rig in terms.rigs)
-    per_px2 = np.array((in_a / a, in_a / a, in_b / b, in_b / b))
+    in_a, in_b = terms.candidates.counts
+    per_px2 = np.array((in_a, in_a, in_b, in_b)) / terms.rigs.area_px2
     return intruder_odds(chi2, per_px2 * terms.candidates.sigma_px[lights] ** 2)
 
 
@@ -128,12 +130,11 @@ def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:
     square_s2 += motion.skew_sigma_s**2
     rates2 = motion.covariance.diagonal() + motion.rates**2
     speed2, turn2 = float(rates2[:3].sum()) / 3.0, float(rates2[3:].sum()) / 3.0
-    per_range = pairs.chord[: pairs.split] / terms.levels[1].length_m
+    per_range = pairs.chord[: pairs.split] / float(terms.rigs.length_m[1])
     variance: Floats = square_s2 * (speed2 * per_range * per_range + turn2)
     return variance
 
 
-def _offset_rounds(levels: tuple[Rig, Rig]) -> int:
+def _offset_rounds(rigs: RigPair) -> int:
     """Give how often the closed form moves the bearings to the bars' middles before the refinement takes over."""
-    offset = max(level.offset_m / level.length_m for level in levels)
-    return 1 if offset < _SMALL_OFFSET else 4
+    return 1 if rigs.offset_m < _SMALL_OFFSET * float(rigs.length_m.min()) else 4

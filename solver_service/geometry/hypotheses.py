@@ -19,7 +19,7 @@ from solver_service.geometry.candidates import Candidates
 from solver_service.geometry.closed_form import Spans
 from solver_service.geometry.evidence import GROSS_SCALE
 from solver_service.geometry.observation import Settings
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
 
 # The join's own error, in units of alpha^2: at the optical axis, and per tan^2 of the widest bearing. Found from
@@ -108,9 +108,7 @@ def _combinations(count_a: int, count_b: int) -> tuple[NDArray[np.intp], NDArray
     return first, second, node
 
 
-def find_pairs(
-    candidates: Candidates, levels: tuple[Rig, Rig], down: tuple[Floats, Floats], settings: Settings
-) -> Pairs:
+def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats], settings: Settings) -> Pairs:
     """Give the pairs whose angle fits the other node's bar within the range limits; down: in each level frame."""
     first, second, node = _combinations(*candidates.counts)
     in_a = candidates.counts[0]
@@ -124,7 +122,7 @@ def find_pairs(
     about = one[1] * two[2] - one[2] * two[1]
     chord2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     variance = total[5] / chord2
-    other_m = np.array((levels[1].length_m, levels[0].length_m))
+    other_m = rigs.length_m[::-1]
     shortest = (_FORESHORTENING / settings.range_max_m * other_m) ** 2
     longest = np.minimum((_NEAREST / settings.range_min_m * other_m) ** 2, _MAX_CHORD2)
     keep = (chord2 >= shortest.take(node)) & (chord2 <= longest.take(node)) & (variance < _MAX_RELATIVE_VARIANCE)
@@ -138,7 +136,7 @@ def find_pairs(
     sin_beta = total[0]
     cos_beta2 = np.maximum(1.0 - sin_beta * sin_beta, 1e-6)
     room = 1.0 - np.abs(w[3:5])
-    own_m = np.array((levels[0].length_m, levels[1].length_m)).take(node)
+    own_m = rigs.length_m.take(node)
     falls = np.array(down).T.take(node, axis=1)
     # Gravity along the bar and along its perpendicular, both as seen across the line of sight.
     across = np.empty((2, len(chord)))
@@ -169,7 +167,7 @@ def _alike(log_area: Floats) -> Floats:
 
 
 def join(
-    pairs: Pairs, levels: tuple[Rig, Rig], gate_sigma: float, motion_variance: Floats, *, by_range: bool, by_twist: bool
+    pairs: Pairs, rigs: RigPair, gate_sigma: float, motion_variance: Floats, *, by_range: bool, by_twist: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
     """Give the combinations of A's and B's pairs that pass the gates, and whether one order swaps.
 
@@ -179,13 +177,14 @@ def join(
     split, in_b = pairs.counts
     chord, variance = pairs.chord[:split], pairs.variance[:split] + motion_variance
     key_a, key_b = pairs.key[:split], pairs.key[split:]
-    slack = (_OFFSET_SLOPE * (levels[0].offset_m + levels[1].offset_m) / levels[1].length_m) * chord
-    chord2 = (max(1.0, levels[0].length_m / levels[1].length_m) * chord) ** 2
+    length_a_m, length_b_m = rigs.length_m.tolist()
+    slack = (_OFFSET_SLOPE * rigs.offset_m / length_b_m) * chord
+    chord2 = (max(1.0, length_a_m / length_b_m) * chord) ** 2
     slack_range = (_KEY_TERM + _KEY_SLOPE * pairs.tan2_beta) * chord2 + slack
     slack_twist = _TWIST_TERM * chord2 + slack
     if by_range:
         # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
-        least2 = np.exp(2.0 * key_a) / levels[1].length_m ** 2
+        least2 = np.exp(2.0 * key_a) / length_b_m**2
         worst = variance + (pairs.variance[split:] * pairs.chord[split:] ** 2).max() / least2
     else:
         worst = variance + pairs.variance[split:].max()
@@ -219,18 +218,18 @@ def join(
 
 
 def search(
-    candidates: Candidates, pairs: Pairs, levels: tuple[Rig, Rig], motion_variance: Floats, settings: Settings
+    candidates: Candidates, pairs: Pairs, rigs: RigPair, motion_variance: Floats, settings: Settings
 ) -> Hypotheses | Literal["range_gap", "twist_gap"]:
     """Give the hypotheses whose gaps pass, read as gravity has them, or the name of the gap that none passes."""
     by_range, by_twist = "range" in settings.checks, "twist" in settings.checks
     gate = settings.gate_sigma
     if math.prod(pairs.counts) <= _MAX_WIDE:
         gate *= GROSS_SCALE
-    ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=by_range, by_twist=by_twist)
+    ia, ib, swap = join(pairs, rigs, gate, motion_variance, by_range=by_range, by_twist=by_twist)
     if not len(ia):
         if not (by_range and by_twist):
             return "range_gap" if by_range else "twist_gap"
-        ia, ib, swap = join(pairs, levels, gate, motion_variance, by_range=True, by_twist=False)
+        ia, ib, swap = join(pairs, rigs, gate, motion_variance, by_range=True, by_twist=False)
         return "twist_gap" if len(ia) else "range_gap"
     # With first -> second as left -> right in A, and B read to agree with it, B's gravity turned into A's frame;
     # across the line of sight the two count the other way round.

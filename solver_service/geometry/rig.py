@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -82,3 +82,37 @@ class Rig:
     def usable(self) -> bool:
         """Whether the lights are finite and apart."""
         return bool(np.isfinite(self.lights_m).all()) and self.length_m >= 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class RigPair:
+    """What follows from two rigs together; arrays hold A's value first.
+
+    levels: the rigs in their level frames. length_m (2,): of the bars. area_px2 (4,): of
+    the picture that each of B's left and right light and A's left and right light is seen in. views_sr: product of
+    both solid angles. middle_m (2, 3): of the bars, level frames; offset_m: of both together.
+    """
+
+    rigs: tuple[Rig, Rig]
+    levels: tuple[Rig, Rig]
+    length_m: Floats
+    middle_m: Floats
+    area_px2: Floats
+    views_sr: float
+    offset_m: float
+
+
+@lru_cache(maxsize=16)
+def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
+    """Give what two rigs have together, once for each two."""
+    a, b = rig_a.camera.area_px2, rig_b.camera.area_px2
+    levels = rig_a.level, rig_b.level
+    return RigPair(
+        rigs=(rig_a, rig_b),
+        levels=levels,
+        length_m=np.array((rig_a.length_m, rig_b.length_m)),
+        middle_m=np.array([level.middle_m for level in levels]),
+        area_px2=np.array((a, a, b, b)),
+        views_sr=rig_a.camera.solid_angle_sr * rig_b.camera.solid_angle_sr,
+        offset_m=rig_a.offset_m + rig_b.offset_m,
+    )

@@ -12,16 +12,15 @@ from solver_service.geometry.candidates import Candidates, find_candidates
 from solver_service.geometry.evidence import Prediction, Sensors, combine
 from solver_service.geometry.observation import Prior, Sensed, Settings, View
 from solver_service.geometry.refinement import Motion
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import Rig, RigPair, pair_of
 from solver_service.geometry.rotation import Floats, matrix_of
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """What a trigger is solved from. rigs: as described; levels: the same, along their bars."""
+    """What a trigger is solved from."""
 
-    rigs: tuple[Rig, Rig]
-    levels: tuple[Rig, Rig]
+    rigs: RigPair
     candidates: Candidates
     sensors: Sensors
     prediction: Prediction | None
@@ -37,14 +36,13 @@ class Terms:
         prior: Prior | None,
     ) -> Terms:
         """Bring everything into the level frames; what is not finite is as good as not there."""
-        levels = rigs[0].level, rigs[1].level
         candidates = find_candidates(views, rigs)
+        pair = pair_of(*rigs)
         return Terms(
-            rigs=rigs,
-            levels=levels,
+            rigs=pair,
             candidates=candidates,
-            sensors=_sensors(levels, sensed),
-            prediction=_prediction(prior, rigs, candidates, settings),
+            sensors=_sensors(pair.levels, sensed),
+            prediction=_prediction(prior, pair, candidates, settings),
             motion=_motion(prior, rigs[0], settings),
             settings=settings,
         )
@@ -60,7 +58,7 @@ def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
     if value is None:
         return None
     array = np.asarray(value, dtype=np.float64)
-    return array if array.shape == shape and np.isfinite(array).all() else None
+    return array if array.shape == shape and math.isfinite(array.sum()) else None
 
 
 def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
@@ -76,19 +74,18 @@ def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
     return combine(levels, (attitudes[0], attitudes[1]), (sigmas[0], sigmas[1]), depth_m, variance)
 
 
-def _prediction(
-    prior: Prior | None, rigs: tuple[Rig, Rig], candidates: Candidates, settings: Settings
-) -> Prediction | None:
+def _prediction(prior: Prior | None, pair: RigPair, candidates: Candidates, settings: Settings) -> Prediction | None:
     if prior is None or not candidates.variance.size:
         return None
     t, q, covariance = _finite(prior.t_a_b_m, (3,)), _finite(prior.q_a_b_xyzw, (4,)), _finite(prior.covariance, (6, 6))
     if t is None or q is None or covariance is None or not q @ q > 0.25:
         return None
-    turn_a, turn_b, both = rigs[0].R_level_camera, rigs[1].R_level_camera, rigs[0].both_level_camera
+    rig_a, rig_b = pair.rigs
+    turn_a, turn_b, both = rig_a.R_level_camera, rig_b.R_level_camera, rig_a.both_level_camera
     # Nobody knows a moving diver to less than a millimetre and a milliradian.
     covariance = both @ covariance @ both.T + 1e-6 * np.eye(6)
-    noise, levels = float(candidates.variance.mean()), (rigs[0].level, rigs[1].level)
-    return Prediction.of(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance, noise, levels, settings)
+    noise = float(candidates.variance.mean())
+    return Prediction.of(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance, noise, pair, settings)
 
 
 def _motion(prior: Prior | None, rig_a: Rig, settings: Settings) -> Motion:

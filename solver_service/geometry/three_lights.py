@@ -78,7 +78,7 @@ def _guess(terms: Terms, pairs: Pairs, seer: int) -> _Guesses:
     of_seer = np.arange(split) if seer == 0 else np.arange(split, len(pairs.key))
     of_other = np.arange(in_a, len(candidates.index)) if seer == 0 else np.arange(in_a)
     pair, single, side = (grid.ravel() for grid in np.meshgrid(of_seer, of_other, (0, 1), indexing="ij"))
-    own, other = terms.levels[seer], terms.levels[1 - seer]
+    own, other = terms.rigs.levels[seer], terms.rigs.levels[1 - seer]
     down_own, down_other = (sensors.down_a, sensors.down_b)[:: 1 - 2 * seer]
     c, w, chord = pairs.c[:, pair], pairs.w[:, pair], pairs.chord[pair]
     seen = candidates.bearings[:, single]
@@ -147,7 +147,7 @@ def _fall(own: Rig, other: Rig, t: Floats, R: Floats, down: Floats) -> Floats:
 
 def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Readings | None:
     """Fit the three lights with tilt and depth, and weigh what comes of it."""
-    candidates, sensors, levels = terms.candidates, terms.sensors, terms.levels
+    candidates, sensors, levels = terms.candidates, terms.sensors, terms.rigs.levels
     absent = lights < 0
     # The missing light has no weight; its bearing only keeps the arithmetic finite.
     bearings = candidates.bearings.T[lights]
@@ -235,14 +235,13 @@ def _log_ratio(
     """Give the log likelihood ratio against chance, by Laplace's approximation about the pose, and the prior's part."""
     settings, candidates = terms.settings, terms.candidates
     range_m = np.sqrt((t * t).sum(1))
-    views_sr = [rig.camera.solid_angle_sr for rig in terms.rigs]
     # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
     prior = -3.0 * np.log(range_m)
-    prior -= math.log(views_sr[0] * views_sr[1] * math.log(settings.range_max_m / settings.range_min_m))
+    prior -= math.log(terms.rigs.views_sr * math.log(settings.range_max_m / settings.range_min_m))
     # Chance puts candidates evenly on the pictures, per px^2.
     chance = np.zeros(len(t))
     for node in (0, 1):
-        count, area_px2 = candidates.counts[node], terms.rigs[node].camera.area_px2
+        count, area_px2 = candidates.counts[node], float(terms.rigs.area_px2[2 * node])
         seen = (lights[:, 2 * node : 2 * node + 2] >= 0).sum(1)
         chance += math.log(count / area_px2) + np.where(seen == 2, math.log(max(count - 1, 1) / area_px2), 0.0)
     sigma2_px = np.where(lights < 0, 1.0, candidates.sigma_px[lights] ** 2).prod(1)

@@ -94,7 +94,7 @@ def solve_trigger(
 
 
 def _solve(terms: Terms) -> Fix | NoFix:
-    pairs = find_pairs(terms.candidates, terms.levels, (terms.sensors.down_a, terms.sensors.down_b), terms.settings)
+    pairs = find_pairs(terms.candidates, terms.rigs, (terms.sensors.down_a, terms.sensors.down_b), terms.settings)
     four = read_four_lights(terms, pairs)
     found = NoFix(*four.why) if four.readings is None else _decide(terms, four.readings, four.others)
     if terms.settings.method != "refined" or not _doubtful(found, four.readings):
@@ -169,7 +169,7 @@ def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
 
 def _fix(terms: Terms, readings: Readings, k: int, weights: Floats, probability: float) -> Fix:
     """Publish reading k, between the cameras' frames; weights: (K,) of all that read about the same pose."""
-    method, (rig_a, rig_b) = terms.settings.method, terms.rigs
+    method, (rig_a, rig_b) = terms.settings.method, terms.rigs.rigs
     lights = readings.lights[k]
     range_a_m, range_b_m = readings.range_m[k].tolist()
     twist_gap_rad = float(readings.twist_gap_rad[k])
