@@ -133,6 +133,12 @@ COMMANDS: Final = (
         ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
     ),
     Command(
+        "experiments",
+        "tools.experiments.command",
+        "the paper's figures and numbers, again, with ours beside them: one report",
+        ("buddyline experiments -o report/ --quick", "buddyline experiments -o report/ --tag-video test_vid.mp4"),
+    ),
+    Command(
         "plan",
         "tools.plan",
         "how far a pair will measure well, by camera, lights and visibility",

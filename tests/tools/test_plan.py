@@ -6,6 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from node.detect import make_detector
+from node.sim.scenario import WATERS, Scenario
+from node.sim.world import World
 from tools import plan
 from tools.bound import pose_bound
 from tools.cli import main
@@ -46,14 +49,14 @@ def test_errors_of_simulated_dives_are_those_of_the_plan(tmp_path, capsys):
 
 
 def test_wider_lights_measure_farther_and_visibility_ends_it(capsys):
-    assert main(["plan", "--visibility", "6", "--json"]) == 0
+    assert main(["plan", "--visibility", "3", "--json"]) == 0
     murky = json.loads(capsys.readouterr().out)
     ends_m = [spacing["ends_m"]["position"] for spacing in murky["by_baseline"]]
     assert ends_m == sorted(ends_m)
     # sd(l) grows with the square of the range over the spacing: four times the lights, twice as far.
     assert ends_m[-1] / ends_m[0] == pytest.approx(2.0, rel=0.1)
     assert murky["limit"] == "visibility"
-    assert murky["far_m"] == murky["reach_m"] == pytest.approx(light_reach_m(6.0))
+    assert murky["far_m"] == murky["reach_m"] == pytest.approx(light_reach_m(3.0))
     assert [row["within"] for row in murky["rows"]] == [
         1.0 < row["range_m"] <= murky["reach_m"] for row in murky["rows"]
     ]
@@ -101,3 +104,22 @@ def test_what_cannot_be_planned_is_one_line(words, named, capsys):
     err = capsys.readouterr().err
     assert named in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_lights_are_found_in_a_rendered_lake_as_far_as_the_plan_says():
+    water = WATERS["lake"]
+    attenuation_per_m = water.absorption_per_m[1] + water.scattering_per_m[1]
+    reach_m = light_reach_m(math.log(50.0) / attenuation_per_m)
+    found = []
+    for seed in (61, 62):
+        near_m, far_m = 0.8 * reach_m, 0.98 * reach_m
+        world = World(Scenario("lake", seed, interruptions=False, range_min_m=near_m, range_max_m=far_m, other_lamps=0))
+        detector = make_detector()
+        for stamp_ns in range(500_000_000, 12_000_000_000, 2_000_000_000):
+            detections = detector.detect(world.render("a", stamp_ns))
+            for light in world.light_truth("a", stamp_ns, 0).lights:
+                away_px = [math.hypot(d.blob.u_px - light.u_px, d.blob.v_px - light.v_px) for d in detections]
+                found += [min(away_px, default=1e9) < 8.2] if light.visible else []
+    assert len(found) > 8
+    assert np.mean(found) > 0.9

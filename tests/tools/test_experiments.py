@@ -1,0 +1,81 @@
+"""The experiments: what a quick run writes, and the figures that it is made of."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from protocol.messages import RelativePose
+from tests.tools.evaluated import INFOS, pose, truth
+from tools.bound import pose_bound
+from tools.cli import main
+from tools.evaluation.poses import pose_errors
+from tools.evaluation.truth import Track, TruthTrack
+from tools.experiments import numbers, page
+
+
+def _errors(offsets_m, range_m=3.0):
+    """Return the errors of poses straight ahead, each too far by its offset."""
+    truths = [truth(k, (0.0, 0.0, range_m)) for k in range(len(offsets_m))]
+    poses: list[RelativePose] = [pose(k, (0.0, 0.0, range_m + off)) for k, off in enumerate(offsets_m)]
+    track = TruthTrack(truths)
+    return pose_errors(poses, track, lambda _: None, Track.of_attitudes([]), INFOS), track
+
+
+def test_errors_go_into_their_range_bin():
+    errors, _ = _errors([0.01, -0.02, 0.03])
+    (row,) = numbers.by_range(errors)
+    assert (row["from_m"], row["to_m"], row["poses"]) == (3.0, 4.0, 3)
+    assert row["position_median_m"] == pytest.approx(0.02, abs=1e-9)
+    assert row["range_rmse_m"] == pytest.approx(np.sqrt(14e-4 / 3), rel=1e-6)
+
+
+def test_near_poses_are_held_against_the_papers_8_cm():
+    errors, _ = _errors([0.01, 0.07, -0.09, 0.5])
+    assert numbers.near_share(errors) == 0.5
+    assert numbers.near_share(_errors([0.01], range_m=6.0)[0]) is None
+
+
+def test_errors_of_the_bounds_size_have_a_ratio_of_1():
+    errors, track = _errors([0.0])
+    bound_m = numbers.bounds(errors, track, INFOS, 0.5)
+    covariance = pose_bound(np.array([0.0, 0.0, 3.0]), np.array([0.0, 1.0, 0.0, 0.0]), *INFOS.values(), 0.5)
+    assert bound_m[0] == pytest.approx(np.sqrt(np.trace(covariance[:3, :3])))
+    errors, track = _errors([float(bound_m[0]), -float(bound_m[0])])
+    ratio = numbers.over_bound(errors, numbers.bounds(errors, track, INFOS, 0.5))["3-4"]["ratio"]
+    assert ratio == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_method_ends_where_half_of_the_triggers_give_no_pose():
+    errors, _ = _errors([0.0, 0.0])
+    triggers = errors.trigger.tolist()
+    ranges_m = np.array([3.0, 3.5, 5.2, 5.4, 5.6])
+    ends = numbers.reach(ranges_m, [*triggers, -1, -2, -3], errors)
+    assert ends["ends_m"] == 4.0
+    assert [row["share"] for row in ends["bins"]] == [1.0, 0.0]
+    assert ends["farthest_m"] == 3.0
+
+
+def test_the_page_escapes_what_it_shows():
+    assert "<b>" not in page.table(("<b>",), [["<b>"]])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_quick_run_writes_a_report_that_needs_nothing_else(tmp_path, capsys):
+    folder = tmp_path / "report"
+    assert main(["experiments", "-o", str(folder), "--quick"]) == 0
+    found = json.loads((folder / "experiments.json").read_text())
+    assert set(found["environments"]) == {"cavern", "night_reef", "lake", "basin"}
+    assert found["right_pairs"]["ours"]["all"]["right_share"] > 0.6
+    assert found["right_pairs"]["ours"]["all"]["wrong"] == 0
+    assert found["near"]["ours"] == 1.0
+    assert all(0.5 < row["ratio"] < 1.6 for row in found["bound"].values())
+    assert found["time"]["eq1_ms"] < found["time"]["trigger"]["median_ms"]
+    html = (folder / "report.html").read_text()
+    assert html.count("data:image/png;base64,") >= 7
+    assert not re.search(r'(src|href)="(?!data:)', html)
+    assert (folder / "headline.md").read_text().count("\n") >= 8
+    assert main(["experiments", "-o", str(folder), "--quick"]) == 2
+    assert "cannot be made" in capsys.readouterr().err

@@ -1,0 +1,164 @@
+"""`buddyline experiments`: the paper's figures and numbers, again, with ours beside them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from protocol.errors import BuddylineError
+from tools.evaluation.logs import load
+from tools.evaluation.truth import TruthTrack
+from tools.experiments import figures, numbers, page, tank, timing
+from tools.experiments.runs import ENVIRONMENTS, FULL, OURS, QUICK, SEED, TAGS, Rendered, Size, long_dive, rendered
+from tools.progress import Progress
+
+log = logging.getLogger(__name__)
+
+SIGMA_PX = 0.7
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="a new folder for the report")
+    parser.add_argument("--quick", action="store_true", help="short dives: a look, not figures to quote")
+    parser.add_argument(
+        "--tag-video",
+        type=Path,
+        metavar="FILE",
+        help="test_vid.mp4 of github.com/mark-belbin/underwater-apriltags",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run everything and write the report; return 0."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        raise BuddylineError("experiments need matplotlib: pip install 'buddyline[plots]'") from None
+    if args.tag_video is not None and not args.tag_video.is_file():
+        raise BuddylineError(f"{args.tag_video}: no such video")
+    try:
+        args.output.mkdir(parents=True)
+    except OSError as error:
+        raise BuddylineError(f"{args.output}: cannot be made: {error.strerror}") from error
+    cv2.setNumThreads(1)
+    # What the commands say one by one is in the report, or of no interest.
+    logging.getLogger("tools").setLevel(logging.ERROR)
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(QUICK if args.quick else FULL, Path(folder), args.output, args.tag_video)
+    found["quick"] = args.quick
+    rows = numbers.headline(found)
+    (args.output / "experiments.json").write_text(json.dumps(found, allow_nan=False, indent=1) + "\n")
+    (args.output / "headline.md").write_text(numbers.markdown(rows))
+    (args.output / "report.html").write_text(report(found, rows, args.output), encoding="utf-8")
+    print(args.output / "report.html")
+    return 0
+
+
+def measure(size: Size, folder: Path, output: Path, video: Path | None) -> dict[str, Any]:
+    """Run all experiments, write the pictures into output, and return the figures."""
+    dives: list[Rendered] = []
+    truths, starts = {}, {}
+    found: dict[str, Any] = {"paper": numbers.PAPER_REPORTS, "seed": SEED, "reach": {}}
+    with Progress("experiments", len(ENVIRONMENTS) + 3) as progress:
+        for environment in ENVIRONMENTS:
+            progress.show(len(dives), environment)
+            dive = rendered(environment, size, folder)
+            dives.append(dive)
+            recorded = load([str(dive.dive)])
+            truths[environment] = np.array([truth.t_a_b_m for truth in recorded.truths])
+            starts[environment] = np.array([truth.stamp_ns for truth in recorded.truths])
+            triggers = [int(truth.trigger) for truth in recorded.truths if isinstance(truth.trigger, int)]
+            ranges_m = np.linalg.norm(truths[environment], axis=1)
+            found["reach"][environment] = {
+                name: numbers.reach(ranges_m, triggers, dive.results[name].errors)
+                for name in (OURS, TAGS)
+                if name in dive.results
+            }
+        progress.show(len(dives), "out to 20 m")
+        long_log, long_results = long_dive(size, folder)
+        found["right_pairs"] = numbers.pairs(dives)
+        found["environments"] = numbers.environments(dives)
+        found["distance"] = {name: numbers.by_range(result.errors) for name, result in long_results.items()}
+        found["near"] = {name: numbers.near_share(result.errors) for name, result in long_results.items()}
+        for dive in dives:
+            if TAGS in dive.results:
+                found["distance"][f"AR tags, {dive.environment.replace('_', ' ')}"] = numbers.by_range(
+                    dive.results[TAGS].errors
+                )
+        errors = long_results[OURS].errors
+        recorded = load([str(long_log)])
+        bound_m = numbers.bounds(errors, TruthTrack(recorded.truths), recorded.infos, SIGMA_PX)
+        found["bound"] = numbers.over_bound(errors, bound_m)
+        progress.show(len(dives) + 1, "run times")
+        found["time"] = {
+            "eq1_ms": timing.equation_1(),
+            "trigger": timing.trigger(long_log),
+            "frame": {dive.environment: timing.frame(dive.dive) for dive in dives},
+        }
+        progress.show(len(dives) + 2, "pictures")
+        if video is not None:
+            found["tank"] = tank.figures(video, size.tank_step)
+        figures.trajectories(dives, truths, output / "trajectories.png")
+        for dive in dives:
+            start_ns = int(starts[dive.environment][0])
+            times_s = (starts[dive.environment] - start_ns) / 1e9
+            path = output / f"over_time_{dive.environment}.png"
+            figures.over_time(dive, times_s, truths[dive.environment], start_ns, path)
+            figures.detections(dive, output / f"detection_{dive.environment}.png")
+        figures.over_range(found["distance"], errors.true_range_m, bound_m, output / "error_over_range.png")
+    return found
+
+
+def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output: Path) -> str:
+    """Return the report's HTML."""
+    quick = "<p><b>Quick look: short dives, not figures to quote.</b></p>" if found["quick"] else ""
+    head = page.table(("", "ours", "the paper's method (or AR tags) here", "the paper reports"), rows)
+    sections = [
+        ("At a glance", quick + head + "<p>Simulated dives, of seeds that nothing was tuned on: not the sea.</p>"),
+        (
+            "Trajectories",
+            page.picture(output / "trajectories.png", "B before A (triangle), from above and from the side; grid 1 m"),
+        ),
+        ("Error against distance", page.picture(output / "error_over_range.png", "Median position error by range")),
+        (
+            "Right pairs",
+            page.table(
+                ("method", "water", "in view", "right, %", "of its poses, %", "another pair", "wrong poses"),
+                page.pair_rows(found["right_pairs"]),
+            ),
+        ),
+    ]
+    for environment in ENVIRONMENTS:
+        name = environment.replace("_", " ")
+        content = page.picture(output / f"over_time_{environment}.png", "Lights and AR tags over time, gaps included")
+        ends = found["reach"][environment]
+        content += page.table(
+            ("", "farthest pose, m", "half of the triggers give a pose up to, m"),
+            [
+                [method, page.number(one["farthest_m"], 1), page.number(one["ends_m"], 1)]
+                for method, one in ends.items()
+            ],
+        )
+        pictured = output / f"detection_{environment}.png"
+        if pictured.exists():
+            content += page.picture(pictured, "A above, B below: raw, candidates, chosen pair (red left, green right)")
+        sections.append((f"In the {name}", content))
+    times = found["time"]
+    costs = [["Eq. 1, both ranges", page.number(times["eq1_ms"], 4)]]
+    costs.append(["a whole trigger, median", page.number(times["trigger"]["median_ms"], 2)])
+    for environment, frame in times["frame"].items():
+        costs.append([f"a frame, {environment}: ours", page.number(frame["source_ms"], 1)])
+        costs.append([f"a frame, {environment}: the paper's", page.number(frame["paper_ms"], 1)])
+    sections.append(("Run time", page.table(("processor time of one thread, this machine", "ms"), costs)))
+    if "tank" in found:
+        listed = [[name.replace("_", " "), page.number(value)] for name, value in found["tank"].items()]
+        sections.append(("AR tags in real water", page.table(("underwater-apriltags' video", ""), listed)))
+    return page.page("Buddyline: the paper's experiments, again", sections)

@@ -1,0 +1,206 @@
+"""The experiments' figures, as JSON takes them, and the table that a reader looks at first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from protocol.messages import NodeInfo
+from tools.bound import pose_bound
+from tools.evaluation.poses import PoseErrors
+from tools.evaluation.report import as_dict
+from tools.evaluation.rotation import Floats
+from tools.evaluation.statistics import Stats, share
+from tools.evaluation.truth import TruthTrack
+from tools.experiments.runs import OURS, OURS_CAMERA, PAPER, PAPER_CAMERA, TAGS, Rendered
+
+EDGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.5, 15.0, 17.5, 20.0)
+# What the paper reports.
+PAPER_REPORTS: Final = {
+    "right_pairs_camera": 0.724,
+    "right_pairs_all_sensors": 0.8446,
+    "error_1.5_to_4_m": 0.08,
+    "tags_end_m": 5.0,
+}
+# Beyond the last bin that gives this share of poses, a method has ended.
+_ENDS_AT: Final = 0.5
+
+
+def by_range(errors: PoseErrors) -> list[dict[str, Any]]:
+    """Return position errors by true range, bins without poses left out."""
+    rows = []
+    for start_m, end_m in pairwise(EDGES_M):
+        chosen = errors.select((errors.true_range_m >= start_m) & (errors.true_range_m < end_m))
+        if not len(chosen):
+            continue
+        position, along = Stats.of(chosen.translation_m), Stats.of(chosen.range_m)
+        rows.append(
+            {
+                "from_m": start_m,
+                "to_m": end_m,
+                "poses": len(chosen),
+                "wrong": int(chosen.wrong.sum()),
+                "position_median_m": position.median,
+                "position_rmse_m": position.rmse,
+                "position_p95_m": position.p95,
+                "range_median_m": along.median,
+                "range_rmse_m": along.rmse,
+            }
+        )
+    return rows
+
+
+def bounds(errors: PoseErrors, track: TruthTrack, infos: Mapping[str, NodeInfo], sigma_px: float) -> Floats:
+    """Return the Cramér-Rao bound of the position's RMS error at each pose (N,), NaN where a light is out of view."""
+    found = []
+    for stamp_ns, trigger in zip(errors.stamp_ns.tolist(), errors.trigger.tolist(), strict=True):
+        known = track.at(stamp_ns, trigger)
+        covariance = pose_bound(*known, infos["a"], infos["b"], sigma_px) if known else np.full((6, 6), np.nan)
+        found.append(float(np.sqrt(np.trace(covariance[:3, :3]))))
+    return np.array(found)
+
+
+def over_bound(errors: PoseErrors, bound_m: Floats) -> dict[str, dict[str, float]]:
+    """Return by range the RMS of position error over its bound (1: nothing better is possible) and the bound itself."""
+    rows = {}
+    for start_m, end_m in pairwise(EDGES_M):
+        inside = (errors.true_range_m >= start_m) & (errors.true_range_m < end_m) & np.isfinite(bound_m) & ~errors.wrong
+        if inside.any():
+            ratio = errors.translation_m[inside] / bound_m[inside]
+            rows[f"{start_m:g}-{end_m:g}"] = {
+                "ratio": float(np.sqrt(np.mean(ratio**2))),
+                "bound_rms_m": float(np.sqrt(np.mean(bound_m[inside] ** 2))),
+            }
+    return rows
+
+
+def reach(truth_ranges_m: Floats, truth_triggers: Sequence[int], errors: PoseErrors) -> dict[str, Any]:
+    """Return the share of triggers that became poses by range, the farthest pose, and where a method ends.
+
+    ends_m: the far edge of the last bin in which half of the triggers, in view or not, gave a pose.
+    """
+    solved = set(errors.trigger[~errors.wrong].tolist())
+    got = np.array([trigger in solved for trigger in truth_triggers])
+    bins, ends_m = [], None
+    for start_m, end_m in pairwise(EDGES_M):
+        inside = (truth_ranges_m >= start_m) & (truth_ranges_m < end_m)
+        if inside.any():
+            part = float(got[inside].mean())
+            bins.append({"from_m": start_m, "to_m": end_m, "triggers": int(inside.sum()), "share": part})
+            ends_m = end_m if part >= _ENDS_AT else ends_m
+    farthest = errors.true_range_m[~errors.wrong]
+    return {"ends_m": ends_m, "farthest_m": float(farthest.max()) if len(farthest) else None, "bins": bins}
+
+
+def near_share(errors: PoseErrors) -> float | None:
+    """Return the share of poses between 1.5 and 4 m whose range is within the paper's 0.08 m."""
+    near = errors.select((errors.true_range_m >= 1.5) & (errors.true_range_m < 4.0))
+    return share(int((np.abs(near.range_m) <= PAPER_REPORTS["error_1.5_to_4_m"]).sum()), len(near))
+
+
+def pairs(dives: Sequence[Rendered]) -> dict[str, dict[str, Any]]:
+    """Return, by method and environment, how the triggers that show all four lights ended; "all": of them together."""
+    table: dict[str, dict[str, Any]] = {}
+    for name in (OURS, OURS_CAMERA, PAPER, PAPER_CAMERA):
+        rows: dict[str, Any] = {}
+        total = np.zeros(4, dtype=int)
+        for dive in dives:
+            found = dive.results[name].pairing
+            if found is None or found.right is None:
+                continue
+            counts = np.array([found.visible, found.right, found.other_pair, found.wrong])
+            rows[dive.environment] = _pair_row(counts)
+            total += counts
+        rows["all"] = _pair_row(total)
+        table[name] = rows
+    return table
+
+
+def _pair_row(counts: Any) -> dict[str, Any]:
+    visible, right, other, wrong = map(int, counts)
+    answered = right + other
+    return {
+        "visible": visible,
+        "right": right,
+        "other_pair": other,
+        "wrong": wrong,
+        "right_share": share(right, visible),
+        "right_of_poses": share(right, answered),
+    }
+
+
+def environments(dives: Sequence[Rendered]) -> dict[str, Any]:
+    """Return everything that evaluate tells, by environment and method."""
+    return {dive.environment: {name: as_dict(result) for name, result in dive.results.items()} for dive in dives}
+
+
+def headline(numbers: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    """Return the rows (what, ours, the paper's method here, what the paper reports)."""
+    found, near = numbers["right_pairs"], numbers["near"]
+    rows = [
+        (
+            "right pair of lights, all sensors",
+            _percent(found[OURS]["all"]["right_share"]),
+            _percent(found[PAPER]["all"]["right_share"]),
+            _percent(PAPER_REPORTS["right_pairs_all_sensors"]),
+        ),
+        (
+            "right pair of lights, camera only",
+            _percent(found[OURS_CAMERA]["all"]["right_share"]),
+            _percent(found[PAPER_CAMERA]["all"]["right_share"]),
+            _percent(PAPER_REPORTS["right_pairs_camera"]),
+        ),
+        (
+            "another pair taken, all sensors",
+            _percent(share(found[OURS]["all"]["other_pair"], found[OURS]["all"]["visible"])),
+            _percent(share(found[PAPER]["all"]["other_pair"], found[PAPER]["all"]["visible"])),
+            "-",
+        ),
+        (
+            "range within 0.08 m, 1.5 to 4 m",
+            _percent(near["ours"]),
+            _percent(near["paper's"]),
+            "all",
+        ),
+    ]
+    ranges = {(row["from_m"], row["to_m"]): row for row in numbers["distance"][OURS]}
+    papers = {(row["from_m"], row["to_m"]): row for row in numbers["distance"]["paper's"]}
+    for bin_m in ((3.0, 4.0), (8.0, 10.0), (17.5, 20.0)):
+        if bin_m in ranges:
+            ours, theirs = ranges[bin_m], papers.get(bin_m)
+            bound = numbers["bound"].get(f"{bin_m[0]:g}-{bin_m[1]:g}")
+            rows.append(
+                (
+                    f"position error, median, {bin_m[0]:g} to {bin_m[1]:g} m (RMS / bound)",
+                    f"{ours['position_median_m']:.3f} m" + (f" ({bound['ratio']:.2f})" if bound else ""),
+                    f"{theirs['position_median_m']:.3f} m" if theirs else "-",
+                    "-",
+                )
+            )
+    for environment, ends in numbers["reach"].items():
+        rows.append(
+            (
+                f"farthest pose in the {environment.replace('_', ' ')}: ours / AR tags",
+                _metres(ends.get(OURS)),
+                _metres(ends.get(TAGS)),
+                "tags end at about 5 m",
+            )
+        )
+    return rows
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.1f} %"
+
+
+def _metres(ends: Mapping[str, Any] | None) -> str:
+    return "none" if ends is None or ends["farthest_m"] is None else f"{ends['farthest_m']:.1f} m"
+
+
+def markdown(rows: Sequence[tuple[str, str, str, str]]) -> str:
+    """Return the table for a README."""
+    lines = ["| | ours | the paper's method (or AR tags) here | the paper reports |", "|---|---|---|---|"]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"

@@ -1,0 +1,130 @@
+"""The dives of the experiments, and what each method makes of them, by the program's own commands."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+from protocol.errors import BuddylineError
+from tools.evaluation.logs import load_for_evaluation
+from tools.evaluation.result import Result, evaluate
+
+ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
+# Seeds that nothing was tuned on.
+SEED: Final = 90_210
+
+OURS: Final = "ours"
+OURS_CAMERA: Final = "ours, camera only"
+PAPER: Final = "paper's, all sensors"
+PAPER_CAMERA: Final = "paper's, camera only"
+TAGS: Final = "AR tags"
+
+_SOLVES: Final[Mapping[str, tuple[str, str, str]]] = {
+    OURS: ("source", "refined", "range,twist,attitude,depth"),
+    OURS_CAMERA: ("source", "refined", "range,twist"),
+    PAPER: ("paper", "paper", "range,attitude,depth"),
+    PAPER_CAMERA: ("paper", "paper", "range"),
+}
+"""Detector, method and checks. The paper tests the range gap, and with sensors attitude and depth."""
+
+_LONG_METHODS: Final = {OURS: "refined", "paper's": "paper", "paper's text, literally": "paper_literal"}
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is simulated. seconds, rate_hz: of each rendered dive; long_*: of the dive of candidates to 20 m."""
+
+    seconds: float
+    rate_hz: float
+    long_seconds: float
+    long_rate_hz: float
+    tank_step: int
+
+
+FULL: Final = Size(seconds=60.0, rate_hz=2.0, long_seconds=240.0, long_rate_hz=4.0, tank_step=5)
+QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.0, tank_step=80)
+
+
+def call(module: str, *words: str) -> None:
+    """Run one command of the program, without its summary; raise BuddylineError where it fails."""
+    command = import_module(f"tools.{module}")
+    parser = argparse.ArgumentParser(prog=f"buddyline {module}")
+    command.add_arguments(parser)
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        status = command.run(parser.parse_args(words))
+    # Tags that no picture shows are a result, too.
+    if status and module != "artag":
+        raise BuddylineError(f"buddyline {module} {' '.join(words)}: ended with {status}")
+
+
+def measured(path: Path) -> Result:
+    """Return a solved log's errors."""
+    recorded = load_for_evaluation([str(path)])
+    return evaluate(
+        recorded.poses,
+        recorded.rejected,
+        recorded.truths,
+        recorded.candidates,
+        recorded.light_truths,
+        recorded.infos,
+        recorded.attitudes_a,
+        nodes=recorded.nodes,
+        environment=recorded.environment,
+    )
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """One environment's dive of pictures. logs, results: by method."""
+
+    environment: str
+    dive: Path
+    logs: dict[str, Path]
+    results: dict[str, Result]
+
+
+def rendered(environment: str, size: Size, directory: Path) -> Rendered:
+    """Simulate a dive of pictures with tags, detect, and solve it by every method."""
+    dive = directory / f"{environment}.mcap"
+    words = ["--environment", environment, "--seconds", str(size.seconds), "--rate", str(size.rate_hz)]
+    seed = SEED + ENVIRONMENTS.index(environment)
+    call("simulate", str(dive), "--images", "--tags", "--seed", str(seed), *words)
+    logs: dict[str, Path] = {}
+    for detector, chosen in (("source", "auto"), ("paper", environment)):
+        found = directory / f"{environment}.{detector}.mcap"
+        call("detect", str(dive), "-o", str(found), "--method", detector, "--environment", chosen)
+        for name, (wanted, method, checks) in _SOLVES.items():
+            if wanted == detector:
+                logs[name] = directory / f"{environment}.{len(logs)}.mcap"
+                call("solve", str(found), "-o", str(logs[name]), "--method", method, "--checks", checks)
+    logs[TAGS] = directory / f"{environment}.tags.mcap"
+    call("artag", str(dive), "-o", str(logs[TAGS]))
+    return Rendered(environment, dive, logs, {name: measured(path) for name, path in logs.items() if has_poses(path)})
+
+
+def has_poses(path: Path) -> bool:
+    """Whether a log has any result: tags may have none at all."""
+    from protocol.divelog import DiveLogReader
+
+    with DiveLogReader(path) as reader:
+        return any(key.endswith(("/pose", "/rejected", "/artag")) for key in reader.keys)
+
+
+def long_dive(size: Size, directory: Path) -> tuple[Path, dict[str, Result]]:
+    """Simulate candidates out to 20 m, and solve them by our method and the paper's."""
+    dive = directory / "long.mcap"
+    words = ["--seconds", str(size.long_seconds), "--rate", str(size.long_rate_hz), "--range-max", "20"]
+    call("simulate", str(dive), "--seed", str(SEED + 10), "--undisturbed", "--gross", "0", "--misses", "0", *words)
+    results = {}
+    for name, method in _LONG_METHODS.items():
+        out = directory / f"long.{method}.mcap"
+        checks = "range,twist,attitude,depth" if name == OURS else "range,attitude,depth"
+        call("solve", str(dive), "-o", str(out), "--method", method, "--checks", checks)
+        results[name] = measured(out)
+    return dive, results

@@ -1,0 +1,80 @@
+"""What things cost on this machine: processor time of one thread, so that other work does not count."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from node.detect import make_detector
+from node.drivers.stored import decode_picture
+from protocol.messages import Candidates, CompressedImage
+from solver_service.config import SolveConfig
+from solver_service.core import SolverCore
+from solver_service.geometry.closed_form import eq1_range_m
+from tools.dives import Dive
+
+_PICTURES: Final = 12
+_TRIGGERS: Final = 100
+
+
+def milliseconds(work: Callable[[], object], repeats: int) -> float:
+    """Return the processor time of one call, the least of five series."""
+    taken = []
+    for _ in range(5):
+        began_s = time.process_time()
+        for _ in range(repeats):
+            work()
+        taken.append((time.process_time() - began_s) / repeats * 1e3)
+    return min(taken)
+
+
+def equation_1() -> float:
+    """Return the time of one evaluation of the paper's Eq. 1, both ranges, ms."""
+    cos_alpha, sin_beta = np.cos([0.2, 0.21]), np.array([0.1, -0.1])
+    sin_alpha, length_m = np.sin([0.2, 0.21]), np.array([0.88, 0.88])
+    return milliseconds(lambda: eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m), 500)
+
+
+def trigger(found: Path) -> dict[str, float]:
+    """Return the time of whole triggers, matching and messages included, by the candidates of a log, ms."""
+    core = SolverCore("a", "b", SolveConfig().settings("experiments"))
+    taken_ms = []
+    with Dive([found]) as dive:
+        for record in dive.records("info", "attitude", "depth", "candidates"):
+            message = record.decode()
+            if message is None:
+                continue
+            matched, began_s = core.matched, time.process_time()
+            core.handle(message)
+            # Most messages resolve nothing: those that do are the triggers.
+            if core.matched > matched:
+                taken_ms.append((time.process_time() - began_s) * 1e3 / (core.matched - matched))
+            if len(taken_ms) >= _TRIGGERS and isinstance(message, Candidates):
+                break
+    return {"median_ms": float(np.median(taken_ms)), "p95_ms": float(np.percentile(taken_ms, 95))}
+
+
+def frame(dive: Path) -> dict[str, float]:
+    """Return the time of detection in one picture by each detector, ms, the median over pictures of a dive."""
+    pictures = []
+    with Dive([dive]) as log:
+        for record in log.records("image"):
+            message = record.decode()
+            if isinstance(message, CompressedImage):
+                pictures.append(decode_picture(message.data, record.key))
+            if len(pictures) == _PICTURES:
+                break
+    times = {}
+    for method in ("source", "paper"):
+        detector = make_detector(method, "auto")
+        taken_ms = []
+        for picture in pictures:
+            began_s = time.process_time()
+            detector.detect(picture)
+            taken_ms.append((time.process_time() - began_s) * 1e3)
+        times[f"{method}_ms"] = float(np.median(taken_ms))
+    return times
