@@ -32,7 +32,12 @@ from node.detect.rings import (
 _RINGS = 16
 _ROUNDS = 2
 _CLIPPED = 249.0
+# What the errors on rendered dives were, against what the equations alone expect.
 _FLOOR_PX = 0.05
+_NOISE_SCALE = 0.3
+_GROWTH_SCALE = 1.3
+_MOVED_SHARE = 0.1
+_SCATTERED_PX = 1.5
 _ROBUST_SD = 3.0
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
@@ -40,6 +45,7 @@ MODEL: Mapping[str, float] = {
     "growth": 0.7,
     "growth_veil": 0.45,
     "growth_size": 0.45,
+    "growth_scatter": 1.0,
     "growth_sd": 0.35,
     "steepness": 0.75,
     "inner": 0.6,
@@ -69,13 +75,15 @@ def locate_sources(
     radius_px: Floats,
     ground: Floats,
     weakest: NDArray[np.bool_],
+    scattered: Floats,
     model: Mapping[str, float] = MODEL,
 ) -> Centres:
     """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture.
 
     start_px: (N, 2) centres and radius_px: (N,) radii of their brightest regions. ground: (N,) what the water itself
     shows there. weakest: (N,) whether the weakest channel is used, which clips last, or the luminance, which is
-    sharper (JPEG halves the resolution of colour).
+    sharper (JPEG halves the resolution of colour). scattered: (N,) 0-1, whether a dim light shows no core of its own
+    but only what the water scatters.
     """
     prior_sd = model["core_share"] * radius_px + 0.5
     by_prior = np.eye(2, dtype=np.float32) * (prior_sd**2)[:, None, None]
@@ -88,6 +96,7 @@ def locate_sources(
     )
     log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
     growth = _growth(radius_px * 820.0 / model.get("width_px", image.shape[1]), ground, model)
+    growth -= np.asarray(model["growth_scatter"] * scattered, np.float32)
     alive = np.ones(len(centre), bool)
     for i in range(_ROUNDS):
         rings = sample_rings(image, centre, radius)
@@ -102,7 +111,10 @@ def locate_sources(
         centre = np.where(alive[:, None], moved, np.where(strayed[:, None], start_px, centre))
         covariance, lean = precision, x[:, 2:]
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
-    covariance = np.where(alive[:, None, None], covariance, by_prior) + np.eye(2) * _FLOOR_PX**2
+    covariance = np.where(alive[:, None, None], covariance, by_prior)
+    moved = centre - start_px
+    covariance = covariance + _MOVED_SHARE**2 * moved[:, :, None] * moved[:, None, :]
+    covariance += np.eye(2) * (_FLOOR_PX**2 + (_SCATTERED_PX * scattered) ** 2)[:, None, None]
     return Centres(centre, covariance, np.where(alive[:, None], lean, 0.0))
 
 
@@ -187,8 +199,8 @@ class _Equations:
         self._weight /= 1.0 + self._weight * residual**2 * (1.0 / _ROBUST_SD**2)
         sd = self._model["growth_sd"]
         x, covariance = self._least_squares(self._glow_share(np.array([0.0, -sd, sd], np.float32)), prior_sd, prior_px)
-        apart = 0.5 * (x[2, :, :2] - x[1, :, :2])
-        return x[0], covariance[0] + apart[:, :, None] * apart[:, None, :]
+        apart = _GROWTH_SCALE * 0.5 * (x[2, :, :2] - x[1, :, :2])
+        return x[0], _NOISE_SCALE**2 * covariance[0] + apart[:, :, None] * apart[:, None, :]
 
     def _glow_share(self, more_growth: Floats) -> Floats:
         """Integrate d ln w / d ln rho along the rings, for S growths; w is 1 at the outermost ring seen, (S, N, M)."""

@@ -69,6 +69,7 @@ class _Lights:
     core_px: Floats
     ground: Floats
     weakest: NDArray[np.bool_]
+    scattered: Floats
     peak: Floats
     edge_px: Floats
     edge_at_px: Floats
@@ -101,6 +102,7 @@ class SourceDetector:
             lights.core_px[chosen],
             lights.ground[chosen],
             lights.weakest[chosen],
+            lights.scattered[chosen],
         )
         return _detections(lights, found, score, chosen, image.shape)
 
@@ -167,6 +169,7 @@ def _measure(image: NDArray[np.uint8], centre: Floats, radius_px: Floats, propos
         core_px,
         below,
         weakest,
+        _scattered(shapes[0], peak),
         peak,
         shapes[0].edge_px[_HALF],
         centre,
@@ -199,6 +202,16 @@ def _rim(shapes: Shapes) -> tuple[Floats, Floats]:
     k = fall.argmax(axis=0)
     n = np.arange(len(k))
     return 0.5 * (centre[k, n] + centre[k + 1, n]), 0.5 * (radius[k, n] + radius[k + 1, n])
+
+
+def _scattered(shapes: Shapes, peak: Floats) -> Floats:
+    """Tell dim lights that show only what the water scatters, (N,) 0-1: not clipped, and yet with a halo.
+
+    A core's own profile falls as steeply below half its height as above it; a glow flattens out.
+    """
+    halo = np.clip((shapes.radius_px[3] / shapes.radius_px[2] - 1.35) / 0.2, 0.0, 1.0)
+    dim = np.clip((240.0 - peak) / 40.0, 0.0, 1.0)
+    return np.asarray(halo * dim, np.float32)
 
 
 def _water_level(image: NDArray[np.uint8]) -> Floats:
