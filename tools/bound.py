@@ -13,19 +13,22 @@ from tools.evaluation.rotation import Floats, conjugate, multiply, normalized, r
 _STEP: Final = 1e-5
 
 
-def pose_bound(t_a_b_m: Floats, q_a_b_xyzw: Floats, info_a: NodeInfo, info_b: NodeInfo, sigma_px: float) -> Floats:
-    """Return the smallest covariance (6, 6) of T_a_b, as RelativePose has it; NaN where a light is not in view.
+def pose_bounds(t_a_b_m: Floats, q_a_b_xyzw: Floats, info_a: NodeInfo, info_b: NodeInfo, sigma_px: float) -> Floats:
+    """Return the smallest covariances (n, 6, 6) of poses (n, 3), (n, 4), in the order that RelativePose has.
 
-    The inverse of J^T J / sigma^2, J the derivatives of the eight image coordinates by differences. sigma_px: noise
-    of a coordinate, 1 sd.
+    The inverse of J^T J / sigma^2, J the derivatives of the eight image coordinates, by differences. NaN where a
+    light has no place in a picture. sigma_px: noise of a coordinate, 1 sd.
     """
-    steps = np.concatenate([np.eye(6), -np.eye(6)]) * _STEP
-    turns = np.concatenate([0.5 * steps[:, 3:], np.ones((12, 1))], axis=1)
-    images = _images(t_a_b_m + steps[:, :3], normalized(multiply(turns, q_a_b_xyzw)), info_a, info_b)
-    J = ((images[:6] - images[6:]) / (2.0 * _STEP)).T
-    if not np.isfinite(J).all():
-        return np.full((6, 6), np.nan)
-    return np.asarray(np.linalg.inv(J.T @ J) * sigma_px**2, dtype=np.float64)
+    steps = np.concatenate([np.eye(6), -np.eye(6)])[:, None] * _STEP
+    turns = np.concatenate([0.5 * steps[..., 3:], np.ones((12, 1, 1))], axis=-1)
+    t_m = t_a_b_m + steps[..., :3]
+    q = normalized(multiply(turns, q_a_b_xyzw[None]))
+    images = _images(t_m.reshape(-1, 3), q.reshape(-1, 4), info_a, info_b).reshape(12, -1, 8)
+    J = np.moveaxis((images[:6] - images[6:]) / (2.0 * _STEP), 0, -1)
+    covariances = np.full((len(t_a_b_m), 6, 6), np.nan)
+    seen = np.isfinite(J).all(axis=(1, 2))
+    covariances[seen] = np.linalg.inv(J[seen].swapaxes(1, 2) @ J[seen]) * sigma_px**2
+    return covariances
 
 
 def _images(t_m: Floats, q_xyzw: Floats, info_a: NodeInfo, info_b: NodeInfo) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 from node.config import load_node_config
 from protocol.errors import BuddylineError
 from protocol.messages import CameraModel, NodeInfo
-from tools.bound import pose_bound
+from tools.bound import pose_bounds
 from tools.dives import load_info
 from tools.evaluation.rotation import Floats, multiply, normalized
 
@@ -25,9 +25,10 @@ FIELD_OF_VIEW_RAD: Final = math.radians(48.8)
 _KOSCHMIEDER: Final = math.log(50.0)
 # How much brighter a dive lamp is at 1 m than the faintest light that a detector takes; see `light_reach_m`.
 LAMP_MARGIN: Final = 1e6
-# Divers hold bars and heads about this straight towards each other (1 sd).
+# Divers hold bars and heads about this straight towards each other, and each other this near to the middle (1 sd).
 _TILT_RAD: Final = math.radians(12.0)
-_ATTITUDES: Final = 8
+_ASIDE: Final = 0.06
+_ATTITUDES: Final = 16
 
 
 @dataclass(frozen=True)
@@ -176,29 +177,26 @@ def light_reach_m(visibility_m: float) -> float:
     return near_m
 
 
-def expected(info: NodeInfo, sigma_px: float, range_m: float) -> Floats:
-    """Return RMS errors at a range (4,): range, position (m), bearing across, rotation (rad).
+def expected(info: NodeInfo, sigma_px: float, ranges_m: Floats) -> Floats:
+    """Return RMS errors at ranges (n,), (n, 4): range, position (m), bearing across, rotation (rad).
 
     By the Cramér-Rao bound of two like nodes that look at each other, over the attitudes that divers hold.
     """
     rng = np.random.default_rng(7)
-    total = np.zeros(4)
-    count = 0
-    for _ in range(_ATTITUDES):
-        lateral = rng.normal(0.0, 0.06, 2)
-        direction = np.array([*lateral, 1.0])
-        t_m = direction / np.linalg.norm(direction) * range_m
-        tilt = rng.normal(0.0, _TILT_RAD, 3) * (0.5, 1.0, 0.5)
-        q = normalized(multiply(np.append(0.5 * tilt, 1.0), np.array([0.0, 1.0, 0.0, 0.0])))
-        covariance = pose_bound(t_m, q, info, info, sigma_px)
-        if not np.isfinite(covariance).all():
-            continue
-        u = t_m / range_m
-        along = float(u @ covariance[:3, :3] @ u)
-        position = float(np.trace(covariance[:3, :3]))
-        total += (along, position, (position - along) / 2.0 / range_m**2, float(np.trace(covariance[3:, 3:])))
-        count += 1
-    return np.sqrt(total / max(count, 1))
+    direction = np.column_stack([rng.normal(0.0, _ASIDE, (_ATTITUDES, 2)), np.ones(_ATTITUDES)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    tilt_rad = rng.normal(0.0, _TILT_RAD, (_ATTITUDES, 3)) * (0.5, 1.0, 0.5)
+    q = normalized(multiply(np.column_stack([0.5 * tilt_rad, np.ones(_ATTITUDES)]), np.array([[0.0, 1.0, 0.0, 0.0]])))
+    t_m = ranges_m[:, None, None] * direction
+    qs = np.broadcast_to(q, (len(ranges_m), *q.shape))
+    covariances = pose_bounds(t_m.reshape(-1, 3), qs.reshape(-1, 4), info, info, sigma_px)
+    covariances = covariances.reshape(len(ranges_m), _ATTITUDES, 6, 6)
+    along = np.einsum("ai,naij,aj->na", direction, covariances[..., :3, :3], direction)
+    position = np.trace(covariances[..., :3, :3], axis1=2, axis2=3)
+    across = (position - along) / 2.0 / ranges_m[:, None] ** 2
+    rotation = np.trace(covariances[..., 3:, 3:], axis1=2, axis2=3)
+    errors: Floats = np.sqrt(np.stack([along, position, across, rotation], axis=-1).mean(axis=1))
+    return errors
 
 
 def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, tolerances: Tolerances) -> Plan:
@@ -206,8 +204,8 @@ def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, to
     length_m = math.dist(info.light_left_m, info.light_right_m)
     near_m = 1.1 * length_m / 2 / math.tan(math.atan(info.width_px / 2 / info.camera.fx_px))
     rows = []
-    for range_m in RANGES_M:
-        along_m, position_m, bearing_rad, rotation_rad = expected(info, sigma_px, range_m).tolist()
+    errors = expected(info, sigma_px, np.array(RANGES_M)).tolist()
+    for range_m, (along_m, position_m, bearing_rad, rotation_rad) in zip(RANGES_M, errors, strict=True):
         azimuth_rad = math.hypot(bearing_rad, compass_rad)
         good = (
             along_m <= tolerances.range_m

@@ -8,7 +8,7 @@ import pytest
 
 from protocol.messages import RelativePose
 from tests.tools.evaluated import INFOS, pose, truth
-from tools.bound import pose_bound
+from tools.bound import pose_bounds
 from tools.cli import main
 from tools.evaluation.poses import pose_errors
 from tools.evaluation.truth import Track, TruthTrack
@@ -40,7 +40,7 @@ def test_near_poses_are_held_against_the_papers_8_cm():
 def test_errors_of_the_bounds_size_have_a_ratio_of_1():
     errors, track = _errors([0.0])
     bound_m = numbers.bounds(errors, track, INFOS, 0.5)
-    covariance = pose_bound(np.array([0.0, 0.0, 3.0]), np.array([0.0, 1.0, 0.0, 0.0]), *INFOS.values(), 0.5)
+    (covariance,) = pose_bounds(np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 1.0, 0.0, 0.0]]), *INFOS.values(), 0.5)
     assert bound_m[0] == pytest.approx(np.sqrt(np.trace(covariance[:3, :3])))
     errors, track = _errors([float(bound_m[0]), -float(bound_m[0])])
     ratio = numbers.over_bound(errors, numbers.bounds(errors, track, INFOS, 0.5))["3-4"]["ratio"]

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from protocol.messages import NodeInfo
-from tools.bound import pose_bound
+from tools.bound import pose_bounds
 from tools.evaluation.poses import PoseErrors
 from tools.evaluation.report import as_dict
 from tools.evaluation.rotation import Floats
@@ -55,12 +55,12 @@ def by_range(errors: PoseErrors) -> list[dict[str, Any]]:
 
 def bounds(errors: PoseErrors, track: TruthTrack, infos: Mapping[str, NodeInfo], sigma_px: float) -> Floats:
     """Return the Cramér-Rao bound of the position's RMS error at each pose (N,), NaN where a light is out of view."""
-    found = []
-    for stamp_ns, trigger in zip(errors.stamp_ns.tolist(), errors.trigger.tolist(), strict=True):
-        known = track.at(stamp_ns, trigger)
-        covariance = pose_bound(*known, infos["a"], infos["b"], sigma_px) if known else np.full((6, 6), np.nan)
-        found.append(float(np.sqrt(np.trace(covariance[:3, :3]))))
-    return np.array(found)
+    known = [track.at(*one) for one in zip(errors.stamp_ns.tolist(), errors.trigger.tolist(), strict=True)]
+    t_m = np.array([one[0] for one in known if one is not None]).reshape(-1, 3)
+    q = np.array([one[1] for one in known if one is not None]).reshape(-1, 4)
+    covariances = pose_bounds(t_m, q, infos["a"], infos["b"], sigma_px)
+    bound_m: Floats = np.sqrt(np.trace(covariances[:, :3, :3], axis1=1, axis2=2))
+    return bound_m
 
 
 def over_bound(errors: PoseErrors, bound_m: Floats) -> dict[str, dict[str, float]]:
