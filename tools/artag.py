@@ -92,7 +92,7 @@ class TagSolver:
                     by_a=node == self.node_a,
                 )
             ]
-            solved = tag_pose(readings, self.layouts[self.node_a].family)
+            solved = tag_pose(readings)
             if solved is not None:
                 self.left_out += solved.left_out
                 poses.append(

@@ -58,7 +58,7 @@ def poses_of(video: Path, step: int) -> tuple[int, int, list[TagPose]]:
             picture = np.asarray(capture.retrieve()[1], dtype=np.uint8)
             readings = readings_of(finder.find(picture), floor, CAMERA, by_a=True)
             several += len(readings) >= 2
-            pose = tag_pose(readings, _FAMILY)
+            pose = tag_pose(readings)
             poses += [pose] if pose is not None else []
     finally:
         capture.release()

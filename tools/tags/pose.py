@@ -25,8 +25,8 @@ _FIT_PX: Final = 1.5
 # A second pose this much less likely (chi-square) is no rival; poses nearer than this are one.
 _RIVAL_CHI2: Final = 9.0
 _SAME_RAD: Final = 0.1
-# Small families read tags into anything: one tag alone is no evidence there.
-_ALONE: Final = ("36h11", "36h10")
+# One tag alone has nothing that checks it: it may be a false one, and glow at a corner turns it unseen.
+_READINGS: Final = 2
 _STEPS: Final = 25
 # Divers' noses and hulls aside, nothing is seen nearer than this.
 _NEAR_M: Final = 0.05
@@ -94,7 +94,7 @@ def readings_of(
     ]
 
 
-def tag_pose(readings: Sequence[Reading], family: str = "36h11") -> TagPose | None:
+def tag_pose(readings: Sequence[Reading]) -> TagPose | None:
     """Return T_a_b from all readings that fit together; None where too few do, or two poses explain them."""
     best: list[Reading] = []
     best_fit: _Fit | None = None
@@ -109,7 +109,7 @@ def tag_pose(readings: Sequence[Reading], family: str = "36h11") -> TagPose | No
                 -_mean(best_fit, best) if best_fit else 0.0,
             ):
                 best, best_fit = chosen, fit
-    if best_fit is None or (len(best) < 2 and family not in _ALONE):
+    if best_fit is None or len(best) < _READINGS:
         return None
     degrees = 8 * len(best) - 6
     variance_px2 = (_PRIOR_COUNT * CORNER_SIGMA_PX**2 + best_fit.squares_px2) / (_PRIOR_COUNT + degrees)
