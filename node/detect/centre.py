@@ -26,11 +26,12 @@ from node.detect.rings import (
     RAYS,
     Floats,
     geometric_radii,
+    luminance,
     sample_rings,
+    weakest_channel,
 )
 
 _RINGS = 16
-_ROUNDS = 2
 _CLIPPED = 249.0
 # What the errors on rendered dives were, against what the equations alone expect.
 _FLOOR_PX = 0.05
@@ -39,7 +40,6 @@ _GROWTH_SCALE = 1.3
 _MOVED_SHARE = 0.1
 _SCATTERED_PX = 1.5
 _ROBUST_SD = 3.0
-LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
 MODEL: Mapping[str, float] = {
     "growth": 0.7,
@@ -98,10 +98,14 @@ def locate_sources(
     growth = _growth(radius_px * 820.0 / model.get("width_px", image.shape[1]), ground, model)
     growth -= np.asarray(model["growth_scatter"] * scattered, np.float32)
     alive = np.ones(len(centre), bool)
-    for i in range(_ROUNDS):
+    prior = np.zeros((len(centre), 4, 4))
+    prior[:, (0, 1), (0, 1)] = 1.0 / prior_sd[:, None] ** 2
+    prior[:, (2, 3), (2, 3)] = 1.0 / model["lean_sd"] ** 2
+    for last in (False, True):
         rings = sample_rings(image, centre, radius)
         system = _Equations(_one_channel(rings.pixels, weakest), rings.inside, radius, log_step, ground, growth, model)
-        x, precision = system.solve(prior_sd, start_px - centre, robust=i == _ROUNDS - 1)
+        x, covariance = system.solve_robust(lean, prior, start_px - centre) if last else system.solve(prior)
+        lean = x[:, 2:]
         step = x[:, :2]
         step *= np.minimum(1.0, (0.6 * radius_px + 1.0) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-6))[:, None]
         moved = centre + step
@@ -109,7 +113,6 @@ def locate_sources(
         strayed = np.hypot(away[:, 0], away[:, 1]) > radius_px + 3.0
         alive &= system.solvable & ~strayed
         centre = np.where(alive[:, None], moved, np.where(strayed[:, None], start_px, centre))
-        covariance, lean = precision, x[:, 2:]
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
     covariance = np.where(alive[:, None, None], covariance, by_prior)
     moved = centre - start_px
@@ -133,13 +136,10 @@ def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Fl
 
 def _one_channel(pixels: Floats, weakest: NDArray[np.bool_]) -> Floats:
     """Give (N, M, K) levels from (N, M, K, C): the weakest channel where asked for, else the luminance."""
-    if pixels.shape[3] == 1:
-        return pixels[..., 0]
-    luma: Floats = pixels @ LUMA_BGR
-    if weakest.any():
-        some = pixels[weakest]
-        luma[weakest] = np.minimum(np.minimum(some[..., 0], some[..., 1]), some[..., 2])
-    return luma
+    level = luminance(pixels)
+    if pixels.shape[3] > 1 and weakest.any():
+        level[weakest] = weakest_channel(pixels[weakest])
+    return level
 
 
 class _Equations:
@@ -181,24 +181,31 @@ class _Equations:
         self._growth = growth[:, None] + model["steepness"] * plain
         self.solvable = seen.sum(axis=1) >= 4
 
-    def solve(self, prior_sd: Floats, prior_px: Floats, robust: bool) -> tuple[Floats, Floats]:
+    def solve(self, prior: Floats) -> tuple[Floats, Floats]:
         """Solve for the step to the source and the lean, (N, 4), and the step's covariance (N, 2, 2).
 
-        prior_sd: (N,) and prior_px: (N, 2), where the source is expected. robust: weigh down what the model does not
-        explain (something in front, another light), and add the growth's own uncertainty.
+        prior: (N, 4, 4) information on both, about zero.
         """
         share = self._glow_share(np.zeros(1, np.float32))
-        x, covariance = self._least_squares(share, prior_sd, prior_px)
-        if not robust:
-            return x[0], covariance[0]
-        u = self._shift * x[0, :, :1] + share[0] * x[0, :, 2:3]
-        v = self._shift * x[0, :, 1:2] + share[0] * x[0, :, 3:4]
+        x, covariance = self._least_squares(share, prior, np.zeros(2))
+        return x[0], covariance[0]
+
+    def solve_robust(self, lean: Floats, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
+        """Solve again, near the solution: as `solve`, with less weight for what the model does not explain.
+
+        That is something in front, or another light. lean: (N, 2) as found before; prior_px: (N, 2) where the prior
+        expects the source. The covariance contains the growth's own uncertainty.
+        """
+        sd = self._model["growth_sd"]
+        share = self._glow_share(np.array([0.0, -sd, sd], np.float32))
         mean = (self._weight * self._y) @ RAY_HARMONICS[:, 0]
         mean /= np.maximum(self._weight @ RAY_HARMONICS[:, 0], 1e-6)
-        residual = self._y - np.stack([mean, u, v], axis=-1) @ RAY_HARMONICS[:, :3].T
+        expected = np.empty((*mean.shape, 3), np.float32)
+        expected[..., 0] = mean
+        expected[..., 1:] = share[0][..., None] * lean[:, None]
+        residual = self._y - expected @ _FIRST_HARMONICS
         self._weight /= 1.0 + self._weight * residual**2 * (1.0 / _ROBUST_SD**2)
-        sd = self._model["growth_sd"]
-        x, covariance = self._least_squares(self._glow_share(np.array([0.0, -sd, sd], np.float32)), prior_sd, prior_px)
+        x, covariance = self._least_squares(share, prior, prior_px)
         apart = _GROWTH_SCALE * 0.5 * (x[2, :, :2] - x[1, :, :2])
         return x[0], _NOISE_SCALE**2 * covariance[0] + apart[:, :, None] * apart[:, None, :]
 
@@ -211,7 +218,7 @@ class _Equations:
         last = np.where(self._seen, log_share, -1e9).max(axis=-1, keepdims=True)
         return np.asarray(np.exp(np.minimum(log_share - last, 0.0)), np.float32)
 
-    def _least_squares(self, share: Floats, prior_sd: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
+    def _least_squares(self, share: Floats, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
         """Solve for (s, k), (S, N, 4), for S shares, each ring's mean eliminated; and the covariances of s."""
         sums = self._weight @ RAY_HARMONICS
         first = (self._weight * self._y) @ RAY_HARMONICS[:, :3]
@@ -228,17 +235,14 @@ class _Equations:
         products[:, :, 2] = share * share
         # Neighbouring samples are correlated: the information is less than their number says.
         less = 1.0 / self._model["inflation"]
-        g = (basis @ level).reshape(-1, 4) * less
-        a = (products @ spread).reshape(-1, 9)[:, _BLOCKS] * less
-        by_prior = np.tile(1.0 / prior_sd**2, len(share))[:, None]
-        g[:, :2] += by_prior * np.tile(prior_px, (len(share), 1))
-        a[:, (0, 1), (0, 1)] += by_prior
-        a[:, (2, 3), (2, 3)] += 1.0 / self._model["lean_sd"] ** 2
-        covariance = np.linalg.inv(a.astype(np.float64))
-        x = (covariance @ g[:, :, None])[:, :, 0].astype(np.float32)
-        shape = share.shape[:2]
-        return x.reshape(*shape, 4), covariance[:, :2, :2].reshape(*shape, 2, 2)
+        g = (basis @ level).reshape(*share.shape[:2], 4) * less
+        g[..., :2] += prior[:, :2, 0].sum(axis=1)[:, None] * prior_px
+        a = (products @ spread).reshape(*share.shape[:2], 9)[..., _BLOCKS] * less + prior
+        covariance = np.linalg.inv(a)
+        x = (covariance @ g[..., None])[..., 0]
+        return x.astype(np.float32), covariance[..., :2, :2]
 
 
+_FIRST_HARMONICS = np.ascontiguousarray(RAY_HARMONICS[:, :3].T)
 _BLOCKS = np.array([[0, 1, 3, 4], [1, 2, 4, 5], [3, 4, 6, 7], [4, 5, 7, 8]])
 """Where the 4x4 normal matrix of (s_u, s_v, k_u, k_v) finds its entries in (ss, sw, ww) x (cc, cs, ss)."""

@@ -19,10 +19,10 @@ from protocol.messages import MAX_BLOBS, Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     {
-        "cavern": {"value_min": 200, "saturation_max": 255, "close_px": 5, "area_min_px": 6},
-        "night_reef": {"value_min": 200, "saturation_max": 255, "close_px": 5, "area_min_px": 6},
-        "lake": {"value_min": 225, "saturation_max": 120, "close_px": 5, "area_min_px": 4},
-        "basin": {"value_min": 240, "saturation_max": 90, "close_px": 3, "area_min_px": 4},
+        "cavern": {"value_min": 250, "saturation_max": 90, "close_px": 5, "area_min_px": 6},
+        "night_reef": {"value_min": 180, "saturation_max": 150, "close_px": 5, "area_min_px": 6},
+        "lake": {"value_min": 180, "saturation_max": 255, "close_px": 5, "area_min_px": 4},
+        "basin": {"value_min": 254, "saturation_max": 90, "close_px": 1, "area_min_px": 4},
     }
 )
 """One set of thresholds a site, as the paper set them by hand; px at a picture 820 px wide."""

@@ -22,6 +22,9 @@ RAY_HARMONICS = np.stack([np.ones(RAYS), RAY_COS, RAY_SIN, RAY_COS**2, RAY_COS *
     np.float32
 )
 """(K, 6): 1, c, s, cc, cs, ss of each ray's direction."""
+LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
+
+_MEAN = np.full(RAYS, 1.0 / RAYS, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,40 +62,13 @@ def geometric_radii(first_px: Floats, last_px: Floats, count: int) -> Floats:
     return radii.astype(np.float32)
 
 
-def follow_edges(
-    level: Floats, inside: NDArray[np.bool_], radius_px: Floats, threshold: Floats
-) -> tuple[Floats, Floats]:
-    """Follow each ray outward to where it first falls below a threshold: the outline of a star-shaped region.
-
-    level: (N, M, K) grey levels on rings of radius_px (N, M); threshold: (N,). The picture's border ends a region,
-    too: inside (N, M, K). Returns the distance to the outline along each ray, (N, K) px, and the share of rays that
-    never fall below the threshold, (N,).
-    """
-    n, m, rays = level.shape
-    below = (level < threshold[:, None, None]) | ~inside
-    first = below.argmax(axis=1)
-    places = np.arange(n)[:, None]
-    ray = np.arange(rays)[None, :]
-    is_open = (first == 0) & ~below[:, 0]
-    first[is_open] = m - 1
-    before = np.maximum(first - 1, 0)
-    outer, inner = level[places, first, ray], level[places, before, ray]
-    share = (inner - threshold[:, None]) / np.maximum(inner - outer, 1e-3)
-    np.clip(share, 0.0, 1.0, out=share)
-    near, far = radius_px[places, before], radius_px[places, first]
-    edge = near + share * (far - near)
-    edge[is_open] = far[is_open]
-    edge[first == 0] *= 0.5
-    return edge, is_open @ np.full(rays, 1.0 / rays, np.float32)
-
-
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """Outlines and moments of star-shaped regions around N places, at S levels.
+    """Outlines and moments of star-shaped regions around N places, in C channels at S levels.
 
-    edge_px: (S, N, K) distance to the outline along each ray; open_share: (S, N) share of rays without one.
-    centre_px: (S, N, 2) centroid relative to the place. radius_px: (S, N) of the circle of equal area. elongation:
-    (S, N) long over short axis.
+    edge_px: (C, S, N, K) distance to the outline along each ray; open_share: (C, S, N) share of rays without one.
+    centre_px: (C, S, N, 2) centroid relative to the place. radius_px: (C, S, N) of the circle of equal area.
+    elongation: (C, S, N) long over short axis.
     """
 
     edge_px: Floats
@@ -102,22 +78,51 @@ class Shapes:
     elongation: Floats
 
 
-def measure_shapes(edge_px: Floats, open_share: Floats, levels: int) -> Shapes:
-    """Measure regions from their outlines' distances along the rays, (S N, K) px."""
+def find_shapes(level: Floats, inside: NDArray[np.bool_], radius_px: Floats, threshold: Floats) -> Shapes:
+    """Follow each ray outward to where it first falls below a threshold, or leaves the picture.
+
+    level: (C, N, M, K) grey levels on rings of radius_px (N, M); inside: (N, M, K); threshold: (C, S, N).
+    """
+    below = (level[:, None] < threshold[..., None, None]) | ~inside
+    first = below.argmax(axis=3)
+    is_open = (first == 0) & ~below[..., 0, :]
+    first[is_open] = level.shape[2] - 1
+    before = np.maximum(first - 1, 0)
+    channel = np.arange(level.shape[0])[:, None, None, None]
+    place = np.arange(level.shape[1])[:, None]
+    ray = np.arange(RAYS)
+    outer, inner = level[channel, place, first, ray], level[channel, place, before, ray]
+    share = (inner - threshold[..., None]) / np.maximum(inner - outer, 1e-3)
+    np.clip(share, 0.0, 1.0, out=share)
+    near, far = radius_px[place, before], radius_px[place, first]
+    edge = near + share * (far - near)
+    edge[is_open] = far[is_open]
+    edge[first == 0] *= 0.5
+    return _measure_shapes(edge, is_open @ _MEAN)
+
+
+def _measure_shapes(edge_px: Floats, open_share: Floats) -> Shapes:
+    """Measure regions from their outlines' distances along the rays, (C, S, N, K) px."""
     square = edge_px * edge_px
-    area = np.maximum(square @ RAY_HARMONICS[:, 0] * (0.5 / RAYS), 1e-6)
-    centre = (square * edge_px) @ RAY_HARMONICS[:, 1:3] / (3.0 * RAYS * area[:, None])
-    second = (square * square) @ RAY_HARMONICS[:, 3:] / (4.0 * RAYS * area[:, None])
-    uu = second[:, 0] - centre[:, 0] ** 2
-    uv = second[:, 1] - centre[:, 0] * centre[:, 1]
-    vv = second[:, 2] - centre[:, 1] ** 2
+    area = np.maximum(square @ _MEAN * 0.5, 1e-6)
+    centre = (square * edge_px) @ RAY_HARMONICS[:, 1:3] / (3.0 * RAYS * area[..., None])
+    second = (square * square) @ RAY_HARMONICS[:, 3:] / (4.0 * RAYS * area[..., None])
+    uu = second[..., 0] - centre[..., 0] ** 2
+    uv = second[..., 1] - centre[..., 0] * centre[..., 1]
+    vv = second[..., 2] - centre[..., 1] ** 2
     mean = 0.5 * (uu + vv)
     spread = np.hypot(0.5 * (uu - vv), uv)
     elongation = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
-    return Shapes(
-        edge_px.reshape(levels, -1, RAYS),
-        open_share.reshape(levels, -1),
-        centre.reshape(levels, -1, 2),
-        np.sqrt(2.0 * area).reshape(levels, -1),
-        elongation.reshape(levels, -1),
-    )
+    return Shapes(edge_px, open_share, centre, np.sqrt(2.0 * area), elongation)
+
+
+def luminance(pixels: Floats) -> Floats:
+    """Give (...,) levels from (..., C) pixels, blue green red or grey."""
+    luma: Floats = pixels[..., 0] if pixels.shape[-1] == 1 else pixels @ LUMA_BGR
+    return luma
+
+
+def weakest_channel(pixels: Floats | NDArray[np.uint8]) -> Floats:
+    """Give (...,) the lowest of three channels: a core is white, and the water colours the glow."""
+    weakest: Floats = np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
+    return weakest

@@ -1,0 +1,163 @@
+"""What the rings around a place tell: outlines, rim, the channel that locates best, and the figures for the score."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.detect.proposals import Proposals
+from node.detect.rings import (
+    Floats,
+    Shapes,
+    find_shapes,
+    geometric_radii,
+    luminance,
+    sample_rings,
+    weakest_channel,
+)
+
+_MAX_MEASURED: Final = 12
+_CORE_RINGS: Final = 7
+_WEAKEST_FROM_PX: Final = 3.0
+_CLIPPED: Final = 249.0
+_LEVELS: Final = np.array([0.9, 0.7, 0.5, 0.3], np.float32)
+_HALF: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Lights:
+    """N bright regions.
+
+    centre_px (N, 2), core_px (N,): the rim, in the channel that locates. ground: (N,) what the water itself shows in
+    that channel. weakest: (N,) whether it is the weakest one, else the luminance. scattered: (N,) 0-1, see
+    _scattered. peak, height: (N,) luminance. edge_px: (N, K) outline at half height around edge_at_px (N, 2), of
+    area_px, elongation and open_share (of rays that find no edge). contrast, clutter: (N,) as proposed.
+    """
+
+    centre_px: Floats
+    core_px: Floats
+    ground: Floats
+    weakest: NDArray[np.bool_]
+    scattered: Floats
+    peak: Floats
+    height: Floats
+    edge_px: Floats
+    edge_at_px: Floats
+    area_px: Floats
+    elongation: Floats
+    open_share: Floats
+    contrast: Floats
+    clutter: Floats
+
+
+def measure_lights(
+    image: NDArray[np.uint8], base: NDArray[np.uint8], base_step_px: float, proposals: Proposals
+) -> Lights:
+    """Measure what was proposed in a BGR (H, W, 3) or grey (H, W) picture; base: its grey, base_step_px a pixel."""
+    centre, radius_px, proposals = _settle(base, base_step_px, proposals)
+    radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), 16)
+    rings = sample_rings(image, centre, radius)
+    colour = image.ndim == 3
+    level = np.empty((1 + colour, *rings.inside.shape), np.float32)
+    level[0] = luminance(rings.pixels)
+    if colour:
+        level[1] = weakest_channel(rings.pixels)
+    peak = np.minimum(level[:, :, :_CORE_RINGS].max(axis=(2, 3)), _CLIPPED)
+    ground = _low(level[:, :, -4:], 0.2)
+    if colour:
+        np.minimum(ground[1], _water_level(image), out=ground[1])
+    height = peak - ground
+    shapes = find_shapes(level, rings.inside, radius, ground[:, None] + _LEVELS[:, None] * height[:, None])
+    rim_px, core_px = _rims(shapes)
+    # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
+    weakest = shapes.radius_px[-1, :2].mean(axis=0) >= _WEAKEST_FROM_PX if colour else np.zeros(len(radius), bool)
+    return Lights(
+        centre + np.where(weakest[:, None], rim_px[-1], rim_px[0]),
+        np.where(weakest, core_px[-1], core_px[0]),
+        np.where(weakest, ground[-1], ground[0]),
+        weakest,
+        _scattered(shapes, peak[0]),
+        peak[0],
+        height[0],
+        shapes.edge_px[0, _HALF],
+        centre,
+        np.pi * shapes.radius_px[0, _HALF] ** 2,
+        shapes.elongation[0, _HALF],
+        shapes.open_share[0, _HALF],
+        proposals.contrast,
+        proposals.clutter,
+    )
+
+
+def distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
+    """Leave out what lies inside an earlier one; give the indices of the rest. centre_px: (N, 2); radius_px: (N,)."""
+    apart = np.hypot(centre_px[:, None, 0] - centre_px[:, 0], centre_px[:, None, 1] - centre_px[:, 1])
+    same = (apart < np.maximum(0.7 * np.maximum(radius_px[:, None], radius_px), 2.0)).tolist()
+    kept: list[int] = []
+    for i, row in enumerate(same):
+        if not any(row[k] for k in kept):
+            kept.append(i)
+    return np.array(kept, np.intp)
+
+
+def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) -> tuple[Floats, Floats, Proposals]:
+    """Move each proposal to the middle of its bright region, and leave out those that end up in one.
+
+    Returns centres (N, 2) and radii (N,) in px of the whole picture, and the proposals they were.
+    """
+    scale = np.float32(base_step_px)
+    step = proposals.step_px / scale
+    at = (proposals.centre_px + 0.5) / scale - 0.5
+    radius = geometric_radii(0.35 * step, 7.0 * step, 12)
+    rings = sample_rings(base, at, radius)
+    level = rings.pixels[None, ..., 0]
+    peak = np.minimum(level[:, :, :7].max(axis=(2, 3)), _CLIPPED)
+    ground = _low(level[:, :, -4:], 0.2)
+    shapes = find_shapes(level, rings.inside, radius, (ground + 0.8 * (peak - ground))[:, None])
+    centre = (at + shapes.centre_px[0, 0] + 0.5) * scale - 0.5
+    radius_px = shapes.radius_px[0, 0] * scale
+    kept = distinct(centre, radius_px)[:_MAX_MEASURED]
+    return centre[kept], radius_px[kept], proposals.at(kept)
+
+
+def _low(level: Floats, share: float) -> Floats:
+    """Give the level that a share of each place's samples lies below: (C, N) from (C, N, M, K)."""
+    flat = level.reshape(*level.shape[:2], -1)
+    k = int(share * flat.shape[2])
+    return np.partition(flat, k, axis=2)[:, :, k]
+
+
+def _rims(shapes: Shapes) -> tuple[Floats, Floats]:
+    """Give each light's rim, where its profile falls the fastest: centres (C, N, 2), radii (C, N).
+
+    It is the lamp's own face where that shows, and the edge of what is clipped where the glow is all there is.
+    """
+    radius, centre = shapes.radius_px, shapes.centre_px
+    fall = 1.0 / np.maximum(radius[:, 1:] - radius[:, :-1], 0.15)
+    k = fall.argmax(axis=1)
+    channel, place = np.arange(k.shape[0])[:, None], np.arange(k.shape[1])
+    return (
+        0.5 * (centre[channel, k, place] + centre[channel, k + 1, place]),
+        0.5 * (radius[channel, k, place] + radius[channel, k + 1, place]),
+    )
+
+
+def _scattered(shapes: Shapes, peak: Floats) -> Floats:
+    """Tell dim lights that show only what the water scatters, (N,) 0-1: not clipped, and yet with a halo.
+
+    A core's own profile falls as steeply below half its height as above it; a glow flattens out.
+    """
+    flattening = shapes.radius_px[0, _HALF + 1] / shapes.radius_px[0, _HALF]
+    halo = np.clip((flattening - 1.35) / 0.2, 0.0, 1.0)
+    dim = np.clip((240.0 - peak) / 40.0, 0.0, 1.0)
+    return np.asarray(halo * dim, np.float32)
+
+
+def _water_level(image: NDArray[np.uint8]) -> Floats:
+    """Give what a fifth of a BGR picture lies below, in the weakest channel."""
+    weak = weakest_channel(image[::16, ::16]).ravel()
+    k = len(weak) // 5
+    return np.asarray(np.partition(weak, k)[k], np.float32)
