@@ -22,7 +22,7 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "cavern": {"value_min": 250, "saturation_max": 90, "close_px": 5, "area_min_px": 6},
         "night_reef": {"value_min": 180, "saturation_max": 150, "close_px": 5, "area_min_px": 6},
         "lake": {"value_min": 180, "saturation_max": 255, "close_px": 5, "area_min_px": 4},
-        "basin": {"value_min": 200, "saturation_max": 90, "close_px": 5, "area_min_px": 4},
+        "basin": {"value_min": 200, "saturation_max": 255, "close_px": 5, "area_min_px": 4},
     }
 )
 """One set of thresholds a site, as the paper set them by hand; px at a picture 820 px wide.
