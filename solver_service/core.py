@@ -42,10 +42,17 @@ class SolverCore:
 
     clock_offset_ns: b's clock minus a's, where it is known; b's times are brought to a's clock by it.
     `counts` holds what became of the triggers ("solved" and the reasons), `late`, `duplicates`, `foreign`
-    what was not used. `alignment` says what the dive tells of the clocks' offset.
+    what was not used. alignment: collects what the fixes tell of the clocks' offset, for whoever wants to know.
     """
 
-    def __init__(self, node_a: str, node_b: str, settings: Settings, clock_offset_ns: int = 0) -> None:
+    def __init__(
+        self,
+        node_a: str,
+        node_b: str,
+        settings: Settings,
+        clock_offset_ns: int = 0,
+        alignment: ClockAlignment | None = None,
+    ) -> None:
         if node_a == node_b:
             raise ValueError(f"the two nodes have the same id, {node_a!r}")
         self.node_a = node_a
@@ -64,7 +71,7 @@ class SolverCore:
         self._newest_resolved = -1
         self._prior = PosePrior()
         self._clock_offset_ns = clock_offset_ns
-        self.alignment = ClockAlignment()
+        self._alignment = alignment
 
     @property
     def received(self) -> tuple[int, int]:
@@ -227,23 +234,13 @@ class SolverCore:
         if not isinstance(outcome, Fix):
             return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
         self._prior.update(stamp_ns, outcome)
-        self._align(frame_a, frame_b, info_a, info_b, (rig_a, rig_b), outcome)
+        if self._alignment is not None:
+            known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
+            sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px
+            self._alignment.add(frame_a.stamp_ns, outcome, (rig_a, rig_b), known_s, sigma_rad)
         self._finish(frame_a.trigger)
         self.counts["solved"] += 1
         return relative_pose(frame_a, frame_b, rig_a, sensed_a, outcome)
-
-    def _align(
-        self,
-        frame_a: Candidates,
-        frame_b: Candidates,
-        info_a: NodeInfo,
-        info_b: NodeInfo,
-        rigs: tuple[Rig, Rig],
-        fix: Fix,
-    ) -> None:
-        known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
-        sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px
-        self.alignment.add(frame_a.stamp_ns, fix, rigs, known_s, sigma_rad)
 
     def _reject(self, frame: Candidates, reason: Reason, detail: str, stamp_ns: int | None = None) -> Rejected:
         self._finish(frame.trigger, newest=reason != "late")

@@ -16,7 +16,7 @@ from protocol.clock import S_NS, Clock, SystemClock
 from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
 from protocol.service import Service
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key
-from solver_service.alignment import ClockOffset
+from solver_service.alignment import ClockAlignment, ClockOffset
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
 from solver_service.health import NodeHealth
@@ -56,6 +56,7 @@ class SolverService(Service):
         self._alive: set[str] = set()
         self._health: NodeHealth | None = None
         self._reported_bad = ""
+        self._alignment = ClockAlignment()
         self._offset: ClockOffset | None = None
         self._aligned_s = time.monotonic()
         if config.nodes:
@@ -142,7 +143,7 @@ class SolverService(Service):
         return results
 
     def _pair(self, node_a: str, node_b: str) -> SolverCore:
-        self._core = SolverCore(node_a, node_b, self._settings)
+        self._core = SolverCore(node_a, node_b, self._settings, alignment=self._alignment)
         self._health = NodeHealth(node_a, node_b)
         for name in self._alive:
             self._health.saw_process(name, True)
@@ -184,7 +185,7 @@ class SolverService(Service):
             problems.append(self._reported_bad)
             self._reported_bad = ""
         if now_s - self._aligned_s > ALIGN_EVERY_S:
-            found = core.alignment.estimate()
+            found = self._alignment.estimate()
             self._offset = found if found is not None and found.sigma_s < REPORTED_OFFSET_SIGMA_S else None
             self._aligned_s = now_s
         offset = self._offset

@@ -11,7 +11,7 @@ from typing import Final
 from protocol.clock import S_NS
 from protocol.errors import BuddylineError
 from protocol.messages import MessageError
-from solver_service.alignment import ClockOffset
+from solver_service.alignment import ClockAlignment, ClockOffset
 from solver_service.config import SolveConfig
 from solver_service.core import SolverCore
 from tools.dives import Dive
@@ -64,13 +64,15 @@ def run(args: argparse.Namespace) -> int:
 def _pass(
     dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
 ) -> ClockOffset | None:
-    core = SolverCore(*pair, SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align"), round(offset_s * S_NS))
+    alignment = ClockAlignment()
+    settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
+    core = SolverCore(*pair, settings, round(offset_s * S_NS), alignment)
     with Progress(f"align, pass {number}", (dive.end_ns - dive.start_ns) / S_NS) as progress:
-        for _, message, log_time_ns in messages_of(dive, args, dive.infos(), *pair):
+        for _, message, _, log_time_ns in messages_of(dive, args, dive.infos(), *pair):
             progress.show((log_time_ns - dive.start_ns) / S_NS)
             if not isinstance(message, MessageError):
                 core.handle(message)
     core.flush()
     if not core.counts["solved"]:
         raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
-    return core.alignment.estimate()
+    return alignment.estimate()

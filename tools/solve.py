@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
             with Progress("solve", (dive.end_ns - dive.start_ns) / 1e9) as progress:
-                for key, message, log_time_ns in messages_of(dive, args, infos, node_a, node_b):
+                for key, message, payload, log_time_ns in messages_of(dive, args, infos, node_a, node_b):
                     progress.show((log_time_ns - dive.start_ns) / 1e9)
                     if isinstance(message, MessageError):
                         bad += 1
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
                         continue
                     if isinstance(message, NodeInfo) and message.node in replaced:
                         continue
-                    writer.write(key, encode(message), log_time_ns)
+                    writer.write(key, payload, log_time_ns)
                     _write(writer, core.handle(message))
             _write(writer, core.flush())
         for text in dive.damage:
@@ -139,8 +139,11 @@ def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
 
 def messages_of(
     dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str
-) -> Iterator[tuple[str, Message | MessageError, int]]:
-    """Yield what the solver and the output need, decoded; pictures of a node without candidates are detected."""
+) -> Iterator[tuple[str, Message | MessageError, bytes, int]]:
+    """Yield what the solver and the output need: key, message, its payload, log time.
+
+    The pictures of a node without candidates are detected.
+    """
     raw = [node for node in pair if node not in dive.nodes("candidates")]
     detector = None
     if raw:
@@ -157,15 +160,15 @@ def messages_of(
             if message is not None and getattr(message, "node", parsed[1][0]) != parsed[1][0]:
                 raise MessageError(f"node {getattr(message, 'node', None)!r} on key {record.key}")
         except MessageError as error:
-            yield record.key, error, record.log_time_ns
+            yield record.key, error, record.payload, record.log_time_ns
             continue
         if isinstance(message, CompressedImage):
             if detector is not None and parsed[1][0] in raw:
                 found = detector.candidates(message)
                 if found is not None:
-                    yield CANDIDATES.key(found.node), found, record.log_time_ns
+                    yield CANDIDATES.key(found.node), found, encode(found), record.log_time_ns
         elif message is not None:
-            yield record.key, message, record.log_time_ns
+            yield record.key, message, record.payload, record.log_time_ns
 
 
 def _write(writer: DiveLogWriter, results: list[RelativePose | Rejected]) -> None:

@@ -102,11 +102,12 @@ def test_too_few_fixes_tell_nothing():
 
 def test_a_dive_with_a_clock_that_is_off():
     messages, _ = dive_messages(seconds=15, seed=1, clock_offset_ns=50_000_000, range_max_m=3.0)
-    core = SolverCore("a", "b", Settings(skew_sigma_s=0.05))
+    alignment = ClockAlignment()
+    core = SolverCore("a", "b", Settings(skew_sigma_s=0.05), alignment=alignment)
     for message in messages:
         core.handle(message)
     core.flush()
-    found = core.alignment.estimate()
+    found = alignment.estimate()
     assert abs(found.offset_s - 0.05) < 4 * found.sigma_s + 0.005
     corrected = SolverCore("a", "b", Settings(), clock_offset_ns=50_000_000)
     results = [result for message in messages for result in corrected.handle(message)]
