@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import json
+import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
@@ -18,6 +19,7 @@ import zenoh.ext
 
 from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name, held_order
 from protocol.clock import Clock, SystemClock
+from protocol.connection import cut_connection
 from protocol.delivery import CLOSE_S, Delivery, FailureLatch, RateCap
 from protocol.endpoint import DEFAULT_ENDPOINT, client_settings, hub_settings
 from protocol.errors import BuddylineError
@@ -31,6 +33,10 @@ ALIVE: Final = "buddyline/@alive"
 HEARTBEAT_S: Final = 0.25
 RETRY_S: Final = 0.25
 QUERY_S: Final = 2.0
+# Longer than the lease: a link that fell silent ends by that, and its questions with it.
+PROBE_S: Final = 4.0
+PROBE_EVERY_S: Final = 2.0
+PROBES: Final = 2
 INTAKE: Final = 8192
 MAX_FETCHING: Final = 16
 FETCHES: Final = 16
@@ -46,6 +52,9 @@ _PRIORITIES: Final = {
 AnySubscriber: TypeAlias = (
     zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]
 )
+
+
+log = logging.getLogger(__name__)
 
 
 def _config(settings: Mapping[str, object]) -> zenoh.Config:
@@ -187,6 +196,56 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
     if errors and not isinstance(errors[0], zenoh.ZError):
         raise errors[0]
     return opened[0] if opened else None
+
+
+class Watchdog:
+    """Ends a connection on which nothing comes in, so that Zenoh makes a new one.
+
+    Zenoh (1.10) gives up a connection that takes too long to open. Where that falls between its sending and its
+    receiving being started, half of it is left: the hub is content, and this end hears nothing, for good.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="bus watchdog", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Look no longer; join() waits for the end of a look that has begun, once the session is closed."""
+        self._stop.set()
+
+    def join(self) -> None:
+        """Wait for the thread's end."""
+        self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        answered, strikes = False, 0
+        while not self._stop.wait(PROBE_EVERY_S):
+            try:
+                timed_out = self._probe()
+            except zenoh.ZError:
+                continue
+            # A hub that answers nobody's question is not judged by it.
+            answered = answered or not timed_out
+            strikes = strikes + 1 if timed_out and answered else 0
+            if strikes == PROBES:
+                strikes = 0
+                self._cut()
+
+    def _probe(self) -> bool:
+        """Ask the hub for nothing; return whether the answer, which is that there is nothing, did not come.
+
+        Where there is no hub, or its lease runs out meanwhile, that is the answer.
+        """
+        replies = self._session.liveliness().get(f"{ALIVE}/probe", timeout=PROBE_S)
+        return any(reply.err is not None for reply in list(replies))
+
+    def _cut(self) -> None:
+        for link in self._session.info.links():
+            host, _, port = str(link.src).partition("/")[2].rpartition(":")
+            if cut_connection(host.strip("[]"), int(port)):
+                log.warning("the hub was not heard for %g s: the connection is made anew", PROBES * PROBE_S)
 
 
 class BulkLink:
@@ -493,6 +552,7 @@ class ZenohBus(Bus):
         self._bulk = BulkLink(config)
         self._cache_s = cache_s
         self._tokens: list[zenoh.LivelinessToken] = []
+        self._watchdog = Watchdog(session)
         # A thread that is still inside Zenoh when the interpreter ends aborts the process.
         atexit.register(self.close)
 
@@ -561,5 +621,7 @@ class ZenohBus(Bus):
 
     def _leave(self) -> None:
         atexit.unregister(self.close)
+        self._watchdog.stop()
         self._session.close()  # type: ignore[no-untyped-call]
+        self._watchdog.join()
         self._bulk.close()

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -18,6 +18,7 @@ import zenoh
 
 from protocol import topics, zenoh_bus
 from protocol.bus import Bus, Received
+from protocol.connection import cut_connection
 from protocol.errors import BuddylineError
 from protocol.zenoh_bus import connect, open_hub
 
@@ -85,6 +86,14 @@ def run_client(endpoint: str, **more: object) -> Bus:
 
 def numbers(received: list[Received]) -> list[int]:
     return [int(r.payload) for r in received]
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for what no event announces."""
+    deadline_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
 
 
 class Inbox:
@@ -262,6 +271,50 @@ def test_closing_does_not_wait_for_a_hub_that_is_gone_or_frozen() -> None:
             closer.join(2.0)
             assert not closer.is_alive(), fault
             hub.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/fd"), reason="needs /proc")
+def test_a_connection_that_hears_nothing_is_made_anew(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Half a connection, as Zenoh may leave it: here its other end stands still for less than the lease."""
+    for name, value in (("PROBE_S", 0.2), ("PROBE_EVERY_S", 0.05)):
+        monkeypatch.setattr(zenoh_bus, name, value)
+    endpoint, inbox, answers = free_endpoint(), Inbox(), []
+    ask = zenoh_bus.Watchdog._probe
+
+    def probe(watchdog: zenoh_bus.Watchdog) -> bool:
+        answers.append(ask(watchdog))
+        return answers[-1]
+
+    monkeypatch.setattr(zenoh_bus.Watchdog, "_probe", probe)
+    with hub_process(endpoint) as hub, run_client(endpoint) as node, run_client(endpoint) as solver:
+        until(lambda: len(answers) > 4)
+        assert not any(answers)
+        solver.subscribe("buddyline/node/*/depth", inbox)
+        publisher = node.publisher(topics.DEPTH, "a")
+        publisher.put_bytes(b"0")
+        inbox.wait_for(1)
+        hub.send_signal(signal.SIGSTOP)
+        until(lambda: "not heard" in caplog.text)
+        publisher.put_bytes(b"1")
+        hub.send_signal(signal.SIGCONT)
+        publisher.put_bytes(b"2")
+        assert inbox.wait_for(3) == [0, 1, 2]
+
+
+def test_only_the_connection_asked_for_is_cut() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
+        with socket.create_connection(address) as first, socket.create_connection(address) as second:
+            ends = [server.accept()[0] for _ in range(2)]
+            assert cut_connection(*first.getsockname())
+            assert ends[0].recv(1) == b""
+            second.sendall(b"x")
+            assert ends[1].recv(1) == b"x"
+            for end in ends:
+                end.close()
+        assert not cut_connection("127.0.0.1", 1)
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs /proc")

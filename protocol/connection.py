@@ -1,0 +1,33 @@
+"""Ending a TCP connection of this process from outside whatever holds it."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Final
+
+_DESCRIPTORS: Final = "/proc/self/fd"
+
+
+def cut_connection(host: str, port: int) -> bool:
+    """Shut down this process's connection whose own end is host:port; False where there is none, or no /proc.
+
+    Whoever holds it finds it broken at its next read or write.
+    """
+    try:
+        descriptors = os.listdir(_DESCRIPTORS)
+    except OSError:
+        return False
+    for descriptor in descriptors:
+        try:
+            if not os.readlink(f"{_DESCRIPTORS}/{descriptor}").startswith("socket:"):
+                continue
+            # A copy: the descriptor itself is not ours to close.
+            with socket.socket(fileno=os.dup(int(descriptor))) as connection:
+                if connection.type == socket.SOCK_STREAM and connection.getsockname()[:2] == (host, port):
+                    connection.shutdown(socket.SHUT_RDWR)
+                    return True
+        except OSError:
+            # It was closed meanwhile, or is of a kind that has no name.
+            continue
+    return False
