@@ -62,10 +62,10 @@ class NoFix:
 # Poses nearer than this, relative to the range and in rad, are one pose.
 _SAME_POSITION: Final = 0.04
 _SAME_ROTATION: Final = 0.1
-# Three lights have no gap to check them: they must be likelier than four, and their position sure to this share of
-# the range (1 sd).
+# Three lights have no gap to check them: they must be likelier than four.
 _THREE_PROBABILITY: Final = 0.98
-_THREE_SIGMA: Final = 0.02
+# A position that is known to this share of the range (1 sd) is no wrong one.
+_SURE_POSITION: Final = 0.02
 # Odds of a false candidate among four lights from which on three are tried.
 _POOR_FIT: Final = 2e-3
 # What is this much less likely widens no covariance.
@@ -126,14 +126,13 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     ratio = np.exp(readings.log_ratio)
     same = ((t - t[k]) ** 2).sum(1) < (_SAME_POSITION * range_m) ** 2
     same &= (R * R[k]).sum((1, 2)) > 1.0 + 2.0 * math.cos(_SAME_ROTATION)
-    intruder = float(ratio[k] * readings.intruder[k])
-    probability = float(ratio[same].sum() / (CHANCE_ODDS + ratio.sum() + others + intruder))
     short = bool((readings.lights[k] < 0).any())
-    if short:
-        sigma_m = math.sqrt(float(readings.covariance[k].diagonal()[:3].sum()))
-        if sigma_m > _THREE_SIGMA * range_m:
-            why = f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only"
-            return NoFix("ambiguous", why)
+    sigma_m = math.sqrt(float(readings.covariance[k].diagonal()[:3].sum()))
+    if short and sigma_m > _SURE_POSITION * range_m:
+        return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
+    # A false candidate in a light's place is off by as much as the covariance has been widened for.
+    intruder = float(ratio[k] * readings.intruder[k]) if sigma_m > _SURE_POSITION * range_m else 0.0
+    probability = float(ratio[same].sum() / (CHANCE_ODDS + ratio.sum() + others + intruder))
     if probability >= (max(settings.min_probability, _THREE_PROBABILITY) if short else settings.min_probability):
         # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
         alone = np.exp(readings.log_ratio - readings.log_prior)
