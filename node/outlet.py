@@ -12,7 +12,6 @@ from protocol.topics import Topic, key_of, topic_of
 
 if TYPE_CHECKING:
     from protocol.bus import Bus, Publisher
-
     from protocol.recorder import Recorder
 
 
