@@ -86,9 +86,7 @@ def locate_sources(
     but only what the water scatters.
     """
     prior_sd = model["core_share"] * radius_px + 0.5
-    by_prior = np.eye(2, dtype=np.float32) * (prior_sd**2)[:, None, None]
-    centre = start_px.astype(np.float32)
-    covariance, lean = by_prior, np.zeros_like(centre)
+    centre: Floats = start_px.astype(np.float32)
     radius = geometric_radii(
         np.maximum(model["inner"] * radius_px, 0.7),
         np.maximum(model["outer"] * radius_px, model["outer_min_px"]),
@@ -97,28 +95,23 @@ def locate_sources(
     log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
     growth = _growth(radius_px * 820.0 / model.get("width_px", image.shape[1]), ground, model)
     growth -= np.asarray(model["growth_scatter"] * scattered, np.float32)
-    alive = np.ones(len(centre), bool)
     prior = np.zeros((len(centre), 4, 4))
     prior[:, (0, 1), (0, 1)] = 1.0 / prior_sd[:, None] ** 2
     prior[:, (2, 3), (2, 3)] = 1.0 / model["lean_sd"] ** 2
-    for last in (False, True):
-        rings = sample_rings(image, centre, radius)
-        system = _Equations(_one_channel(rings.pixels, weakest), rings.inside, radius, log_step, ground, growth, model)
-        x, covariance = system.solve_robust(lean, prior, start_px - centre) if last else system.solve(prior)
-        lean = x[:, 2:]
-        step = x[:, :2]
-        step *= np.minimum(1.0, (0.6 * radius_px + 1.0) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-6))[:, None]
-        moved = centre + step
-        away = moved - start_px
-        strayed = np.hypot(away[:, 0], away[:, 1]) > radius_px + 3.0
-        alive &= system.solvable & ~strayed
-        centre = np.where(alive[:, None], moved, np.where(strayed[:, None], start_px, centre))
+    first = _Equations(image, centre, radius, log_step, ground, weakest, growth, model)
+    x, _ = first.solve(prior)
+    centre = np.where(first.solvable[:, None], centre + x[:, :2], centre)
+    again = _Equations(image, centre, radius, log_step, ground, weakest, growth, model)
+    x, covariance = again.solve_robust(x[:, 2:], prior, start_px - centre)
+    found = centre + x[:, :2]
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
-    covariance = np.where(alive[:, None, None], covariance, by_prior)
-    moved = centre - start_px
-    covariance = covariance + _MOVED_SHARE**2 * moved[:, :, None] * moved[:, None, :]
-    covariance += np.eye(2) * (_FLOOR_PX**2 + (_SCATTERED_PX * scattered) ** 2)[:, None, None]
-    return Centres(centre, covariance, np.where(alive[:, None], lean, 0.0))
+    moved = found - start_px
+    holds = first.solvable & again.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
+    moved *= holds[:, None]
+    own_px2 = np.where(holds, _FLOOR_PX**2 + (_SCATTERED_PX * scattered) ** 2, prior_sd**2)
+    covariance = covariance * holds[:, None, None] + own_px2[:, None, None] * np.eye(2)
+    covariance += _MOVED_SHARE**2 * moved[:, :, None] * moved[:, None, :]
+    return Centres(start_px + moved, covariance, x[:, 2:] * holds[:, None])
 
 
 def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
@@ -147,17 +140,20 @@ class _Equations:
 
     def __init__(
         self,
-        level: Floats,
-        inside: NDArray[np.bool_],
+        image: NDArray[np.uint8],
+        centre_px: Floats,
         radius: Floats,
         log_step: Floats,
         ground: Floats,
+        weakest: NDArray[np.bool_],
         growth: Floats,
         model: Mapping[str, float],
     ) -> None:
         self._model = model
+        rings = sample_rings(image, centre_px, radius)
+        level = _one_channel(rings.pixels, weakest)
         above = level - ground[:, None, None]
-        usable = inside & (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        usable = rings.inside & (level < _CLIPPED) & (above > 3.0 * model["noise"])
         np.maximum(above, 1.0, out=above)
         self._y = np.log(above)
         np.divide(model["noise"], above, out=above)

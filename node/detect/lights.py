@@ -111,11 +111,11 @@ def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) 
     scale = np.float32(base_step_px)
     step = proposals.step_px / scale
     at = (proposals.centre_px + 0.5) / scale - 0.5
-    radius = geometric_radii(0.35 * step, 7.0 * step, 12)
+    radius = geometric_radii(0.4 * step, 7.0 * step, 10)
     rings = sample_rings(base, at, radius)
     level = rings.pixels[None, ..., 0]
-    peak = np.minimum(level[:, :, :7].max(axis=(2, 3)), _CLIPPED)
-    ground = _low(level[:, :, -4:], 0.2)
+    peak = np.minimum(level[:, :, :5].max(axis=(2, 3)), _CLIPPED)
+    ground = _low(level[:, :, -3:], 0.2)
     shapes = find_shapes(level, rings.inside, radius, (ground + 0.8 * (peak - ground))[:, None])
     centre = (at + shapes.centre_px[0, 0] + 0.5) * scale - 0.5
     radius_px = shapes.radius_px[0, 0] * scale

@@ -13,6 +13,7 @@ _BASE_WIDTH_PX = 512
 _SMALLEST_PX = 5
 _CLUTTER_CELL = 4
 _WORD = 8
+_WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
@@ -41,23 +42,27 @@ class _Octave:
     """Working memory of one octave. contrast and marks are parts of arrays that hold all octaves, end to end."""
 
     level: NDArray[np.uint8]
-    centre: NDArray[np.uint8]
     surround: NDArray[np.uint8]
     contrast: NDArray[np.uint8]
     marks: NDArray[np.uint8]
     clutter: NDArray[np.uint8]
 
-    def mark_maxima(self, contrast_min: float) -> None:
-        """Mark the local maxima of centre minus surround, and measure the neighbourhoods' mean contrast."""
-        cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.centre)
-        cv2.blur(self.level, (9, 9), dst=self.surround)
-        cv2.subtract(self.centre, self.surround, dst=self.contrast)
-        coarse = halve(halve(self.contrast))
-        cv2.blur(coarse, (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
-        cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.centre)
-        cv2.compare(self.contrast, self.centre, cv2.CMP_EQ, dst=self.centre)
+    def mark_maxima(self, contrast_min: float, below: NDArray[np.uint8] | None) -> None:
+        """Mark the local maxima of centre minus surround, and measure the neighbourhoods' mean contrast.
+
+        below: the level of the next octave, of which the surround is made.
+        """
+        cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.contrast)
+        if below is None:
+            cv2.blur(self.level, (9, 9), dst=self.surround)
+        else:
+            cv2.pyrUp(cv2.blur(below, (5, 5)), dst=self.surround, dstsize=self.level.shape[::-1])
+        cv2.subtract(self.contrast, self.surround, dst=self.contrast)
+        cv2.blur(halve(halve(self.contrast)), (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
+        cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.surround)
+        cv2.compare(self.contrast, self.surround, cv2.CMP_EQ, dst=self.marks)
         cv2.threshold(self.contrast, contrast_min - 0.5, 255, cv2.THRESH_BINARY, dst=self.surround)
-        cv2.bitwise_and(self.centre, self.surround, dst=self.marks)
+        cv2.bitwise_and(self.marks, self.surround, dst=self.marks)
 
 
 class ProposalFinder:
@@ -81,33 +86,35 @@ class ProposalFinder:
         """Find at most `limit` places in a (H, W, 3) BGR or (H, W) grey picture."""
         if image.shape != self._shape:
             self._allocate(image.shape)
-        above: NDArray[np.uint8] | None = None
-        for octave in self._octaves:
-            if above is None:
+        below: NDArray[np.uint8] | None = None
+        for i, octave in enumerate(self._octaves):
+            if i == 0:
                 self._fill_base(image, octave.level)
             else:
-                halve(above, octave.level)
-            above = octave.level
-            octave.mark_maxima(contrast_min)
+                halve(self._octaves[i - 1].level, octave.level)
+        for octave in reversed(self._octaves):
+            octave.mark_maxima(contrast_min, below)
+            below = octave.level
 
         # Empty places are passed over a machine word at a time.
-        places = (np.flatnonzero(self._marks.view(np.uint64))[:, None] * _WORD + np.arange(_WORD)).ravel()
+        places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()
         places = places[self._marks[places] > 0]
         which = np.searchsorted(self._table[:, 0], places, side="right") - 1
-        start, width, cell_start, cell_rows, cell_columns = self._table[which].T
+        start, width, cell_start, last_cell_row, cell_columns = self._table[which].T
         rows, columns = np.divmod(places - start, width)
-        cells = (
-            cell_start
-            + np.minimum(rows // _CLUTTER_CELL, cell_rows - 1) * cell_columns
-            + np.minimum(columns // _CLUTTER_CELL, cell_columns - 1)
-        )
+        cells = np.minimum(rows // _CLUTTER_CELL, last_cell_row) * cell_columns
+        cells += np.minimum(columns // _CLUTTER_CELL, cell_columns - 1) + cell_start
         contrast = self._contrast[places].astype(np.float32)
         clutter = self._clutter[cells].astype(np.float32)
-        order = np.argsort(-contrast / (_NOISE + clutter), kind="stable")
-        order = order[contrast[order] >= contrast_min + clutter_gain * clutter[order]][:limit]
-        step = np.float32(self._base_step_px) * np.exp2(which[order]).astype(np.float32)
-        at = np.stack([columns[order], rows[order]], axis=1).astype(np.float32)
-        return Proposals((at + 0.5) * step[:, None] - 0.5, step, contrast[order], clutter[order])
+        outstanding = contrast / (_NOISE + clutter)
+        outstanding[contrast < contrast_min + clutter_gain * clutter] = 0.0
+        order = np.argsort(-outstanding, kind="stable")[:limit]
+        order = order[outstanding[order] > 0.0]
+        step = np.float32(self._base_step_px) * np.exp2(which[order], dtype=np.float32)
+        centre_px = np.empty((len(order), 2), np.float32)
+        centre_px[:, 0] = columns[order]
+        centre_px[:, 1] = rows[order]
+        return Proposals((centre_px + 0.5) * step[:, None] - 0.5, step, contrast[order], clutter[order])
 
     @property
     def base(self) -> tuple[NDArray[np.uint8], float]:
@@ -135,11 +142,11 @@ class ProposalFinder:
         self._contrast = np.zeros(int(starts[-1]), np.uint8)
         self._clutter = np.zeros(int(cell_starts[-1]), np.uint8)
         self._table = np.array(
-            [(s, w, cs, *c) for s, (_, w), cs, c in zip(starts, sizes, cell_starts, cells, strict=False)], np.int64
+            [(s, w, cs, c[0] - 1, c[1]) for s, (_, w), cs, c in zip(starts, sizes, cell_starts, cells, strict=False)],
+            np.int64,
         ).reshape(-1, 5)
         self._octaves = [
             _Octave(
-                np.empty(size, np.uint8),
                 np.empty(size, np.uint8),
                 np.empty(size, np.uint8),
                 self._contrast[start : start + size[0] * size[1]].reshape(size),
@@ -150,16 +157,25 @@ class ProposalFinder:
         ]
 
     def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
-        """Halve down to the pyramid's base; colours merge after the first halving."""
+        """Halve down to the pyramid's base; colours merge after the first halving.
+
+        Where the picture is to be quartered or less, every other row will do: the blur of a lens that resolves so
+        many pixels is wider than two of them.
+        """
         level = image
-        for half in self._halves:
-            level = halve(level, half)
-            if level.ndim == 3:
-                level = np.asarray(cv2.cvtColor(level, cv2.COLOR_BGR2GRAY), np.uint8)
-        if level.ndim == 3:
-            cv2.cvtColor(level, cv2.COLOR_BGR2GRAY, dst=base)
-        else:
-            base[...] = level
+        halves = self._halves
+        if len(halves) > 1:
+            height, width = halves[1].shape
+            level = halve(_grey(level[: 4 * height : 2, : 4 * width]))
+            level = np.asarray(cv2.resize(level, (width, height), dst=halves[1]), np.uint8)
+            halves = halves[2:]
+        for half in halves:
+            level = _grey(halve(level, half))
+        base[...] = _grey(level)
+
+
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
 def halve(image: NDArray[np.uint8], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:

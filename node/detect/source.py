@@ -29,7 +29,7 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     }
 )
 _AUTO: Final = {"contrast_min": 5.0, "clutter_gain": 2.0}
-_MAX_PROPOSALS: Final = 24
+_MAX_PROPOSALS: Final = 20
 _MAX_FOUND: Final = 8
 _ALWAYS_KEPT: Final = 5
 _UNLIKELY: Final = 0.02
