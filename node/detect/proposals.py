@@ -16,6 +16,7 @@ _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
+_MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 
@@ -82,16 +83,33 @@ class ProposalFinder:
         self._table = np.zeros((0, 5), np.int64)
         self._base_step_px = 1.0
 
-    def find(self, image: NDArray[np.uint8], contrast_min: float, clutter_gain: float, limit: int) -> Proposals:
-        """Find at most `limit` places in a (H, W, 3) BGR or (H, W) grey picture."""
+    def load(self, image: NDArray[np.uint8]) -> None:
+        """Make the pyramid of a (H, W, 3) BGR or (H, W) grey picture."""
         if image.shape != self._shape:
             self._allocate(image.shape)
-        below: NDArray[np.uint8] | None = None
         for i, octave in enumerate(self._octaves):
             if i == 0:
                 self._fill_base(image, octave.level)
             else:
                 halve(self._octaves[i - 1].level, octave.level)
+
+    def noise(self) -> float:
+        """Estimate the noise at the pyramid's base, 1 sd in grey levels, from neighbouring pixels of some rows."""
+        if not self._octaves:
+            return 0.0
+        some = self._octaves[0].level[::32].astype(np.int16)
+        steps = np.abs(some[:, 1:] - some[:, :-1]).ravel()
+        # What is not noise (edges, texture) stands in the upper half; below it, noise is as good as normal.
+        lower = np.partition(steps, len(steps) // 2)[: len(steps) // 2 + 1]
+        return float(lower.mean()) / _MEAN_OF_LOWER_HALF
+
+    def find(self, contrast_min: float, clutter_gain: float, limit: int) -> Proposals:
+        """Find at most `limit` places in the picture that was loaded.
+
+        A place counts from a contrast of contrast_min grey levels, plus clutter_gain times the mean contrast of its
+        neighbourhood.
+        """
+        below: NDArray[np.uint8] | None = None
         for octave in reversed(self._octaves):
             octave.mark_maxima(contrast_min, below)
             below = octave.level

@@ -28,7 +28,10 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "basin": {"contrast_min": 5.0, "clutter_gain": 3.0},
     }
 )
-_AUTO: Final = {"contrast_min": 5.0, "clutter_gain": 2.0}
+_CLUTTER_GAIN: Final = 2.0
+_CONTRAST_MIN: Final = (4.0, 16.0)
+_CONTRAST_TO_NOISE: Final = 2.0
+_MEMORY: Final = 0.8
 _MAX_PROPOSALS: Final = 20
 _MAX_FOUND: Final = 8
 _ALWAYS_KEPT: Final = 5
@@ -45,13 +48,18 @@ class SourceDetector:
     """The default detector; adapts to the picture and its predecessors where the environment is `auto`."""
 
     def __init__(self, environment: str, overrides: Mapping[str, float]) -> None:
-        self._values = {**PRESETS.get(environment, _AUTO), **overrides}
+        self._values = {**PRESETS.get(environment, {}), **overrides}
         self._finder = ProposalFinder()
+        self._noise: float | None = None
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Find the candidates of one picture, the likeliest first."""
         check_image(image)
-        proposals = self._finder.find(image, self._values["contrast_min"], self._values["clutter_gain"], _MAX_PROPOSALS)
+        self._finder.load(image)
+        contrast_min = self._values.get("contrast_min")
+        if contrast_min is None:
+            contrast_min = self._adapt()
+        proposals = self._finder.find(contrast_min, self._values.get("clutter_gain", _CLUTTER_GAIN), _MAX_PROPOSALS)
         if len(proposals.step_px) == 0:
             return []
         lights = measure_lights(image, *self._finder.base, proposals)
@@ -68,6 +76,12 @@ class SourceDetector:
             lights.scattered[chosen],
         )
         return _detections(lights, found, score, chosen, image.shape)
+
+    def _adapt(self) -> float:
+        """Give the contrast that counts as one: above this picture's noise and that of those before it."""
+        noise = self._finder.noise()
+        self._noise = noise if self._noise is None else _MEMORY * self._noise + (1.0 - _MEMORY) * noise
+        return float(np.clip(_CONTRAST_TO_NOISE * self._noise, *_CONTRAST_MIN))
 
 
 def _score(lights: Lights) -> Floats:
