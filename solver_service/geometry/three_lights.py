@@ -34,24 +34,32 @@ from solver_service.geometry.terms import Terms
 
 # More combinations than this are not tried: among so many, three lights are never certain.
 _MAX_COMBINATIONS: Final = 4000
-_ROUNDS: Final = 4
+_ROUNDS: Final = 3
 # chi^2 of tilt and depth, three degrees of freedom, before and after the refinement.
 _GATE_CHI2: Final = 40.0
 _FITS_CHI2: Final = 16.0
 # No gap tells a gross error of the pair: the covariance has its share of them.
 _UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
+# So many guesses are weighed against the prediction, so many of them refined.
+_KEPT: Final = 64
 _REFINED: Final = 6
-_STEPS: Final = 6
+_STEPS: Final = 4
+# A step this small, relative to the range and in rad, leaves less than its square.
+_SMALL: Final = 1e-3
+# How far a bar may rise more than its attitude says, and the middle stand off the bisector: shares of alpha.
+_BAR_RISE: Final = 0.15
+_SPLIT_SHARE: Final = 0.1
+_X: Final = np.array(((1.0,), (0.0,), (0.0,)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Guesses:
-    """M poses T_a_b between the level frames: lights (M, 4), t (M, 3), R (M, 3, 3), chi2 (M,) of the sensors."""
+    """M poses T_a_b between the level frames: lights (M, 4), t (M, 3), R (M, 3, 3), score (M,), the less the better."""
 
     lights: NDArray[np.intp]
     t_a_b_m: Floats
     R_a_b: Floats
-    chi2: Floats
+    score: Floats
 
 
 def read_three_lights(terms: Terms, pairs: Pairs) -> Readings | None:
@@ -61,88 +69,118 @@ def read_three_lights(terms: Terms, pairs: Pairs) -> Readings | None:
     in_a, in_b = terms.candidates.counts
     if not supported or 2 * (pairs.counts[0] * in_b + pairs.counts[1] * in_a) > _MAX_COMBINATIONS:
         return None
-    both = [_guess(terms, pairs, seer) for seer in (0, 1)]
-    lights = np.concatenate([guesses.lights for guesses in both])
-    t = np.concatenate([guesses.t_a_b_m for guesses in both])
-    R = np.concatenate([guesses.R_a_b for guesses in both])
-    chi2 = np.concatenate([guesses.chi2 for guesses in both])
-    best = np.argsort(chi2, kind="stable")[:_REFINED]
-    best = best[chi2[best] < _GATE_CHI2]
-    return _refined(terms, lights[best], t[best], R[best]) if len(best) else None
+    guesses = _guess(terms, pairs)
+    score = guesses.score
+    if terms.prediction is not None and len(score):
+        score = score - 2.0 * weigh_prediction(guesses.R_a_b.transpose(1, 2, 0), guesses.t_a_b_m.T, terms.prediction)
+    best = np.argsort(score, kind="stable")[:_REFINED]
+    best = best[np.isfinite(score[best])]
+    return _refined(terms, guesses.lights[best], guesses.t_a_b_m[best], guesses.R_a_b[best]) if len(best) else None
 
 
-def _guess(terms: Terms, pairs: Pairs, seer: int) -> _Guesses:
-    """Try all pairs of the seer's picture with all candidates of the other's, each as left and as right light."""
-    candidates, sensors = terms.candidates, terms.sensors
-    split, in_a = pairs.split, candidates.counts[0]
-    of_seer = np.arange(split) if seer == 0 else np.arange(split, len(pairs.key))
-    of_other = np.arange(in_a, len(candidates.index)) if seer == 0 else np.arange(in_a)
-    pair, single, side = (grid.ravel() for grid in np.meshgrid(of_seer, of_other, (0, 1), indexing="ij"))
-    own, other = terms.rigs.levels[seer], terms.rigs.levels[1 - seer]
-    down_own, down_other = (sensors.down_a, sensors.down_b)[:: 1 - 2 * seer]
+def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
+    """Try all pairs of either picture with all candidates of the other, each as left and as right light."""
+    candidates, sensors, settings = terms.candidates, terms.sensors, terms.settings
+    pair, single = (np.concatenate(parts) for parts in zip(*(_opposite(terms, pairs, k) for k in (0, 1)), strict=True))
+    pair, single, side = np.repeat(pair, 2), np.repeat(single, 2), np.tile((0, 1), len(pair))
+    # Who sees the pair: 0 is A.
+    seer = (pair >= pairs.split).astype(np.intp)
+    levels = terms.rigs.levels
+
+    def each(of_a: Floats, of_b: Floats) -> tuple[Floats, Floats]:
+        """Give the seer's own and the other's (..., M)."""
+        both = np.stack((of_a, of_b), axis=-1)
+        return both[..., seer], both[..., 1 - seer]
+
+    down_own, down_other = each(sensors.down_a, sensors.down_b)
+    middle_own, middle_other = each(levels[0].middle_m, levels[1].middle_m)
+    _, length_m = each(terms.rigs.length_m[0], terms.rigs.length_m[1])
+    light = np.stack((levels[0].lights_m, levels[1].lights_m))[seer, side].T
     c, w, chord = pairs.c[:, pair], pairs.w[:, pair], pairs.chord[pair]
     seen = candidates.bearings[:, single]
     cos_alpha, sin_alpha = 1.0 - 0.5 * chord * chord, chord * np.sqrt(1.0 - 0.25 * chord * chord)
-    light = own.lights_m[side].T
     u_other = seen
-    for _ in range(_ROUNDS):
+    for step in range(_ROUNDS):
         sin_beta = u_other[0]
+        to_frame = _frame(-u_other, down_other)
+        if step == 0:
+            # Gravity tells which end of the pair is the right light.
+            w = np.where(dot(w, _turned(_frame(c, down_own), to_frame, _X)) < 0.0, -w, w)
         half = 0.5 * (np.arcsin(sin_beta) - np.arcsin(sin_beta * cos_alpha))
-        R = _triad(c, down_own, -u_other, down_other)
-        # Gravity tells which end of the pair is the right light.
-        w = np.where(dot(w, R[:, 0]) < 0.0, -w, w)
         u = c * np.cos(half) - w * np.sin(half)
-        R = _triad(u, down_own, -u_other, down_other)
-        range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.array(other.length_m))
-        t = own.middle_m[:, None] + u * range_m - (R * other.middle_m[:, None]).sum(1)
-        q = (R * (light - t)[:, None]).sum(0)
+        frame = _frame(u, down_own)
+        range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m)
+        q = _turned(to_frame, frame, light - middle_own - u * range_m) + middle_other
         u_other = u_other + seen - q / np.sqrt(dot(q, q))
         u_other = u_other / np.sqrt(dot(u_other, u_other))
+    to_frame = _frame(-u_other, down_other)
+    t = middle_own + u * range_m - _turned(frame, to_frame, middle_other)
     # Both components of the tilt that remain: along the line of sight, and about it.
-    rise = np.arcsin(down_own @ u) - np.arcsin(-(down_other @ u_other))
-    across = R[:, 0] - u * dot(u, R[:, 0])
-    about = np.arcsin(np.clip(dot(u, _cross(across / np.sqrt(dot(across, across)), w)), -1.0, 1.0))
-    fall = _fall(own, other, t, R, down_own)
-    sign = 1.0 - 2.0 * seer
+    rise = np.arcsin(dot(down_own, u)) - np.arcsin(-dot(down_other, u_other))
+    bar = _turned(frame, to_frame, _X)
+    across = bar - u * dot(u, bar)
+    about = dot(u, _cross(across, w)) / np.sqrt(dot(across, across))
+    port_own, port_other = each(levels[0].depth_port_m, levels[1].depth_port_m)
+    fall = dot(down_own, t - port_own + _turned(frame, to_frame, port_other))
     level2 = dot(t, t) - fall * fall
-    spread2 = sensors.depth_variance + 0.5 * sensors.tilt_variance * level2 + pairs.variance[pair] * fall * fall
-    chi2 = (rise * rise + about * about) / (sensors.tilt_variance + pairs.variance[pair])
-    chi2 = chi2 + (sign * fall - (sensors.depth_m or 0.0)) ** 2 / spread2
-    settings = terms.settings
-    inside = (range_m > settings.range_min_m) & (range_m < settings.range_max_m)
-    swapped = dot(w, pairs.w[:, pair]) < 0.0
+    variance = pairs.variance[pair]
+    spread2 = sensors.depth_variance + 0.5 * sensors.tilt_variance * level2 + variance * fall * fall
+    chi2 = (rise * rise + about * about) / (sensors.tilt_variance + variance)
+    chi2 = chi2 + ((1 - 2 * seer) * fall - (sensors.depth_m or 0.0)) ** 2 / spread2
+    keep = (range_m > settings.range_min_m) & (range_m < settings.range_max_m) & (chi2 < _GATE_CHI2)
+    # Chance puts two candidates near each other the more rarely, the nearer.
+    score = chi2 + 4.0 * np.log(chord)
+    keep = np.flatnonzero(keep)
+    keep = keep[np.argsort(score[keep], kind="stable")[:_KEPT]]
+    pair, single, side, seer = pair[keep], single[keep], side[keep], seer[keep]
+    swapped = dot(w[:, keep], pairs.w[:, pair]) < 0.0
     first, second = pairs.first[pair], pairs.second[pair]
-    lights = np.full((len(pair), 4), -1)
-    lights[:, 2 * seer] = np.where(swapped, second, first)
-    lights[:, 2 * seer + 1] = np.where(swapped, first, second)
-    lights[np.arange(len(pair)), 2 - 2 * seer + side] = single
-    R, t = R.transpose(2, 0, 1), t.T
-    if seer == 1:
-        R = R.swapaxes(1, 2)
-        t = -(R @ t[:, :, None])[:, :, 0]
-    return _Guesses(lights, t, R, np.where(inside & np.isfinite(chi2), chi2, np.inf))
+    lights, rows = np.full((len(keep), 4), -1), np.arange(len(keep))
+    lights[rows, 2 * seer] = np.where(swapped, second, first)
+    lights[rows, 2 * seer + 1] = np.where(swapped, first, second)
+    lights[rows, 2 - 2 * seer + side] = single
+    R = np.zeros((len(keep), 3, 3))
+    for to, of in zip(frame, to_frame, strict=True):
+        R += to[:, keep].T[:, :, None] * of[:, keep].T[:, None]
+    t = t[:, keep].T
+    turned = seer == 1
+    R[turned] = R[turned].swapaxes(1, 2)
+    t[turned] = -(R[turned] @ t[turned][:, :, None])[:, :, 0]
+    return _Guesses(lights, t, R, score[keep])
+
+
+def _opposite(terms: Terms, pairs: Pairs, seer: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Give the pairs of the seer and the candidates of the other that lie in opposite elevations."""
+    candidates, sensors = terms.candidates, terms.sensors
+    start_pair, end_pair = ((0, pairs.split), (pairs.split, len(pairs.key)))[seer]
+    in_a = candidates.counts[0]
+    start_single, end_single = ((in_a, len(candidates.index)), (0, in_a))[seer]
+    down_own, down_other = (sensors.down_a, sensors.down_b)[:: 1 - 2 * seer]
+    rise = np.arcsin(down_own @ pairs.c[:, start_pair:end_pair])
+    fall = np.arcsin(-(down_other @ candidates.bearings[:, start_single:end_single]))
+    # The single light stands off the middle by half its bar: so much at the range that the pair has at least.
+    ratio = float(terms.rigs.length_m[seer] / terms.rigs.length_m[1 - seer])
+    share = 0.75 * ratio * (abs(float(down_own[0])) + _BAR_RISE) + _SPLIT_SHARE
+    slack = share * pairs.chord[start_pair:end_pair] + math.sqrt(_GATE_CHI2 * sensors.tilt_variance)
+    pair, single = np.nonzero(np.abs(rise[:, None] - fall) < slack[:, None])
+    return pair + start_pair, single + start_single
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
     return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
 
 
-def _triad(u: Floats, down_u: Floats, v: Floats, down_v: Floats) -> Floats:
-    """Give the rotations (3, 3, M) that take v to u, and down_v as near to down_u as that leaves it."""
-    frames = []
-    for sight, down in ((u, down_u), (v, down_v)):
-        level = down[:, None] - sight * (down @ sight)
-        level = level / np.sqrt(dot(level, level))
-        frames.append((sight, level, _cross(sight, level)))
-    R: Floats = sum(a[:, None] * b[None] for a, b in zip(*frames, strict=True))
-    return R
+def _frame(sight: Floats, down: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give the axes (3, M) along a line of sight, down across it, and across both."""
+    level = down - sight * dot(down, sight)
+    level = level / np.sqrt(dot(level, level))
+    return sight, level, _cross(sight, level)
 
 
-def _fall(own: Rig, other: Rig, t: Floats, R: Floats, down: Floats) -> Floats:
-    """Give how far the other's depth port lies below one's own (M,)."""
-    below = t - own.depth_port_m[:, None] + (R * other.depth_port_m[:, None]).sum(1)
-    fall: Floats = down @ below
-    return fall
+def _turned(to: tuple[Floats, ...], of: tuple[Floats, ...], v: Floats) -> Floats:
+    """Turn vectors (3, M) from the rig that has one frame of axes to the rig that has the other."""
+    x, y, z = (a * dot(b, v) for a, b in zip(to, of, strict=True))
+    return x + y + z
 
 
 def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Readings | None:
@@ -159,10 +197,11 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     seen = Sightings(bearings, tangents, candidates.dt_s[lights] * ~absent)
     rates = terms.motion.rates if terms.motion.rates.any() else None
     bodies = levels[0].lights_m, levels[1].lights_m
+    across = _basis(sensors.down_a)
     weight = np.eye(8)
     for step in range(_STEPS):
         r, J, along = residuals(t, R, seen, bodies, rates)
-        r_s, J_s, sigma = _sensor_rows(sensors, levels, t, R)
+        r_s, J_s, sigma = _sensor_rows(sensors, across, levels, t, R)
         if step == 0:
             weight = weight_of(J, seen.dt_s, terms.motion)
         JtW, JtW_s = J.swapaxes(1, 2) @ weight, J_s.swapaxes(1, 2)
@@ -170,11 +209,14 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         unit = 1.0 / np.sqrt(H[:, range(6), range(6)])
         scale = unit[:, :, None] * unit[:, None, :]
         covariance = np.linalg.inv(H * scale + 1e-13 * np.eye(6)) * scale
-        if step + 1 < _STEPS:
-            move = (covariance @ (JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]))[:, :, 0]
-            t, R = t - move[:, :3], rotation_near(-move[:, 3:]) @ R
-    column = r[:, :, None]
-    chi2 = (column * (weight @ column)).sum((1, 2)) + (r_s * r_s).sum(1)
+        g = JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]
+        move = (covariance @ g)[:, :, 0]
+        column = r[:, :, None]
+        chi2 = (column * (weight @ column)).sum((1, 2)) + (r_s * r_s).sum(1) - (g[:, :, 0] * move).sum(1)
+        t, R = t - move[:, :3], rotation_near(-move[:, 3:]) @ R
+        move[:, :3] /= np.sqrt((t * t).sum(1))[:, None]
+        if not (np.abs(move) > _SMALL).any():
+            break
     range2 = (t * t).sum(1)
     settings = terms.settings
     sound = np.isfinite(chi2) & (chi2 < _FITS_CHI2) & (along > 0.0).all(1)
@@ -201,10 +243,11 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     )
 
 
-def _sensor_rows(sensors: Sensors, levels: tuple[Rig, Rig], t: Floats, R: Floats) -> tuple[Floats, Floats, Floats]:
+def _sensor_rows(
+    sensors: Sensors, across: Floats, levels: tuple[Rig, Rig], t: Floats, R: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Give whitened residuals (K, 3) of tilt and depth, their derivatives (K, 3, 6), and the product of their sds."""
     down_a = sensors.down_a
-    across = _basis(down_a)
     down_b = R @ sensors.down_b
     port_b = R @ levels[1].depth_port_m
     below = t - levels[0].depth_port_m + port_b
