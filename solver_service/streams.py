@@ -44,6 +44,7 @@ class NodeStream:
         self.newest_ns: int | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
+        self._newest_trigger = -1
         self._far: list[int] = []
 
     def add_info(self, info: NodeInfo) -> None:
@@ -72,6 +73,7 @@ class NodeStream:
                 return Arrival.DUPLICATE
             return Arrival.CONFLICT
         self._sequence[frame.trigger] = (frame.boot, frame.seq, frame.stamp_ns)
+        self._newest_trigger = max(self._newest_trigger, frame.trigger)
         if len(self._sequence) > MAX_SEQUENCE_MEMORY:
             self._sequence.popitem(last=False)
         self.frames[frame.trigger] = frame
@@ -96,12 +98,13 @@ class NodeStream:
         self._far.clear()
         self.frames.clear()
         self._sequence.clear()
+        self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns
         return Arrival.CLOCK_SET
 
     def has_passed(self, trigger: int) -> bool:
         """Whether this node sent no frame for trigger: its neighbours are here, with nothing between them."""
-        if trigger in self._sequence:
+        if trigger in self._sequence or trigger > self._newest_trigger:
             return False
         if trigger - 1 in self._sequence and trigger + 1 in self._sequence:
             before: int | None = trigger - 1
