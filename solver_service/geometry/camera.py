@@ -42,6 +42,13 @@ class Camera:
             return self._fisheye_rays(xd, yd)
         return self._pinhole_rays(xd, yd)
 
+    def same_as(self, other: Camera) -> bool:
+        """Whether both have the same lens; their pictures' sizes may differ."""
+        mine, others = (
+            (c.model, c.fx_px, c.fy_px, c.cx_px, c.cy_px, *(float(k) for k in c.distortion)) for c in (self, other)
+        )
+        return mine == others
+
     def bearings(self, pixels: Floats) -> Floats:
         """Give the unit bearings (N, 3) of distorted pixels (N, 2)."""
         return self.rays(pixels)[0]

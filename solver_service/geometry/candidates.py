@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solver_service.geometry.observation import View
-from solver_service.geometry.rig import Rig
+from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
 
 # A message holds no more.
@@ -41,30 +41,35 @@ class Candidates:
     log_area: Floats
 
 
-def find_candidates(views: tuple[View, View], rigs: tuple[Rig, Rig]) -> Candidates:
+def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     """Turn both views into bearings; the instant of the pose is the mean of both stamps.
 
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
     """
+    pixels_a, pixels_b = (np.reshape(view.pixels, (-1, 2))[:_MAX_CANDIDATES] for view in views)
+    in_a, in_b = len(pixels_a), len(pixels_b)
+    pixels = np.concatenate((pixels_a, pixels_b))
+    a, b = slice(0, in_a), slice(in_a, None)
+    rig_a, rig_b = rigs.rigs
+    if rigs.one_camera:
+        bearings, in_camera = rig_a.camera.rays(pixels)
+    else:
+        rays = rig_a.camera.rays(pixels_a), rig_b.camera.rays(pixels_b)
+        bearings, in_camera = (np.concatenate(parts) for parts in zip(*rays, strict=True))
     offset_s = 0.5e-9 * (views[0].stamp_ns - views[1].stamp_ns)
-    in_a, in_b = (min(len(view.pixels), _MAX_CANDIDATES) for view in views)
     table, tangents = np.empty((9, in_a + in_b)), np.empty((in_a + in_b, 2, 3))
-    index = np.empty(in_a + in_b, dtype=np.intp)
-    for view, rig, part, shift_s in (
-        (views[0], rigs[0], slice(0, in_a), offset_s),
-        (views[1], rigs[1], slice(in_a, None), -offset_s),
+    index = np.arange(in_a + in_b)
+    index[b] -= in_a
+    for view, rig, part, n, shift_s in (
+        (views[0], rig_a, a, in_a, offset_s),
+        (views[1], rig_b, b, in_b, -offset_s),
     ):
-        columns = table[:, part]
-        n = columns.shape[1]
-        pixels = np.reshape(view.pixels, (-1, 2))[:n]
-        bearings, in_camera = rig.camera.rays(pixels)
-        np.matmul(rig.R_level_camera, bearings.T, out=columns[:3])
-        np.matmul(in_camera, rig.R_level_camera.T, out=tangents[part])
-        np.divide(pixels.T, rig.camera.size_px, out=columns[3:5])
-        columns[5] = view.dt_s[:n]
-        columns[5] += shift_s
+        columns, turn = table[:, part], rig.R_level_camera
+        np.matmul(turn, bearings[part].T, out=columns[:3])
+        np.matmul(in_camera[part], turn.T, out=tangents[part])
+        np.divide(pixels[part].T, rig.camera.size_px, out=columns[3:5])
+        np.add(view.dt_s[:n], shift_s, out=columns[5])
         columns[6], columns[7], columns[8] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
-        index[part] = np.arange(n)
     usable = np.isfinite(table[:7].sum(0))
     if not usable.all():
         in_a = int(usable[:in_a].sum())

@@ -42,7 +42,7 @@ MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
 # Eight coordinates leave two residuals: of a light's two, the other three leave a quarter of the variance open each.
 # Seen from there, the position foretold has four times the light's own variance.
-_FORETOLD_VARIANCE: Final = np.array(4.0)
+_FORETOLD_VARIANCE: Final = 4.0
 # What chance gives: the spread of relative pitch (rad) and heading (rad), and of depth differences (m).
 PITCH_SPREAD: Final = 1.1
 _HEADING_SPREAD: Final = 1.5
@@ -172,15 +172,15 @@ def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
     return density
 
 
-def intruder_odds(chi2: Floats, per_area: Floats) -> Floats:
-    """Give the odds (K,) that one of four lights is missing and a false candidate stands in for it.
+def intruder_odds(chi2: float, clutter: float) -> float:
+    """Give the odds that one of four lights is missing and a false candidate stands in for it.
 
-    chi2: (K,) of the poses. per_area: (K, 4) candidates per variance of position (px^2). The other three foretell
-    where a light stands; a false candidate falls there by chance.
+    chi2: of the pose. clutter: candidates that chance puts into the variance of the lights' positions. The other
+    three foretell where a light stands; a false candidate falls there by chance.
     """
-    foretold = np.exp(log_gaps(chi2, _FORETOLD_VARIANCE, 2))
-    odds: Floats = MISSING_ODDS / foretold * per_area.sum(1)
-    return odds
+    usual = (1.0 - GROSS_PROBABILITY) * math.exp(-0.5 * chi2)
+    gross = GROSS_PROBABILITY * GROSS_SCALE**-2 * math.exp(-0.5 * chi2 / GROSS_SCALE**2)
+    return MISSING_ODDS * clutter * 2.0 * math.pi * _FORETOLD_VARIANCE / max(usual + gross, 1e-300)
 
 
 def log_chance(rigs: RigPair, counts: tuple[int, int], settings: Settings) -> float:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solver_service.geometry.closed_form import Bars, dot, solve_exact
-from solver_service.geometry.evidence import intruder_odds, log_chance, log_gaps, weigh
+from solver_service.geometry.evidence import log_chance, log_gaps, weigh
 from solver_service.geometry.hypotheses import Hypotheses, Pairs, search
 from solver_service.geometry.observation import Reason
 from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import Refined, Sightings, refine
+from solver_service.geometry.refinement import Sightings, refine
 from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
 from solver_service.geometry.terms import Terms
@@ -26,8 +26,6 @@ _NEGLIGIBLE: Final = 16.0
 _SPLIT_ROUNDS: Final = 2
 # Bars whose middle is nearer to the camera than this, relative to their length, need but one round.
 _SMALL_OFFSET: Final = 0.02
-# chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
-_GROSS_CHI2: Final = 11.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     range2 = dot(t, t)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
     log_ratio = np.where(inside, base + log_gaps(chi2, variance, gaps), -np.inf)
-    best = np.argsort(-log_ratio, kind="stable")[:_REFINED]
+    best = (-log_ratio).argsort(kind="stable")[:_REFINED]
     if log_ratio[best[0]] == -np.inf:
         what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
         return FourLights(None, why=("out_of_range", what))
@@ -90,14 +88,14 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             lights=found.lights[:, best].T,
             t_a_b_m=refined.t_a_b_m,
             R_a_b=refined.R_a_b,
-            covariance=_inflated(refined),
+            covariance=refined.covariance,
             chi2=chi2,
             log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, variance[best], gaps), -np.inf),
             tilt_chi2=support.tilt_chi2[best],
             depth_chi2=support.depth_chi2[best],
             range_m=solved.range_m[:, best].T,
             twist_gap_rad=twist_gap_rad[best],
-            intruder=_intruder(terms, chi2, found.lights[:, best].T) if gaps == 2 else np.zeros(len(best)),
+            clutter=_clutter(terms, found.lights[:, best]) if gaps == 2 else np.zeros(len(best)),
             log_prior=support.log_prior[best],
         ),
         others=float(ratio.sum() - ratio[best].sum()),
@@ -109,18 +107,12 @@ def _sightings(terms: Terms, found: Hypotheses, best: NDArray[np.intp]) -> Sight
     return Sightings(candidates.bearings.T[lights], candidates.tangents[lights], candidates.dt_s[lights])
 
 
-def _inflated(refined: Refined) -> Floats:
-    """Widen the covariance where one light is off by more than its noise; which one, two residuals cannot tell."""
-    scale = np.where(refined.chi2 > _GROSS_CHI2, 0.5 * refined.chi2, 1.0)
-    covariance: Floats = refined.covariance * scale[:, None, None]
-    return covariance
-
-
-def _intruder(terms: Terms, chi2: Floats, lights: NDArray[np.intp]) -> Floats:
-    """Give the odds that one of four lights is missing and a false candidate stands in for it."""
+def _clutter(terms: Terms, lights: NDArray[np.intp]) -> Floats:
+    """Give how many candidates chance puts into the variance of the four lights' positions (K,)."""
     in_a, in_b = terms.candidates.counts
     per_px2 = np.array((in_a, in_a, in_b, in_b)) / terms.rigs.area_px2
-    return intruder_odds(chi2, per_px2 * terms.candidates.sigma_px[lights] ** 2)
+    clutter: Floats = per_px2 @ terms.candidates.sigma_px[lights] ** 2
+    return clutter
 
 
 def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:

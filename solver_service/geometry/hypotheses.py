@@ -237,7 +237,7 @@ def search(
     da, db = pairs.down[:, ia], pairs.down[:, ib]
     upright = da[0] * (cosine * db[0] + sine * db[1]) + da[1] * (sine * db[0] - cosine * db[1])
     flip = upright < 0.0
-    undecided = np.flatnonzero(np.abs(upright) < _UNDECIDED)
+    undecided = (np.abs(upright) < _UNDECIDED).nonzero()[0]
     if len(undecided):
         both = np.concatenate((np.arange(len(ia)), undecided))
         ia, ib, swap = ia[both], ib[both], swap[both]

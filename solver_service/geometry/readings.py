@@ -17,8 +17,8 @@ class Readings:
     lights: (K, 4) B's left and right in A's picture, A's left and right in B's; -1: not seen. t_a_b_m (K, 3), R_a_b
     (K, 3, 3), covariance (K, 6, 6), chi2 (K,). log_ratio: (K,) against chance, -inf where the pose is not sound.
     tilt_chi2, depth_chi2: (K,) of the sensors. range_m: (K, 2) by A's bar and by B's, twist_gap_rad (K,); both by
-    the closed form. intruder: (K,) odds that one of the lights is missing and a false candidate stands in for it.
-    log_prior: (K,) the prediction's part in log_ratio.
+    the closed form. clutter: (K,) candidates that chance puts in the place of one of the lights, per variance of its
+    position, 0 where all would be missed. log_prior: (K,) the prediction's part in log_ratio.
     """
 
     lights: NDArray[np.intp]
@@ -31,7 +31,7 @@ class Readings:
     depth_chi2: Floats
     range_m: Floats
     twist_gap_rad: Floats
-    intruder: Floats
+    clutter: Floats
     log_prior: Floats
 
     def __len__(self) -> int:

@@ -16,7 +16,6 @@ _MAX_STEPS: Final = 12
 _SMALL: Final = 5e-4
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
-_DIAGONAL: Final = np.arange(6)
 _DAMPING: Final = 1e-13 * np.eye(6)
 # Which sightings a later clock of B moves, and where to.
 _SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
@@ -85,7 +84,7 @@ def refine(
         JtW = J.swapaxes(1, 2) if weight is None else J.swapaxes(1, 2) @ weight
         H = JtW @ J
         # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-        unit = 1.0 / np.sqrt(H[:, _DIAGONAL, _DIAGONAL])
+        unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
         scale = unit[:, :, None] * unit[:, None, :]
         inverse = np.linalg.inv(H * scale + _DAMPING)
         covariance = inverse * scale
@@ -102,7 +101,7 @@ def refine(
         move[:, :3] /= np.sqrt((t * t).sum(1))[:, None, None]
         if not (np.abs(move) > _SMALL).any():
             break
-    determined = inverse[:, _DIAGONAL, _DIAGONAL].max(1) < _UNDETERMINED
+    determined = inverse.diagonal(0, 1, 2).max(1) < _UNDETERMINED
     sound = determined & (depth > 0.0).all(1) & np.isfinite(covariance.sum((1, 2)) + chi2 + t.sum(1))
     return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
 

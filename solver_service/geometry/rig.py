@@ -90,7 +90,8 @@ class RigPair:
 
     levels: the rigs in their level frames. length_m (2,): of the bars. area_px2 (4,): of
     the picture that each of B's left and right light and A's left and right light is seen in. views_sr: product of
-    both solid angles. middle_m (2, 3): of the bars, level frames; offset_m: of both together.
+    both solid angles. middle_m (2, 3): of the bars, level frames; offset_m: of both together. one_camera:
+    whether both cameras have the same parameters.
     """
 
     rigs: tuple[Rig, Rig]
@@ -100,6 +101,7 @@ class RigPair:
     area_px2: Floats
     views_sr: float
     offset_m: float
+    one_camera: bool
 
 
 @lru_cache(maxsize=16)
@@ -115,4 +117,5 @@ def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
         area_px2=np.array((a, a, b, b)),
         views_sr=rig_a.camera.solid_angle_sr * rig_b.camera.solid_angle_sr,
         offset_m=rig_a.offset_m + rig_b.offset_m,
+        one_camera=rig_a.camera.same_as(rig_b.camera),
     )

@@ -36,8 +36,8 @@ class Terms:
         prior: Prior | None,
     ) -> Terms:
         """Bring everything into the level frames; what is not finite is as good as not there."""
-        candidates = find_candidates(views, rigs)
         pair = pair_of(*rigs)
+        candidates = find_candidates(views, pair)
         return Terms(
             rigs=pair,
             candidates=candidates,
@@ -62,12 +62,15 @@ def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
 
 
 def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
-    attitudes = [_finite(one.q_ned_body_xyzw, (4,)) for one in sensed]
-    attitudes = [q if q is not None and q @ q > 0.25 else None for q in attitudes]
+    attitudes: list[Floats | None] = []
+    for one in sensed:
+        q = _finite(one.q_ned_body_xyzw, (4,))
+        attitudes.append(q if q is not None and q @ q > 0.25 else None)
     sigmas = [_finite(one.sigma_rad, (3,)) for one in sensed]
+    depth_a_m, depth_b_m = sensed[0].depth_m, sensed[1].depth_m
     depth_m, variance = None, 0.0
-    if all(one.depth_m is not None and math.isfinite(one.depth_m) for one in sensed):
-        depth_m = float(sensed[1].depth_m or 0.0) - float(sensed[0].depth_m or 0.0)
+    if depth_a_m is not None and depth_b_m is not None and math.isfinite(depth_b_m - depth_a_m):
+        depth_m = depth_b_m - depth_a_m
         for one in sensed:
             sigma_m = one.depth_sigma_m
             variance += sigma_m**2 if sigma_m is not None and math.isfinite(sigma_m) else 0.0

@@ -206,7 +206,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
             weight = weight_of(J, seen.dt_s, terms.motion)
         JtW, JtW_s = J.swapaxes(1, 2) @ weight, J_s.swapaxes(1, 2)
         H = JtW @ J + JtW_s @ J_s
-        unit = 1.0 / np.sqrt(H[:, range(6), range(6)])
+        unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
         scale = unit[:, :, None] * unit[:, None, :]
         covariance = np.linalg.inv(H * scale + 1e-13 * np.eye(6)) * scale
         g = JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]
@@ -238,7 +238,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         depth_chi2=none,
         range_m=np.stack((range_m, range_m), axis=1),
         twist_gap_rad=none,
-        intruder=none,
+        clutter=none,
         log_prior=log_prior,
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from solver_service.geometry.camera import Camera
 from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.evidence import AGREES, CHANCE_ODDS
+from solver_service.geometry.evidence import AGREES, CHANCE_ODDS, intruder_odds
 from solver_service.geometry.four_lights import read_four_lights
 from solver_service.geometry.hypotheses import find_pairs
 from solver_service.geometry.observation import Prior, Reason, Sensed, Settings, View
@@ -64,6 +64,8 @@ _SAME_POSITION: Final = 0.04
 _SAME_ROTATION: Final = 0.1
 # Three lights have no gap to check them: they must be likelier than four.
 _THREE_PROBABILITY: Final = 0.98
+# chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
+_GROSS_CHI2: Final = 11.3
 # A position that is known to this share of the range (1 sd) is no wrong one.
 _SURE_POSITION: Final = 0.02
 # Odds of a false candidate among four lights from which on three are tried.
@@ -110,7 +112,8 @@ def _doubtful(found: Fix | NoFix, readings: Readings | None) -> bool:
     if readings is None or isinstance(found, NoFix):
         return True
     k = int(readings.log_ratio.argmax())
-    return bool(readings.intruder[k] > _POOR_FIT or readings.log_prior[k] < 0.0)
+    poor = intruder_odds(float(readings.chi2[k]), float(readings.clutter[k])) > _POOR_FIT
+    return bool(poor or readings.log_prior[k] < 0.0)
 
 
 def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
@@ -127,16 +130,22 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     same = ((t - t[k]) ** 2).sum(1) < (_SAME_POSITION * range_m) ** 2
     same &= (R * R[k]).sum((1, 2)) > 1.0 + 2.0 * math.cos(_SAME_ROTATION)
     short = bool((readings.lights[k] < 0).any())
-    sigma_m = math.sqrt(float(readings.covariance[k].diagonal()[:3].sum()))
+    chi2 = float(readings.chi2[k])
+    # One of four lights may be off by more than its noise; which one, two residuals cannot tell.
+    widened = 0.5 * chi2 if chi2 > _GROSS_CHI2 and not short else 1.0
+    sigma_m = math.sqrt(widened * float(readings.covariance[k].diagonal()[:3].sum()))
     if short and sigma_m > _SURE_POSITION * range_m:
         return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
     # A false candidate in a light's place is off by as much as the covariance has been widened for.
-    intruder = float(ratio[k] * readings.intruder[k]) if sigma_m > _SURE_POSITION * range_m else 0.0
+    intruder = 0.0
+    if sigma_m > _SURE_POSITION * range_m:
+        intruder = float(ratio[k]) * intruder_odds(chi2, float(readings.clutter[k]))
     probability = float(ratio[same].sum() / (CHANCE_ODDS + ratio.sum() + others + intruder))
     if probability >= (max(settings.min_probability, _THREE_PROBABILITY) if short else settings.min_probability):
         # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
         alone = np.exp(readings.log_ratio - readings.log_prior)
-        return _fix(terms, readings, k, np.where(same, alone, 0.0), probability)
+        covariance = widened * _spread(readings, k, np.where(same, alone, 0.0))
+        return _fix(terms, readings, k, covariance, probability)
     tilt_chi2, depth_chi2 = float(readings.tilt_chi2[k]), float(readings.depth_chi2[k])
     what = f"the best of the hypotheses, at {range_m:.3g} m,"
     if tilt_chi2 > AGREES:
@@ -148,7 +157,7 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     rival = int(rivals.argmax())
     if rivals[rival] > readings.log_ratio[k] - _RIVAL:
         why = f"another stands at {math.sqrt(float(t[rival] @ t[rival])):.3g} m"
-    return NoFix("ambiguous", f"{what} is {probability:.0%} likely: {why} (chi2 {readings.chi2[k]:.1f})")
+    return NoFix("ambiguous", f"{what} is {probability:.0%} likely: {why} (chi2 {chi2:.1f})")
 
 
 def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
@@ -166,8 +175,8 @@ def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
     return tuple(checks)
 
 
-def _fix(terms: Terms, readings: Readings, k: int, weights: Floats, probability: float) -> Fix:
-    """Publish reading k, between the cameras' frames; weights: (K,) of all that read about the same pose."""
+def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probability: float) -> Fix:
+    """Publish reading k, between the cameras' frames."""
     method, (rig_a, rig_b) = terms.settings.method, terms.rigs.rigs
     lights = readings.lights[k]
     range_a_m, range_b_m = readings.range_m[k].tolist()
@@ -181,7 +190,7 @@ def _fix(terms: Terms, readings: Readings, k: int, weights: Floats, probability:
         t, R = solved.t_a_b_m[:, 0], solved.R_a_b[:, :, 0]
         range_a_m, range_b_m = solved.range_m[:, 0].tolist()
         twist_gap_rad = float(solved.twist_gap_rad[0])
-    covariance = rig_a.both_level_camera.T @ _spread(readings, k, weights) @ rig_a.both_level_camera
+    covariance = rig_a.both_level_camera.T @ covariance @ rig_a.both_level_camera
     index = np.where(lights < 0, -1, terms.candidates.index[lights]).tolist()
     return Fix(
         t_a_b_m=t,
@@ -202,7 +211,7 @@ def _fix(terms: Terms, readings: Readings, k: int, weights: Floats, probability:
 
 
 def _spread(readings: Readings, k: int, weights: Floats) -> Floats:
-    """Give the covariance of pose k, which may as well be one of its near neighbours."""
+    """Give the covariance of pose k, which may as well be one of its near neighbours; weights: (K,) theirs."""
     covariance: Floats = readings.covariance[k]
     near = np.flatnonzero(weights > _NEGLIGIBLE * weights[k])
     for i in near[near != k]:
