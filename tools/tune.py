@@ -1,0 +1,269 @@
+"""`buddyline tune`: propose a detector's values from a site's own pictures, and show the pictures they were judged on.
+
+Where the dive carries truth for its lights, that is what counts; else the likely candidates of the default detector
+stand in for it, and the proposed values are the strictest that keep them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.detect import ENVIRONMENTS, METHODS, draw, make_detector, presets
+from node.drivers.stored import PictureError, decode_picture, picture_files
+from protocol.clock import trigger_index
+from protocol.errors import BuddylineError
+from protocol.messages import CompressedImage, LightTruth, MessageError, decode
+from protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
+from tools.dives import Dive
+from tools.progress import Progress
+
+log = logging.getLogger(__name__)
+
+Values: TypeAlias = dict[str, float]
+Points: TypeAlias = NDArray[np.float64]
+
+GRIDS: Final[Mapping[str, Sequence[float]]] = {
+    "contrast_min": (3, 4, 5, 6, 8, 10, 13, 16),
+    "clutter_gain": (0.5, 1, 1.5, 2, 3, 4),
+    "value_min": (120, 140, 160, 180, 200, 220, 235, 245, 250),
+    "saturation_max": (40, 60, 90, 120, 150, 200, 255),
+    "close_px": (1, 3, 5, 9),
+    "area_min_px": (1, 2, 4, 6, 10, 20),
+}
+FIRST: Final = 8
+NEAR_WIDTHS: Final = 0.01
+COST_OF_FALSE: Final = 0.01
+LIKELY: Final = 0.5
+ROUNDS: Final = 2
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with the lights that should be found in it, (L, 2) px."""
+
+    name: str
+    pixels: NDArray[np.uint8]
+    lights_px: Points
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How a set of values does: share of lights among the first candidates, false candidates a picture."""
+
+    recall: float
+    false: float
+
+    @property
+    def worth(self) -> float:
+        """One figure for both."""
+        return self.recall - COST_OF_FALSE * self.false
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap")
+    parser.add_argument(
+        "--truth", metavar="T.mcap", help="where the lights truly are; default: in the dive, if it says"
+    )
+    parser.add_argument("--method", default=METHODS[0], choices=METHODS, help=f"default: {METHODS[0]}")
+    parser.add_argument(
+        "--environment", default=ENVIRONMENTS[1], choices=ENVIRONMENTS[1:], help="the preset to start from"
+    )
+    parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
+    parser.add_argument("--draw", default="tuned", metavar="DIR", help="for the marked pictures; default: tuned")
+    parser.add_argument("--json", action="store_true")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Propose values; return 0."""
+    cv2.setNumThreads(1)
+    if args.pictures < 1:
+        raise BuddylineError("--pictures: at least 1")
+    pictures, by = _load(args.inputs, args.truth, args.pictures)
+    lights = sum(len(picture.lights_px) for picture in pictures)
+    if lights == 0:
+        raise BuddylineError("no lights in these pictures to tune on; give pictures with the lamps on, or --truth")
+    present = dict(presets(args.method)[args.environment])
+    proposed, before, after = propose(args.method, args.environment, present, pictures)
+    folder = _write(args.draw, args.method, args.environment, proposed, pictures)
+    report = {
+        "method": args.method,
+        "environment": args.environment,
+        "pictures": len(pictures),
+        "lights": lights,
+        "judged_by": by,
+        "present": present | {"recall": before.recall, "false_a_picture": before.false},
+        "proposed": proposed | {"recall": after.recall, "false_a_picture": after.false},
+        "marked": str(folder),
+    }
+    if args.json:
+        json.dump(report, sys.stdout, indent=1)
+        sys.stdout.write("\n")
+    else:
+        sys.stdout.write(_text(report, proposed, before, after))
+    return 0
+
+
+def propose(
+    method: str, environment: str, present: Values, pictures: Sequence[Picture]
+) -> tuple[Values, Judged, Judged]:
+    """Try one value after the other on its grid; return the best set, and how the present and the best one do.
+
+    A value changes only where that is of use: of equals, the present one stays.
+    """
+    best = dict(present)
+    before = judged = judge(method, environment, best, pictures)
+    trials = [(name, value) for name in present for value in GRIDS[name]]
+    with Progress("tune", ROUNDS * len(trials)) as progress:
+        for round_ in range(ROUNDS):
+            improved = False
+            for i, (name, value) in enumerate(trials):
+                progress.show(round_ * len(trials) + i, f"{name} = {value:g}")
+                if value == best[name]:
+                    continue
+                trial = best | {name: float(value)}
+                result = judge(method, environment, trial, pictures)
+                if result.worth > judged.worth + 1e-9:
+                    best, judged, improved = trial, result, True
+            if not improved:
+                break
+    return best, before, judged
+
+
+def judge(method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Judged:
+    """Return how a set of values does on these pictures."""
+    detector = make_detector(method, environment, values)
+    found = lights = false = 0
+    for picture in pictures:
+        blobs = [d.blob for d in detector.detect(picture.pixels)]
+        at_px = np.array([(blob.u_px, blob.v_px) for blob in blobs]).reshape(-1, 2)
+        apart = np.hypot(*(at_px[:, None] - picture.lights_px).transpose(2, 0, 1))
+        near = apart < NEAR_WIDTHS * picture.pixels.shape[1]
+        found += int(near[:FIRST].any(axis=0).sum())
+        false += int((~near.any(axis=1)).sum())
+        lights += len(picture.lights_px)
+    return Judged(found / max(lights, 1), false / max(len(pictures), 1))
+
+
+def _load(inputs: Sequence[str], truth: str | None, limit: int) -> tuple[list[Picture], str]:
+    """Return the pictures to judge by, and by what."""
+    dives = [name for name in inputs if Path(name).suffix == ".mcap"]
+    if dives and len(dives) != len(inputs):
+        raise BuddylineError("give either pictures or dive logs, not both at once")
+    known: dict[tuple[str, int], Points] = {}
+    if dives:
+        known = _truths([*dives, *([truth] if truth else [])])
+        named = list(_dive_pictures(dives, known, limit))
+    elif truth:
+        raise BuddylineError("--truth: is a dive's; pictures have none")
+    else:
+        named = [(str(file), None, pixels) for file, pixels in _readable(_spread(_files(inputs), limit))]
+    if not named:
+        raise BuddylineError(f"{', '.join(inputs)}: hold no pictures" + (" with truth" if known else ""))
+    if known:
+        return [Picture(name, pixels, lights) for name, lights, pixels in named if lights is not None], "truth"
+    detector = make_detector()
+    pictures = []
+    for name, _, pixels in named:
+        likely = [d.blob for d in detector.detect(pixels) if isinstance(d.blob.score, float) and d.blob.score >= LIKELY]
+        pictures.append(Picture(name, pixels, np.array([(b.u_px, b.v_px) for b in likely]).reshape(-1, 2)))
+    return pictures, "likely candidates of the default detector"
+
+
+def _truths(paths: Sequence[str]) -> dict[tuple[str, int], Points]:
+    """Return the visible lights of each node's picture at each trigger, as far as these logs say."""
+    known = {}
+    with Dive(list(paths)) as dive:
+        for record in dive.records(LIGHT_TRUTH.name):
+            try:
+                said = decode(record.payload, LightTruth)
+            except MessageError:
+                continue
+            lights = [(light.u_px, light.v_px) for light in said.lights if light.visible]
+            known[said.node, said.trigger] = np.array(lights).reshape(-1, 2)
+    return known
+
+
+def _dive_pictures(
+    paths: Sequence[str], known: Mapping[tuple[str, int], Points], limit: int
+) -> Iterable[tuple[str, Points | None, NDArray[np.uint8]]]:
+    with Dive(list(paths)) as dive:
+        infos = dive.infos()
+        listed = []
+        for record in dive.records(IMAGE.name):
+            parsed = parse_key(record.key)
+            node = parsed[1][0] if parsed else ""
+            try:
+                image = decode(record.payload, CompressedImage)
+            except MessageError:
+                continue
+            trigger = trigger_index(image.stamp_ns, infos[node].trigger_period_ns) if node in infos else 0
+            if not known or (node, trigger) in known:
+                listed.append((node, trigger, image.data))
+        for node, trigger, data in _spread(listed, limit):
+            name = f"{node}_{trigger}"
+            try:
+                yield name, known.get((node, trigger)), decode_picture(data, name)
+            except PictureError as error:
+                log.warning("skipped: %s", error)
+
+
+def _files(inputs: Sequence[str]) -> list[Path]:
+    files: list[Path] = []
+    for name in inputs:
+        if not Path(name).exists():
+            raise BuddylineError(f"{name}: no such picture, folder or dive log")
+        files += picture_files(Path(name))
+    return files
+
+
+def _readable(files: Iterable[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
+    """Yield the pictures that can be used; the others with a warning each."""
+    for file in files:
+        try:
+            yield file, decode_picture(file.read_bytes(), str(file))
+        except (PictureError, OSError) as error:
+            log.warning("skipped: %s", error)
+
+
+def _spread(items: list[Any], limit: int) -> list[Any]:
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, min(limit, len(items)))]
+
+
+def _write(folder: str, method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Path:
+    """Write every picture with what the proposed values find in it, the lights it was judged by as crosses."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    detector = make_detector(method, environment, values)
+    for picture in pictures:
+        marked = draw(picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px])
+        cv2.imwrite(str(path / f"{Path(picture.name).stem}.png"), marked)
+    return path
+
+
+def _text(report: Mapping[str, Any], proposed: Values, before: Judged, after: Judged) -> str:
+    lines = [
+        f"{report['pictures']} pictures, {report['lights']} lights, judged by {report['judged_by']}",
+        f"{'':16s}{'present':>10s}{'proposed':>10s}",
+        *(f"{name:16s}{report['present'][name]:10g}{value:10g}" for name, value in proposed.items()),
+        f"{'lights found':16s}{before.recall:10.1%}{after.recall:10.1%}",
+        f"{'false a picture':16s}{before.false:10.2f}{after.false:10.2f}",
+        f"marked pictures: {report['marked']}/",
+        "",
+        "[detector]",
+        f'method = "{report["method"]}"',
+        f'environment = "{report["environment"]}"',
+        "overrides = { " + ", ".join(f"{name} = {value:.1f}" for name, value in proposed.items()) + " }",
+    ]
+    return "\n".join(lines) + "\n"
