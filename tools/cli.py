@@ -73,6 +73,12 @@ COMMANDS: Final = (
         ),
     ),
     Command(
+        "tune",
+        "tools.tune",
+        "propose a site's detector values, and show the pictures they were judged on",
+        ("buddyline tune dive.mcap", "buddyline tune pictures/ --draw judged/"),
+    ),
+    Command(
         "solve",
         "tools.solve",
         "solve stored dives offline",
