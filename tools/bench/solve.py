@@ -1,7 +1,8 @@
 """How fast the solver is: milliseconds per trigger, nanoseconds per hypothesis, growth with the candidates.
 
-A hypothesis is one pair of candidates in A's picture with one in B's; which of a pair is left and which right makes
-four assignments of each. Beside it, in the same run: Eq. 1 alone, once per hypothesis, in C and in numpy.
+A hypothesis is an assignment of two candidates in A's picture to B's left and right light, and of two in B's to A's.
+The column beside it counts combinations of pairs, whichever of a pair is left: a quarter as many. In the same run:
+Eq. 1 alone, in C and in numpy.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from numpy.typing import NDArray
 
 from protocol.errors import BuddylineError
 from solver_service.geometry.closed_form import eq1_range_m
-from solver_service.geometry.rotation import quaternion_of
-from solver_service.geometry.trigger import Camera, Fix, Rig, Sensed, Settings, View, solve_trigger
+from solver_service.geometry.trigger import Fix, Settings
+from tools.bench.triggers import Trigger, simulate
 
 Floats = NDArray[np.float64]
 
 COUNTS: Final = (2, 4, 8, 16, 32, 64)
 TRIGGERS: Final = 20
-CAMERA: Final = Camera("pinhole", 1640, 1232, 1800.0, 1800.0, 819.5, 615.5)
-RIG: Final = Rig(CAMERA, np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]]))
+RANGE_M: Final = (2.0, 15.0)
+SETTINGS: Final = Settings()
 EQ1_C: Final = """
 #include <math.h>
 void eq1(long n, const double *alpha, const double *beta, double d, double *l)
@@ -68,14 +69,15 @@ def measure(counts: list[int], repeats: int) -> dict[str, Any]:
     """Return all figures, times as the median over triggers of the fastest repeat."""
     rows = []
     for count in counts:
-        row: dict[str, Any] = {"candidates": count, "hypotheses": math.comb(count, 2) ** 2}
-        for name, sensed in (("alone_ms", False), ("sensors_ms", True)):
+        row: dict[str, Any] = {"candidates": count, "hypotheses": (count * (count - 1)) ** 2}
+        for name, sensors in (("alone_ms", False), ("sensors_ms", True)):
             rng = np.random.default_rng(count)
-            triggers = [trigger(rng, count, sensed) for _ in range(TRIGGERS)]
-            times, right = zip(*(timed(arguments, repeats) for arguments in triggers), strict=True)
+            triggers = [simulate(rng, RANGE_M, count - 2) for _ in range(TRIGGERS)]
+            times, right = zip(*(timed(trigger, sensors, repeats) for trigger in triggers), strict=True)
             row[name] = 1e3 * float(np.median(times))
             row[name.replace("_ms", "_solved")] = sum(right) / TRIGGERS
         row["ns_per_hypothesis"] = 1e6 * row["sensors_ms"] / row["hypotheses"]
+        row["ns_per_combination"] = 4.0 * row["ns_per_hypothesis"]
         rows.append(row)
     figures: dict[str, Any] = {"solver": rows, "eq1_numpy_ns": eq1_numpy_ns(repeats), "eq1_c_ns": eq1_c_ns(repeats)}
     by_count = {row["candidates"]: row["sensors_ms"] for row in rows}
@@ -86,10 +88,11 @@ def measure(counts: list[int], repeats: int) -> dict[str, Any]:
 
 def table(figures: dict[str, Any]) -> str:
     """Return the figures for a person."""
-    lines = ["candidates  hypotheses   ms alone (solved)   ms with sensors (solved)   ns/hypothesis"]
+    lines = ["candidates  hypotheses   ms alone (solved)   ms with sensors (solved)   ns/hypothesis  ns/combination"]
     lines += [
         f"{row['candidates']:10d}  {row['hypotheses']:10d}  {row['alone_ms']:8.3f} ({row['alone_solved']:4.0%})"
         f"      {row['sensors_ms']:8.3f} ({row['sensors_solved']:4.0%})         {row['ns_per_hypothesis']:10.1f}"
+        f"      {row['ns_per_combination']:10.1f}"
         for row in figures["solver"]
     ]
     if "growth_16_to_64" in figures:
@@ -101,59 +104,14 @@ def table(figures: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def timed(arguments: tuple[Any, ...], repeats: int) -> tuple[float, bool]:
+def timed(trigger: Trigger, sensors: bool, repeats: int) -> tuple[float, bool]:
     """Return the fastest of some repeats, and whether there was a pose."""
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        found = solve_trigger(*arguments)
+        found = trigger.solve(SETTINGS, sensors=sensors)
         seconds.append(time.perf_counter() - start)
     return min(seconds), isinstance(found, Fix)
-
-
-def trigger(rng: np.random.Generator, count: int, sensed: bool) -> tuple[Any, ...]:
-    """Return the arguments of one trigger: two nodes face to face at 2 to 15 m, four lights and false candidates."""
-    mount = RIG.R_body_camera
-    while True:
-        R_ned_a, R_ned_b = upright(rng, 0.0) @ mount, upright(rng, math.pi) @ mount
-        t = rng.uniform(2.0, 15.0) * CAMERA.bearings(rng.uniform((300, 200), (1340, 1032), (1, 2)))[0]
-        R = R_ned_a.T @ R_ned_b
-        pixels = [image(RIG.lights_m @ R.T + t), image((RIG.lights_m - t) @ R)]
-        if all((p > 0).all() and (p < (1639, 1231)).all() for p in pixels):
-            break
-    views = []
-    for clear in pixels:
-        false = rng.uniform((0, 0), (1640, 1232), (count - 2, 2))
-        all_px = rng.permutation(np.concatenate((clear + rng.standard_normal((2, 2)), false)))
-        one = np.ones(count)
-        views.append(View(all_px, one, np.full(count, np.nan), 100.0 * one, 255.0 * one, 0.0 * one, 0))
-    sensors = [Sensed(), Sensed()]
-    if sensed:
-        sigma = np.radians((1.0, 1.0, 4.0))
-        depth_m = 10.0 + float((R_ned_a @ t)[2])
-        sensors = [
-            Sensed(quaternion_of(R_ned_a @ mount.T), sigma, 10.0, 0.02),
-            Sensed(quaternion_of(R_ned_b @ mount.T), sigma, depth_m, 0.02),
-        ]
-    return (*views, RIG, RIG, *sensors, Settings())
-
-
-def upright(rng: np.random.Generator, heading_rad: float) -> Floats:
-    """Return a body's rotation to NED: about upright, about that heading."""
-    (y, p, r), R = rng.normal((heading_rad, 0.0, 0.0), 0.1), np.eye(3)
-    for i, j, angle in ((0, 1, y), (2, 0, p), (1, 2, r)):
-        turn = np.eye(3)
-        turn[i, i] = turn[j, j] = math.cos(angle)
-        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
-        R = R @ turn
-    return R
-
-
-def image(points_m: Floats) -> Floats:
-    """Project points of the camera's frame with the plain pinhole; behind it nothing is in the picture."""
-    z = np.where(points_m[:, 2:] > 0.1, points_m[:, 2:], np.nan)
-    pixels: Floats = points_m[:, :2] / z * CAMERA.fx_px + (CAMERA.cx_px, CAMERA.cy_px)
-    return pixels
 
 
 def fastest_ns(evaluate: Callable[[], object], repeats: int) -> float:

@@ -1,0 +1,45 @@
+"""The search: it leaves out nothing that passes both gaps."""
+
+import numpy as np
+import pytest
+
+from solver_service.geometry.closed_form import closed_form
+from solver_service.geometry.hypotheses import find_pairs, join
+from solver_service.geometry.observation import Settings
+from solver_service.geometry.terms import Terms
+from solver_service.geometry.trigger import Sensed
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, view
+
+GATE = 4.5
+
+
+@pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
+def test_every_combination_within_both_gates_is_found(rigs):
+    rng = np.random.default_rng(1)
+    passing = 0
+    for _ in range(25):
+        views = tuple(view(rng.uniform((0, 0), (1640, 1232), (14, 2)), 1.0) for _ in range(2))
+        terms = Terms.of(views, rigs, (Sensed(), Sensed()), Settings(), None)
+        pairs = find_pairs(terms.candidates, terms.rigs, (terms.sensors.down_a, terms.sensors.down_b), terms.settings)
+        none = np.zeros(pairs.split)
+        ia, ib, _ = join(pairs, terms.rigs, GATE, none, by_range=True, by_twist=True)
+        found = set(zip(ia.tolist(), ib.tolist(), strict=True))
+        of_a, of_b = np.arange(pairs.split), np.arange(pairs.split, len(pairs.key))
+        a, b, swap = (grid.ravel() for grid in np.meshgrid(of_a, of_b, (False, True), indexing="ij"))
+        bearings = terms.candidates.bearings
+        first, second = np.where(swap, pairs.second[b], pairs.first[b]), np.where(swap, pairs.first[b], pairs.second[b])
+        levels = terms.rigs.levels
+        with np.errstate(all="ignore"):
+            solved = closed_form(
+                np.stack((bearings[:, pairs.first[a]], bearings[:, first])),
+                np.stack((bearings[:, pairs.second[a]], bearings[:, second])),
+                *levels,
+            )
+            gap = np.log(solved.range_m[0] / solved.range_m[1])
+            gate = GATE * np.sqrt(pairs.variance[a] + pairs.variance[b])
+            within = (np.abs(gap) < gate) & (np.abs(solved.twist_gap_rad) < gate)
+            within &= solved.range_m.mean(0) > 1.5
+        expected = set(zip(a[within].tolist(), b[within].tolist(), strict=True))
+        passing += len(expected)
+        assert expected <= found
+    assert passing > 20

@@ -1,0 +1,153 @@
+"""How good the solver is, on simulated triggers: errors over the Cramer-Rao bound, and the choice of the four lights.
+
+Bound: of the eight coordinates, by numeric derivatives of the projection. Choice: the right four lights of all
+triggers, with so many false candidates in each picture, by the range gap alone (the paper's test: the pairs whose
+ranges agree best), by pictures alone, and with attitude and depth; then wrong poses (more than 10 % of the range off).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.errors import BuddylineError
+from solver_service.geometry.closed_form import closed_form
+from solver_service.geometry.rotation import matrix_of, rotation_exp, rotation_log
+from solver_service.geometry.trigger import Fix, Settings
+from tools.bench.triggers import CAMERA, RIG, Trigger, images, simulate
+
+Floats = NDArray[np.float64]
+
+RANGES_M: Final = (1.5, 2.0, 4.0, 6.0, 10.0, 15.0, 20.0)
+SIGMAS_PX: Final = (0.3, 1.0)
+METHODS: Final = ("refined", "exact", "paper", "paper_midpoint", "paper_literal")
+BANDS_M: Final = ((1.5, 4.0), (4.0, 10.0), (10.0, 20.0))
+FALSE: Final = (1, 2, 4, 8, 16)
+WRONG: Final = 0.1
+STEP: Final = 1e-6
+
+
+def main(argv: list[str]) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m tools.bench accuracy", description=__doc__)
+    parser.add_argument("--triggers", type=int, default=200, metavar="N", help="of each kind")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    if args.triggers < 1:
+        raise BuddylineError("--triggers: at least 1")
+    errors = [over_bound(range_m, sigma_px, args.triggers) for range_m in RANGES_M for sigma_px in SIGMAS_PX]
+    choices = [choice(band_m, false, args.triggers) for band_m in BANDS_M for false in FALSE]
+    if args.json:
+        json.dump({"errors": errors, "choices": choices}, sys.stdout, indent=1)
+        sys.stdout.write("\n")
+    else:
+        sys.stdout.write(table(errors, choices))
+    return 0
+
+
+def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
+    """Return RMSE over the bound, position and rotation, of every method, and the covariance's normalized error."""
+    rng = np.random.default_rng(round(100 * range_m))
+    bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in METHODS}, []
+    for _ in range(count):
+        trigger = simulate(rng, (range_m, range_m), sigma_px=sigma_px)
+        bound += limit(trigger, sigma_px)
+        for method in METHODS:
+            settings = Settings(method=method, min_probability=0.0, range_min_m=0.5, range_max_m=60.0)
+            fix = trigger.solve(settings, sensors=False)
+            if not isinstance(fix, Fix):
+                raise BuddylineError(f"{method} finds no pose at {range_m:g} m: {fix.detail}")
+            turn = rotation_log(trigger.R_a_b @ matrix_of(fix.q_a_b_xyzw).T)
+            error = np.concatenate((trigger.t_a_b_m - fix.t_a_b_m, turn))
+            squares[method] += error[:3] @ error[:3], error[3:] @ error[3:]
+            if method == "refined":
+                nees.append(float(error @ np.linalg.solve(fix.covariance, error)) / 6.0)
+    return {
+        "range_m": range_m,
+        "sigma_px": sigma_px,
+        "bound_m": math.sqrt(bound[0] / count),
+        "bound_rad": math.sqrt(bound[1] / count),
+        "over_bound": {method: np.sqrt(squares[method] / bound).tolist() for method in METHODS},
+        "nees": float(np.mean(nees)),
+    }
+
+
+def limit(trigger: Trigger, sigma_px: float) -> tuple[float, float]:
+    """Return the bound's traces: position, m^2, and rotation, rad^2."""
+    columns = []
+    for step in STEP * np.eye(6):
+        ends = [images(trigger.t_a_b_m + s[:3], rotation_exp(s[3:]) @ trigger.R_a_b) for s in (step, -step)]
+        columns.append((ends[0] - ends[1]).ravel() / (2.0 * STEP))
+    J = np.array(columns).T
+    covariance = sigma_px**2 * np.linalg.inv(J.T @ J)
+    return float(np.trace(covariance[:3, :3])), float(np.trace(covariance[3:, 3:]))
+
+
+def choice(band_m: tuple[float, float], false: int, count: int) -> dict[str, Any]:
+    """Return the shares of right choices, and of wrong poses among all poses."""
+    rng = np.random.default_rng(false)
+    row: dict[str, Any] = {"range_m": list(band_m), "false": false, "range_gap_alone": 0.0}
+    tally = {name: [0, 0, 0] for name in ("pictures", "sensors")}
+    for _ in range(count):
+        trigger = simulate(rng, band_m, false)
+        row["range_gap_alone"] += trigger_by_range_gap(trigger) / count
+        for name, counts in tally.items():
+            fix = trigger.solve(Settings(), sensors=name == "sensors")
+            if isinstance(fix, Fix):
+                off = float(np.linalg.norm(fix.t_a_b_m - trigger.t_a_b_m) / np.linalg.norm(trigger.t_a_b_m))
+                counts[0] += trigger.right(fix)
+                counts[1] += off > WRONG
+                counts[2] += 1
+    for name, (right, wrong, poses) in tally.items():
+        row[name] = right / count
+        row[f"{name}_wrong"] = wrong / poses if poses else 0.0
+    return row
+
+
+def trigger_by_range_gap(trigger: Trigger) -> bool:
+    """Choose the pairs whose ranges agree best, the right light on the left in the picture; tell if they are right."""
+    pairs, rays = [], []
+    for view in trigger.views:
+        first, second = np.triu_indices(len(view.pixels), 1)
+        swap = view.pixels[first, 0] < view.pixels[second, 0]
+        left, right = np.where(swap, second, first), np.where(swap, first, second)
+        bearings = CAMERA.bearings(view.pixels)
+        pairs.append((left, right))
+        rays.append((bearings[left].T, bearings[right].T))
+    a, b = (grid.ravel() for grid in np.meshgrid(*(np.arange(len(left)) for left, _ in pairs), indexing="ij"))
+    ends = [np.stack((rays[0][end][:, a], rays[1][end][:, b])) for end in (0, 1)]
+    range_m = closed_form(ends[0], ends[1], RIG, RIG, "paper").range_m
+    inside = (range_m.mean(0) > Settings().range_min_m) & (range_m.mean(0) < Settings().range_max_m)
+    best = int(np.where(inside, np.abs(range_m[0] - range_m[1]), np.inf).argmin())
+    chosen = [(int(left[k]), int(right[k])) for (left, right), k in zip(pairs, (a[best], b[best]), strict=True)]
+    return chosen == [trigger.pair_a, trigger.pair_b]
+
+
+def table(errors: list[dict[str, Any]], choices: list[dict[str, Any]]) -> str:
+    """Return both tables for a person."""
+    lines = [
+        "RMSE over the bound, position / rotation",
+        "range sigma    bound          " + "  ".join(METHODS) + "  NEES",
+    ]
+    for row in errors:
+        ratios = "  ".join(f"{position:.3f}/{rotation:.3f}" for position, rotation in row["over_bound"].values())
+        bound = f"{1e3 * row['bound_m']:6.1f} mm {math.degrees(row['bound_rad']):.3f} deg"
+        lines.append(f"{row['range_m']:4.1f}m {row['sigma_px']:.1f}px  {bound}  {ratios}  {row['nees']:.3f}")
+    lines += [
+        "",
+        "right lights, and wrong poses of all poses",
+        "range      false  range gap alone  pictures       with sensors",
+    ]
+    for row in choices:
+        low, high = row["range_m"]
+        lines.append(
+            f"{low:4.1f}-{high:4.1f} m  {row['false']:3d}     {row['range_gap_alone']:.3f}       "
+            f"{row['pictures']:.3f} {row['pictures_wrong']:.4f}   {row['sensors']:.3f} {row['sensors_wrong']:.4f}"
+        )
+    return "\n".join(lines) + "\n"

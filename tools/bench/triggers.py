@@ -1,0 +1,105 @@
+"""Simulated triggers with their truth, for the benchmarks: two like nodes face to face, and false candidates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from solver_service.geometry.rotation import quaternion_of
+from solver_service.geometry.trigger import Camera, Fix, NoFix, Rig, Sensed, Settings, View, solve_trigger
+
+Floats = NDArray[np.float64]
+
+CAMERA: Final = Camera("pinhole", 1640, 1232, 1800.0, 1800.0, 819.5, 615.5)
+RIG: Final = Rig(CAMERA, np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]]))
+# As in the design's table: roll and pitch 1.4 degrees, yaw 5 and depth 3 cm between the two, 1 sd.
+TILT_SIGMA_RAD: Final = math.radians(1.0)
+HEADING_SIGMA_RAD: Final = math.radians(3.5)
+DEPTH_SIGMA_M: Final = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Trigger:
+    """One trigger: what is seen and sensed, and the truth: T_a_b and the true candidates (left, right)."""
+
+    views: tuple[View, View]
+    sensed: tuple[Sensed, Sensed]
+    t_a_b_m: Floats
+    R_a_b: Floats
+    pair_a: tuple[int, int]
+    pair_b: tuple[int, int]
+
+    def solve(self, settings: Settings, *, sensors: bool) -> Fix | NoFix:
+        """Solve it, with what is sensed or without."""
+        sensed = self.sensed if sensors else (Sensed(), Sensed())
+        return solve_trigger(*self.views, RIG, RIG, *sensed, settings)
+
+    def right(self, fix: Fix) -> bool:
+        """Whether all four lights are the true ones."""
+        return (fix.pair_a, fix.pair_b) == (self.pair_a, self.pair_b)
+
+
+def simulate(rng: np.random.Generator, range_m: tuple[float, float], false: int = 0, sigma_px: float = 1.0) -> Trigger:
+    """Return a trigger with all four lights in view and so many false candidates in each picture."""
+    mount = RIG.R_body_camera
+    while True:
+        r = rng.uniform(*range_m)
+        edge_px = min(0.4 * RIG.length_m / r * CAMERA.fx_px, 0.45 * CAMERA.width_px)
+        pixel = rng.uniform((edge_px, 0), (CAMERA.width_px - edge_px, CAMERA.height_px), (1, 2))
+        R_ned_a, R_ned_b = _upright(rng, 0.0) @ mount, _upright(rng, math.pi) @ mount
+        t, R = r * CAMERA.bearings(pixel)[0], R_ned_a.T @ R_ned_b
+        clear = images(t, R)
+        if (clear > 0.0).all() and (clear < (CAMERA.width_px - 1, CAMERA.height_px - 1)).all():
+            break
+    views, pairs = [], []
+    for lights in clear.reshape(2, 2, 2):
+        pixels = np.concatenate(
+            (
+                lights + sigma_px * rng.standard_normal((2, 2)),
+                rng.uniform((0, 0), (CAMERA.width_px, CAMERA.height_px), (false, 2)),
+            )
+        )
+        order = rng.permutation(len(pixels))
+        places = np.argsort(order)
+        pairs.append((int(places[0]), int(places[1])))
+        one = np.ones(len(pixels))
+        views.append(View(pixels[order], sigma_px * one, np.nan * one, 100.0 * one, 255.0 * one, 0.0 * one, 0))
+    sigma_rad = np.array((TILT_SIGMA_RAD, TILT_SIGMA_RAD, HEADING_SIGMA_RAD))
+    depths_m = 10.0, 10.0 + float((R_ned_a @ t)[2])
+    sensed = [
+        Sensed(
+            quaternion_of(R_ned @ mount.T @ _turn(rng.normal(0.0, sigma_rad[::-1]))),
+            sigma_rad,
+            depth_m + rng.normal(0.0, DEPTH_SIGMA_M),
+            DEPTH_SIGMA_M,
+        )
+        for R_ned, depth_m in zip((R_ned_a, R_ned_b), depths_m, strict=True)
+    ]
+    return Trigger((views[0], views[1]), (sensed[0], sensed[1]), t, R, pairs[0], pairs[1])
+
+
+def images(t_a_b_m: Floats, R_a_b: Floats) -> Floats:
+    """Project B's left and right light into A's picture, and A's into B's (4, 2); NaN behind a camera."""
+    points_m = np.concatenate((RIG.lights_m @ R_a_b.T + t_a_b_m, (RIG.lights_m - t_a_b_m) @ R_a_b))
+    z = np.where(points_m[:, 2:] > 0.1, points_m[:, 2:], np.nan)
+    pixels: Floats = points_m[:, :2] / z * CAMERA.fx_px + (CAMERA.cx_px, CAMERA.cy_px)
+    return pixels
+
+
+def _upright(rng: np.random.Generator, heading_rad: float) -> Floats:
+    """Return a body's rotation to NED: about upright, about that heading."""
+    return _turn(rng.normal((heading_rad, 0.0, 0.0), (0.3, 0.2, 0.2)))
+
+
+def _turn(yaw_pitch_roll_rad: Floats) -> Floats:
+    R = np.eye(3)
+    for (i, j), angle in zip(((0, 1), (2, 0), (1, 2)), yaw_pitch_roll_rad, strict=True):
+        turn = np.eye(3)
+        turn[i, i] = turn[j, j] = math.cos(angle)
+        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
+        R = R @ turn
+    return R
