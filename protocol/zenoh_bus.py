@@ -33,10 +33,11 @@ ALIVE: Final = "buddyline/@alive"
 HEARTBEAT_S: Final = 0.25
 RETRY_S: Final = 0.25
 QUERY_S: Final = 2.0
-# Longer than the lease: a link that fell silent ends by that, and its questions with it.
+# Longer than the lease: a link that fell silent ends by that, and its questions with it. Then once more, for a
+# machine that was too busy.
 PROBE_S: Final = 4.0
+PROBE_AGAIN_S: Final = 1.0
 PROBE_EVERY_S: Final = 2.0
-PROBES: Final = 2
 INTAKE: Final = 8192
 MAX_FETCHING: Final = 16
 FETCHES: Final = 16
@@ -220,32 +221,33 @@ class Watchdog:
         self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
-        answered, strikes = False, 0
+        answered = just_cut = False
         while not self._stop.wait(PROBE_EVERY_S):
             try:
-                timed_out = self._probe()
+                # Cutting one half may leave another: what was just made anew needs no long proof.
+                patience_s = PROBE_AGAIN_S if just_cut else PROBE_S
+                deaf = self._times_out(patience_s) and self._times_out(PROBE_AGAIN_S)
             except zenoh.ZError:
                 continue
             # A hub that answers nobody's question is not judged by it.
-            answered = answered or not timed_out
-            strikes = strikes + 1 if timed_out and answered else 0
-            if strikes == PROBES:
-                strikes = 0
-                self._cut()
+            answered = answered or not deaf
+            if deaf and answered:
+                self._cut(patience_s + PROBE_AGAIN_S)
+            just_cut = deaf and not just_cut
 
-    def _probe(self) -> bool:
+    def _times_out(self, timeout_s: float) -> bool:
         """Ask the hub for nothing; return whether the answer, which is that there is nothing, did not come.
 
         Where there is no hub, or its lease runs out meanwhile, that is the answer.
         """
-        replies = self._session.liveliness().get(f"{ALIVE}/probe", timeout=PROBE_S)
+        replies = self._session.liveliness().get(f"{ALIVE}/probe", timeout=timeout_s)
         return any(reply.err is not None for reply in list(replies))
 
-    def _cut(self) -> None:
+    def _cut(self, unheard_s: float) -> None:
         for link in self._session.info.links():
             host, _, port = str(link.src).partition("/")[2].rpartition(":")
             if cut_connection(host.strip("[]"), int(port)):
-                log.warning("the hub was not heard for %g s: the connection is made anew", PROBES * PROBE_S)
+                log.warning("the hub was not heard for %g s: the connection is made anew", unheard_s)
 
 
 class BulkLink:

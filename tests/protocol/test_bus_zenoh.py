@@ -278,16 +278,16 @@ def test_a_connection_that_hears_nothing_is_made_anew(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Half a connection, as Zenoh may leave it: here its other end stands still for less than the lease."""
-    for name, value in (("PROBE_S", 0.2), ("PROBE_EVERY_S", 0.05)):
+    for name, value in (("PROBE_S", 0.3), ("PROBE_AGAIN_S", 0.2), ("PROBE_EVERY_S", 0.05)):
         monkeypatch.setattr(zenoh_bus, name, value)
     endpoint, inbox, answers = free_endpoint(), Inbox(), []
-    ask = zenoh_bus.Watchdog._probe
+    ask = zenoh_bus.Watchdog._times_out
 
-    def probe(watchdog: zenoh_bus.Watchdog) -> bool:
-        answers.append(ask(watchdog))
+    def times_out(watchdog: zenoh_bus.Watchdog, timeout_s: float) -> bool:
+        answers.append(ask(watchdog, timeout_s))
         return answers[-1]
 
-    monkeypatch.setattr(zenoh_bus.Watchdog, "_probe", probe)
+    monkeypatch.setattr(zenoh_bus.Watchdog, "_times_out", times_out)
     with hub_process(endpoint) as hub, run_client(endpoint) as node, run_client(endpoint) as solver:
         until(lambda: len(answers) > 4)
         assert not any(answers)
