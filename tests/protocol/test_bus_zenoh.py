@@ -16,11 +16,12 @@ from contextlib import contextmanager
 import pytest
 import zenoh
 
-from protocol import topics, zenoh_bus
+from protocol import topics
 from protocol.bus import Bus, Received
 from protocol.connection import cut_connection
 from protocol.errors import BuddylineError
-from protocol.zenoh_bus import connect, open_hub
+from protocol.zenoh_bus import connect, open_hub, watchdog
+from protocol.zenoh_bus import subscription as subscription_module
 
 WAIT_S = 10.0
 
@@ -279,15 +280,15 @@ def test_a_connection_that_hears_nothing_is_made_anew(
 ) -> None:
     """Half a connection, as Zenoh may leave it: here its other end stands still for less than the lease."""
     for name, value in (("PROBE_S", 0.3), ("PROBE_AGAIN_S", 0.2), ("PROBE_EVERY_S", 0.05)):
-        monkeypatch.setattr(zenoh_bus, name, value)
+        monkeypatch.setattr(watchdog, name, value)
     endpoint, inbox, answers = free_endpoint(), Inbox(), []
-    ask = zenoh_bus.Watchdog._times_out
+    ask = watchdog.Watchdog._times_out
 
-    def times_out(watchdog: zenoh_bus.Watchdog, timeout_s: float) -> bool:
-        answers.append(ask(watchdog, timeout_s))
+    def times_out(dog: watchdog.Watchdog, timeout_s: float) -> bool:
+        answers.append(ask(dog, timeout_s))
         return answers[-1]
 
-    monkeypatch.setattr(zenoh_bus.Watchdog, "_times_out", times_out)
+    monkeypatch.setattr(watchdog.Watchdog, "_times_out", times_out)
     with hub_process(endpoint) as hub, run_client(endpoint) as node, run_client(endpoint) as solver:
         until(lambda: len(answers) > 4)
         assert not any(answers)
@@ -340,7 +341,7 @@ def test_nothing_listens_but_the_hub_and_stdout_is_ours() -> None:
 
 def test_samples_that_never_came_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foreign publisher whose numbers jump, and who cannot be asked for what is missing."""
-    monkeypatch.setattr(zenoh_bus, "FETCHES", 2)
+    monkeypatch.setattr(subscription_module, "FETCHES", 2)
     inbox = Inbox()
     with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
         subscription = bus.subscribe("buddyline/node/*/depth", inbox)

@@ -1,0 +1,174 @@
+"""One process's connection to the hub: its publishers, its subscriptions, its token."""
+
+from __future__ import annotations
+
+import atexit
+import threading
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+import zenoh.ext
+
+from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
+from protocol.clock import Clock, SystemClock
+from protocol.delivery import Delivery, RateCap
+from protocol.endpoint import DEFAULT_ENDPOINT, client_settings
+from protocol.security import Tls
+from protocol.topics import Topic
+from protocol.zenoh_bus.alive import ALIVE, ZenohWatch
+from protocol.zenoh_bus.session import BulkLink, config_of, open_client
+from protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
+from protocol.zenoh_bus.watchdog import Watchdog
+
+HEARTBEAT_S: Final = 0.25
+
+_PRIORITIES: Final = {
+    "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
+    "data_high": zenoh.Priority.DATA_HIGH,
+    "data": zenoh.Priority.DATA,
+    "data_low": zenoh.Priority.DATA_LOW,
+    "background": zenoh.Priority.BACKGROUND,
+}
+
+
+def connect(
+    endpoint: str = DEFAULT_ENDPOINT,
+    *,
+    namespace: str | None = None,
+    stop: threading.Event,
+    on_wait: Callable[[str], None],
+    clock: Clock | None = None,
+    cache_s: float = CACHE_S,
+    tls: Tls | None = None,
+) -> ZenohBus | None:
+    """Connect to the hub, waiting for it where it is not there yet; None where stop was set before.
+
+    on_wait is called once, with what is being waited for. cache_s: how long an outage may last without loss.
+    Raises RefusedError where a hub is there and the two do not accept each other.
+    """
+    config = config_of(client_settings(endpoint, namespace, tls))
+    session = open_client(config, endpoint, tls, stop, on_wait)
+    return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
+
+
+class ZenohPublisher(Publisher):
+    """A Publisher over Zenoh. declare: returns None while its session is not there yet."""
+
+    def __init__(
+        self,
+        declare: Callable[[], zenoh.Publisher | zenoh.ext.AdvancedPublisher | None],
+        topic: Topic,
+        key: str,
+        cap: RateCap,
+    ) -> None:
+        super().__init__(topic, key, cap)
+        self._declare = declare
+        self._declare_lock = threading.Lock()
+        self._publisher = declare()
+
+    def _send(self, payload: bytes) -> bool:
+        if self._publisher is None:
+            with self._declare_lock:
+                self._publisher = self._publisher or self._declare()
+        if self._publisher is None:
+            return False
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError:
+            # The session may close under a device thread that is about to publish.
+            if self._closed:
+                return False
+            raise
+        return True
+
+    def close(self) -> None:
+        """Publish no longer; what the cache held is gone."""
+        if not self._closed:
+            self._closed = True
+            if self._publisher is not None:
+                self._publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+class ZenohBus(Bus):
+    """A Bus over Zenoh; get one from connect()."""
+
+    def __init__(self, session: zenoh.Session, config: zenoh.Config, clock: Clock, cache_s: float) -> None:
+        super().__init__(clock)
+        self._session = session
+        self._bulk = BulkLink(config)
+        self._cache_s = cache_s
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._watchdog = Watchdog(session)
+        # A thread that is still inside Zenoh when the interpreter ends aborts the process.
+        atexit.register(self.close)
+
+    def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
+        """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
+        key, depth = topic.key(*ids), cache_depth(topic, self._cache_s)
+        settings: dict[str, Any] = {
+            "encoding": topic.encoding,
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "priority": _PRIORITIES[topic.priority],
+            "express": topic.express,
+        }
+        if not depth:
+            self._bulk.open()
+
+        def declare() -> zenoh.Publisher | zenoh.ext.AdvancedPublisher | None:
+            if not depth:
+                bulk = self._bulk.session
+                return None if bulk is None else bulk.declare_publisher(key, **settings)
+            return zenoh.ext.declare_advanced_publisher(
+                self._session,
+                key,
+                cache=zenoh.ext.CacheConfig(depth),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+                **settings,
+            )
+
+        wrapped = ZenohPublisher(declare, topic, key, RateCap(max_rate_hz, self.clock))
+        with self._lock:
+            self._publishers.append(wrapped)
+        return wrapped
+
+    def subscribe(
+        self, key_expr: str, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+    ) -> Subscription:
+        """Hand every message on key_expr to handle, one at a time (protocol.bus.Bus has the contract)."""
+        delivery = Delivery(f"bus {key_expr}", handle, capacity, self._failures)
+        subscription = ZenohSubscription(
+            self._session, key_expr, delivery, history=history, clock=self.clock, failures=self._failures
+        )
+        with self._lock:
+            self._subscriptions.append(subscription)
+        return subscription
+
+    def declare_alive(self, name: str) -> None:
+        """Let others see that this process lives, until it closes the bus or dies."""
+        key = f"{ALIVE}/{check_alive_name(name)}/{self._session.zid()}"
+        token = self._session.liveliness().declare_token(key)
+        with self._lock:
+            self._tokens.append(token)
+
+    def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
+        """Call handle(name, alive) for everyone who is alive now, and at every change."""
+        delivery = Delivery[tuple[str, bool]]("bus alive", lambda item: handle(*item), 1024, self._failures)
+        watch = ZenohWatch(self._session, delivery, self._failures)
+        with self._lock:
+            self._subscriptions.append(watch)
+        return watch
+
+    def is_alive(self, name: str) -> bool:
+        """Return whether another process on this bus has declared name."""
+        replies = self._session.liveliness().get(f"{ALIVE}/{check_alive_name(name)}/*", timeout=QUERY_S)
+        own = str(self._session.zid())
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return any(not key.endswith(f"/{own}") for key in keys)
+
+    def _leave(self) -> None:
+        atexit.unregister(self.close)
+        self._watchdog.stop()
+        self._session.close()  # type: ignore[no-untyped-call]
+        self._watchdog.join()
+        self._bulk.close()

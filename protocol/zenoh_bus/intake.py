@@ -1,0 +1,60 @@
+"""Samples out of Zenoh as they come."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
+import zenoh
+import zenoh.ext
+
+from protocol.delivery import CLOSE_S, FailureLatch
+
+INTAKE: Final = 8192
+
+AnySubscriber: TypeAlias = (
+    zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]
+)
+
+
+class Intake:
+    """A thread that takes samples out of Zenoh as they come, so that its own ring never overflows.
+
+    name tells the thread from others; accept gets each sample, and must not wait for its consumer.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        subscriber: AnySubscriber,
+        accept: Callable[[zenoh.Sample], None],
+        failures: FailureLatch,
+    ) -> None:
+        self._subscriber = subscriber
+        # The subscriber's own recv cannot be undeclared while another thread waits in it; its handler's can.
+        self._samples = subscriber.handler
+        self._accept = accept
+        self._failures = failures
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name=f"bus intake {name}", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Undeclare the subscriber, take in what has come, end the thread."""
+        if not self._closed:
+            self._closed = True
+            self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+        if self._thread is not threading.current_thread():
+            self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        try:
+            while True:
+                try:
+                    sample = self._samples.recv()
+                except zenoh.ZError:
+                    return
+                self._accept(sample)
+        except Exception as error:
+            self._failures.report(self._thread.name, error)

@@ -1,0 +1,167 @@
+"""Samples of a key expression in order, each once, with what a fault of the link took."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+import zenoh
+import zenoh.ext
+
+from protocol.bus import Received, held_order
+from protocol.clock import Clock
+from protocol.delivery import CLOSE_S, Delivery, FailureLatch
+from protocol.sequence import Gap, Sequence, Source
+from protocol.topics import parse_key
+from protocol.zenoh_bus.intake import INTAKE, AnySubscriber, Intake
+from protocol.zenoh_bus.session import RETRY_S
+
+QUERY_S: Final = 2.0
+MAX_FETCHING: Final = 16
+FETCHES: Final = 16
+
+
+class ZenohSubscription:
+    """A Subscription over Zenoh: samples in order, each once, with what can be fetched of those that are missing.
+
+    Zenoh's own recovery does most of it. What it leaves: a publisher first heard of in the middle of its
+    numbers, and gaps whose query was lost with the link, as when the hub stood still for longer than the lease.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key_expr: str,
+        delivery: Delivery[Received],
+        *,
+        history: bool,
+        clock: Clock,
+        failures: FailureLatch,
+    ) -> None:
+        self._session = session
+        self._delivery = delivery
+        self._history = history
+        self._clock = clock
+        self._failures = failures
+        self._lock = threading.Lock()
+        self._sequence = Sequence(self._deliver)
+        self._fetching: set[threading.Thread] = set()
+        self._stop = threading.Event()
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
+        subscriber: AnySubscriber
+        if history:
+            recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, recovery=recovery)
+            held = list(self._query(f"{key_expr}/@adv/pub/**"))
+            for sample in sorted(held, key=_number):
+                self._sequence.begin(_source(sample), _number(sample))
+            for sample in sorted(held, key=_held_order):
+                self._accept(sample)
+        else:
+            subscriber = session.declare_subscriber(key_expr, ring)
+        self._intake = Intake(key_expr, subscriber, self._accept, failures)
+
+    @property
+    def dropped(self) -> int:
+        """How many were dropped because the handler was too slow."""
+        return self._delivery.dropped
+
+    @property
+    def missed(self) -> int:
+        """How many of its publishers' samples never came."""
+        return self._sequence.missed
+
+    def close(self) -> None:
+        """Let the handler finish what is queued, one second at most, and end the threads."""
+        self._stop.set()
+        self._intake.close()
+        self._delivery.close()
+        with self._lock:
+            threads = list(self._fetching)
+        for thread in threads:
+            thread.join(CLOSE_S)
+
+    def _accept(self, sample: zenoh.Sample) -> None:
+        """Deliver a sample, or hold it until those of its publisher that should have come before are fetched."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        if sample.source_info is None:
+            self._deliver(sample)
+            return
+        key = str(sample.key_expr)
+        parsed = parse_key(key)
+        newest_only = parsed is None or parsed[0].latest_only
+        with self._lock:
+            gap = self._sequence.accept(
+                _source(sample), _number(sample), key, sample, recover=self._history, newest_only=newest_only
+            )
+            # Whoever invents publishers with gaps must not have a thread for each.
+            while gap is not None and len(self._fetching) >= MAX_FETCHING:
+                gap = self._sequence.close(gap, [])
+            if gap is not None:
+                thread = threading.Thread(target=self._fill, args=(gap,), name=f"bus fetch {key}", daemon=True)
+                self._fetching.add(thread)
+                thread.start()
+
+    def _fill(self, gap: Gap) -> None:
+        """Fetch what is missing and go on, in a thread of its own: other publishers' samples do not wait for it."""
+        try:
+            due: Gap | None = gap
+            while due is not None:
+                found = self._fetch(due)
+                with self._lock:
+                    due = self._sequence.close(due, found)
+        except Exception as error:
+            if not self._stop.is_set():
+                self._failures.report(f"bus fetch {gap.key}", error)
+        finally:
+            with self._lock:
+                self._fetching.discard(threading.current_thread())
+
+    def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
+        """Return what its publisher still holds of a gap; what does not answer is asked again for a while."""
+        zid, eid = gap.source
+        # The number after the gap has come, so whoever answers holds it: with it, all there is has been said.
+        after = gap.missing[-1] + 1
+        selector = f"{gap.key}/@adv/pub/{zid}/{eid}/**?_sn={gap.missing[0]}..{after}"
+        found: dict[int, zenoh.Sample] = {}
+        for _ in range(FETCHES):
+            found.update((_number(sample), sample) for sample in self._query(selector))
+            if after in found or self._stop.wait(RETRY_S):
+                break
+        return list(found.items())
+
+    def _query(self, selector: str) -> Iterator[zenoh.Sample]:
+        for reply in self._session.get(
+            selector,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=QUERY_S,
+        ):
+            if reply.ok is not None and reply.ok.source_info is not None:
+                yield reply.ok
+
+    def _deliver(self, sample: zenoh.Sample) -> None:
+        received = Received(
+            key=str(sample.key_expr),
+            payload=bytes(sample.payload),
+            receive_ns=self._clock.now_ns(),
+            encoding=str(sample.encoding),
+        )
+        self._delivery.offer(received, len(received.payload))
+
+
+def _source(sample: zenoh.Sample) -> Source:
+    info = sample.source_info
+    return ("", 0) if info is None else (str(info.source_id.zid), info.source_id.eid)
+
+
+def _number(sample: zenoh.Sample) -> int:
+    info = sample.source_info
+    return -1 if info is None else info.source_sn
+
+
+def _held_order(sample: zenoh.Sample) -> tuple[bool, int, int]:
+    return (*held_order(str(sample.key_expr), bytes(sample.payload)), _number(sample))
