@@ -120,6 +120,13 @@ class Bus(ABC):
         """
 
     @abstractmethod
+    def newest(self, topic: Topic) -> list[Received]:
+        """Return the newest message of each key of a retained topic, whether who sent it is still there or not.
+
+        None where the hub was started since, or is another program than ours.
+        """
+
+    @abstractmethod
     def declare_alive(self, name: str) -> None:
         """Let others see that this process lives, until it closes the bus or dies. name: `node/<id>`, ..."""
 

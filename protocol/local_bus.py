@@ -45,6 +45,7 @@ class LocalNetwork:
         self.subscriptions: list[LocalSubscription] = []
         self.watches: list[LocalWatch] = []
         self.alive: list[tuple[str, LocalBus]] = []
+        self.newest: dict[str, tuple[Topic, bytes]] = {}
 
     def connect(self) -> LocalBus:
         """Return one more client."""
@@ -67,6 +68,8 @@ class LocalPublisher(Publisher):
     def _send(self, payload: bytes) -> bool:
         with self._network.lock:
             self.cache.append(payload)
+            if self.topic.retained:
+                self._network.newest[self.key] = self.topic, payload
             for subscription in self._network.subscriptions:
                 if key_matches(subscription.key_expr, self.key):
                     subscription.offer(self, payload)
@@ -164,6 +167,13 @@ class LocalBus(Bus):
             self._network.subscriptions.append(subscription)
             self._subscriptions.append(subscription)
         return subscription
+
+    def newest(self, topic: Topic) -> list[Received]:
+        """Return the newest message of each key of a retained topic."""
+        with self._network.lock:
+            held = list(self._network.newest.items())
+        now_ns = self.clock.now_ns()
+        return [Received(key, payload, now_ns, of.encoding) for key, (of, payload) in held if of is topic]
 
     def declare_alive(self, name: str) -> None:
         """Let others see that this process lives, until it closes the bus."""

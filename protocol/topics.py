@@ -19,7 +19,8 @@ class Topic:
 
     template: its key, with {node} or {a} and {b}. schema: the message's type; rate_hz: nominal, 0 where it comes
     on change. latest_only: late joiners get the newest one (else the cache serves to recover what was missed).
-    express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never).
+    express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never). retained:
+    the hub keeps the newest of each key, and what was said stays known when who said it is gone.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Topic:
     express: bool = False
     latest_only: bool = False
     stale_s: float = 0.0
+    retained: bool = False
 
     def key(self, *ids: str) -> str:
         """Return the Zenoh key and MCAP topic for these node ids: one, or a and b."""
@@ -127,6 +129,7 @@ POSE: Final = Topic(
     "interactive_high",
     express=True,
     stale_s=1.0,
+    retained=True,
 )
 # After POSE, which carries the same schema: topic_of gives the first.
 ARTAG: Final = Topic(
@@ -140,6 +143,7 @@ REJECTED: Final = Topic(
     10.0,
     "interactive_high",
     express=True,
+    retained=True,
 )
 TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(

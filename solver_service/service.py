@@ -17,6 +17,7 @@ from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejec
 from protocol.service import Service
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key
 from solver_service.alignment import ClockAlignment, ClockOffset
+from solver_service.answered import Answered
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
 from solver_service.health import NodeHealth
@@ -56,6 +57,9 @@ class SolverService(Service):
         self._alive: set[str] = set()
         self._health: NodeHealth | None = None
         self._reported_bad = ""
+        self._said: list[RelativePose | Rejected] = []
+        self._answered = Answered()
+        self._joined_ns: int | None = None
         self._alignment = ClockAlignment()
         self._offset: ClockOffset | None = None
         self._aligned_s = time.monotonic()
@@ -92,12 +96,14 @@ class SolverService(Service):
     def attach(self, bus: Bus) -> None:
         """Subscribe to the nodes, and publish on this bus."""
         self._bus = bus
+        self._said = _said_before(bus)
         if self._core is not None:
             self._declare(self._core)
         bus.subscribe(INFO.key_any(), self.receive, capacity=64)
-        bus.subscribe(ATTITUDE.key_any(), self.receive, capacity=8192)
+        bus.subscribe(ATTITUDE.key_any(), self.receive, capacity=16384)
         bus.subscribe(DEPTH.key_any(), self.receive, capacity=4096)
         bus.subscribe(CANDIDATES.key_any(), self.receive, capacity=4096)
+        self._joined_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus; a bad one is counted and reported, and stops nothing."""
@@ -116,6 +122,9 @@ class SolverService(Service):
             return
         with self._lock:
             self._publish(self._handle(message, node))
+            joined_ns = self._joined_ns
+            if isinstance(message, Candidates) and joined_ns is not None and received.receive_ns > joined_ns:
+                self._publish(self._answered.saw_new_frame(message.trigger))
             if self._health is not None and isinstance(message, Candidates):
                 self._health.saw_frame(node, message.stamp_ns, time.monotonic())
             elif self._health is not None and isinstance(message, NodeInfo):
@@ -155,12 +164,14 @@ class SolverService(Service):
     def _declare(self, core: SolverCore) -> None:
         if self._bus is None:
             return
+        pair = core.node_a, core.node_b
+        self._answered = Answered(one for one in self._said if (one.node_a, one.node_b) == pair)
         for topic in (POSE, REJECTED, SOLVER_STATUS):
             self._publishers[topic.name] = self._bus.publisher(topic, core.node_a, core.node_b)
 
     def _publish(self, results: list[RelativePose | Rejected]) -> None:
         now_ns = self.clock.now_ns()
-        for result in results:
+        for result in self._answered.unsaid(results):
             topic = POSE if isinstance(result, RelativePose) else REJECTED
             self._publishers[topic.name].put(result)
             age_ns = now_ns - result.stamp_ns
@@ -215,3 +226,18 @@ class SolverService(Service):
             clock_skew_s=UNSET if offset is None else offset.offset_s,
             problem="; ".join(problems),
         )
+
+
+def _said_before(bus: Bus) -> list[RelativePose | Rejected]:
+    """Return the last of what solvers before this one have said of each pair."""
+    said = []
+    for topic in (POSE, REJECTED):
+        for received in bus.newest(topic):
+            try:
+                message = decode(received.payload, topic.schema)
+            except MessageError as error:
+                log.warning("solver: what the hub holds on %s: %s", received.key, error)
+                continue
+            if isinstance(message, RelativePose | Rejected):
+                said.append(message)
+    return said

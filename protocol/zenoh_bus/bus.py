@@ -144,6 +144,18 @@ class ZenohBus(Bus):
             self._subscriptions.append(subscription)
         return subscription
 
+    def newest(self, topic: Topic) -> list[Received]:
+        """Return the newest message of each key of a retained topic."""
+        replies = self._session.get(
+            topic.key_any(),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=QUERY_S,
+        )
+        samples = [reply.ok for reply in replies if reply.ok is not None]
+        now_ns = self.clock.now_ns()
+        return [Received(str(s.key_expr), bytes(s.payload), now_ns, str(s.encoding)) for s in samples]
+
     def declare_alive(self, name: str) -> None:
         """Let others see that this process lives, until it closes the bus or dies."""
         key = f"{ALIVE}/{check_alive_name(name)}/{self._session.zid()}"

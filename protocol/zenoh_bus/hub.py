@@ -1,16 +1,51 @@
-"""The hub's session."""
+"""The hub's session, and what it remembers of those that are gone."""
 
 from __future__ import annotations
 
+import threading
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import zenoh
 
 from protocol.endpoint import DEFAULT_ENDPOINT, hub_settings
 from protocol.errors import BuddylineError
 from protocol.security import Tls
+from protocol.topics import TOPICS
 from protocol.zenoh_bus.session import config_of
+
+# Whoever invents keys, or sends what is no pose, must not fill the hub's memory.
+MAX_RETAINED: Final = 256
+MAX_RETAINED_BYTES: Final = 65536
+
+
+class Retained:
+    """The newest message of each key whose topic is retained, for those that ask (protocol.bus.Bus.newest)."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._samples: dict[str, zenoh.Sample] = {}
+        self._lock = threading.Lock()
+        for topic in TOPICS:
+            if topic.retained:
+                # A deployment's namespace stands in front; the hub has none of its own.
+                key_expr = f"**/{topic.key_any()}"
+                session.declare_subscriber(key_expr, self._keep)
+                session.declare_queryable(key_expr, self._answer)
+
+    def _keep(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT or len(sample.payload) > MAX_RETAINED_BYTES:
+            return
+        key = str(sample.key_expr)
+        with self._lock:
+            if key in self._samples or len(self._samples) < MAX_RETAINED:
+                self._samples[key] = sample
+
+    def _answer(self, query: zenoh.Query) -> None:
+        with self._lock:
+            samples = list(self._samples.values())
+        for sample in samples:
+            if query.key_expr.intersects(sample.key_expr):
+                query.reply(sample.key_expr, sample.payload, encoding=sample.encoding)
 
 
 class Hub:
@@ -19,6 +54,7 @@ class Hub:
     def __init__(self, session: zenoh.Session, endpoint: str) -> None:
         self.endpoint = endpoint
         self._session = session
+        self._retained = Retained(session)
 
     def close(self) -> None:
         """Stop listening."""

@@ -186,6 +186,27 @@ def test_a_late_joiner_gets_two_nodes_messages_by_their_stamps(client: Connect) 
     assert [decode(r.payload, Depth).stamp_ns for r in inbox.wait_for(100)] == list(range(100))
 
 
+def test_what_was_said_last_is_known_when_who_said_it_is_gone(client: Connect) -> None:
+    solver, reader, inbox = client(), client(), Inbox()
+    reader.subscribe("buddyline/pair/*/*/rejected", inbox)
+    assert [r for r in reader.newest(topics.REJECTED) if "/gone/" in r.key] == []
+    for pair in (("gone", "h"), ("gone", "i")):
+        publisher = solver.publisher(topics.REJECTED, *pair)
+        for trigger in range(3):
+            publisher.put(rejected(trigger))
+    inbox.wait_for(6)
+    solver.close()
+
+    def known() -> list[tuple[str, int]]:
+        newest = reader.newest(topics.REJECTED)
+        return sorted((r.key, decode(r.payload, Rejected).trigger) for r in newest if "/gone/" in r.key)
+
+    # The hub keeps it beside passing it on, neither waiting for the other.
+    until(lambda: [trigger for _, trigger in known()] == [2, 2])
+    assert [key for key, _ in known()] == [topics.REJECTED.key("gone", end) for end in "hi"]
+    assert reader.newest(topics.POSE) == []
+
+
 def test_without_history_only_what_comes_from_now_on(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(10):

@@ -89,6 +89,8 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
             latecomer.subscribe(topics.EVERYTHING, late)
             for key in said:
                 late.wait_for(key)
+            # Nor what the hub remembers.
+            assert [r.payload for r in latecomer.newest(topics.POSE)] == [b'{"stamp_ns":1}']
         assert sorted(inbox.keys) == said
         assert sorted(late.keys) == said
         assert sorted(set(alive.keys)) == [f"{n} True" for n in ("node/a", "node/b", "solver/a_b", "viewer/v")]

@@ -21,6 +21,7 @@ from protocol.bus import Bus, Received
 from protocol.connection import cut_connection
 from protocol.errors import BuddylineError
 from protocol.zenoh_bus import connect, open_hub, watchdog
+from protocol.zenoh_bus import hub as hub_module
 from protocol.zenoh_bus import subscription as subscription_module
 
 WAIT_S = 10.0
@@ -196,6 +197,24 @@ def test_namespaces_keep_two_systems_apart() -> None:
         assert (one.wait_for(1), two.wait_for(1)) == ([1], [2])
         assert one.received[0].key == "buddyline/node/a/depth"
         assert not second.is_alive("node/a")
+        first.publisher(topics.POSE, "a", "b").put_bytes(b"3")
+        until(lambda: first.newest(topics.POSE) != [])
+        assert [(r.key, r.payload) for r in first.newest(topics.POSE)] == [("buddyline/pair/a/b/pose", b"3")]
+        assert second.newest(topics.POSE) == []
+
+
+def test_the_hub_remembers_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "MAX_RETAINED", 2)
+    with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
+        for name in ("x", "y", "z"):
+            bus.publisher(topics.POSE, "a", name).put_bytes(b"0")
+            if name != "z":
+                until(lambda name=name: len(bus.newest(topics.POSE)) == "xyz".index(name) + 1)
+        big = bus.publisher(topics.POSE, "a", "x")
+        big.put_bytes(b"1" * (hub_module.MAX_RETAINED_BYTES + 1))
+        big.put_bytes(b"2")
+        until(lambda: b"2" in [r.payload for r in bus.newest(topics.POSE)])
+        assert sorted((r.key[-6:], r.payload) for r in bus.newest(topics.POSE)) == [("x/pose", b"2"), ("y/pose", b"0")]
 
 
 def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
