@@ -11,6 +11,7 @@ import json
 import statistics
 import sys
 
+from tests.faults.observer import Tally
 from tests.faults.scenarios import SCENARIOS, Report
 
 HEADER = (
@@ -60,7 +61,12 @@ def main() -> int:
             print(f"  {note}", file=sys.stderr)
     if args.json:
         print(json.dumps([dataclasses.asdict(report) for report in reports], indent=2))
-    return 1 if any(report.tally.lost or report.tally.without_outcome for report in reports) else 0
+    return 1 if any(failed(report.tally) for report in reports) else 0
+
+
+def failed(tally: Tally) -> bool:
+    """Whether anything was lost, came twice or out of order, or a trigger has no outcome, or two."""
+    return any((tally.lost, tally.duplicated, tally.disordered, tally.without_outcome, tally.outcomes_doubled))
 
 
 if __name__ == "__main__":
