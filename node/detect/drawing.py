@@ -27,7 +27,7 @@ def draw(
     """
     check_image(image)
     marked = np.array(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-    size = max(0.3, image.shape[1] / 1800)
+    size = max(0.4, image.shape[1] / 1800)
     for rank, detection in reversed(list(enumerate(detections, start=1))):
         _mark(marked, rank, detection, size)
     for u_px, v_px in truth or ():
@@ -55,4 +55,6 @@ def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: floa
     cv2.putText(marked, text, where, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
     if rank <= 3:
         below = (where[0], where[1] + round(26 * size))
-        cv2.putText(marked, detection.why, below, cv2.FONT_HERSHEY_SIMPLEX, 0.7 * size, colour, 1, cv2.LINE_AA)
+        cv2.putText(
+            marked, detection.why, below, cv2.FONT_HERSHEY_SIMPLEX, max(0.35, 0.7 * size), colour, 1, cv2.LINE_AA
+        )

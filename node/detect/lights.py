@@ -19,7 +19,7 @@ from node.detect.rings import (
     weakest_channel,
 )
 
-_MAX_MEASURED: Final = 12
+_ALWAYS_MEASURED, _MAX_MEASURED = 12, 24
 _CORE_RINGS: Final = 7
 _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
@@ -120,6 +120,7 @@ def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) 
     centre = (at + shapes.centre_px[0, 0] + 0.5) * scale - 0.5
     radius_px = shapes.radius_px[0, 0] * scale
     kept = distinct(centre, radius_px)[:_MAX_MEASURED]
+    kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.clear[kept])))]
     return centre[kept], radius_px[kept], proposals.at(kept)
 
 

@@ -16,6 +16,8 @@ _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
+_CLEAR = 5.0
+_ALWAYS, _AT_MOST = 20, 64
 _MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
@@ -32,6 +34,11 @@ class Proposals:
     step_px: NDArray[np.float32]
     contrast: NDArray[np.float32]
     clutter: NDArray[np.float32]
+
+    @property
+    def clear(self) -> NDArray[np.bool_]:
+        """Tell which of them clearly stand out of their neighbourhood, (N,): the first ones."""
+        return np.asarray(self.contrast >= _CLEAR * (_NOISE + self.clutter))
 
     def at(self, index: NDArray[np.intp]) -> Proposals:
         """Give some of them."""
@@ -103,8 +110,8 @@ class ProposalFinder:
         lower = np.partition(steps, len(steps) // 2)[: len(steps) // 2 + 1]
         return float(lower.mean()) / _MEAN_OF_LOWER_HALF
 
-    def find(self, contrast_min: float, clutter_gain: float, limit: int) -> Proposals:
-        """Find at most `limit` places in the picture that was loaded.
+    def find(self, contrast_min: float, clutter_gain: float) -> Proposals:
+        """Find places in the picture that was loaded: the most outstanding 20, and up to 64 that clearly stand out.
 
         A place counts from a contrast of contrast_min grey levels, plus clutter_gain times the mean contrast of its
         neighbourhood.
@@ -126,7 +133,8 @@ class ProposalFinder:
         clutter = self._clutter[cells].astype(np.float32)
         outstanding = contrast / (_NOISE + clutter)
         outstanding[contrast < contrast_min + clutter_gain * clutter] = 0.0
-        order = np.argsort(-outstanding, kind="stable")[:limit]
+        clear = int(np.count_nonzero(outstanding >= _CLEAR))
+        order = np.argsort(-outstanding, kind="stable")[: min(max(clear, _ALWAYS), _AT_MOST)]
         order = order[outstanding[order] > 0.0]
         step = np.float32(self._base_step_px) * np.exp2(which[order], dtype=np.float32)
         centre_px = np.empty((len(order), 2), np.float32)

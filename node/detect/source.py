@@ -32,10 +32,8 @@ _CLUTTER_GAIN: Final = 2.0
 _CONTRAST_MIN: Final = (4.0, 16.0)
 _CONTRAST_TO_NOISE: Final = 2.0
 _MEMORY: Final = 0.8
-_MAX_PROPOSALS: Final = 20
-_MAX_FOUND: Final = 8
-_ALWAYS_KEPT: Final = 5
-_UNLIKELY: Final = 0.02
+_KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.5))
+"""How many candidates are kept, from which score on: some always, more where they are likely."""
 
 _SCORE_AT_ZERO: Final = -5.2
 _SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
@@ -59,14 +57,14 @@ class SourceDetector:
         contrast_min = self._values.get("contrast_min")
         if contrast_min is None:
             contrast_min = self._adapt()
-        proposals = self._finder.find(contrast_min, self._values.get("clutter_gain", _CLUTTER_GAIN), _MAX_PROPOSALS)
+        proposals = self._finder.find(contrast_min, self._values.get("clutter_gain", _CLUTTER_GAIN))
         if len(proposals.step_px) == 0:
             return []
         lights = measure_lights(image, *self._finder.base, proposals)
         score = _score(lights)
         order = np.argsort(-score, kind="stable")
-        order = order[(np.arange(len(order)) < _ALWAYS_KEPT) | (score[order] >= _UNLIKELY)]
-        chosen = order[distinct(lights.centre_px[order], lights.core_px[order])][:_MAX_FOUND]
+        order = order[distinct(lights.centre_px[order], lights.core_px[order])]
+        chosen = order[: max(min(many, int(np.count_nonzero(score[order] >= least))) for many, least in _KEPT)]
         found = locate_sources(
             image,
             lights.centre_px[chosen],

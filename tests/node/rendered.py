@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+LEANS_FROM_PX = 40.0
 WATER_BGR = np.array([1.0, 0.9, 0.45])
 
 
@@ -25,7 +26,8 @@ def lamp_picture(
     """Render lamps into a (H, W, 3) BGR picture.
 
     A lamp is a gaussian core (peak `core`, sd core_px) and a glow that falls as 1/distance (`glow` at 1 px), leaning
-    towards +u by the factor exp(lean cos phi): scattered light along a beam that points to the right.
+    towards +u by the factor exp(lean cos phi): scattered light along a beam that points to the right. Near the source
+    it leans less: there, light scattered by small angles prevails, which comes from all around the beam.
     """
     width, height = size
     v, u = np.mgrid[:height, :width].astype(np.float64)
@@ -34,7 +36,8 @@ def lamp_picture(
         distance = np.hypot(u - u_px, v - v_px)
         cosine = (u - u_px) / np.maximum(distance, 1e-6)
         light += core * np.exp(-0.5 * (distance / core_px) ** 2)
-        light += glow * np.exp(lean * (cosine - 1.0)) / np.maximum(distance, 1.0)
+        leans = lean * distance / (distance + LEANS_FROM_PX)
+        light += glow * np.exp(leans * (cosine - 1.0)) / np.maximum(distance, 1.0)
     picture = ground + light[:, :, None] * WATER_BGR
     picture += np.random.default_rng(seed).normal(0.0, noise, picture.shape)
     return np.clip(np.round(picture), 0, 255).astype(np.uint8)
