@@ -69,7 +69,10 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
 
 
 class RecordConfig(Config, frozen=True, kw_only=True):
-    """[record]: the node's own log. Pictures: at most images_hz of them, JPEG of this quality."""
+    """[record]: the node's own log. Pictures: at most images_hz of them, JPEG of this quality.
+
+    min_free_mb: where less is free, the oldest pictures are deleted, those of earlier dives first; 0: never.
+    """
 
     directory: str = "dives"
     images_hz: Annotated[float, Meta(ge=0)] = 1.0
@@ -96,12 +99,13 @@ class SimulationConfig(Config, frozen=True, kw_only=True):
 
 
 class NodeConfig(Config, frozen=True, kw_only=True):
-    """A whole node."""
+    """A whole node. status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py)."""
 
     node: NodeId
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
     tls: Tls | None = None
+    status_file: str = ""
     rate_hz: Annotated[float, Meta(gt=0, le=200)] = 10.0
     camera: CameraConfig = field(default_factory=CameraConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -35,8 +36,10 @@ class Camera(Protocol):
     """Gives one frame per trigger; used by one thread.
 
     row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" where all
-    is well.
+    is well. skipped: frames that were not given out, by reason.
     """
+
+    skipped: Counter[str]
 
     @property
     def row_time_ns(self) -> int: ...  # noqa: D102
@@ -60,13 +63,16 @@ class Camera(Protocol):
 class Source(Protocol):
     """One sensor, or several that are read together; used by one thread.
 
-    problem: what is wrong, "" where all is well.
+    problem: what is wrong, "" where all is well. retries: transfers on its bus that had to be repeated.
     """
 
     name: str
 
     @property
     def problem(self) -> str: ...  # noqa: D102
+
+    @property
+    def retries(self) -> int: ...  # noqa: D102
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next samples (Imu, Attitude, Depth); None where there will be none, or stop is set."""

@@ -15,20 +15,23 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import UNSET
-from numpy.typing import NDArray
 
 from node import __version__
+from node.clock_watch import ClockWatch
 from node.config import NodeConfig
 from node.detect import make_detector
 from node.devices import Camera, Frame, Source, open_camera, open_sensors
+from node.images import Images
 from node.outlet import Outlet
 from node.pipeline import Pipeline
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.config import ConfigError, config_sha256
-from protocol.messages import CompressedImage, FoxgloveTime, NodeInfo, NodeStatus
-from protocol.recorder import Recorder
+from protocol.messages import NodeInfo, NodeStatus
+from protocol.pictures import PictureLog
+from protocol.recorder import Recorder, RecordError
 from protocol.security import RefusedError, SecurityError, check_identity, node_name
 from protocol.service import Service
+from protocol.statusfile import StatusFile
 from protocol.topics import TOPICS
 
 if TYPE_CHECKING:
@@ -38,6 +41,11 @@ log = logging.getLogger(__name__)
 
 FRAME_QUEUE: Final = 2
 STALE_S: Final = 2.0
+# A device that has given nothing for so long, and does not say why, hangs; the first may take its time.
+HANGS_S: Final = 5.0
+FIRST_S: Final = 15.0
+LOOK_S: Final = 0.2
+TEMPERATURE: Final = Path("/sys/class/thermal/thermal_zone0/temp")
 REFUSED_RETRY_S: Final = 5.0
 
 
@@ -45,7 +53,7 @@ class NodeService(Service):
     """Captures, detects, publishes and records until it is stopped."""
 
     def __init__(self, config: NodeConfig, clock: Clock | None = None) -> None:
-        super().__init__(f"node {config.node}")
+        super().__init__(f"node {config.node}", StatusFile.of(f"node-{config.node}", config.status_file))
         self.config = config
         self.clock = clock or SystemClock()
         self.boot = uuid.uuid4().hex[:12]
@@ -54,6 +62,10 @@ class NodeService(Service):
         self._software = f"buddyline {__version__}"
         self._started_s = time.monotonic()
         self._last_s: dict[str, float] = {}
+        self._seen_s = self._started_s + FIRST_S
+        self._ended: set[str] = set()
+        # Stored pictures may be far apart.
+        self._watched = config.camera.name != "stored" and config.rate_hz >= 1.0
         self._detect_s: deque[float] = deque(maxlen=100)
         self._frames: deque[Frame] = deque()
         self._frame_ready = threading.Condition()
@@ -61,8 +73,7 @@ class NodeService(Service):
         self._problems: dict[str, str] = {}
         self._sent_before: Counter[str] = Counter()
         self._status_s = self._started_s
-        self._next_image_ns = 0
-        self._next_preview_ns = 0
+        self._clock_watch = ClockWatch(self.clock.now_ns)
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError where one cannot be had."""
@@ -77,8 +88,12 @@ class NodeService(Service):
                 self.config.detector.method, self.config.detector.environment, self.config.detector.overrides
             ),
         )
-        self.recorder = Recorder(self._log_path(), metadata=self._log_metadata())
+        path, metadata = self._log_path(), self._log_metadata()
+        min_free_bytes = self.config.record.min_free_mb * 1_000_000
+        self.pictures = PictureLog(path, f"{self.config.node}-*", min_free_bytes, metadata=metadata)
+        self.recorder = Recorder(path, metadata=metadata, pictures=self.pictures)
         self.outlet = Outlet(self.config.node, self.recorder, self.clock)
+        self._images = Images(self.config, self.outlet)
         self.outlet.send(info)
 
     def _info(self) -> NodeInfo:
@@ -120,23 +135,42 @@ class NodeService(Service):
     def close(self) -> int:
         """Stop all threads, write the log's end; return the exit status."""
         status = self.join()
+        # Before the devices, whose end may take its time.
+        try:
+            self.recorder.close()
+        except RecordError as error:
+            log.error("%s: %s", self.name, error)
+            status = status or 2
+        else:
+            log.info("%s: log %s", self.name, self.recorder.path)
         self.camera.close()
         for source in self.sources:
             source.close()
-        self.recorder.close()
-        log.info("%s: log %s", self.name, self.recorder.path)
         return status
 
+    def progressing(self) -> bool:
+        """Return whether frames and sensors go on.
+
+        A sensor that says what is wrong is looked for by its driver: to start the node anew would end the rest too.
+        """
+        now_s = time.monotonic()
+        if self._watched and self._capturing and now_s - self._seen_s > HANGS_S:
+            return False
+        return all(
+            source.problem
+            or source.name in self._ended
+            or now_s - self._last_s.get(source.name, self._started_s + FIRST_S) <= HANGS_S
+            for source in self.sources
+        )
+
     def _capture(self) -> None:
-        # Stored pictures may be far apart.
-        watched = self.config.camera.name != "stored" and self.config.rate_hz >= 1.0
         try:
             while not self.stop.is_set():
                 frame = self.camera.next_frame(self.stop)
                 if frame is None:
                     break
                 self._last_s["camera"] = time.monotonic()
-                if watched:
+                if self._watched:
                     self.going_on()
                 with self._frame_ready:
                     self._frames.append(frame)
@@ -165,40 +199,17 @@ class NodeService(Service):
             began_s = time.perf_counter()
             candidates = self.pipeline.candidates(frame)
             self._detect_s.append(time.perf_counter() - began_s)
+            self._seen_s = time.monotonic()
             if candidates is None:
                 continue
             self.outlet.send(candidates)
-            self._send_images(frame)
-
-    def _send_images(self, frame: Frame) -> None:
-        record, preview = self.config.record, self.config.preview
-        if record.images_hz > 0 and frame.stamp_ns >= self._next_image_ns:
-            self._next_image_ns = frame.stamp_ns + round(0.99e9 / record.images_hz)
-            self.outlet.send(self._image(frame.image, frame.stamp_ns, record.image_quality), publish=False)
-        if preview.rate_hz > 0 and frame.stamp_ns >= self._next_preview_ns:
-            self._next_preview_ns = frame.stamp_ns + round(0.99e9 / preview.rate_hz)
-            height, width = frame.image.shape[:2]
-            scale = min(preview.width_px / width, 1.0)
-            small = cv2.resize(
-                frame.image, (round(width * scale), max(round(height * scale), 1)), interpolation=cv2.INTER_AREA
-            )
-            self.outlet.send(self._image(np.asarray(small, np.uint8), frame.stamp_ns, preview.quality), record=False)
-
-    def _image(self, image: NDArray[np.uint8], stamp_ns: int, quality: int) -> CompressedImage:
-        sound, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-        if not sound:
-            raise RuntimeError("the picture could not be encoded")
-        return CompressedImage(
-            timestamp=FoxgloveTime(sec=stamp_ns // S_NS, nsec=stamp_ns % S_NS),
-            frame_id=f"{self.config.node}_camera",
-            data=data.tobytes(),
-            format="jpeg",
-        )
+            self._images.send(frame)
 
     def _read(self, source: Source) -> None:
         while not self.stop.is_set():
             messages = source.next_messages(self.stop)
             if messages is None:
+                self._ended.add(source.name)
                 return
             self._last_s[source.name] = time.monotonic()
             for message in messages:
@@ -247,9 +258,14 @@ class NodeService(Service):
         return None
 
     def _report(self) -> None:
-        while not self.stop.wait(1.0):
-            self.outlet.send(self.status())
+        report_s = time.monotonic() + 1.0
+        while not self.stop.wait(LOOK_S):
             self.going_on()
+            self._clock_watch.look()
+            if time.monotonic() >= report_s:
+                report_s += 1.0
+                self.status_message = status = self.status()
+                self.outlet.send(status)
 
     def status(self) -> NodeStatus:
         """Return the node's health; rates are over the time since the last call."""
@@ -263,18 +279,11 @@ class NodeService(Service):
         }
         self._sent_before, self._status_s = sent, now_s
         ages_s = {name: now_s - last_s for name, last_s in self._last_s.items()}
-        problems = [f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > STALE_S]
-        problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
-        devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
-        problems += [f"{name}: {text}" for name, text in devices if text]
-        if self.recorder.error is not None:
-            problems.append(f"log: {self.recorder.error}; not recording")
-        if self.recorder.dropped:
-            problems.append(f"log: {self.recorder.dropped} messages dropped, the disk is too slow")
-        free_bytes = shutil.disk_usage(self.recorder.path.parent).free
-        if free_bytes < self.config.record.min_free_mb * 1e6:
-            problems.append(f"disk: {free_bytes / 1e6:.0f} MB free")
+        free_bytes = self._free_bytes()
+        self.problems = self._find_problems(ages_s, free_bytes)
         residual_s = self.pipeline.residual_s
+        retries = [source.retries for source in self.sources]
+        temperature_degc = cpu_temperature_degc()
         return NodeStatus(
             node=self.config.node,
             stamp_ns=self.clock.now_ns(),
@@ -282,11 +291,58 @@ class NodeService(Service):
             software=self._software,
             uptime_s=now_s - self._started_s,
             rates_hz=rates_hz,
-            drops={**self.drops, "log": self.recorder.dropped, "repeated_trigger": self.pipeline.repeated},
+            drops=self._all_drops(),
             ages_s=ages_s,
             trigger_residual_s=UNSET if residual_s is None else residual_s,
             detect_s=float(np.median(self._detect_s)) if self._detect_s else UNSET,
-            disk_free_bytes=free_bytes,
+            disk_free_bytes=UNSET if free_bytes is None else free_bytes,
+            temperature_degc=UNSET if temperature_degc is None else temperature_degc,
+            bus_retries=max(retries) if retries else UNSET,
             log=self.recorder.path.name,
-            problem="; ".join(problems),
+            problem="; ".join(self.problems),
         )
+
+    def _all_drops(self) -> dict[str, int]:
+        # Frames between two instants were never due.
+        skipped = {f"camera_{why}": count for why, count in self.camera.skipped.items() if why != "not_nearest"}
+        return {
+            **self.drops,
+            **skipped,
+            "log": self.recorder.dropped,
+            "picture": self.pictures.dropped,
+            "picture_file": self.pictures.deleted,
+            "repeated_trigger": self.pipeline.repeated,
+        }
+
+    def _free_bytes(self) -> int | None:
+        try:
+            return shutil.disk_usage(self.recorder.path.parent).free
+        except OSError:
+            return None
+
+    def _find_problems(self, ages_s: dict[str, float], free_bytes: int | None) -> list[str]:
+        problems = [f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > STALE_S]
+        problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
+        devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
+        problems += [f"{name}: {text}" for name, text in devices if text]
+        if self._clock_watch.problem:
+            problems.append(self._clock_watch.problem)
+        if self.recorder.error is not None:
+            problems.append(f"log: {self.recorder.error}; kept in memory, tried again")
+        if self.recorder.dropped:
+            problems.append(f"log: {self.recorder.dropped} messages dropped, the disk is too slow")
+        if self.pictures.problem:
+            problems.append(f"disk: {self.pictures.problem}")
+        if free_bytes is None:
+            problems.append(f"disk: {self.recorder.path.parent} cannot be reached")
+        elif free_bytes < self.config.record.min_free_mb * 1e6:
+            problems.append(f"disk: {free_bytes / 1e6:.0f} MB free")
+        return problems
+
+
+def cpu_temperature_degc() -> float | None:
+    """Return the processor's temperature, None where the machine does not tell."""
+    try:
+        return int(TEMPERATURE.read_text()) / 1e3
+    except (OSError, ValueError):
+        return None

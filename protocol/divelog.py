@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import heapq
-import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, cast
 
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
@@ -22,6 +21,7 @@ from protocol.errors import BuddylineError
 from protocol.messages import Message, MessageError, decode, encode, payload_stamp_ns
 from protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
 from protocol.schemas import json_schema
+from protocol.spool import Spool
 
 CHUNK_BYTES: Final = 1024 * 1024
 LOG_NOTE: Final = "buddyline.log"
@@ -55,26 +55,36 @@ class DiveLogWriter:
     def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None) -> None:
         self.path = Path(path)
         try:
-            self._file: IO[bytes] = open(self.path, "xb")
+            self._file = Spool(self.path)
         except FileExistsError:
             raise BuddylineError(
                 f"{self.path}: exists; a log is never overwritten, name another or remove it first"
             ) from None
         except OSError as error:
             raise BuddylineError(f"{self.path}: cannot be written: {error.strerror}") from error
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="buddyline", library="buddyline")
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
         self.count = 0
         if metadata:
             self._writer.add_metadata(LOG_NOTE, metadata)
-        self._writer.flush()
+
+    @property
+    def size_bytes(self) -> int:
+        """How long the file is, without the chunk in progress."""
+        return self._file.tell()
 
     def write(
         self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int | None = None, schema: str = ""
     ) -> None:
-        """Add one payload; publish_time_ns: its stamp, by default read from it; schema: for keys not ours."""
+        """Add one payload; publish_time_ns: its stamp, by default read from it; schema: for keys not ours.
+
+        Raises OSError where the disk takes nothing; that payload is not in the log then, and all before it are kept
+        to be written later.
+        """
+        if self._file.stuck:
+            self._file.flush()
         if publish_time_ns is None:
             publish_time_ns = payload_stamp_ns(payload)
         if publish_time_ns is None:
@@ -104,10 +114,10 @@ class DiveLogWriter:
         return channel
 
     def flush(self, *, sync: bool = False) -> None:
-        """Finish the chunk and hand it to the system; sync: and to the disk."""
+        """Finish the chunk and hand it to the system; sync: and to the disk. Raises OSError; then call it again."""
         self._writer.flush()
         if sync:
-            os.fsync(self._file.fileno())
+            self._file.sync()
 
     def close(self) -> None:
         """Write index and end, and close the file."""
@@ -116,9 +126,13 @@ class DiveLogWriter:
         try:
             self._writer.finish()
             self._file.flush()
-            os.fsync(self._file.fileno())
+            self._file.sync()
         finally:
             self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file as it stands, without what the disk did not take."""
+        self._file.close()
 
     def __enter__(self) -> DiveLogWriter:
         return self

@@ -231,7 +231,8 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     """Health of a node, 1 Hz.
 
     rates: messages a second by topic; drops: lost messages by cause; ages_s: time since the newest sample of a
-    device; problem: what is wrong in words, empty where nothing is.
+    device; bus_retries: transfers on the sensors' I2C bus that had to be repeated; problem: what is wrong in words,
+    empty where nothing is.
     """
 
     node: NodeId
@@ -247,6 +248,7 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     clock_offset_s: float | UnsetType = UNSET
     disk_free_bytes: Count | UnsetType = UNSET
     temperature_degc: float | UnsetType = UNSET
+    bus_retries: Count | UnsetType = UNSET
     log: str = ""
     problem: str = ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -9,29 +10,44 @@ from pathlib import Path
 from typing import Final
 
 from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.pictures import FULL, PictureLog
 from protocol.topics import IMAGE, parse_key
 
+log = logging.getLogger(__name__)
+
 SYNC_INTERVAL_S: Final = 1.0
+RETRY_S: Final = 0.5
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
+
+Item = tuple[str, bytes, int, str]
+
+
+class RecordError(BuddylineError):
+    """A log that cannot be written."""
 
 
 class Recorder:
     """Writes payloads into a dive log; at most a second of it is ever off the disk.
 
-    Where the disk cannot keep up, the oldest pictures are dropped first, then the oldest messages; `dropped`
-    counts them. `error` holds what made the thread end, None while it is sound.
+    Where the disk cannot keep up, or takes nothing, messages wait in memory; beyond 64 MB the oldest pictures are
+    dropped first, then the oldest messages; `dropped` counts them. `error` says why nothing can be written, None
+    while it can: the thread tries again until it is closed. pictures: where pictures go, instead of into the log.
     """
 
-    def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None) -> None:
+    def __init__(
+        self, path: Path | str, *, metadata: dict[str, str] | None = None, pictures: PictureLog | None = None
+    ) -> None:
         self._writer = DiveLogWriter(path, metadata=metadata)
         self.path = self._writer.path
+        self.pictures = pictures
         self.dropped = 0
         self.written = 0
         self.error: Exception | None = None
-        self._queue: deque[tuple[str, bytes, int, str]] = deque()
+        self._queue: deque[Item] = deque()
         self._queued_bytes = 0
         self._ready = threading.Condition()
-        self._closing = False
+        self._closing = self._last_try = False
         self._thread = threading.Thread(target=self._run, name=f"recorder {self.path.name}", daemon=True)
         self._thread.start()
 
@@ -40,13 +56,15 @@ class Recorder:
         with self._ready:
             self._queue.append((key, payload, log_time_ns, schema))
             self._queued_bytes += len(payload)
-            while self._queued_bytes > MAX_QUEUED_BYTES:
-                self._drop_one()
+            self._bound()
             self._ready.notify()
 
+    def _bound(self) -> None:
+        while self._queued_bytes > MAX_QUEUED_BYTES:
+            self._drop_one()
+
     def _drop_one(self) -> None:
-        pictures = (i for i, item in enumerate(self._queue) if (p := parse_key(item[0])) and p[0] is IMAGE)
-        oldest = next(pictures, 0)
+        oldest = next((i for i, item in enumerate(self._queue) if _is_picture(item[0])), 0)
         payload = self._queue[oldest][1]
         del self._queue[oldest]
         self._queued_bytes -= len(payload)
@@ -54,32 +72,83 @@ class Recorder:
 
     def _run(self) -> None:
         try:
-            synced_s = time.monotonic()
-            while True:
+            while not self._turn():
+                pass
+        except Exception as error:  # the thread's end is reported, whatever ended it
+            log.error("log %s: no longer written", self.path, exc_info=error)
+            self.error = error
+
+    def _turn(self) -> bool:
+        """Write for a second, then sync; return whether that was the last time."""
+        ends_s = time.monotonic() + SYNC_INTERVAL_S
+        closing = False
+        try:
+            while not closing and time.monotonic() < ends_s:
                 with self._ready:
                     if not self._queue and not self._closing:
                         self._ready.wait(SYNC_INTERVAL_S / 4)
                     batch, self._queue = self._queue, deque()
                     self._queued_bytes = 0
                     closing = self._closing
-                for key, payload, log_time_ns, schema in batch:
-                    self._writer.write(key, payload, log_time_ns, schema=schema)
-                self.written += len(batch)
-                if time.monotonic() - synced_s >= SYNC_INTERVAL_S:
-                    self._writer.flush(sync=True)
-                    synced_s = time.monotonic()
-                if closing and not batch:
-                    break
-            self._writer.close()
-        except Exception as error:  # the thread's end is reported, whatever ended it
-            self.error = error
+                self._write(batch)
+            self._writer.flush(sync=True)
+        except OSError as error:
+            return self._refused(error, batch)
+        if self.error is not None:
+            log.info("log %s: written again; nothing of it is lost", self.path)
+            self.error = None
+        if self.pictures is not None:
+            self.pictures.flush()
+            self.pictures.keep_room()
+        if closing:
+            self._close()
+        return closing
+
+    def _write(self, batch: deque[Item]) -> None:
+        """Write the items and take them out of the batch; raise OSError with those in it that are still to be."""
+        while batch:
+            key, payload, log_time_ns, schema = batch[0]
+            if self.pictures is not None and _is_picture(key):
+                self.pictures.write(key, payload, log_time_ns, schema)
+            else:
+                self._writer.write(key, payload, log_time_ns, schema=schema)
+            batch.popleft()
+            self.written += 1
+
+    def _refused(self, error: OSError, unwritten: deque[Item]) -> bool:
+        """Keep what the disk did not take, make room where there is none, and wait; return whether it is given up."""
+        with self._ready:
+            if self._last_try:
+                self._writer.abandon()
+                raise error
+            self._last_try = self._closing
+            self._queued_bytes += sum(len(item[1]) for item in unwritten)
+            self._queue.extendleft(reversed(unwritten))
+            self._bound()
+        if self.error is None:
+            log.error("log %s: %s; kept in memory and tried again", self.path, error.strerror)
+        self.error = RecordError(f"{self.path}: {error.strerror}")
+        if self.pictures is not None:
+            self.pictures.keep_room(full=error.errno in FULL)
+        with self._ready:
+            self._ready.wait_for(lambda: self._closing, RETRY_S)
+        return False
+
+    def _close(self) -> None:
+        if self.pictures is not None:
+            self.pictures.close()
+        self._writer.close()
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Write what is queued, and the log's end; raise what the thread met."""
+        """Write what is queued, and the log's end; raise RecordError where the disk does not take it."""
         with self._ready:
             self._closing = True
             self._ready.notify()
         self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise RecordError(f"{self.path}: the disk has not taken its end within {timeout_s:g} s")
+        if isinstance(self.error, OSError):
+            raise RecordError(f"{self.path}: its end is lost: {self.error.strerror}") from self.error
         if self.error is not None:
             raise self.error
 
@@ -88,3 +157,8 @@ class Recorder:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _is_picture(key: str) -> bool:
+    parsed = parse_key(key)
+    return parsed is not None and parsed[0] is IMAGE

@@ -9,9 +9,14 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from protocol.errors import BuddylineError
+from protocol.systemd import Notifier
+
+if TYPE_CHECKING:
+    from protocol.messages import Message
+    from protocol.statusfile import StatusFile
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +25,7 @@ STUCK_S: Final = 15.0
 # A stuck thread may hold what the process needs to end in good order.
 END_ANYWAY_S: Final = 10.0
 WATCH_S: Final = 0.2
+BEAT_S: Final = 1.0 - WATCH_S / 2
 
 
 class StuckError(RuntimeError):
@@ -27,15 +33,20 @@ class StuckError(RuntimeError):
 
 
 class Service:
-    """Runs until `stop` is set or one of its threads fails.
+    """Runs until `stop` is set or one of its threads fails; tells systemd and the status file how it is.
 
     A thread that ends with an exception ends the service: exit status 2 for a BuddylineError (one line), 1
     for a bug (with its traceback). A thread that returns only ends itself. One that has said `going_on` and
-    then does not say so for STUCK_S ends the process with its name and status 1.
+    then does not say so for STUCK_S ends the process with its name and status 1. problems: what is wrong, in
+    words; status: the last status message. Both go into the status file, where there is one.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, status_file: StatusFile | None = None) -> None:
         self.name = name
+        self.problems: list[str] = []
+        self.status_message: Message | None = None
+        self._status_file = status_file
+        self._notifier = Notifier()
         self.stop = threading.Event()
         self.interrupted = False
         self.failure: tuple[str, BaseException] | None = None
@@ -69,6 +80,8 @@ class Service:
 
     def handle_signals(self) -> None:
         """Stop on SIGINT, SIGTERM and a terminal that closes; for the main thread of a process."""
+        # systemd's watchdog ends a process with SIGABRT: what each thread was at is then in the journal.
+        faulthandler.enable()
 
         def interrupt(number: int, _frame: object) -> None:
             self.interrupted = number == signal.SIGINT
@@ -83,13 +96,28 @@ class Service:
         ends_s = None if seconds is None else time.monotonic() + seconds
         # In slices: an Event.wait without an end keeps Python from handling signals on some platforms.
         looked_s = time.monotonic()
+        self._notifier.ready()
+        self._beat()
+        beat_s = looked_s
         while not self.stop.wait(WATCH_S):
             now_s = time.monotonic()
             if ends_s is not None and now_s >= ends_s:
                 break
             self._look_for_stuck(now_s, now_s - looked_s - WATCH_S)
             looked_s = now_s
+            if now_s - beat_s >= BEAT_S:
+                self._beat()
+                beat_s = now_s
         self.stop.set()
+
+    def progressing(self) -> bool:
+        """Return whether the service does its work; where not, systemd restarts it after a while."""
+        return True
+
+    def _beat(self) -> None:
+        self._notifier.tell("; ".join(self.problems) or "all is well", goes_on=self.progressing())
+        if self._status_file is not None:
+            self._status_file.write(self.name, self.problems, self.status_message)
 
     def _look_for_stuck(self, now_s: float, stood_s: float) -> None:
         """Fail where a thread has not gone on; stood_s: for how long this one did not either."""
@@ -111,6 +139,9 @@ class Service:
     def join(self) -> int:
         """Join all threads, name those that do not end; return the exit status."""
         self.stop.set()
+        self._notifier.stopping()
+        if self._status_file is not None:
+            self._status_file.remove()
         ends_s = time.monotonic() + JOIN_TIMEOUT_S
         for thread in self._threads:
             thread.join(max(ends_s - time.monotonic(), 0.0))

@@ -12,6 +12,7 @@ from protocol.divelog import DiveLogReader, DiveLogWriter
 from protocol.messages import Rejected, RelativePose
 from tests.processes import Process, buddyline, free_endpoint
 from tests.solver_service.conftest import dive_messages
+from tools.dives import Dive
 
 END_WITHIN_S = 2.0
 
@@ -121,8 +122,11 @@ def test_demo_shows_poses_and_leaves_nothing_running(tmp_path):
     for log in logs:
         with DiveLogReader(log) as reader:
             names = {key.rpartition("/")[2] for key in reader.keys}
-            assert {"info", "candidates", "attitude", "depth", "imu", "image"} <= names
+            assert {"info", "candidates", "attitude", "depth", "imu"} <= names
             assert reader.damage == []
+        with Dive([log]) as dive:
+            assert dive.nodes("image") == [log.name[0]]
+            assert dive.damage == []
 
 
 def test_demo_summary_as_json():

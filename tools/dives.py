@@ -13,11 +13,12 @@ from protocol.config import ConfigError
 from protocol.divelog import DiveLogReader, Record, read_logs
 from protocol.errors import BuddylineError
 from protocol.messages import MessageError, NodeInfo, decode
+from protocol.pictures import with_pictures
 from protocol.topics import INFO, parse_key
 
 
 class Dive:
-    """One dive out of one or more logs (each node's own, say)."""
+    """One dive out of one or more logs (each node's own, say), with the pictures beside them."""
 
     def __init__(self, paths: list[str] | list[Path]) -> None:
         self._stack = ExitStack()
@@ -28,6 +29,7 @@ class Dive:
                 if path.resolve() in seen:
                     raise BuddylineError(f"{path}: is named twice")
                 seen.add(path.resolve())
+            for path in with_pictures(paths):
                 self.readers.append(self._stack.enter_context(DiveLogReader(path)))
             self._check_one_dive()
         except BaseException:

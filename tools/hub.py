@@ -14,17 +14,22 @@ from protocol.errors import BuddylineError
 from protocol.messages import NodeId
 from protocol.security import HUB, Tls, check_identity
 from protocol.service import Service
+from protocol.statusfile import StatusFile
 
 log = logging.getLogger(__name__)
 
 
 class HubConfig(Config, frozen=True, kw_only=True):
-    """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it."""
+    """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it.
+
+    status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py).
+    """
 
     listen: str = DEFAULT_ENDPOINT
     namespace: str = ""
     nodes: list[NodeId] = field(default_factory=list)
     tls: Tls | None = None
+    status_file: str = ""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
     if warning is not None:
         log.warning("hub: %s", warning)
     access = None if config.tls is None else access_rules(config.nodes, config.namespace)
-    service = Service("hub")
+    service = Service("hub", StatusFile.of("hub", config.status_file))
     service.handle_signals()
     with open_hub(config.listen, tls=config.tls, access=access):
         log.info("hub: listens on %s%s", config.listen, " (TLS, client certificates)" if config.tls else "")

@@ -74,6 +74,11 @@ class ImuSource:
         """What is wrong with it, "" where nothing is."""
         return "; ".join(filter(None, (self._health.problem, self._compass.problem)))
 
+    @property
+    def retries(self) -> int:
+        """Transfers on the bus that had to be repeated, of all its chips."""
+        return self._bus.retries
+
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample."""
         while not self._turn.wait(stop):
@@ -146,6 +151,11 @@ class DepthSource:
     def problem(self) -> str:
         """What is wrong with it, "" where nothing is."""
         return self._health.problem
+
+    @property
+    def retries(self) -> int:
+        """Transfers on the bus that had to be repeated, of all its chips."""
+        return self._bus.retries
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample."""

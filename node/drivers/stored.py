@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
@@ -20,9 +22,10 @@ from node.config import NodeConfig
 from node.devices import Frame
 from protocol.clock import Clock
 from protocol.config import ConfigError
-from protocol.divelog import DiveLogReader
+from protocol.divelog import DiveLogReader, read_logs
 from protocol.errors import BuddylineError
 from protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, MessageError, NodeInfo
+from protocol.pictures import with_pictures
 from protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
 
 log = logging.getLogger(__name__)
@@ -67,7 +70,7 @@ class FolderCamera:
     problem = ""
 
     def __init__(self, files: list[Path], trigger_period_ns: int, clock: Clock) -> None:
-        self.skipped = 0
+        self.skipped: Counter[str] = Counter()
         self._files = iter(files)
         self._period_ns = trigger_period_ns
         self._clock = clock
@@ -83,7 +86,7 @@ class FolderCamera:
             try:
                 picture = decode_picture(file.read_bytes(), str(file))
             except (BuddylineError, OSError) as error:
-                self.skipped += 1
+                self.skipped["unreadable"] += 1
                 log.warning("skipped: %s", error)
                 continue
             due_ns = (self._clock.now_ns() // self._period_ns + 1) * self._period_ns
@@ -101,7 +104,8 @@ class _Paced:
     """Messages of one node of a log, each when its time has come."""
 
     def __init__(self, path: Path, node: str, kinds: frozenset[str], clock: Clock) -> None:
-        self._reader = DiveLogReader(path)
+        self._logs = ExitStack()
+        self._readers = [self._logs.enter_context(DiveLogReader(file)) for file in with_pictures([path])]
         self._path = path
         self._node = node
         self._messages = self._decoded(kinds)
@@ -109,7 +113,7 @@ class _Paced:
         self._began_ns: int | None = None
 
     def _decoded(self, kinds: frozenset[str]) -> Iterator[Message]:
-        for record in self._reader.records(lambda key: key in kinds):
+        for record in read_logs(self._readers, lambda key: key in kinds):
             try:
                 message = record.decode()
             except MessageError as error:
@@ -125,11 +129,11 @@ class _Paced:
         if self._began_ns is None:
             self._began_ns = self._clock.now_ns()
         stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
-        due_ns = self._began_ns + stamp_ns - (self._reader.start_ns or stamp_ns)
+        due_ns = self._began_ns + stamp_ns - (self._readers[0].start_ns or stamp_ns)
         return None if self._clock.wait_until_ns(due_ns, stop) else message
 
     def close(self) -> None:
-        self._reader.close()
+        self._logs.close()
 
 
 class DiveCamera:
@@ -139,15 +143,16 @@ class DiveCamera:
     problem = ""
 
     def __init__(self, path: Path, node: str, clock: Clock) -> None:
-        with DiveLogReader(path) as reader:
+        with ExitStack() as stack:
+            readers = [stack.enter_context(DiveLogReader(file)) for file in with_pictures([path])]
             key = INFO.key(node)
-            found = next(iter(reader.records(lambda topic: topic == key)), None)
+            found = next(iter(readers[0].records(lambda topic: topic == key)), None)
             message = found.decode() if found else None
-            if IMAGE.key(node) not in reader.keys:
-                raise ConfigError(f"{path}: holds no pictures of node {node}; topics: {', '.join(reader.keys)}")
+            if not any(IMAGE.key(node) in reader.keys for reader in readers):
+                raise ConfigError(f"{path}: holds no pictures of node {node}; topics: {', '.join(readers[0].keys)}")
         self._info = message if isinstance(message, NodeInfo) else None
         self._paced = _Paced(path, node, frozenset({IMAGE.key(node)}), clock)
-        self.skipped = 0
+        self.skipped: Counter[str] = Counter()
 
     def info(self) -> NodeInfo | None:
         """Return the log's calibration of this node."""
@@ -161,7 +166,7 @@ class DiveCamera:
             try:
                 picture = decode_picture(message.data, f"picture at {message.stamp_ns}")
             except PictureError as error:
-                self.skipped += 1
+                self.skipped["unreadable"] += 1
                 log.warning("skipped: %s", error)
                 continue
             return Frame(picture, message.stamp_ns, self._info.row_time_ns if self._info else 0)
@@ -177,6 +182,7 @@ class DiveSensors:
 
     name = "stored sensors"
     problem = ""
+    retries = 0
 
     def __init__(self, path: Path, node: str, clock: Clock) -> None:
         kinds = frozenset({ATTITUDE.key(node), DEPTH.key(node), IMU.key(node)})

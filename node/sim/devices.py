@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
@@ -53,6 +54,7 @@ class SimulatedCamera:
         self._period_ns = config.trigger_period_ns
         self._info = self._world.info(self._node, clock.now_ns(), self._period_ns)
         self._last_ns = clock.now_ns()
+        self.skipped: Counter[str] = Counter()
 
     def info(self) -> NodeInfo | None:
         """Return the simulated rig."""
@@ -74,6 +76,7 @@ class SimulatedSensor:
     """One sensor of the simulated node at a constant rate."""
 
     problem = ""
+    retries = 0
 
     def __init__(self, name: str, rate_hz: int, sample: Callable[[int], Message], clock: Clock) -> None:
         self.name = name

@@ -56,7 +56,7 @@ def test_a_folder_gives_one_picture_a_trigger_and_skips_the_broken(tmp_path):
     frames = [camera.next_frame(stop) for _ in range(2)]
     assert [f.stamp_ns for f in frames] == [300_000_000, 400_000_000]
     assert camera.next_frame(stop) is None
-    assert camera.skipped == 1
+    assert camera.skipped["unreadable"] == 1
     assert camera.info() is None
 
 
@@ -76,7 +76,7 @@ def test_a_dive_keeps_its_own_times(tmp_path):
     camera = open_camera(config(path=str(path)), clock)
     assert [camera.next_frame(stop).stamp_ns for _ in range(2)] == [100_000_000_000, 100_200_000_000]
     assert camera.next_frame(stop) is None
-    assert (camera.skipped, clock.now_ns()) == (1, 200_000_005)
+    assert (camera.skipped.total(), clock.now_ns()) == (1, 200_000_005)
     (sensors,) = open_sensors(config(path=str(path)), clock)
     found = [sensors.next_messages(stop)[0] for _ in range(3)]
     assert all(isinstance(message, Attitude) for message in found)

@@ -11,6 +11,7 @@ from protocol.clock import S_NS
 from protocol.divelog import DiveLogReader, Record, read_logs
 from protocol.errors import BuddylineError
 from protocol.messages import MessageError, NodeInfo, Rejected, RelativePose, decode
+from protocol.pictures import with_pictures
 from protocol.topics import (
     ATTITUDE,
     CANDIDATES,
@@ -39,7 +40,7 @@ class Playback:
         self._stack = ExitStack()
         self.bad = 0
         try:
-            self._readers = [self._stack.enter_context(DiveLogReader(Path(path))) for path in paths]
+            self._readers = [self._stack.enter_context(DiveLogReader(path)) for path in with_pictures(paths)]
             starts = [reader.start_ns for reader in self._readers if reader.start_ns is not None]
             if not starts:
                 raise BuddylineError(f"{', '.join(paths)}: no message can be read")

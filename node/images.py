@@ -1,0 +1,64 @@
+"""Which frames go out as pictures: some of them recorded as they are, some published small."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from node.config import NodeConfig
+from node.devices import Frame
+from node.outlet import Outlet
+from protocol.clock import S_NS
+from protocol.messages import CompressedImage, FoxgloveTime
+
+
+class Turn:
+    """Picks at most rate_hz of the frames, whatever the clock does meanwhile; none where that is 0."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = round(0.99e9 / rate_hz) if rate_hz > 0 else 0
+        self._next_ns = 0
+
+    def has_come(self, stamp_ns: int) -> bool:
+        """Return whether the frame of this stamp is to be taken."""
+        # A clock that is set back must not make pictures wait until it is there again.
+        if self._period_ns == 0 or 0 < self._next_ns - stamp_ns <= self._period_ns:
+            return False
+        self._next_ns = stamp_ns + self._period_ns
+        return True
+
+
+class Images:
+    """Sends a node's pictures."""
+
+    def __init__(self, config: NodeConfig, outlet: Outlet) -> None:
+        self._frame_id = f"{config.node}_camera"
+        self._record = config.record
+        self._preview = config.preview
+        self._outlet = outlet
+        self._record_turn = Turn(config.record.images_hz)
+        self._preview_turn = Turn(config.preview.rate_hz)
+
+    def send(self, frame: Frame) -> None:
+        """Record or publish a frame's picture where its turn has come."""
+        if self._record_turn.has_come(frame.stamp_ns):
+            image = self._encoded(frame.image, frame.stamp_ns, self._record.image_quality)
+            self._outlet.send(image, publish=False)
+        if self._preview_turn.has_come(frame.stamp_ns):
+            height, width = frame.image.shape[:2]
+            scale = min(self._preview.width_px / width, 1.0)
+            size = (round(width * scale), max(round(height * scale), 1))
+            small = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            self._outlet.send(self._encoded(small, frame.stamp_ns, self._preview.quality), record=False)
+
+    def _encoded(self, image: NDArray[np.uint8], stamp_ns: int, quality: int) -> CompressedImage:
+        sound, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+        if not sound:
+            raise RuntimeError("the picture could not be encoded")
+        return CompressedImage(
+            timestamp=FoxgloveTime(sec=stamp_ns // S_NS, nsec=stamp_ns % S_NS),
+            frame_id=self._frame_id,
+            data=data.tobytes(),
+            format="jpeg",
+        )

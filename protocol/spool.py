@@ -1,0 +1,70 @@
+"""A file that is written to its end whatever the disk says meanwhile: what it does not take is kept and tried again."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from pathlib import Path
+from typing import Final
+
+HELD_BYTES: Final = 1024 * 1024
+
+
+class Spool:
+    """A new file, as a stream to write to.
+
+    `write` never fails; `flush` raises OSError, loses nothing, and goes on where it stopped when it is called again.
+    stuck: whether the disk refused what was last tried.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.stuck = False
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        self._held: deque[bytes] = deque()
+        self._held_bytes = 0
+        self._length = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self._fd < 0
+
+    def tell(self) -> int:
+        """Return how much was written to it, on the disk or not."""
+        return self._length
+
+    def write(self, data: bytes) -> int:
+        """Take bytes; large amounts go on to the disk at once, if it is sound."""
+        self._held.append(bytes(data))
+        self._held_bytes += len(data)
+        self._length += len(data)
+        if self._held_bytes > HELD_BYTES and not self.stuck:
+            with contextlib.suppress(OSError):  # `stuck` says so, and the next flush raises
+                self.flush()
+        return len(data)
+
+    def flush(self) -> None:
+        """Hand everything to the system; raise OSError where it does not take it."""
+        self.stuck = True
+        while self._held:
+            data = self._held.popleft()
+            try:
+                done = os.write(self._fd, data) if data else 0
+            except OSError:
+                self._held.appendleft(data)
+                raise
+            self._held_bytes -= done
+            if done < len(data):
+                self._held.appendleft(data[done:])
+        self.stuck = False
+
+    def sync(self) -> None:
+        """Have the system write it to the disk; raise OSError."""
+        os.fsync(self._fd)
+
+    def close(self) -> None:
+        """Close the file; what the disk did not take is lost."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
