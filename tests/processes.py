@@ -37,14 +37,16 @@ def buddyline(*words: str, timeout: float = 60.0, cwd: Path | None = None) -> su
 class Process:
     """A running command; its stderr is read as it comes, so that a test can wait for a line.
 
-    prefix: a command that runs it in its own place, as `ip netns exec`.
+    prefix: a command that runs it in its own place, as `ip netns exec`. module: what runs the words.
     """
 
-    def __init__(self, *words: str, cwd: Path | None = None, prefix: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, *words: str, cwd: Path | None = None, prefix: tuple[str, ...] = (), module: str = "tools"
+    ) -> None:
         self.lines: list[str] = []
         self._changed = threading.Condition()
         self._child = subprocess.Popen(
-            [*prefix, sys.executable, "-m", "tools", *map(str, words)],
+            [*prefix, sys.executable, "-m", module, *map(str, words)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -58,6 +60,10 @@ class Process:
     @property
     def pid(self) -> int:
         return self._child.pid
+
+    @property
+    def ended(self) -> bool:
+        return self._child.poll() is not None
 
     def _read(self) -> None:
         for line in self._child.stderr:

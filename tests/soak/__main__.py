@@ -1,0 +1,71 @@
+"""Run two nodes at 30 Hz, hub, solver, recorder and two viewers for as long as one likes.
+
+python -m tests.soak --minutes 60
+
+Prints a line a minute, then what was published, received, lost and doubled, and memory and open files after a minute
+and at the end. Exit status 1 where anything was lost or doubled, or grew beyond the bounds in tests/soak/system.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.soak.system import Minute, Result, soak
+
+RATES = ("candidates", "attitude", "imu", "depth", "pose", "rejected")
+
+
+def show(minute: Minute) -> None:
+    rates = " ".join(f"{name} {minute.rates_hz.get(name, 0.0):.1f}" for name in RATES)
+    loads = " ".join(f"{name} {load.rss_mb:.1f}/{load.fds}" for name, load in minute.loads.items())
+    print(
+        f"{minute.at_s / 60:5.1f} min: Hz {rates}; ms median {minute.median_ms:.1f} p99 {minute.p99_ms:.1f}; "
+        f"missed {minute.missed}; MB/files {loads}; load average {minute.load_average:.1f}",
+        flush=True,
+    )
+
+
+def report(result: Result) -> None:
+    print("\n| key | published | viewer received | lost | doubled | recorder received | lost | doubled |")
+    print("|" + " --- |" * 8)
+    for row in result.rows:
+        cells = [row.key, "-" if row.published is None else row.published]
+        for name in ("viewer", "recorder"):
+            cells += [row.seen[name].count, row.lost.get(name, 0), row.seen[name].repeated]
+        print("| " + " | ".join(map(str, cells)) + " |")
+    first = next((m for m in result.minutes if m.at_s >= 59.0), result.minutes[0])
+    last = result.minutes[-1]
+    print(f"\n| process | MB at {first.at_s / 60:.1f} min | at {last.at_s / 60:.1f} | files | at the end | CPU |")
+    print("|" + " --- |" * 6)
+    for name, load in last.loads.items():
+        early = first.loads[name]
+        share = (load.cpu_s - early.cpu_s) / max(last.at_s - first.at_s, 1e-9)
+        print(
+            f"| {name} | {early.rss_mb:.1f} | {load.rss_mb:.1f} | {early.fds} | {load.fds} | "
+            f"{'-' if last is first else f'{share:.1%}'} |"
+        )
+    medians, p99s = ([getattr(m, name) for m in result.minutes] for name in ("median_ms", "p99_ms"))
+    print(
+        f"\nexposure to pose, ms, of each minute: median {min(medians):.1f} to {max(medians):.1f}, "
+        f"p99 {min(p99s):.1f} to {max(p99s):.1f}; {result.triggers} triggers, each with one outcome unless said below"
+    )
+    print("\n".join(result.failures) if result.failures else "\nnothing lost, nothing doubled, within the bounds")
+
+
+def main() -> int:
+    """Run; 1 where a bound was broken."""
+    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0, help="default: 60")
+    parser.add_argument("--every", type=float, default=60.0, metavar="S", help="between two lines; default: 60")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        result = soak(Path(directory), 60 * args.minutes, args.every, show)
+    report(result)
+    return 1 if result.failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""Two nodes at 30 Hz with attitude at 100 Hz, hub, solver, recorder and two viewers, as real processes."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from bisect import bisect_left, bisect_right
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from protocol.clock import S_NS
+from tests.processes import Process, free_endpoint
+from tests.soak.meter import Load, Stream, Streams, Viewer, load_of, stamps_of, streams_of
+
+RATE_HZ = 30.0
+# The first frames wait for those of the node that starts last.
+START_S = 3.0
+# What is exposed in the last moment may not have left its node, or be answered.
+END_NS = 2 * S_NS
+
+# Once the publishers' caches, which hold a minute or a little more, are full.
+SETTLED_S = 180.0
+MAX_GROWTH_MB = 4.0
+MAX_GROWTH_MB_PER_H = 16.0
+MAX_MORE_FDS = 4
+# Of the p99 of a minute's latencies: the median of the last third over that of the first.
+MAX_P99_RATIO, MAX_P99_MORE_MS = 1.5, 10.0
+
+NODE = """
+node = "{node}"
+connect = "{endpoint}"
+rate_hz = {rate_hz}
+[camera]
+name = "repeating"
+width_px = 205
+height_px = 154
+[sensors]
+name = "repeating"
+[record]
+directory = "{directory}"
+images_hz = 0.0
+[simulation]
+environment = "basin"
+"""
+
+
+@dataclass
+class Minute:
+    """A line of the report. rates_hz: by topic, of all nodes."""
+
+    at_s: float
+    rates_hz: dict[str, float]
+    median_ms: float
+    p99_ms: float
+    missed: int
+    loads: dict[str, Load]
+    load_average: float  # of the machine, over the last minute
+
+
+@dataclass
+class Row:
+    """A line of the table: one key, by the log of its node (poses and rejections: none), the viewer, the recorder."""
+
+    key: str
+    published: int | None
+    seen: dict[str, Stream]
+    lost: dict[str, int]
+
+
+@dataclass
+class Result:
+    """All that was measured, and what of it is beyond the bounds."""
+
+    minutes: list[Minute] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    triggers: int = 0
+    failures: list[str] = field(default_factory=list)
+
+
+def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute], None] = lambda _: None) -> Result:
+    """Run the system for so long; measure every so many seconds, and at the end compare with the nodes' logs."""
+    result, endpoint = Result(), free_endpoint()
+    with ExitStack() as stack:
+
+        def start(name: str, ready: str, *words: str, module: str = "tools") -> None:
+            process = stack.enter_context(Process(*words, module=module))
+            processes[name] = process
+            process.wait_for(ready, timeout=60.0)
+
+        processes: dict[str, Process] = {}
+        start("hub", "listens", "hub", "--listen", endpoint)
+        viewer = Viewer(endpoint)
+        stack.callback(viewer.bus.close)
+        start("recorder", "into", "record", str(directory / "topside.mcap"), "--connect", endpoint)
+        if find_spec("viser"):
+            start("monitor", "look at", "monitor", "--connect", endpoint, "--port", str(free_port()))
+        start("solver", "connected", "solver", "--connect", endpoint)
+        for node in ("a", "b"):
+            config = directory / f"{node}.toml"
+            config.write_text(NODE.format(node=node, endpoint=endpoint, rate_hz=RATE_HZ, directory=directory))
+            start(f"node {node}", "connected", "--config", str(config), module="tests.soak.node")
+        _measure(result, processes, viewer, seconds, every_s, show)
+        statuses = {name: processes[name].end() for name in ("node a", "node b")}
+        time.sleep(3.0)  # the solver takes a pause of 2.5 s for the end
+        statuses |= {name: processes[name].end() for name in processes if name not in statuses and name != "hub"}
+        result.failures += [f"{name}: exit status {status}" for name, status in statuses.items() if status]
+        for name, process in processes.items():
+            result.failures += [f"{name}: {line}" for line in process.lines if line.startswith(("E ", "Traceback"))]
+    _compare(result, directory, viewer.streams)
+    _judge_loads(result)
+    return result
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _measure(
+    result: Result,
+    processes: dict[str, Process],
+    viewer: Viewer,
+    seconds: float,
+    every_s: float,
+    show: Callable[[Minute], None],
+) -> None:
+    time.sleep(START_S)
+    viewer.latencies_ms()
+    began_s, before, viewer_before = time.monotonic(), 0.0, viewer.counts()
+    while before < seconds:
+        time.sleep(max(began_s + min(before + every_s, seconds) - time.monotonic(), 0.0))
+        at_s, counts, latencies_ms = time.monotonic() - began_s, viewer.counts(), viewer.latencies_ms()
+        rates: Counter[str] = Counter()
+        for key, count in (counts - viewer_before).items():
+            rates[key.rpartition("/")[2]] += count
+        result.minutes.append(
+            Minute(
+                at_s=at_s,
+                rates_hz={name: count / (at_s - before) for name, count in rates.items()},
+                median_ms=latencies_ms[len(latencies_ms) // 2] if latencies_ms else -1.0,
+                p99_ms=latencies_ms[len(latencies_ms) * 99 // 100] if latencies_ms else -1.0,
+                missed=viewer.missed,
+                loads={name: load_of(process.pid) for name, process in processes.items()},
+                load_average=os.getloadavg()[0],
+            )
+        )
+        show(result.minutes[-1])
+        ended = [f"{name}: ended: {process.lines[-5:]}" for name, process in processes.items() if process.ended]
+        if ended:
+            raise RuntimeError("; ".join(ended))
+        before, viewer_before = at_s, counts
+
+
+def _compare(result: Result, directory: Path, viewer: Streams) -> None:
+    """Count what was published, by the nodes' own logs, from the first of each key that was on the bus."""
+    seen = {"viewer": viewer, "recorder": streams_of(directory / "topside.mcap")}
+    published = {key: stamps for log in sorted(directory.glob("[ab]-*.mcap")) for key, stamps in stamps_of(log).items()}
+    for key in sorted(viewer.by_key):
+        stamps = published.get(key)
+        row = Row(key, None, {name: streams.by_key.get(key, Stream()) for name, streams in seen.items()}, {})
+        if stamps is not None:
+            first = bisect_left(stamps, row.seen["viewer"].first_ns)
+            row.published = len(stamps) - first
+            for name, stream in row.seen.items():
+                through = bisect_right(stamps, stream.last_ns)
+                row.lost[name] = through - first - stream.count
+                row.lost[name] += max(bisect_right(stamps, stamps[-1] - END_NS) - through, 0)
+        else:
+            row.lost["recorder"] = row.seen["viewer"].count - row.seen["recorder"].count
+        result.rows.append(row)
+        for name, stream in row.seen.items():
+            if row.lost.get(name) or stream.repeated or stream.seq_gaps:
+                result.failures.append(f"{key}: {name}: {row.lost.get(name)} lost, {stream}")
+            # Poses and rejections are in the order of triggers; a late one's stamp may be before another's.
+            if stream.disordered and stamps is not None:
+                result.failures.append(f"{key}: {name}: {stream.disordered} out of order")
+    for name, streams in seen.items():
+        due = {trigger for trigger in streams.triggers if trigger <= max(streams.triggers) - 2 * RATE_HZ}
+        outcomes = Counter(streams.outcomes)
+        result.triggers = len(due)
+        without, doubled = len(due - outcomes.keys()), sum(outcomes.values()) - len(outcomes)
+        if without or doubled or not due:
+            result.failures.append(f"{name}: of {len(due)} triggers {without} without an outcome, {doubled} with two")
+
+
+def _judge_loads(result: Result) -> None:
+    settled = [minute for minute in result.minutes if minute.at_s >= min(SETTLED_S, result.minutes[-1].at_s / 2)]
+    first, last = settled[0], settled[-1]
+    hours = (last.at_s - first.at_s) / 3600
+    for name, load in last.loads.items():
+        grown_mb, more_fds = load.rss_mb - first.loads[name].rss_mb, load.fds - first.loads[name].fds
+        if last.at_s > SETTLED_S and grown_mb > MAX_GROWTH_MB + MAX_GROWTH_MB_PER_H * hours:
+            result.failures.append(f"{name}: grew by {grown_mb:.1f} MB in {hours:.2f} h")
+        if more_fds > MAX_MORE_FDS:
+            result.failures.append(f"{name}: {more_fds} more open files")
+    third = len(settled) // 3
+    if third >= 2:
+        early, late = (median([m.p99_ms for m in part]) for part in (settled[:third], settled[-third:]))
+        if late > MAX_P99_RATIO * early + MAX_P99_MORE_MS:
+            result.failures.append(f"p99 of the latency went from {early:.1f} to {late:.1f} ms")
+
+
+def median(values: list[float]) -> float:
+    return sorted(values)[len(values) // 2]
