@@ -45,12 +45,16 @@ class SolveConfig(Config, frozen=True, kw_only=True):
 
 
 class SolverConfig(Config, frozen=True, kw_only=True):
-    """A whole solver. nodes: the pair [a, b]; empty: the first two that appear, in alphabetical order."""
+    """A whole solver. nodes: the pair [a, b]; empty: the first two that appear, in alphabetical order.
+
+    status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py).
+    """
 
     nodes: list[NodeId] = field(default_factory=list)
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
     tls: Tls | None = None
+    status_file: str = ""
     solve: SolveConfig = field(default_factory=SolveConfig)
 
     def __post_init__(self) -> None:

@@ -15,6 +15,7 @@ from protocol import __version__
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
 from protocol.service import Service
+from protocol.statusfile import StatusFile
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key
 from solver_service.alignment import ClockAlignment, ClockOffset
 from solver_service.answered import Answered
@@ -42,7 +43,8 @@ class SolverService(Service):
     """Solves the configured pair, or the first two nodes that appear."""
 
     def __init__(self, config: SolverConfig, source: str = "defaults", clock: Clock | None = None) -> None:
-        super().__init__("solver")
+        super().__init__("solver", StatusFile.of("solver", config.status_file))
+        self.problems = ["no hub yet"]
         self.config = config
         self.clock = clock or SystemClock()
         self.bad_messages = 0
@@ -88,6 +90,7 @@ class SolverService(Service):
             bus.watch_alive(self._watch)
             bus.declare_alive(f"solver/{'_'.join(self.config.nodes) or 'any'}")
             log.info("solver: connected to %s", self.config.connect)
+            self.problems = ["no two nodes yet"]
             while not self.stop.wait(1.0):
                 self._report()
                 self.going_on()
@@ -186,7 +189,9 @@ class SolverService(Service):
             newest_s = self._health.newest_frame_s() if self._health is not None else None
             if core.pending and (newest_s is None or time.monotonic() - newest_s > PAUSE_S):
                 self._publish(core.flush())
-            self._publishers[SOLVER_STATUS.name].put(self.status(core))
+            self.status_message = status = self.status(core)
+            self.problems = [status.problem] if status.problem else []
+            self._publishers[SOLVER_STATUS.name].put(status)
 
     def status(self, core: SolverCore) -> SolverStatus:
         """Return the solver's health."""
