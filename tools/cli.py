@@ -43,6 +43,12 @@ COMMANDS: Final = (
     Command(
         "node", "node.__main__", "run one node: camera, sensors, detector, log", ("buddyline node --config a.toml",)
     ),
+    Command(
+        "install-service",
+        "tools.install_service",
+        "write the systemd unit of node, hub or solver",
+        ("sudo .venv/bin/buddyline install-service node --config pi.toml", "buddyline install-service hub --print"),
+    ),
     Command("solver", "solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)),
     Command(
         "play",

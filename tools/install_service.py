@@ -1,0 +1,234 @@
+"""`buddyline install-service`: systemd units for node, hub and solver, written and never overwritten in silence."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import getpass
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from protocol.errors import BuddylineError
+
+SERVICES: Final = ("node", "hub", "solver")
+STATE: Final = Path("/var/lib/buddyline")
+# Chrony first, where it is installed: the triggers are instants of its clock.
+AFTER: Final = {
+    "node": "chrony.service",
+    "hub": "network-online.target",
+    "solver": "buddyline-hub.service",
+}
+# The kernel's own interfaces are out of reach of a service that has no business there. ProtectClock and PrivateDevices
+# are not for the node: both close /dev to it, camera and I2C bus included.
+HARDENING: Final = """
+NoNewPrivileges=yes
+CapabilityBoundingSet=
+ProtectSystem=strict
+ProtectHome=read-only
+PrivateTmp=yes
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectKernelLogs=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+SystemCallArchitectures=native
+""".strip()
+WITHOUT_DEVICES: Final = "PrivateDevices=yes\nProtectClock=yes"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("service", choices=SERVICES, help="which unit to write: buddyline-<service>.service")
+    parser.add_argument("--config", metavar="FILE.toml", help="its configuration; a node must have one")
+    parser.add_argument(
+        "--run-as", metavar="USER", help="default: whoever called sudo; needs no rights but the camera's and the bus's"
+    )
+    parser.add_argument("--print", action="store_true", help="show the unit, write nothing")
+    parser.add_argument("--user", action="store_true", help="a unit of your own (systemctl --user), not hardened")
+    parser.add_argument("--root", metavar="DIR", help="write below this directory: a mounted card, say")
+    parser.add_argument("--force", action="store_true", help="replace a unit that has other contents")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a unit is made from. groups: those whose devices it opens; writable: where it writes besides its state."""
+
+    service: str
+    config: Path | None = None
+    user: str = ""
+    groups: tuple[str, ...] = ()
+    writable: tuple[Path, ...] = ()
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write one unit, or show it."""
+    if args.user and (args.root or args.run_as):
+        raise BuddylineError("--user writes a unit of your own: it goes with neither --root nor --run-as")
+    plan = _plan(args)
+    text = user_unit(plan) if args.user else system_unit(plan)
+    if args.print:
+        sys.stdout.write(text)
+        return 0
+    path = _directory(args) / f"buddyline-{plan.service}.service"
+    print(f"{path}: {_write(path, text, force=args.force)}")
+    if not args.root:
+        print("\n".join(_next_commands(f"buddyline-{plan.service}", user=args.user)))
+    return 0
+
+
+def system_unit(plan: Plan) -> str:
+    """Return the unit of the whole machine."""
+    lines = [
+        "StateDirectory=buddyline",
+        "RuntimeDirectory=buddyline",
+        # The three services share it: the one that ends first must not take it from the others.
+        "RuntimeDirectoryPreserve=yes",
+        f"WorkingDirectory={STATE}",
+        f"User={plan.user}",
+    ]
+    if plan.groups:
+        lines.append(f"SupplementaryGroups={' '.join(plan.groups)}")
+    lines += [f"ReadWritePaths={_quoted(f'-{path}')}" for path in plan.writable]
+    lines.append(HARDENING)
+    if not plan.groups:
+        lines.append(WITHOUT_DEVICES)
+    return _unit(plan, lines, "multi-user.target")
+
+
+def user_unit(plan: Plan) -> str:
+    """Return the unit of one user's own manager, which lacks the rights to harden anything."""
+    directory = plan.config.parent if plan.config else Path.home()
+    lines = ["RuntimeDirectory=buddyline", "RuntimeDirectoryPreserve=yes", f"WorkingDirectory={_escaped(directory)}"]
+    return _unit(plan, lines, "default.target")
+
+
+def _unit(plan: Plan, lines: list[str], target: str) -> str:
+    words = [str(_program()), plan.service, *(["--config", str(plan.config)] if plan.config else [])]
+    after = AFTER[plan.service]
+    wants = f"Wants={after}\n" if plan.service == "hub" else ""
+    own = "\n".join(lines)
+    return f"""\
+# Written by `buddyline install-service {plan.service}`; your own changes: `systemctl edit buddyline-{plan.service}`.
+[Unit]
+Description=Buddyline {plan.service}
+After={after}
+{wants}# However often it fails: under water nobody is there to start it.
+StartLimitIntervalSec=0
+
+[Service]
+Type=notify
+ExecStart={" ".join(_quoted(word) for word in words)}
+TimeoutStartSec=60
+WatchdogSec=10
+Restart=on-failure
+RestartSec=2
+TimeoutStopSec=10
+{own}
+
+[Install]
+WantedBy={target}
+"""
+
+
+def _plan(args: argparse.Namespace) -> Plan:
+    config = Path(args.config).resolve() if args.config else None
+    if args.service != "node":
+        if config is not None:
+            _check_config(args.service, config)
+        return Plan(args.service, config, _user(args))
+    if config is None:
+        raise BuddylineError("a node needs its configuration: --config FILE.toml")
+    from node.config import load_node_config
+
+    node = load_node_config(config)
+    groups = ["video"] if node.camera.name == "picamera2" else []
+    groups += ["i2c"] if node.sensors.name == "i2c" else []
+    directory = Path(node.record.directory)
+    writable = (directory,) if directory.is_absolute() and not directory.is_relative_to(STATE) else ()
+    return Plan("node", config, _user(args), tuple(groups), writable)
+
+
+def _check_config(service: str, config: Path) -> None:
+    if service == "hub":
+        from tools.hub import load_hub_config
+
+        load_hub_config(str(config))
+    else:
+        from solver_service.config import load_solver_config
+
+        load_solver_config(config)
+
+
+def _user(args: argparse.Namespace) -> str:
+    name: str = args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
+    if not all(letter.isalnum() or letter in "_-." for letter in name):
+        raise BuddylineError(f"--run-as {name}: not a user's name")
+    return name
+
+
+def _program() -> Path:
+    """Return this program as it is installed; raise BuddylineError where it runs out of a source tree alone."""
+    program = Path(sys.executable).parent / "buddyline"
+    if not program.is_file():
+        raise BuddylineError(f"{program}: not there; install the program first: make install")
+    return program
+
+
+def _directory(args: argparse.Namespace) -> Path:
+    if args.user:
+        return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "systemd" / "user"
+    return Path(args.root or "/") / "etc" / "systemd" / "system"
+
+
+def _write(path: Path, text: str, *, force: bool) -> str:
+    """Write a unit; return what was done. One that differs is shown, and replaced only by force."""
+    try:
+        before = path.read_text() if path.exists() else None
+        if before == text:
+            return "is as it should be"
+        if before is not None:
+            difference = difflib.unified_diff(
+                before.splitlines(keepends=True), text.splitlines(keepends=True), f"{path} as it is", "as it would be"
+            )
+            sys.stderr.writelines(difference)
+            if not force:
+                raise BuddylineError(f"{path}: has other contents, see above; --force replaces it")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = path.with_name(f".{path.name}.new")
+        fresh.write_text(text)
+        fresh.replace(path)
+    except PermissionError as error:
+        raise BuddylineError(f"{path}: not allowed: use sudo, or --user") from error
+    except OSError as error:
+        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    return "written" if before is None else "replaced"
+
+
+def _next_commands(unit: str, *, user: bool) -> list[str]:
+    systemctl, journalctl = ("systemctl --user", "journalctl --user") if user else ("sudo systemctl", "journalctl")
+    lines = [
+        "next:",
+        f"  {systemctl} daemon-reload",
+        f"  {systemctl} enable {unit}          # from the next start of the machine on",
+        f"  {systemctl} restart {unit}         # and now",
+        f"  systemctl {'--user ' if user else ''}status {unit}",
+        f"  {journalctl} -fu {unit}",
+    ]
+    return [*lines, "  loginctl enable-linger             # without you being logged in"] if user else lines
+
+
+def _escaped(text: object) -> str:
+    return str(text).replace("%", "%%")
+
+
+def _quoted(text: str) -> str:
+    """Return a word as a unit's setting takes it."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
+    return f'"{escaped}"' if any(letter in escaped for letter in " \t\"'\\;") else escaped
