@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from protocol.security import SOLVER, VIEWER, node_name
+from protocol.security import PLAYER, SOLVER, SURVEYOR, VIEWER, node_name
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
 _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
@@ -14,23 +14,26 @@ _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"
 def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
     """Return Zenoh's `access_control`: a node publishes its own keys, the solver its pair's, all read all.
 
-    Everything else is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do not match: they
-    are named beside each key, or history would be lost in silence.
+    A surveyor marks where any node stands; a player stands in for all the nodes of a stored dive. Everything else
+    is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do not match: they are named beside each
+    key, or history would be lost in silence.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
     everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**"]
-    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER]
+    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER, SURVEYOR, PLAYER]
     rules: list[dict[str, object]] = [
         _rule("ask", ["ingress", "egress"], _ASK, everything),
         _rule("hear", ["egress"], _SAY, everything),
     ]
     policies: list[dict[str, object]] = [{"rules": ["ask", "hear"], "subjects": clients}]
     for name, keys, alive in [
-        *((node_name(node), f"{root}/node/{node}/*", f"node/{node}") for node in nodes),
-        (SOLVER, f"{root}/pair/*/*/*", "solver"),
-        (VIEWER, None, "viewer"),
+        *((node_name(node), [f"node/{node}/*"], f"node/{node}") for node in nodes),
+        (SOLVER, ["pair/*/*/*"], "solver"),
+        (VIEWER, [], "viewer"),
+        (SURVEYOR, ["node/*/mark"], "surveyor"),
+        (PLAYER, ["node/*/*", "pair/*/*/truth", "pair/*/*/artag"], "player"),
     ]:
-        own = [f"{root}/@alive/{alive}/**"] + ([keys, f"{keys}/@adv/**"] if keys else [])
+        own = [f"{root}/@alive/{alive}/**"] + [f"{root}/{key}{end}" for key in keys for end in ("", "/@adv/**")]
         rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))
         policies.append({"rules": [f"say {name}"], "subjects": [name]})
     return {

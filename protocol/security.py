@@ -21,6 +21,8 @@ from protocol.errors import BuddylineError
 HUB: Final = "hub"
 SOLVER: Final = "solver"
 VIEWER: Final = "viewer"
+SURVEYOR: Final = "surveyor"
+PLAYER: Final = "player"
 
 PROBE_S: Final = 1.0
 

@@ -12,20 +12,20 @@ from protocol.security import VIEWER, Tls, check_identity
 
 
 class ClientConfig(Config, frozen=True, kw_only=True):
-    """The TOML file of a command that only reads the bus (`buddyline keys viewer` writes one)."""
+    """The TOML file of a command on the bus (`buddyline keys viewer`, `surveyor` and `player` write one)."""
 
     connect: str = DEFAULT_ENDPOINT
     namespace: str = ""
     tls: Tls | None = None
 
 
-def add_client_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what says where the hub is."""
-    parser.add_argument("--config", metavar="FILE.toml", help="where the hub is, with [tls] (`buddyline keys viewer`)")
+def add_client_arguments(parser: argparse.ArgumentParser, role: str = VIEWER) -> None:
+    """Declare what says where the hub is; role: whose certificate the command needs."""
+    parser.add_argument("--config", metavar="FILE.toml", help=f"where the hub is, with [tls] (`buddyline keys {role}`)")
     parser.add_argument("--connect", metavar="ENDPOINT", help=f"the hub; default: {DEFAULT_ENDPOINT}")
 
 
-def client_config(args: argparse.Namespace) -> ClientConfig:
+def client_config(args: argparse.Namespace, role: str = VIEWER) -> ClientConfig:
     """Return what the arguments say; raise BuddylineError naming the file and what is wrong with it."""
     config = load_config(args.config, ClientConfig) if args.config else ClientConfig()
     if config.tls is not None:
@@ -33,5 +33,5 @@ def client_config(args: argparse.Namespace) -> ClientConfig:
     if args.connect:
         config = replace(config, connect=args.connect)
     if config.tls is not None:
-        check_identity(config.tls, VIEWER)
+        check_identity(config.tls, role)
     return config

@@ -1,4 +1,4 @@
-"""`buddyline keys`: a small authority of one's own, and certificates for hub, nodes, solver and viewers."""
+"""`buddyline keys`: a small authority of one's own, and certificates for everyone on the bus."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from protocol.endpoint import host_and_port
 from protocol.errors import BuddylineError
-from protocol.security import HUB, SOLVER, VIEWER, node_name
+from protocol.security import HUB, PLAYER, SOLVER, SURVEYOR, VIEWER, node_name
 from protocol.topics import check_node_id
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
 
+ROLES: Final = (SOLVER, VIEWER, SURVEYOR, PLAYER)
+
 _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
 
 
@@ -28,13 +30,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--directory", default=DIRECTORY, metavar="DIR", help=f"where all of it is: {DIRECTORY}/")
     parser.add_argument("--days", type=int, metavar="N", help=f"how long it is valid; {DAYS}, the authority 10 years")
-    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer")
+    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer|surveyor|player")
     first = whose.add_parser("init", help="make the authority and the hub's certificate")
     first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find the hub; 127.0.0.1")
     node = whose.add_parser("node", help="make a node's certificate, and let it publish what is its own")
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
     whose.add_parser("solver", help="make the solver's certificate, which may publish poses")
     whose.add_parser("viewer", help="make the certificate of all that only read: record, monitor")
+    whose.add_parser("surveyor", help="make the certificate of who marks stations: mark, survey watch; reads, too")
+    whose.add_parser("player", help="make the certificate of `play`, which may publish what any node publishes")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -75,7 +79,7 @@ def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Pa
 
 
 def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[Path]:
-    name = {"solver": SOLVER, "viewer": VIEWER}.get(args.whose) or node_name(check_node_id(args.node))
+    name = args.whose if args.whose in ROLES else node_name(check_node_id(args.node))
     made = authority.issue(name, days)
     path = authority.directory / f"{name}.toml"
     connect = f'connect = "tls/{authority.hub_host()}:{PORT}"\n\n{_tls_table(name)}'

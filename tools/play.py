@@ -15,11 +15,12 @@ from msgspec.structs import replace
 
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.divelog import Record
-from protocol.endpoint import DEFAULT_ENDPOINT
 from protocol.errors import BuddylineError
 from protocol.messages import CompressedImage, FoxgloveTime, Message, MessageError, encode
+from protocol.security import PLAYER
 from protocol.service import Service
 from protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
+from tools.client import add_client_arguments, client_config
 from tools.dives import Dive
 from tools.progress import Progress
 
@@ -47,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
     parser.add_argument("--end", type=float, metavar="S", help="seconds from the dive's start")
     parser.add_argument("--loop", action="store_true", help="again and again, with the times carried on")
-    parser.add_argument("--connect", default=DEFAULT_ENDPOINT, metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
+    add_client_arguments(parser, PLAYER)
 
 
 class SolverFollower:
@@ -166,13 +167,20 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"--speed {args.speed}: 0 or more")
     from protocol.zenoh_bus import connect
 
+    config = client_config(args, PLAYER)
     service = Service("play")
     service.handle_signals()
     with Dive(args.dives) as dive:
         start_ns, stop_ns = _span(dive, args.start, args.end)
         if not dive.nodes("candidates"):
             log.warning("play: %s holds no candidates: a solver finds nothing; run `buddyline detect` first", dive.name)
-        bus = connect(args.connect, stop=service.stop, on_wait=lambda text: log.info("play: %s", text))
+        bus = connect(
+            config.connect,
+            namespace=config.namespace or None,
+            stop=service.stop,
+            on_wait=lambda text: log.info("play: %s", text),
+            tls=config.tls,
+        )
         if bus is None:
             return service.join()
         with bus:

@@ -12,11 +12,12 @@ import pytest
 from protocol import topics
 from protocol.access import access_rules
 from protocol.bus import Received
-from protocol.divelog import DiveLogReader
+from protocol.divelog import DiveLogReader, DiveLogWriter
 from protocol.errors import BuddylineError
+from protocol.messages import Mark
 from protocol.security import RefusedError, Tls
 from protocol.zenoh_bus import ZenohBus, connect, open_hub
-from tests.processes import Process, free_endpoint
+from tests.processes import Process, buddyline, free_endpoint
 from tests.tools.identities import copy_of, expired, make_keys, tls
 
 WAIT_S = 10.0
@@ -60,6 +61,8 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         join(endpoint, tls(keys, "node-b")) as b,
         join(endpoint, tls(keys, "solver")) as solver,
         join(endpoint, tls(keys, "viewer")) as viewer,
+        join(endpoint, tls(keys, "surveyor")) as surveyor,
+        join(endpoint, tls(keys, "player")) as player,
         join(endpoint, tls(keys, "viewer")) as watcher,
     ):
         inbox, alive = Inbox(), Inbox()
@@ -70,17 +73,23 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
             (a, [(topics.DEPTH, "b"), (topics.TRUTH, "a", "b")], (topics.DEPTH, "a")),
             (b, [(topics.CANDIDATES, "a"), (topics.POSE, "a", "b")], (topics.CANDIDATES, "b")),
             (solver, [(topics.CANDIDATES, "a")], (topics.POSE, "a", "b")),
+            (surveyor, [(topics.CANDIDATES, "a"), (topics.INFO, "a"), (topics.TRUTH, "a", "b")], (topics.MARK, "a")),
+            (player, [(topics.POSE, "a", "b"), (topics.REJECTED, "a", "b")], (topics.TRUTH, "a", "b")),
         ):
             for topic, *ids in [*denied, allowed]:
                 assert bus.publisher(topic, *ids).put_bytes(b'{"stamp_ns":1}')
         for topic, *ids in ((topics.DEPTH, "a"), (topics.CANDIDATES, "b"), (topics.POSE, "a", "b")):
             assert viewer.publisher(topic, *ids).put_bytes(b'{"stamp_ns":2}')
+        player.publisher(topics.CANDIDATES, "c").put_bytes(b'{"stamp_ns":1}')
         b.declare_alive("node/a")
+        surveyor.declare_alive("node/a")
+        player.declare_alive("node/a")
         viewer.declare_alive("solver/any")
         for bus, name in ((a, "node/a"), (b, "node/b"), (solver, "solver/a_b"), (viewer, "viewer/v")):
             bus.declare_alive(name)
             alive.wait_for(f"{name} True")
-        said = ["buddyline/node/a/depth", "buddyline/node/b/candidates", "buddyline/pair/a/b/pose"]
+        said = ["buddyline/node/a/depth", "buddyline/node/a/mark", "buddyline/node/b/candidates"]
+        said += ["buddyline/node/c/candidates", "buddyline/pair/a/b/pose", "buddyline/pair/a/b/truth"]
         for key in said:
             inbox.wait_for(key)
         # What was denied never got into anybody's history either, and what was allowed did.
@@ -174,16 +183,52 @@ def test_a_hub_without_tls_is_waited_for_and_what_is_missing_is_said(keys: Path)
     assert "no hub with TLS" in said[0]
 
 
+def test_marks_and_stored_dives_reach_a_secured_hub_with_the_right_certificate_alone(
+    keys: Path, tmp_path: Path
+) -> None:
+    own = copy_of(keys, tmp_path / "own")
+    endpoint = at(own, tls_endpoint())
+    mark = Mark(node="a", stamp_ns=5, kind="note", name="", note="from the dive")
+    with DiveLogWriter(tmp_path / "dive.mcap") as writer:
+        writer.write_message(mark)
+    with (
+        Process("hub", "--config", own / "hub.toml") as hub,
+        Process("record", tmp_path / "r.mcap", "--config", own / "viewer.toml") as record,
+    ):
+        hub.wait_for("TLS, client certificates")
+        record.wait_for("Ctrl-C ends")
+        words = ("mark", "T4", "--node", "b", "--config")
+        for command, refused, role in (
+            (words, "viewer", "surveyor"),
+            (("play", tmp_path / "dive.mcap", "--config"), "surveyor", "player"),
+        ):
+            done = buddyline(*command, own / f"{refused}.toml")
+            assert done.returncode == 2
+            assert f"{refused}.crt: is the certificate of {refused!r}, and {role!r} is needed here" in done.stderr
+            done = buddyline(*command, own / f"{role}.toml")
+            assert done.returncode == 0, done.stderr
+        plain = buddyline("mark", "T5", "--node", "b", "--connect", endpoint.replace("tls/", "tcp/"))
+        assert (plain.returncode, "wants TLS" in plain.stderr) == (2, True)
+        assert record.end() == 0
+    with DiveLogReader(tmp_path / "r.mcap") as reader:
+        marks = [record.decode() for record in reader.records(lambda key: key.endswith("/mark"))]
+    assert [(m.node, m.name or m.note) for m in marks] == [("b", "T4"), ("a", "from the dive")]
+
+
+def at(keys: Path, endpoint: str) -> str:
+    """Put a free endpoint in the place of the one that all configurations have; return it."""
+    for path in keys.glob("*.toml"):
+        text = path.read_text().replace("tls/0.0.0.0:7447", endpoint).replace("tls/127.0.0.1:7447", endpoint)
+        path.write_text(text)
+    return endpoint
+
+
 def test_a_node_that_is_refused_records_all_the_same_and_says_so(keys: Path, tmp_path: Path) -> None:
     """Processes from the files as `buddyline keys` wrote them, but for the endpoint."""
     own = copy_of(keys, tmp_path / "own")
-    endpoint = tls_endpoint()
-    for name in ("hub", "node-a", "viewer"):
-        path = own / f"{name}.toml"
-        text = path.read_text().replace("tls/0.0.0.0:7447", endpoint).replace("tls/127.0.0.1:7447", endpoint)
-        if name == "node-a":
-            text = text.replace("[tls]", f'[record]\ndirectory = "{tmp_path}/logs"\n\n[tls]')
-        path.write_text(text)
+    at(own, tls_endpoint())
+    config = own / "node-a.toml"
+    config.write_text(config.read_text().replace("[tls]", f'[record]\ndirectory = "{tmp_path}/logs"\n\n[tls]'))
     expired(own, "node-a")
     with (
         Process("hub", "--config", own / "hub.toml") as hub,

@@ -39,13 +39,22 @@ def test_the_written_configurations_load_and_name_the_right_identities(keys):
 
 def test_private_keys_are_private(keys):
     found = {path.name: stat.S_IMODE(path.stat().st_mode) for path in keys.glob("*.key")}
-    assert set(found) == {"ca.key", "hub.key", "node-a.key", "node-b.key", "solver.key", "viewer.key"}
+    assert set(found) == {
+        "ca.key",
+        "hub.key",
+        "node-a.key",
+        "node-b.key",
+        "solver.key",
+        "viewer.key",
+        "surveyor.key",
+        "player.key",
+    }
     assert set(found.values()) == {0o600}
 
 
 def test_nothing_is_overwritten(keys):
     before = {path.name: path.read_bytes() for path in keys.iterdir()}
-    for words in (["init"], ["node", "a"], ["solver"], ["viewer"]):
+    for words in (["init"], ["node", "a"], ["solver"], ["viewer"], ["surveyor"], ["player"]):
         assert main(["keys", "--directory", str(keys), *words]) == 2
     assert {path.name: path.read_bytes() for path in keys.iterdir()} == before
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from protocol.clock import S_NS
 from protocol.errors import BuddylineError
 from protocol.messages import Attitude, Depth, Imu, Mark, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.security import SURVEYOR
 from protocol.service import Service
 from protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
 from tools.client import client_config
@@ -150,7 +151,7 @@ def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
 
     service = Service("survey watch")
     service.handle_signals()
-    config = client_config(args)
+    config = client_config(args, SURVEYOR)
     bus = connect(
         config.connect,
         namespace=config.namespace or None,

@@ -9,6 +9,7 @@ import threading
 from protocol.clock import SystemClock
 from protocol.errors import BuddylineError
 from protocol.messages import Mark
+from protocol.security import SURVEYOR
 from protocol.topics import MARK, check_node_id
 from tools.client import add_client_arguments, client_config
 from tools.survey.marks import KINDS, stamp_ns_of
@@ -24,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--kind", choices=KINDS, default="station", help="default: station")
     parser.add_argument("--note", default="", metavar="TEXT")
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
-    add_client_arguments(parser)
+    add_client_arguments(parser, SURVEYOR)
     parser.add_argument("--linger", type=float, default=1.0, metavar="S", help="stay on the bus so long; default: 1")
 
 
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
     mark = mark_of(args, SystemClock().now_ns())
     stop = threading.Event()
-    config = client_config(args)
+    config = client_config(args, SURVEYOR)
     bus = connect(
         config.connect,
         namespace=config.namespace or None,
