@@ -1,0 +1,56 @@
+"""The status file: where it is, what is in it, and that a disk which refuses it costs nothing."""
+
+import json
+import logging
+
+import pytest
+
+from protocol.messages import NodeStatus, decode
+from protocol.statusfile import StatusFile
+
+STATUS = NodeStatus(
+    node="a", stamp_ns=5, boot="b", software="s", uptime_s=1.0, rates_hz={}, drops={}, ages_s={}, problem="disk: full"
+)
+
+
+@pytest.mark.parametrize(
+    ("configured", "variables", "path"),
+    [
+        ("/etc/x.json", {"RUNTIME_DIRECTORY": "/run/b", "XDG_RUNTIME_DIR": "/run/user/1"}, "/etc/x.json"),
+        ("", {"RUNTIME_DIRECTORY": "/run/b:/run/c", "XDG_RUNTIME_DIR": "/run/user/1"}, "/run/b/node-a.json"),
+        ("", {"XDG_RUNTIME_DIR": "/run/user/1"}, "/run/user/1/buddyline/node-a.json"),
+        ("", {}, None),
+    ],
+)
+def test_its_place(monkeypatch, configured, variables, path):
+    for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    found = StatusFile.of("node-a", configured)
+    assert (None if found is None else str(found.path)) == path
+
+
+def test_it_is_whole_and_goes_with_the_service(tmp_path):
+    file = StatusFile(tmp_path / "run" / "node-a.json")
+    for problems in ([], ["disk: full"]):
+        file.write("node a", problems, STATUS)
+        content = json.loads(file.path.read_bytes())
+        assert content["service"] == "node a"
+        assert content["problems"] == problems
+        assert content["stamp_ns"] > 0
+        assert decode(json.dumps(content["status"]).encode(), NodeStatus) == STATUS
+    assert [path.name for path in file.path.parent.iterdir()] == ["node-a.json"]
+    file.remove()
+    assert not file.path.exists()
+    file.remove()
+
+
+def test_a_place_that_cannot_be_written_is_said_once(tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    file = StatusFile(tmp_path / "file" / "node-a.json")
+    with caplog.at_level(logging.WARNING):
+        file.write("node a", [], None)
+        file.write("node a", [], None)
+        file.remove()
+    assert caplog.text.count("cannot be written") == 1
