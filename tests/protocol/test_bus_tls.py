@@ -66,7 +66,7 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         join(endpoint, tls(keys, "viewer")) as watcher,
     ):
         inbox, alive = Inbox(), Inbox()
-        watcher.subscribe(topics.EVERYTHING, inbox, history=False)
+        watcher.subscribe(topics.EVERYTHING, inbox)
         watcher.watch_alive(lambda name, here: alive(Received(f"{name} {here}", b"", 0, "")))
         # Denied first, allowed last, of one session and one priority: what is denied would come before.
         for bus, denied, allowed in (
