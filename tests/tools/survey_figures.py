@@ -1,8 +1,9 @@
 """The survey's figures: simulated surveys of 12 to 30 legs through the true solver, against truth and by hand.
 
-    python -m tests.tools.survey_figures --loops 40 --lines 20 --disturbed 20
+    python -m tests.tools.survey_figures                  # all of it, about half an hour
+    python -m tests.tools.survey_figures --only loops --surveys 5
 
-Each survey is solved, made into legs, adjusted, and read by the real cavern.
+Each survey is solved, made into legs, adjusted, and read by the real cavern in all styles of .svx.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import argparse
 import math
 import tempfile
 from collections import defaultdict
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +27,43 @@ from tools.survey.readings import of_messages
 from tools.survey.settings import AlarmSettings, SurveySettings
 
 HANDS = 5
+# Swimming past the other and on to the next station, at this speed, and then tying off.
+SWIM_MPS, TIE_S = 0.4, 20.0
+STRETCH = 3
 
 
-def measure(kind, seed, flaws, directory, figures):
+@dataclass(frozen=True)
+class Campaign:
+    """Surveys of one kind. disturbed: three stations in a row turn compasses by 6 to 20 degrees, each by its own."""
+
+    kind: str
+    flaws: world.Flaws = field(default_factory=world.Flaws)
+    disturbed: bool = False
+
+
+CAMPAIGNS = {
+    "loops": Campaign("loop"),
+    "loops-4deg": Campaign("loop", world.Flaws(compass_deg=4.0)),
+    "lines": Campaign("line"),
+    "lines-4deg": Campaign("line", world.Flaws(compass_deg=4.0)),
+    "lines-4deg-disturbed": Campaign("line", world.Flaws(compass_deg=4.0), disturbed=True),
+}
+
+
+def measure(campaign, seed, directory, figures):
     """Survey one course; add its figures, errors over sigmas and errors in % of the length, by name."""
     rng = np.random.default_rng(seed)
-    course = {"loop": world.loop, "line": world.line}[kind](rng, int(rng.integers(12, 31)))
+    course = {"loop": world.loop, "line": world.line}[campaign.kind](rng, int(rng.integers(12, 31)))
+    bad = {}
+    if campaign.disturbed:
+        first = int(rng.integers(1, len(course.stations_m) - STRETCH))
+        bad = {first + k: float(rng.choice([-1, 1]) * rng.uniform(6, 20)) for k in range(STRETCH)}
+    pause_s = 2 * course.length_m / len(course.legs) / SWIM_MPS + TIE_S
+    messages = world.dive(
+        course, rng, campaign.flaws, 8.0, 4.0, disturb=lambda _, station: bad.get(station, 0.0), pause_s=pause_s
+    )
     derived = Derived()
-    derived.add(of_messages(world.dive(course, rng, flaws, rest_s=8.0, swim_s=4.0)), SurveySettings(), AlarmSettings())
+    derived.add(of_messages(messages), SurveySettings(), AlarmSettings())
     at = dict(zip(course.names, (world.enu(place) for place in course.stations_m), strict=True))
     legs = [leg for leg in derived.legs if leg.from_ in at and leg.to in at]
     lost = len(course.legs) - len(legs)
@@ -41,7 +72,13 @@ def measure(kind, seed, flaws, directory, figures):
         # It is said, and on the leg after it; what becomes of its stations is a person's to mark.
         figures["lost and not said"].append(not any("makes no leg" in problem.text for problem in derived.problems))
         return
-    project = world.project_of(derived.legs)
+    _legs(legs, at, figures)
+    _cavern(derived.legs, directory, figures)
+    _far_ends(campaign, course, adjust(world.project_of(derived.legs)), at, bad, rng, figures)
+
+
+def _legs(legs, at, figures):
+    project = world.project_of(legs)
     for leg in legs:
         way = at[leg.to] - at[leg.from_]
         line = line_of(leg, project, 0.0, {}, alone=True)
@@ -49,65 +86,79 @@ def measure(kind, seed, flaws, directory, figures):
         azimuth = math.atan2(line.vector_m[0], line.vector_m[1]) - math.atan2(way[0], way[1])
         figures["azimuth / sigma"].append(wrap(azimuth) / bearing_of(leg, project).sigma)
         figures["rise / sigma"].append((line.vector_m[2] - way[2]) / line.rise_sigma_m)
+
+
+def _cavern(legs, directory, figures):
     for depth in ("absolute", "readings"):
-        project = world.project_of(derived.legs, depth)
+        project = world.project_of(legs, depth)
         adjusted = adjust(project)
-        said, ratios, found = world.cavern(directory, survex.diving(project, adjusted))
-        figures["cavern's warnings"].append(len(said))
-        same = [float(np.abs(p.position_m - found[name]).max()) for name, p in adjusted.positions.items()]
-        figures["cavern differs, m"].append(max(same))
-        figures[f"H, depths {depth}"] += [h for h, _ in ratios]
-        if depth == "readings":
-            figures["V, depths readings"] += [v for _, v in ratios]
-    adjusted = adjust(world.project_of(derived.legs))
+        texts = {style: survex.readings(project, adjusted, style) for style in ("auto", "diving", "normal")}
+        for style, text in (texts | {"cartesian": survex.cartesian(project, adjusted)}).items():
+            said, ratios, found = world.cavern(directory, text)
+            which = f"{style}, {depth}"
+            figures[f"cavern's warnings, {which}"].append(len(said))
+            same = [float(np.abs(p.position_m - found[name]).max()) for name, p in adjusted.positions.items()]
+            figures[f"cavern off, m: {which}"].append(max(same))
+            figures[f"H: {which}"] += [h for h, _ in ratios]
+            if depth == "readings":
+                figures[f"V: {which}"] += [v for _, v in ratios]
+
+
+def _far_ends(campaign, course, adjusted, at, bad, rng, figures):
     start = at["0"]
-    far = max(at, key=lambda name: float(np.linalg.norm(at[name] - start))) if kind == "loop" else course.names[-1]
+    far = course.names[-1]
+    if campaign.kind == "loop":
+        far = max(at, key=lambda name: float(np.linalg.norm(at[name] - start)))
     error = adjusted.positions[far].position_m - adjusted.positions["0"].position_m - (at[far] - start)
     figures["far end, % of length"].append(100 * float(np.linalg.norm(error)) / course.length_m)
     covariance = adjusted.positions[far].covariance[:2, :2]
     figures["far end / ellipse"].append(math.sqrt(error[:2] @ np.linalg.solve(covariance, error[:2]) / 2))
     figures["closure, % of length"] += [100 * loop.error_m / loop.length_m for loop in adjusted.loops]
-    end = course.stations_m[course.legs[-1][1]]
+    goal = course.names.index(far)
     for _ in range(HANDS):
-        missed = float(np.linalg.norm(world.by_hand(course, rng) - end))
-        figures["by hand: closure, %" if kind == "loop" else "by hand: far end, %"].append(
-            100 * missed / course.length_m
-        )
+        by_hand = world.by_hand(course, rng, bad)
+        if campaign.kind == "loop":
+            end = course.legs[-1][1]
+            closure_m = by_hand[end] - course.stations_m[end]
+            figures["by hand: closure, %"].append(100 * float(np.linalg.norm(closure_m)) / course.length_m)
+            # Closed as surveyors close it: the misclosure shared out by length.
+            walked_m = sum(
+                float(np.linalg.norm(course.stations_m[j] - course.stations_m[i])) for i, j, _ in course.legs[:goal]
+            )
+            by_hand[goal] = by_hand[goal] - closure_m * walked_m / course.length_m
+        missed = float(np.linalg.norm(by_hand[goal] - course.stations_m[goal]))
+        figures["by hand: far end, %"].append(100 * missed / course.length_m)
 
 
 def table(figures):
-    """Return the figures as lines: median, 95th percentile and root mean square of the magnitudes."""
-    rows = [f"{'':26}{'n':>6}{'median':>9}{'p95':>9}{'rms':>9}"]
+    """Return the figures as lines: median, 95th percentile, greatest and root mean square of the magnitudes."""
+    rows = [f"{'':34}{'n':>6}{'median':>9}{'p95':>9}{'max':>9}{'rms':>9}"]
     for name, values in figures.items():
         if values:
             size = np.abs(np.array(values, dtype=float))
-            rms = math.sqrt(float((size**2).mean()))
-            rows.append(f"{name:26}{len(size):6}{np.median(size):9.3f}{np.percentile(size, 95):9.3f}{rms:9.3f}")
+            parts = np.median(size), np.percentile(size, 95), size.max(), math.sqrt(float((size**2).mean()))
+            rows.append(f"{name:34}{len(size):6}" + "".join(f"{part:9.3f}" for part in parts))
     return rows
 
 
-def campaign(kind, count, flaws):
-    """Measure surveys 0 .. count - 1 of a kind."""
+def run(campaign, count):
+    """Measure surveys 0 .. count - 1 of a campaign."""
     figures = defaultdict(list)
     with tempfile.TemporaryDirectory() as directory:
         for seed in range(count):
-            measure(kind, seed, flaws, Path(directory), figures)
+            measure(campaign, seed, Path(directory), figures)
     return figures
 
 
 def main():
     """Print the figures."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--loops", type=int, default=40)
-    parser.add_argument("--lines", type=int, default=20)
-    parser.add_argument("--disturbed", type=int, default=20)
+    parser.add_argument("--surveys", type=int, default=40, help="of each kind; default: 40")
+    parser.add_argument("--only", choices=list(CAMPAIGNS))
     args = parser.parse_args()
-    for title, kind, count, flaws in (
-        ("loops, undisturbed", "loop", args.loops, world.Flaws()),
-        ("lines, undisturbed", "line", args.lines, world.Flaws()),
-        ("lines, a tenth of the stations disturbed", "line", args.disturbed, world.Flaws(disturbed_share=0.1)),
-    ):
-        print(f"{count} {title}", *table(campaign(kind, count, flaws)), sep="\n", flush=True)
+    for name, campaign in CAMPAIGNS.items():
+        if args.only in (None, name):
+            print(f"{args.surveys} {name}", *table(run(campaign, args.surveys)), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

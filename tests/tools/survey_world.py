@@ -197,8 +197,12 @@ class _Node:
         )
 
 
-def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None):
-    """Return all messages of a leapfrog survey along a course, poses and rejections of the true solver included."""
+def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s=0.0):
+    """Return all messages of a leapfrog survey along a course, poses and rejections of the true solver included.
+
+    disturb: of a node's index and a station's, to its compass's error there (degrees). After each rest the nodes
+    see nothing of each other for swim_s, and for pause_s more, of which there are no messages.
+    """
     flaws = flaws or Flaws()
     nodes = [_Node(rng, 0, flaws), _Node(rng, 1, flaws)]
     core = SolverCore("a", "b", SolveConfig().settings("test"))
@@ -253,22 +257,30 @@ def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None):
                 take(*nodes[i].sensors(stamp_ns, held[i], facing[i]), nodes[i].dark(stamp_ns, seq))
             stamp_ns += PERIOD_NS
             seq += 1
+        stamp_ns += round(pause_s * 1e9 / PERIOD_NS) * PERIOD_NS
     out.extend(core.flush())
     return out
 
 
-def by_hand(course, rng, compass_deg=1.5, tape_m=0.086, depth_m=0.1):
-    """Return the far station as compass, tape and gauge give it, (3,) NED: one foresight a leg (MNemoLink's sds)."""
+def by_hand(course, rng, disturbed_deg=None, compass_deg=1.5, tape_m=0.086, depth_m=0.1):
+    """Return all stations as compass, tape and gauge give them, NED, by index: one foresight a leg (MNemoLink's sds).
+
+    disturbed_deg: stations' indices to the error of any compass there. A loop's end is not made to close.
+    """
+    disturbed_deg = disturbed_deg or {}
     place = course.stations_m[course.legs[0][0]].copy()
+    found = {course.legs[0][0]: place.copy()}
     depths = {k: z + rng.normal(0, depth_m) for k, z in enumerate(course.stations_m[:, 2])}
     for start, end, _ in course.legs:
         way = course.stations_m[end] - course.stations_m[start]
         tape = np.linalg.norm(way) + rng.normal(0, tape_m)
-        azimuth = math.atan2(way[1], way[0]) + math.radians(rng.normal(0, compass_deg))
+        wrong_deg = rng.normal(0, compass_deg) + disturbed_deg.get(start, 0.0)
+        azimuth = math.atan2(way[1], way[0]) + math.radians(wrong_deg)
         rise = depths[end] - depths[start]
         run = math.sqrt(max(tape**2 - rise**2, 0))
         place += (run * math.cos(azimuth), run * math.sin(azimuth), rise)
-    return place
+        found[end] = place.copy()
+    return found
 
 
 def readings_of(course, rng, compass_deg=1.0, tape_m=0.02, depth_m=0.02):

@@ -49,13 +49,35 @@ def differences(adjusted, found, *, shift=False):
 @pytest.mark.parametrize("make", [world.line, world.loop])
 def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
     project, adjusted = survey(make, depth=depth, **PLACES[place])
-    said, ratios, found = world.cavern(tmp_path, survex.diving(project, adjusted))
+    said, ratios, found = world.cavern(tmp_path, survex.readings(project, adjusted))
     assert not said
     assert max(differences(adjusted, found)) <= SAME_M
     assert len(ratios) == len(adjusted.loops)
     for (h, v), loop in zip(ratios, adjusted.loops, strict=True):
         assert h == pytest.approx(loop.horizontal_ratio, rel=0.05, abs=0.02)
         assert v == pytest.approx(loop.vertical_ratio, rel=0.1, abs=0.05)
+
+
+@CAVERN
+@pytest.mark.parametrize("style", ["diving", "normal"])
+def test_cavern_takes_all_legs_in_one_style(tmp_path, style):
+    project, adjusted = survey(depth="readings")
+    text = survex.readings(project, adjusted, style)
+    assert (survex.DIVING in text) == (style == "diving")
+    assert (survex.NORMAL in text) == (style == "normal")
+    said, ((h, v),), found = world.cavern(tmp_path, text)
+    assert not said
+    assert h == pytest.approx(adjusted.loops[0].horizontal_ratio, rel=0.1)
+    assert v == pytest.approx(adjusted.loops[0].vertical_ratio, rel=0.1, abs=0.05)
+    # That diving style is no good here is Survex's fault; where it is none any more, `auto` has had its day.
+    assert (max(differences(adjusted, found)) <= SAME_M) == (style == "normal")
+
+
+@CAVERN
+def test_held_depths_cost_nothing_but_cavern_s_own_rounding(tmp_path):
+    project, adjusted = survey(legs=25, seed=4)
+    _, _, found = world.cavern(tmp_path, survex.readings(project, adjusted))
+    assert max(differences(adjusted, found)) <= 0.0055
 
 
 @CAVERN
@@ -66,7 +88,7 @@ def test_cavern_agrees_on_crossing_loops_side_shots_and_steep_legs(tmp_path):
     course.legs += [(2, 8, 0), (4, 12, 0), (2, 13, 1), (4, 5, 0)]
     project = world.project_of(world.readings_of(course, np.random.default_rng(2)))
     adjusted = adjust(project)
-    text = survex.diving(project, adjusted)
+    text = survex.readings(project, adjusted)
     assert survex.NORMAL in text
     assert survex.DIVING in text
     said, _, found = world.cavern(tmp_path, text)
@@ -80,7 +102,7 @@ def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
     legs = world.readings_of(course, np.random.default_rng(2))
     legs[1] = replace(legs[1], back_azimuth_deg=(legs[1].back_azimuth_deg + 15) % 360)
     project = world.project_of(legs)
-    said, _, found = world.cavern(tmp_path, survex.diving(project, adjust(project)))
+    said, _, found = world.cavern(tmp_path, survex.readings(project, adjust(project)))
     assert not said
     assert found
 
@@ -119,7 +141,7 @@ def test_therion_compiles(tmp_path, place):
 
 def test_an_unknown_declination_is_never_written():
     project, adjusted = survey(place=Place())
-    text = survex.diving(project, adjusted)
+    text = survex.readings(project, adjusted)
     assert "*declination" not in text
     assert "declination not known" in text
     assert "\n    declination" not in therion.centreline(project, adjusted)
@@ -136,7 +158,7 @@ def test_readings_people_instruments_and_notes_are_in_the_export():
         survey=replace(project.survey, notes="silt at 4", instruments={"depth": "MS5837"}),
         edit=[Edit(leg="0-1", note="second try")],
     )
-    text = survex.diving(project, adjusted)
+    text = survex.readings(project, adjusted)
     for words in ('*team "A. Diver"', '*instrument depth "MS5837"', "; silt at 4", "second try", "*date 2026.05.01"):
         assert words in text
     assert "*declination -12.3000 degrees" in text

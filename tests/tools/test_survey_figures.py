@@ -6,8 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from tests.tools import survey_world as world
-from tests.tools.survey_figures import campaign, table
+from tests.tools.survey_figures import CAMPAIGNS, run, table
 
 pytestmark = [
     pytest.mark.slow,
@@ -21,28 +20,24 @@ def rms(values):
 
 
 def test_loops_close_as_their_sigmas_say():
-    figures = campaign("loop", 50, world.Flaws())
+    figures = run(CAMPAIGNS["loops"], 42)
     print(*table(figures), sep="\n")
-    assert len(figures["V, depths readings"]) >= 40
-    # A centimetre, and half of one that Survex rounds away.
-    assert max(figures["cavern differs, m"]) <= 0.015
-    assert not any(figures["cavern's warnings"])
+    assert len(figures["V: auto, readings"]) >= 40
+    # Half a centimetre is what Survex rounds away; of held depths that is all.
+    assert max(figures["cavern off, m: auto, absolute"]) <= 0.0055
+    assert max(figures["cavern off, m: auto, readings"]) <= 0.015
+    assert not any(value for name, values in figures.items() if "warnings" in name for value in values)
     # The rms of 40 such ratios has a standard deviation of about 0.1.
-    for name in ("H, depths absolute", "H, depths readings", "V, depths readings"):
+    for name in ("H: auto, absolute", "H: auto, readings", "V: auto, readings", "H: diving, readings"):
         assert 0.7 < rms(figures[name]) < 1.3
     for name in ("distance / sigma", "azimuth / sigma", "rise / sigma"):
         assert 0.8 < rms(figures[name]) < 1.2
 
 
-def test_open_lines_end_about_as_near_as_by_hand():
-    figures = campaign("line", 20, world.Flaws())
+@pytest.mark.parametrize(("name", "worse"), [("lines", 1.5), ("lines-4deg-disturbed", 2.0)])
+def test_open_lines_end_as_near_as_their_compasses_let_them(name, worse):
+    figures = run(CAMPAIGNS[name], 20)
     print(*table(figures), sep="\n")
-    assert np.median(figures["far end, % of length"]) < 1.5 * np.median(figures["by hand: far end, %"])
+    # By hand it is one compass of 1.5 degrees, here two of 1.5 or 4.
+    assert np.median(figures["far end, % of length"]) < worse * np.median(figures["by hand: far end, %"])
     assert 0.6 < rms(figures["far end / ellipse"]) < 1.4
-
-
-def test_disturbed_stations_do_not_carry_the_line_away():
-    figures = campaign("line", 20, world.Flaws(disturbed_share=0.1))
-    print(*table(figures), sep="\n")
-    # By hand is undisturbed here: what the nodes see of their fields must make up for it.
-    assert np.median(figures["far end, % of length"]) < 1.5 * np.median(figures["by hand: far end, %"])

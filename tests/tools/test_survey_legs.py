@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from protocol.messages import Imu, Mark, RelativePose
+from protocol.messages import Imu, Mark, Rejected, RelativePose
 from tests.tools import survey_world as world
 from tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from tools.survey.chain import Stop, stand
@@ -143,6 +143,41 @@ def test_a_rest_too_short_for_a_leg_is_said(messages):
     assert len(found.legs) == 4
     assert any("makes no leg" in problem.text for problem in found.problems)
     assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
+
+
+def test_a_rest_in_which_poses_were_refused_is_said(messages):
+    third = derived(messages).legs[2]
+    kept = 0
+    refused = []
+    for message in messages:
+        if isinstance(message, RelativePose) and third.start_ns - 10**9 <= message.stamp_ns <= third.end_ns + 10**9:
+            kept += 1
+            if kept > 2:
+                a, b = message.node_a, message.node_b
+                rejected = Rejected(
+                    node_a=a, node_b=b, stamp_ns=message.stamp_ns, trigger=message.trigger, reason="range_gap"
+                )
+                refused.append(rejected)
+                continue
+        refused.append(message)
+    found = derived(refused)
+    assert len(found.legs) == 4
+    (problem,) = found.problems
+    assert "makes no leg" in problem.text
+    assert "refused: range_gap" in problem.text
+    assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
+
+
+def test_rests_that_follow_at_once_are_two_legs():
+    messages = world.dive(COURSE, np.random.default_rng(3), rest_s=8.0, swim_s=0.0)
+    shorter = [m for m in messages if not _approaching(m)]
+    assert [(leg.from_, leg.to) for leg in derived(shorter).legs] == [(str(k), str(k + 1)) for k in range(5)]
+
+
+def _approaching(message):
+    """Tell whether a pose is of the three seconds in which a node swims up to its station."""
+    second = (message.stamp_ns - world.START_NS) / 1e9 % 11.0 if isinstance(message, RelativePose) else 10.0
+    return second < 3.0
 
 
 def test_swimming_is_not_rest(messages):

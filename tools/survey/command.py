@@ -7,15 +7,19 @@ import json
 import os
 import sys
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from msgspec.structs import replace
 
 from protocol.errors import BuddylineError
+from protocol.security import SURVEYOR
 from tools.client import add_client_arguments
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from tools.survey.network import Adjusted
     from tools.survey.project import Project
 
@@ -48,10 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     export = does.add_parser("export", help="write the survey for other programs")
     export.add_argument("project", metavar="PROJECT.toml")
     export.add_argument("--format", choices=FORMATS, default="svx", help="default: svx (Survex)")
+    export.add_argument(
+        "--style",
+        choices=("auto", "diving", "normal"),
+        default="auto",
+        help="of svx: diving (tape, compass, depths) or normal (tape, compass, clino); default: diving, but normal for "
+        "legs of loops, because no Survex up to 1.4.22 adjusts loops of diving legs rightly",
+    )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
     _depth_argument(export)
     watch = does.add_parser("watch", help="say on the bus, live, when sights, fields or depths disagree")
-    add_client_arguments(watch)
+    add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
@@ -80,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         project = replace(project, adjust=AdjustSettings(depth=args.depth))
     adjusted = adjust(project)
     if args.does == "export":
-        return _export(path, args.format, args.output, project, adjusted)
+        return _export(path, args, project, adjusted)
     from tools.survey import report
 
     if args.does == "report":
@@ -126,18 +137,21 @@ def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
     return 0 if derived.legs or derived.points else 1
 
 
-def _export(path: Path, kind: str, output: str | None, project: Project, adjusted: Adjusted) -> int:
+def _export(path: Path, args: argparse.Namespace, project: Project, adjusted: Adjusted) -> int:
     from tools.survey import compass, drawing, survex, tables, therion
 
+    kind = args.format
+    if args.style != "auto" and kind != "svx":
+        raise BuddylineError(f"--style is of svx; {kind} has one style")
     title = project.survey.title or project.survey.name
-    target = output or str(path.with_suffix(SUFFIXES.get(kind, f".{kind}")))
+    target = args.output or str(path.with_suffix(SUFFIXES.get(kind, f".{kind}")))
     if kind == "pdf":
         content: str | bytes = drawing.pdf([drawing.plan(adjusted, title), drawing.profile(adjusted, title)])
     elif kind in ("svg", "profile"):
         content = (drawing.plan if kind == "svg" else drawing.profile)(adjusted, title).svg()
     else:
-        writers = {
-            "svx": survex.diving,
+        writers: dict[str, Callable[[Project, Adjusted], str]] = {
+            "svx": partial(survex.readings, style=args.style),
             "svx-cartesian": survex.cartesian,
             "th": therion.centreline,
             "dat": compass.dat,

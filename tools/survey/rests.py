@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -23,6 +24,8 @@ SAME_SHARE: Final = 0.06
 LEAST_RUN: Final = 3
 FEEL_NS: Final = 500_000_000
 GRAVITY_MPS2: Final = 9.80665
+# Rejections of triggers at which the nodes did not look at each other, or that the link lost.
+UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +46,13 @@ class Rest:
 def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Rest]:
     """Return the rests of a dive in their order; too_short where not rest_s long with rest_fixes fixes.
 
-    What is shorter than half of that is no rest, but a swimmer's pause.
+    What is shorter than half of that is no rest, but a swimmer's pause; unless poses were refused meanwhile, which
+    makes up for the fixes in being one, though not in making a leg.
     """
     held = handled(readings.a, seen.stamps_ns, settings), handled(readings.b, seen.stamps_ns, settings)
     still = (speeds_mps(seen) < settings.rest_speed_mps + WANDER_RADPS * seen.range_m) & ~held[0] & ~held[1]
-    runs = _merged(_runs(seen.stamps_ns, still), seen)
-    found = []
+    runs = _merged(_runs(seen, still), seen)
+    found: list[Rest] = []
     for run in runs:
         start_ns, end_ns = int(seen.stamps_ns[run[0]]), int(seen.stamps_ns[run[-1]])
         seconds = (end_ns - start_ns) / 1e9
@@ -65,7 +69,34 @@ def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Re
             if start_ns <= one.stamp_ns <= end_ns:
                 unused.setdefault(one.reason, []).append(one.trigger)
         found.append(Rest(chosen, start_ns, end_ns, _line_m(seen, run), too_short, unused))
-    return found
+    return sorted([*found, *_refused(readings, seen, still, found, settings)], key=lambda one: one.start_ns)
+
+
+def _refused(readings: Readings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings) -> list[Rest]:
+    """Return stretches outside of the rests found in which both nodes saw lights, but hardly a pose came of it."""
+    events = [(int(seen.stamps_ns[i]), "fix") for i in np.flatnonzero(still).tolist()]
+    events += [(one.stamp_ns, one.reason) for one in readings.rejected if one.reason not in UNSEEN]
+    groups: list[list[tuple[int, str]]] = []
+    for stamp_ns, reason in sorted(events):
+        if any(one.start_ns - PAUSE_NS <= stamp_ns <= one.end_ns + PAUSE_NS for one in found):
+            continue
+        if groups and stamp_ns - groups[-1][-1][0] < PAUSE_NS:
+            groups[-1].append((stamp_ns, reason))
+        else:
+            groups.append([(stamp_ns, reason)])
+    lost = []
+    for group in groups:
+        start_ns, end_ns = group[0][0], group[-1][0]
+        seconds = (end_ns - start_ns) / 1e9
+        if seconds < settings.rest_s / 2 or len(group) < settings.rest_fixes / 2:
+            continue
+        reasons = Counter(reason for _, reason in group)
+        fixes = reasons.pop("fix", 0)
+        text = f"{seconds:.0f} s with {fixes} fixes"
+        if reasons:
+            text += "; refused: " + ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
+        lost.append(Rest(np.zeros(len(still), dtype=bool), start_ns, end_ns, np.zeros(3), text))
+    return lost
 
 
 def same_line(one_m: Floats, other_m: Floats) -> bool:
@@ -116,12 +147,13 @@ def handled(node: Node, stamps_ns: Stamps, settings: SurveySettings) -> Bools:
     return result
 
 
-def _runs(stamps_ns: Stamps, still: Bools) -> list[list[int]]:
+def _runs(seen: Sights, still: Bools) -> list[list[int]]:
+    """Return neighbouring fixes at rest, of one and the same line between the nodes."""
     runs: list[list[int]] = []
     last = -2
     for i in np.flatnonzero(still).tolist():
-        close = bool(runs) and int(stamps_ns[i] - stamps_ns[last]) < PAUSE_NS
-        if close and i - last <= 3:
+        close = bool(runs) and int(seen.stamps_ns[i] - seen.stamps_ns[last]) < PAUSE_NS and i - last <= 3
+        if close and same_line(_line_m(seen, [last]), _line_m(seen, [i])):
             runs[-1].append(i)
         else:
             runs.append([i])

@@ -1,9 +1,9 @@
-"""Survex: a survey in diving style with backsights and each leg's sds, or as cartesian vectors."""
+"""Survex: a survey as readings, in diving style where Survex adjusts that rightly, or as cartesian vectors."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -18,15 +18,22 @@ def quoted(text: str) -> str:
     return '"' + text.replace('"', "'").replace("\n", " ") + '"'
 
 
-def diving(project: Project, adjusted: Adjusted) -> str:
-    """Return .svx text: tape, compass, backcompass and depths, each leg with its own sds.
+Style = Literal["auto", "diving", "normal"]
 
-    Legs that close a loop, steep ones, and those without depths are written with the clino that follows: of
-    diving legs cavern (1.4.4, and 1.4.9) takes the covariances in a wrong order, which bends the loops they are
-    in. Elsewhere covariances move nothing. Fore- and backsight have one sd, because it weighs unequal ones wrongly.
+
+def readings(project: Project, adjusted: Adjusted, style: Style = "auto") -> str:
+    """Return .svx text: tape, compass, backcompass and depths or clino, each leg with its own sds.
+
+    auto: diving style, but the clino that follows from the depths for legs that close a loop. diving, normal: all
+    legs alike, but steep ones and those without depths never in diving style.
+
+    No Survex up to 1.4.22 adjusts diving legs rightly (datain.c, process_diving: the covariance of east and north
+    has a wrong sign, and the three go on in another order than they are taken in), which bends the loops they are
+    in by metres. Elsewhere covariances move nothing. Fore- and backsight have one sd, because it weighs unequal
+    ones wrongly.
     """
     depths = held_depths(project)
-    checked = {id(one.leg) for one in adjusted.residuals if one.chi2 is not None}
+    in_loop = {id(one.leg) for one in adjusted.residuals if one.chi2 is not None}
     body = [
         "*calibrate depth 0 -1 ; gauges read down, Survex wants altitude",
         "*units tape depth metres",
@@ -34,17 +41,18 @@ def diving(project: Project, adjusted: Adjusted) -> str:
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
     ]
     state: dict[str, str] = {}
-    style = ""
+    last = ""
     for line in adjusted.lines:
         reading = reading_of(line, project, depths)
-        by_clino = line.by_clino or id(line.leg) in checked
-        sds = _sds(reading, by_clino)
+        by_clino = line.by_clino or style == "normal" or (style == "auto" and id(line.leg) in in_loop)
+        held = line.leg.from_ in depths and line.leg.to in depths and not line.by_clino
+        sds = _sds(reading, by_clino, held)
         body += [f"*sd {name} {value}" for name, value in sds.items() if state.get(name) != value]
         state |= sds
         wanted = NORMAL if by_clino else DIVING
-        if wanted != style:
+        if wanted != last:
             body.append(wanted)
-            style = wanted
+            last = wanted
         body.append(_row(line, reading, by_clino))
     return _file(project, adjusted, heading_of(project, adjusted), body)
 
@@ -53,15 +61,22 @@ NORMAL: Final = "*data normal from to tape compass backcompass clino ignoreall"
 DIVING: Final = "*data diving from to tape compass backcompass fromdepth todepth ignoreall"
 
 
-def _sds(reading: Reading, by_clino: bool) -> dict[str, str]:
+def _sds(reading: Reading, by_clino: bool, held: bool) -> dict[str, str]:
+    """Return a leg's sds as Survex takes them; held: its stations are held at their depths."""
     compass = f"{reading.compass_sigma_deg:.3f} degrees"
     sds = {"tape": f"{reading.tape_sigma_m:.4f} metres", "compass": compass, "backcompass": compass}
-    if by_clino:
-        run_m = reading.tape_m * math.cos(math.radians(reading.clino_deg))
-        sds["clino"] = f"{max(math.degrees(reading.rise_sigma_m / run_m), 0.001):.3f} degrees"
+    if not by_clino:
+        return sds | {"depth": f"{reading.rise_sigma_m / math.sqrt(2):.4f} metres"}
+    level = math.cos(math.radians(reading.clino_deg))
+    if held:
+        # The rise is exact, so an error of the tape is one of the run, and none of the height. Equal sds along the
+        # leg and across its slope say that: then no misclosure on the map moves a height.
+        run_sigma_m = reading.tape_sigma_m / level
+        clino_rad = run_sigma_m / reading.tape_m
+        sds["tape"] = f"{run_sigma_m:.4f} metres"
     else:
-        sds["depth"] = f"{reading.rise_sigma_m / math.sqrt(2):.4f} metres"
-    return sds
+        clino_rad = reading.rise_sigma_m / (reading.tape_m * level)
+    return sds | {"clino": f"{max(math.degrees(clino_rad), 0.001):.3f} degrees"}
 
 
 def _row(line: Line, reading: Reading, by_clino: bool) -> str:
