@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import UNSET
 
 from node import __version__
+from node.clock_sync import ClockSync
 from node.clock_watch import ClockWatch
 from node.config import NodeConfig
 from node.detect import make_detector
@@ -45,6 +46,7 @@ STALE_S: Final = 2.0
 HANGS_S: Final = 5.0
 FIRST_S: Final = 15.0
 LOOK_S: Final = 0.2
+REPORT_S: Final = 1.0
 TEMPERATURE: Final = Path("/sys/class/thermal/thermal_zone0/temp")
 REFUSED_RETRY_S: Final = 5.0
 
@@ -74,6 +76,7 @@ class NodeService(Service):
         self._sent_before: Counter[str] = Counter()
         self._status_s = self._started_s
         self._clock_watch = ClockWatch(self.clock.now_ns)
+        self._clock_sync = ClockSync(config.node, self.boot, self.clock)
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError where one cannot be had."""
@@ -130,6 +133,7 @@ class NodeService(Service):
         for source in self.sources:
             self.spawn(source.name, lambda source=source: self._read(source))  # type: ignore[misc]
         self.spawn("status", self._report)
+        self.spawn("clock", lambda: self._clock_sync.follow_chrony(self.stop))
         self.spawn("bus", self._connect)
 
     def close(self) -> int:
@@ -229,7 +233,7 @@ class NodeService(Service):
             bus.declare_alive(f"node/{self.config.node}")
             self.outlet.connect(bus)
             log.info("%s: connected to %s", self.name, self.config.connect)
-            self.stop.wait()
+            self._clock_sync.exchange(bus, self.outlet, self.stop)
             self.outlet.disconnect()
 
     def _open_bus(self) -> Bus | None:
@@ -258,12 +262,12 @@ class NodeService(Service):
         return None
 
     def _report(self) -> None:
-        report_s = time.monotonic() + 1.0
+        report_s = time.monotonic() + REPORT_S
         while not self.stop.wait(LOOK_S):
             self.going_on()
             self._clock_watch.look()
             if time.monotonic() >= report_s:
-                report_s += 1.0
+                report_s += REPORT_S
                 self.status_message = status = self.status()
                 self.outlet.send(status)
 
@@ -298,6 +302,7 @@ class NodeService(Service):
             disk_free_bytes=UNSET if free_bytes is None else free_bytes,
             temperature_degc=UNSET if temperature_degc is None else temperature_degc,
             bus_retries=max(retries) if retries else UNSET,
+            **self._clock_sync.status_fields(),
             log=self.recorder.path.name,
             problem="; ".join(self.problems),
         )
@@ -325,6 +330,8 @@ class NodeService(Service):
         problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
         devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
         problems += [f"{name}: {text}" for name, text in devices if text]
+        if self._clock_sync.problem:
+            problems.append(f"clock: {self._clock_sync.problem}")
         if self._clock_watch.problem:
             problems.append(self._clock_watch.problem)
         if self.recorder.error is not None:

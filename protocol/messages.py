@@ -18,6 +18,7 @@ from protocol.errors import BuddylineError
 
 NODE_ID_PATTERN: Final = r"^[a-z0-9_]{1,32}\Z"
 MAX_BLOBS: Final = 64
+MAX_HEARD: Final = 16
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 
 NodeId: TypeAlias = Annotated[str, Meta(pattern=NODE_ID_PATTERN)]
@@ -206,6 +207,30 @@ class Depth(Message, frozen=True, kw_only=True):
     temperature_degc: float | UnsetType = UNSET
 
 
+class HeardClock(Struct, frozen=True, kw_only=True):
+    """Another node's newest ClockBeacon, as it arrived.
+
+    sent_ns: its stamp_ns, on that node's clock. received_ns: on the clock of the node that says this.
+    """
+
+    node: NodeId
+    boot: str
+    sent_ns: StampNs
+    received_ns: StampNs
+
+
+class ClockBeacon(Message, frozen=True, kw_only=True):
+    """The time at which a node sent this, and when it received the others' newest ones.
+
+    Two nodes' beacons together hold what a ping's four timestamps do: their clocks' offset and the round trip.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    boot: str
+    heard: Annotated[list[HeardClock], Meta(max_length=MAX_HEARD)]
+
+
 class FoxgloveTime(Struct, frozen=True, kw_only=True):
     """A Foxglove timestamp."""
 
@@ -233,6 +258,9 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     rates: messages a second by topic; drops: lost messages by cause; ages_s: time since the newest sample of a
     device; bus_retries: transfers on the sensors' I2C bus that had to be repeated; problem: what is wrong in words,
     empty where nothing is.
+    clock_offset_s: this clock minus the true time, as chrony estimates it; clock_rms_s: chrony's long-term RMS of it;
+    clock_bound_s: the true time is no farther away; clock_frequency_ppm: by how much the uncorrected clock gains;
+    clock_source: what chrony follows, empty where nothing. All are left out where chrony does not tell.
     """
 
     node: NodeId
@@ -246,6 +274,10 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     trigger_residual_s: float | UnsetType = UNSET
     detect_s: float | UnsetType = UNSET
     clock_offset_s: float | UnsetType = UNSET
+    clock_rms_s: NonNegative | UnsetType = UNSET
+    clock_bound_s: NonNegative | UnsetType = UNSET
+    clock_frequency_ppm: float | UnsetType = UNSET
+    clock_source: str | UnsetType = UNSET
     disk_free_bytes: Count | UnsetType = UNSET
     temperature_degc: float | UnsetType = UNSET
     bus_retries: Count | UnsetType = UNSET

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 
 from protocol import messages
@@ -111,6 +112,15 @@ NODE_STATUS: Final = Topic(
     latest_only=True,
     stale_s=3.0,
 )
+CLOCK: Final = Topic(
+    "clock",
+    "buddyline/node/{node}/clock",
+    messages.ClockBeacon,
+    "buddyline.ClockBeacon",
+    4.0,
+    "interactive_high",
+    express=True,
+)
 LIGHT_TRUTH: Final = Topic(
     "light_truth",
     "buddyline/node/{node}/light_truth",
@@ -165,6 +175,7 @@ TOPICS: Final = (
     DEPTH,
     IMAGE,
     NODE_STATUS,
+    CLOCK,
     LIGHT_TRUTH,
     MARK,
     POSE,
@@ -198,6 +209,7 @@ def check_node_id(node_id: str) -> str:
     return node_id
 
 
+@lru_cache(maxsize=4096)
 def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
     """Return the topic and node ids of a key, or None where it is none of ours."""
     for topic, pattern in _PATTERNS:

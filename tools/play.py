@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Poses and what else a solver made are not sent: a solver on the bus makes them anew.
-NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status"})
+# Poses and what else a solver made are not sent: a solver on the bus makes them anew. What the clocks were then says
+# nothing of those that are on the bus now.
+NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status", "clock"})
 # Pictures go out as previews: the bus is for what the solver needs.
 IMAGES_HZ: Final = 2.0
 # At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time:

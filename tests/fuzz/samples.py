@@ -49,6 +49,13 @@ SOUND: tuple[m.Message, ...] = (
         drops={"frame": 0},
         ages_s={"camera": 0.1},
         clock_offset_s=0.001,
+        clock_rms_s=0.0005,
+        clock_bound_s=0.002,
+        clock_frequency_ppm=-3.5,
+        clock_source="192.0.2.1",
+    ),
+    m.ClockBeacon(
+        **_NODE, boot="x", heard=[m.HeardClock(node="b", boot="y", sent_ns=STAMP_NS, received_ns=STAMP_NS + 300_000)]
     ),
     m.LightTruth(**_NODE, trigger=3, lights=[m.TrueLight(name="left", u_px=1.0, v_px=2.0, visible=True, merged=False)]),
     m.Mark(**_NODE, name="12"),

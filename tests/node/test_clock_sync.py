@@ -1,0 +1,117 @@
+"""Beacons between two nodes, and chrony's figures on their way into the status."""
+
+import threading
+
+import msgspec
+import pytest
+
+from node.chrony import ChronyError, decode_tracking
+from node.clock_sync import HEARD_FOR_S, Beacons, ClockSync
+from protocol.bus import Received
+from protocol.clock import ManualClock
+from protocol.local_bus import LocalNetwork
+from protocol.messages import MAX_HEARD, ClockBeacon, MessageError, decode, encode
+from protocol.topics import CLOCK
+from tests.node.test_chrony import FOLLOWS, LOST
+
+NOW_NS = 1_764_000_000_000_000_000
+
+
+def received(beacon, key=None, receive_ns=NOW_NS):
+    return Received(key or CLOCK.key(beacon.node), encode(beacon), receive_ns, CLOCK.encoding)
+
+
+def of(node, stamp_ns, heard=()):
+    return ClockBeacon(node=node, stamp_ns=stamp_ns, boot="x", heard=list(heard))
+
+
+def test_a_beacon_says_when_the_other_was_heard():
+    a, b = Beacons("a", "boot_a"), Beacons("b", "boot_b")
+    first = a.beacon(ManualClock(NOW_NS), 0.0)
+    assert (first.node, first.stamp_ns, first.heard) == ("a", NOW_NS, [])
+    b.hear(received(first, receive_ns=NOW_NS + 5_000_300), 0.1)
+    answer = b.beacon(ManualClock(NOW_NS + 9_000_000), 0.2)
+    (heard,) = answer.heard
+    assert (heard.node, heard.boot, heard.sent_ns, heard.received_ns) == ("a", "boot_a", NOW_NS, NOW_NS + 5_000_300)
+    assert b.beacon(ManualClock(NOW_NS), 0.1 + HEARD_FOR_S + 0.01).heard == []
+
+
+def test_own_forged_and_broken_beacons_are_not_heard():
+    a = Beacons("a", "boot")
+    a.hear(received(of("a", NOW_NS)), 0.0)
+    a.hear(received(of("b", NOW_NS), key=CLOCK.key("c")), 0.0)
+    a.hear(Received(CLOCK.key("b"), b"{}", NOW_NS, CLOCK.encoding), 0.0)
+    assert a.beacon(ManualClock(NOW_NS), 0.0).heard == []
+    assert a.bad == 2
+
+
+def test_no_crowd_makes_a_beacon_that_nobody_takes():
+    a = Beacons("a", "boot")
+    for number in range(3 * MAX_HEARD):
+        a.hear(received(of(f"n{number}", NOW_NS)), 0.0)
+    beacon = decode(encode(a.beacon(ManualClock(NOW_NS), 0.0)), ClockBeacon)
+    assert [heard.node for heard in beacon.heard] == [f"n{number}" for number in range(2 * MAX_HEARD, 3 * MAX_HEARD)]
+    with pytest.raises(MessageError, match="heard"):
+        encode(msgspec.structs.replace(beacon, heard=beacon.heard * 2))
+
+
+class Sent:
+    """An outlet that publishes, and says when it has."""
+
+    def __init__(self, bus, node):
+        self._publisher = bus.publisher(CLOCK, node)
+        self.heard = threading.Event()
+
+    def send(self, message):
+        self._publisher.put(message)
+        if message.heard:
+            self.heard.set()
+
+
+def test_two_nodes_hear_each_other_over_a_bus():
+    network, stop = LocalNetwork(), threading.Event()
+    buses = [network.connect() for _ in "ab"]
+    outlets = [Sent(bus, node) for bus, node in zip(buses, "ab", strict=True)]
+    threads = [
+        threading.Thread(
+            target=ClockSync(node, node, network.clock, lambda: None).exchange, args=(bus, outlet, stop), name=node
+        )
+        for bus, outlet, node in zip(buses, outlets, "ab", strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    try:
+        assert all(outlet.heard.wait(20.0) for outlet in outlets)
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+        for bus in buses:
+            bus.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem", "fields"),
+    [
+        (FOLLOWS, "", {"clock_source": "127.0.0.1", "clock_rms_s": 9.47e-7}),
+        (LOST, "not synchronised", {"clock_source": ""}),
+        (None, "", {}),
+        (ChronyError("chronyc gave no answer"), "no answer", {}),
+    ],
+)
+def test_chronys_figures_reach_the_status(answer, problem, fields):
+    stop = threading.Event()
+
+    def read():
+        stop.set()
+        if isinstance(answer, Exception):
+            raise answer
+        return None if answer is None else decode_tracking(answer)
+
+    sync = ClockSync("a", "x", ManualClock(NOW_NS), read)
+    sync.follow_chrony(stop)
+    assert problem in sync.problem
+    assert bool(problem) == bool(sync.problem)
+    said = sync.status_fields()
+    assert {name: said.get(name) for name in fields} == fields
+    assert bool(fields) == bool(said)
