@@ -6,6 +6,7 @@ import heapq
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import IO, Final, cast
 
@@ -203,6 +204,7 @@ class DiveLogReader:
         wanted: whether a topic is to be read; since_ns: the least log time. Chunks without any such record are
         passed over unread, where the log's index tells.
         """
+        wanted = cache(wanted) if wanted else None
         heap: list[tuple[int, int, Record]] = []
         order = 0
         for message in self._contents.loose:

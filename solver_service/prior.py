@@ -63,8 +63,9 @@ class PosePrior:
         t, R, P = self._predicted(stamp_ns)
         innovation = np.concatenate((fix.t_a_b_m - t, rotation_log(R_fix @ R.T)))
         S = P[:6, :6] + fix.covariance
-        gain = np.linalg.solve(S, P[:6]).T
-        if innovation @ np.linalg.solve(S, innovation) > GATE_CHI2:
+        solved = np.linalg.solve(S, np.concatenate((P[:6], innovation[:, None]), axis=1))
+        gain = solved[:, :12].T
+        if innovation @ solved[:, 12] > GATE_CHI2:
             self._start(stamp_ns, fix, R_fix)
             return
         step = gain @ innovation

@@ -37,16 +37,21 @@ def rig_of(info: NodeInfo) -> Rig:
 
 def view_of(frame: Candidates) -> View:
     """Return a frame's candidates as arrays; an unknown score is NaN."""
-    blobs = frame.blobs
-    return View(
-        pixels=np.array([[blob.u_px, blob.v_px] for blob in blobs]).reshape(-1, 2),
-        sigma_px=np.array([blob.sigma_px for blob in blobs]),
-        score=np.array([math.nan if blob.score is UNSET else blob.score for blob in blobs], dtype=float),
-        area_px=np.array([blob.area_px for blob in blobs]),
-        peak=np.array([blob.peak for blob in blobs]),
-        dt_s=np.array([blob.dt_ns for blob in blobs]) / 1e9,
-        stamp_ns=frame.stamp_ns,
-    )
+    rows = [
+        (
+            blob.u_px,
+            blob.v_px,
+            blob.sigma_px,
+            math.nan if blob.score is UNSET else blob.score,
+            blob.area_px,
+            blob.peak,
+            1e-9 * blob.dt_ns,
+        )
+        for blob in frame.blobs
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
+    _, _, sigma_px, score, area_px, peak, dt_s = table.T
+    return View(table[:, :2], sigma_px, score, area_px, peak, dt_s, frame.stamp_ns)
 
 
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:

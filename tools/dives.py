@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
@@ -31,7 +32,7 @@ class Dive:
                 seen.add(path.resolve())
             for path in with_pictures(paths):
                 self.readers.append(self._stack.enter_context(DiveLogReader(path)))
-            self._check_one_dive()
+            self._infos = self._check_one_dive()
         except BaseException:
             self._stack.close()
             raise
@@ -46,7 +47,7 @@ class Dive:
         """Topics of all logs, sorted."""
         return sorted({key for reader in self.readers for key in reader.keys})
 
-    @property
+    @cached_property
     def start_ns(self) -> int:
         """Log time of the first message; raises where no log has any."""
         starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
@@ -54,7 +55,7 @@ class Dive:
             raise BuddylineError(f"{self.name}: no message can be read{self._damage_text()}")
         return min(starts)
 
-    @property
+    @cached_property
     def end_ns(self) -> int:
         """Log time of the last message."""
         return max((reader.end_ns for reader in self.readers if reader.end_ns is not None), default=0)
@@ -94,14 +95,10 @@ class Dive:
 
     def infos(self) -> dict[str, NodeInfo]:
         """Return the first sound NodeInfo of each node."""
-        infos: dict[str, NodeInfo] = {}
-        for reader in self.readers:
-            for info in _infos_of(reader):
-                infos.setdefault(info.node, info)
-        return infos
+        return dict(self._infos)
 
-    def _check_one_dive(self) -> None:
-        """Refuse logs of which two describe one node differently at the same time."""
+    def _check_one_dive(self) -> dict[str, NodeInfo]:
+        """Return the first NodeInfo of each node; refuse logs of which two describe one differently at one time."""
         first: dict[str, tuple[DiveLogReader, NodeInfo]] = {}
         for reader in self.readers:
             for info in _infos_of(reader):
@@ -113,6 +110,7 @@ class Dive:
                         f"{other.path} and {reader.path} describe node {info.node} differently at the same time: "
                         "they are of two dives or two rigs; solve them apart"
                     )
+        return {node: info for node, (_, info) in first.items()}
 
     def close(self) -> None:
         """Close all logs."""

@@ -17,14 +17,17 @@ class Progress:
         self.what = what
         self.total = max(total, 1e-9)
         self._stream = stream or sys.stderr
+        self._seen = self._stream.isatty()
         self._began_s = time.monotonic()
         self._shown_s = 0.0
         self._shown = False
 
     def show(self, done: float, note: str = "") -> None:
         """Say how much of the total is done."""
+        if not self._seen:
+            return
         now_s = time.monotonic()
-        if not self._stream.isatty() or now_s - self._began_s < SHOW_AFTER_S or now_s - self._shown_s < 0.1:
+        if now_s - self._began_s < SHOW_AFTER_S or now_s - self._shown_s < 0.1:
             return
         share = min(max(done / self.total, 0.0), 1.0)
         left_s = (now_s - self._began_s) * (1 - share) / share if share > 0 else 0.0

@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
                         continue
                     if isinstance(message, NodeInfo) and message.node in replaced:
                         continue
-                    writer.write(key, payload, log_time_ns)
+                    writer.write(key, payload, log_time_ns, getattr(message, "stamp_ns", None))
                     _write(writer, core.handle(message))
             _write(writer, core.flush())
         for text in dive.damage:

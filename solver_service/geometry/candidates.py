@@ -75,9 +75,6 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
         in_a = int(usable[:in_a].sum())
         table, tangents, index = table[:, usable], tangents[usable], index[usable]
     sigma_px = np.maximum(table[6], _MIN_SIGMA_PX)
-    log_score = None
-    if not np.isnan(table[7]).all():
-        log_score = np.concatenate([_log_score(part) for part in (table[7, :in_a], table[7, in_a:])])
     tangents /= sigma_px[:, None, None]
     gram = tangents @ tangents.swapaxes(1, 2)
     return Candidates(
@@ -89,13 +86,24 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
         shares=table[3:5],
         sigma_px=sigma_px,
         dt_s=table[5],
-        log_score=log_score,
+        log_score=_log_score(table[7], in_a),
         log_area=np.log(np.fmax(table[8], 1.0)),
     )
 
 
-def _log_score(score: Floats) -> Floats:
-    """Give half the log odds of scores, within limits; on average they are no evidence, nor is one not known."""
-    odds = np.clip(np.where(np.isfinite(score), score, 0.5), 1e-3, 1.0 - 1e-3)
-    weight = np.clip(0.5 * np.log(odds / (1.0 - odds)), -_MAX_LOG_SCORE, _MAX_LOG_SCORE)
-    return weight - math.log(np.exp(weight).mean()) if len(weight) else weight
+def _log_score(score: Floats, in_a: int) -> Floats | None:
+    """Give half the log odds of scores, within limits; on each picture's average, and where unknown, no evidence.
+
+    None where none is known.
+    """
+    known = np.isfinite(score)
+    if not known.any():
+        return None
+    odds = np.minimum(np.maximum(np.where(known, score, 0.5), 1e-3), 1.0 - 1e-3)
+    weight = 0.5 * np.log(odds / (1.0 - odds))
+    weight = np.minimum(np.maximum(weight, -_MAX_LOG_SCORE), _MAX_LOG_SCORE)
+    ratio = np.exp(weight)
+    for part in (slice(0, in_a), slice(in_a, None)):
+        if len(ratio[part]):
+            weight[part] -= math.log(float(ratio[part].sum()) / len(ratio[part]))
+    return weight

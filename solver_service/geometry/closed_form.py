@@ -22,6 +22,8 @@ Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"
 
 # A round of the split shrinks its error by about alpha^2 / 4, a round of the offset by its ratio to the range.
 _ROUNDS: Final = 9
+# Left and right of a middle.
+_ENDS: Final[Floats] = np.array((-1.0, 1.0)).reshape(2, 1, 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +52,18 @@ class Spans:
     chord: Floats
 
     @staticmethod
-    def of(left: Floats, right: Floats) -> Spans:
-        """Take unit bearings (2, 3, K) of left and right."""
+    def of(ends: Floats) -> Spans:
+        """Take unit bearings (2, 2, 3, K) of left and right, those on the first axis."""
+        left, right = ends
         total, difference = left + right, right - left
         chord = np.sqrt(dot(difference, difference))
         return Spans(total / np.sqrt(dot(total, total))[:, None], difference / chord[:, None], chord)
 
     @property
-    def ends(self) -> tuple[Floats, Floats]:
-        """The bearings of left and right."""
+    def ends(self) -> Floats:
+        """The bearings (2, 2, 3, K) of left and right."""
         half = 0.5 * self.chord[:, None]
-        along, across = self.c * np.sqrt(1.0 - half * half), self.w * half
-        return along - across, along + across
+        return self.c * np.sqrt(1.0 - half * half) + _ENDS * (self.w * half)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
     "paper_literal" the latter and the angle to the optical axis for beta, as the paper's text has them.
     """
     levels = np.array((rig_a.R_level_camera, rig_b.R_level_camera))
-    spans = Spans.of(levels @ left, levels @ right)
+    spans = Spans.of(levels @ np.array((left, right)))
     bars = Bars.of(pair_of(rig_a, rig_b))
     if variant == "exact":
         solved = solve_exact(spans, bars)
@@ -139,12 +141,13 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
 
 def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
     """Solve K hypotheses between the level frames."""
-    u, span = _split(spans, split_rounds)
+    # What tells only how to move the bearings need not be split as finely.
+    u, span = _split(spans, split_rounds if bars.centred else 1)
     chord = spans.chord
     if not bars.centred:
         ends = spans.ends
         for _ in range(offset_rounds):
-            moved = Spans.of(*_from_middles(*ends, u, span, chord, bars))
+            moved = Spans.of(_from_middles(ends, u, span, chord, bars))
             u, span = _split(moved, split_rounds)
             chord = moved.chord
     return _pose(u, span, u[:, 0], chord, bars, mean_twist=True)
@@ -195,18 +198,16 @@ def _pose(u: Floats, span: Floats, slant: Floats, chord: Floats, bars: Bars, *, 
     return ClosedForm(u, range_m, twist, R, t)
 
 
-def _from_middles(
-    left: Floats, right: Floats, u: Floats, span: Floats, chord: Floats, bars: Bars
-) -> tuple[Floats, Floats]:
-    """Move the bearings from the cameras to the middles of their own bars, by the distances known so far."""
+def _from_middles(ends: Floats, u: Floats, span: Floats, chord: Floats, bars: Bars) -> Floats:
+    """Move the bearings (2, 2, 3, K) from the cameras to the middles of their own bars, by the distances so far."""
     cos_alpha, sin_alpha = _angles(chord)
     sin_beta = u[:, 0]
-    range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, bars.length_m).mean(0)
+    of_a_m, of_b_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, bars.length_m)
+    range_m = 0.5 * (of_a_m + of_b_m)
     sin_beta, cos_beta = sin_beta[::-1, None], np.sqrt(1.0 - sin_beta * sin_beta)[::-1, None]
     middle = bars.middle_m + range_m * u
     arm = 0.5 * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
-    moved = []
-    for bearing, light in ((left, middle - arm), (right, middle + arm)):
-        ray = bearing * np.sqrt(dot(light, light))[:, None] - bars.middle_m
-        moved.append(ray / np.sqrt(dot(ray, ray))[:, None])
-    return moved[0], moved[1]
+    light = middle + _ENDS * arm
+    ray = ends * np.sqrt(dot(light, light))[:, :, None] - bars.middle_m
+    moved: Floats = ray / np.sqrt(dot(ray, ray))[:, :, None]
+    return moved

@@ -110,7 +110,7 @@ class Prediction:
     ) -> Prediction:
         """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
         range2 = float(t_a_b_m @ t_a_b_m) + 1e-6
-        sight = np.outer(t_a_b_m, t_a_b_m) / range2
+        sight = t_a_b_m[:, None] * (t_a_b_m / range2)
         # Of ln range and of the twist, by both pictures.
         relative = bearing_variance * range2 * 0.5 * float((rigs.length_m**-2.0).sum())
         total = covariance.copy()
@@ -254,11 +254,11 @@ def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
 
 def weigh_prediction(R_a_b: Floats, t_a_b_m: Floats, prediction: Prediction) -> Floats:
     """Weigh K poses against a prediction from earlier ones: a bounded gain and a bounded loss."""
-    # [j, i] holds R_a_b R_predicted^T [i, j].
-    turned = np.tensordot(prediction.R_a_b, R_a_b, (1, 1))
+    # [i, j] holds R_a_b R_predicted^T.
+    turned = prediction.R_a_b @ R_a_b
     e = np.empty((6, t_a_b_m.shape[1]))
     e[:3] = t_a_b_m - prediction.t_a_b_m[:, None]
-    e[3], e[4], e[5] = turned[1, 2] - turned[2, 1], turned[2, 0] - turned[0, 2], turned[0, 1] - turned[1, 0]
+    e[3], e[4], e[5] = turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]
     e[3:] *= 0.5
     chi2 = (e * (prediction.information @ e)).sum(0)
     # Half a turn away the vector is short again.

@@ -16,7 +16,7 @@ _MAX_STEPS: Final = 12
 _SMALL: Final = 5e-4
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
-_DAMPING: Final = 1e-13 * np.eye(6)
+DAMPING: Final = 1e-13 * np.eye(6)
 # Which sightings a later clock of B moves, and where to.
 _SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
 
@@ -74,19 +74,20 @@ def refine(
     t, R = t_a_b_m, R_a_b
     lights = rig_a.lights_m, rig_b.lights_m
     timed = bool(seen.dt_s.any())
-    rates = motion.rates if timed and motion.rates.any() else None
+    shifts = shifts_of(seen.dt_s, motion.rates) if timed else None
     weight = None
     steps = 0
     while True:
-        r, J, depth = residuals(t, R, seen, lights, rates)
+        r, J, depth = residuals(t, R, seen, lights, shifts)
         if steps == 0 and (timed or motion.skew_sigma_s > 0.0):
             weight = weight_of(J, seen.dt_s, motion)
-        JtW = J.swapaxes(1, 2) if weight is None else J.swapaxes(1, 2) @ weight
+        Jt = J.swapaxes(1, 2)
+        JtW = Jt if weight is None else Jt @ weight
         H = JtW @ J
         # Positions and rotations have their own units: scaled to a unit diagonal before solving.
         unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
         scale = unit[:, :, None] * unit[:, None, :]
-        inverse = np.linalg.inv(H * scale + _DAMPING)
+        inverse = np.linalg.inv(H * scale + DAMPING)
         covariance = inverse * scale
         column = r[:, :, None]
         g = JtW @ column
@@ -106,12 +107,20 @@ def refine(
     return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
 
 
+def shifts_of(dt_s: Floats, rates: Floats) -> tuple[Floats, Floats] | None:
+    """Give how far (K, 4, 3) the pose has moved and turned (K, 4, 3, 3) at each sighting, None where it rests."""
+    if not rates.any():
+        return None
+    moved = dt_s[:, :, None] * rates
+    return moved[:, :, :3], rotation_near(moved[:, :, 3:])
+
+
 def residuals(
-    t: Floats, R: Floats, seen: Sightings, lights: tuple[Floats, Floats], rates: Floats | None
+    t: Floats, R: Floats, seen: Sightings, lights: tuple[Floats, Floats], shifts: tuple[Floats, Floats] | None
 ) -> tuple[Floats, Floats, Floats]:
     """Give residuals (K, 8), their derivatives (K, 8, 6) by the pose, and the distances along the bearings (K, 4).
 
-    A light seen at dt sees the pose moved by rates * dt.
+    shifts: of the pose at each sighting, as by `shifts_of`.
     """
     K = len(t)
     Rt = R.swapaxes(1, 2)
@@ -120,14 +129,13 @@ def residuals(
     y = np.empty((K, 4, 3))
     y[:, :2] = lights[1] @ Rt
     y[:, 2:] = lights[0] - t[:, None]
-    if rates is not None:
-        turn = rotation_near(seen.dt_s[:, :, None] * rates[3:])
-        shift = seen.dt_s[:, :, None] * rates[:3]
+    if shifts is not None:
+        shift, turn = shifts
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
         y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
     q[:, :2] = y[:, :2] + t[:, None]
     q[:, 2:] = y[:, 2:] @ R
-    if rates is not None:
+    if shifts is not None:
         q[:, :2] += shift[:, :2]
     depth = (seen.bearings * q).sum(2)
     G = seen.tangents / depth[:, :, None, None]

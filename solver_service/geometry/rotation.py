@@ -17,6 +17,8 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_i, _j, _k] = -1.0
 _CROSS_FLAT: Final[Floats] = _CROSS.reshape(3, 9)
 _EYE: Final[Floats] = np.eye(3)
+# An angle whose sine is itself.
+_TINY: Final = 1e-100
 
 
 def skew(v: Floats) -> Floats:
@@ -58,10 +60,10 @@ def quaternion_of(R: Floats) -> Floats:
 
 def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
-    angle = np.sqrt((w_rad * w_rad).sum(-1))
     # sin(x)/x and (1 - cos x)/x^2, without a division by zero.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)
+    sine = np.sin(half) / half
+    first, second = sine * np.cos(half), 0.5 * sine * sine
     K = skew(w_rad)
     R: Floats = _EYE + first[..., None, None] * K + second[..., None, None] * (K @ K)
     return R

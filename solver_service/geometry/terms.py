@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from solver_service.geometry.observation import Prior, Sensed, Settings, View
 from solver_service.geometry.refinement import Motion
 from solver_service.geometry.rig import Rig, RigPair, pair_of
 from solver_service.geometry.rotation import Floats, matrix_of
+
+# Nobody knows a moving diver to less than a millimetre and a milliradian.
+_LEAST_KNOWN: Final = 1e-6 * np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +89,8 @@ def _prediction(prior: Prior | None, pair: RigPair, candidates: Candidates, sett
         return None
     rig_a, rig_b = pair.rigs
     turn_a, turn_b, both = rig_a.R_level_camera, rig_b.R_level_camera, rig_a.both_level_camera
-    # Nobody knows a moving diver to less than a millimetre and a milliradian.
-    covariance = both @ covariance @ both.T + 1e-6 * np.eye(6)
-    noise = float(candidates.variance.mean())
+    covariance = both @ covariance @ both.T + _LEAST_KNOWN
+    noise = float(candidates.variance.sum()) / len(candidates.variance)
     return Prediction.of(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance, noise, pair, settings)
 
 

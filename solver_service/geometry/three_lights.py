@@ -27,14 +27,14 @@ from solver_service.geometry.evidence import (
 )
 from solver_service.geometry.hypotheses import Pairs
 from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import Sightings, residuals, weight_of
+from solver_service.geometry.refinement import DAMPING, Sightings, residuals, shifts_of, weight_of
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats, rotation_near, skew
 from solver_service.geometry.terms import Terms
 
 # More combinations than this are not tried: among so many, three lights are never certain.
 _MAX_COMBINATIONS: Final = 4000
-_ROUNDS: Final = 3
+_ROUNDS: Final = 2
 # chi^2 of tilt and depth, three degrees of freedom, before and after the refinement.
 _GATE_CHI2: Final = 40.0
 _FITS_CHI2: Final = 16.0
@@ -82,46 +82,50 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     """Try all pairs of either picture with all candidates of the other, each as left and as right light."""
     candidates, sensors, settings = terms.candidates, terms.sensors, terms.settings
     pair, single = (np.concatenate(parts) for parts in zip(*(_opposite(terms, pairs, k) for k in (0, 1)), strict=True))
-    pair, single, side = np.repeat(pair, 2), np.repeat(single, 2), np.tile((0, 1), len(pair))
-    # Who sees the pair: 0 is A.
+    pair, single, side = pair.repeat(2), single.repeat(2), np.tile((0, 1), len(pair))
+    # Who sees the pair: 0 is A. From here on the seer's own comes first, then the other's.
     seer = (pair >= pairs.split).astype(np.intp)
+    own_other = np.array((seer, 1 - seer))
     levels = terms.rigs.levels
 
-    def each(of_a: Floats, of_b: Floats) -> tuple[Floats, Floats]:
-        """Give the seer's own and the other's (..., M)."""
-        both = np.stack((of_a, of_b), axis=-1)
-        return both[..., seer], both[..., 1 - seer]
+    def each(of_a: Floats, of_b: Floats) -> Floats:
+        """Give both vectors (2, 3, M), the seer's own first."""
+        return np.array((of_a, of_b)).T.take(own_other, axis=1).swapaxes(0, 1)
 
-    down_own, down_other = each(sensors.down_a, sensors.down_b)
-    middle_own, middle_other = each(levels[0].middle_m, levels[1].middle_m)
-    _, length_m = each(terms.rigs.length_m[0], terms.rigs.length_m[1])
-    light = np.stack((levels[0].lights_m, levels[1].lights_m))[seer, side].T
+    down = each(sensors.down_a, sensors.down_b)
+    middle = each(levels[0].middle_m, levels[1].middle_m)
+    length_m = terms.rigs.length_m.take(own_other[1])
+    arm = np.array((levels[0].lights_m, levels[1].lights_m))[seer, side].T - middle[0]
     c, w, chord = pairs.c[:, pair], pairs.w[:, pair], pairs.chord[pair]
     seen = candidates.bearings[:, single]
     cos_alpha, sin_alpha = 1.0 - 0.5 * chord * chord, chord * np.sqrt(1.0 - 0.25 * chord * chord)
-    u_other = seen
+    # Both lines of sight point from the seer to the other.
+    sight = np.array((c, -seen))
+    own, other = _frames(sight, down)
+    # Gravity tells which end of the pair is the right light.
+    w = np.where(dot(w, _turned(other, own, _X)) < 0.0, -w, w)
+    range_m = np.zeros(len(pair))
     for step in range(_ROUNDS):
-        sin_beta = u_other[0]
-        to_frame = _frame(-u_other, down_other)
-        if step == 0:
-            # Gravity tells which end of the pair is the right light.
-            w = np.where(dot(w, _turned(_frame(c, down_own), to_frame, _X)) < 0.0, -w, w)
+        if step > 0:
+            q = _turned(own, other, arm - sight[0] * range_m) + middle[1]
+            back = seen - sight[1] - q / np.sqrt(dot(q, q))
+            sight[1] = back / -np.sqrt(dot(back, back))
+        sin_beta = -sight[1, 0]
         half = 0.5 * (np.arcsin(sin_beta) - np.arcsin(sin_beta * cos_alpha))
-        u = c * np.cos(half) - w * np.sin(half)
-        frame = _frame(u, down_own)
+        sight[0] = c * np.cos(half) - w * np.sin(half)
         range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m)
-        q = _turned(to_frame, frame, light - middle_own - u * range_m) + middle_other
-        u_other = u_other + seen - q / np.sqrt(dot(q, q))
-        u_other = u_other / np.sqrt(dot(u_other, u_other))
-    to_frame = _frame(-u_other, down_other)
-    t = middle_own + u * range_m - _turned(frame, to_frame, middle_other)
+        own, other = _frames(sight, down)
+    R_own_other = (own[:, :, None] * other[:, None]).sum(0)
+    u = sight[0]
+    t = middle[0] + u * range_m - (R_own_other * middle[1]).sum(1)
     # Both components of the tilt that remain: along the line of sight, and about it.
-    rise = np.arcsin(dot(down_own, u)) - np.arcsin(-dot(down_other, u_other))
-    bar = _turned(frame, to_frame, _X)
+    rise_own, rise_other = np.arcsin(dot(down, sight))
+    rise = rise_own - rise_other
+    bar = R_own_other[:, 0]
     across = bar - u * dot(u, bar)
     about = dot(u, _cross(across, w)) / np.sqrt(dot(across, across))
-    port_own, port_other = each(levels[0].depth_port_m, levels[1].depth_port_m)
-    fall = dot(down_own, t - port_own + _turned(frame, to_frame, port_other))
+    port = each(levels[0].depth_port_m, levels[1].depth_port_m)
+    fall = dot(down[0], t - port[0] + (R_own_other * port[1]).sum(1))
     level2 = dot(t, t) - fall * fall
     variance = pairs.variance[pair]
     spread2 = sensors.depth_variance + 0.5 * sensors.tilt_variance * level2 + variance * fall * fall
@@ -139,9 +143,7 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     lights[rows, 2 * seer] = np.where(swapped, second, first)
     lights[rows, 2 * seer + 1] = np.where(swapped, first, second)
     lights[rows, 2 - 2 * seer + side] = single
-    R = np.zeros((len(keep), 3, 3))
-    for to, of in zip(frame, to_frame, strict=True):
-        R += to[:, keep].T[:, :, None] * of[:, keep].T[:, None]
+    R = R_own_other[:, :, keep].transpose(2, 0, 1).copy()
     t = t[:, keep].T
     turned = seer == 1
     R[turned] = R[turned].swapaxes(1, 2)
@@ -167,20 +169,25 @@ def _opposite(terms: Terms, pairs: Pairs, seer: int) -> tuple[NDArray[np.intp], 
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    return np.array((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+    """Give the cross products of vectors (..., 3, M)."""
+    product = np.empty_like(a)
+    product[..., 0, :] = a[..., 1, :] * b[..., 2, :] - a[..., 2, :] * b[..., 1, :]
+    product[..., 1, :] = a[..., 2, :] * b[..., 0, :] - a[..., 0, :] * b[..., 2, :]
+    product[..., 2, :] = a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]
+    return product
 
 
-def _frame(sight: Floats, down: Floats) -> tuple[Floats, Floats, Floats]:
-    """Give the axes (3, M) along a line of sight, down across it, and across both."""
-    level = down - sight * dot(down, sight)
-    level = level / np.sqrt(dot(level, level))
-    return sight, level, _cross(sight, level)
+def _frames(sight: Floats, down: Floats) -> Floats:
+    """Give the axes (2, 3, 3, M) along each line of sight (2, 3, M), down across it, and across both."""
+    level = down - sight * dot(down, sight)[:, None]
+    level /= np.sqrt(dot(level, level))[:, None]
+    return np.array((sight, level, _cross(sight, level))).swapaxes(0, 1)
 
 
-def _turned(to: tuple[Floats, ...], of: tuple[Floats, ...], v: Floats) -> Floats:
-    """Turn vectors (3, M) from the rig that has one frame of axes to the rig that has the other."""
-    x, y, z = (a * dot(b, v) for a, b in zip(to, of, strict=True))
-    return x + y + z
+def _turned(of: Floats, to: Floats, v: Floats) -> Floats:
+    """Turn vectors (3, M) from the rig that has the axes `of` (3, 3, M) to the rig that has the axes `to`."""
+    turned: Floats = (to * (of * v).sum(1)[:, None]).sum(0)
+    return turned
 
 
 def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Readings | None:
@@ -195,12 +202,12 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     bearings[absent] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
     tangents = candidates.tangents[lights] * ~absent[:, :, None, None]
     seen = Sightings(bearings, tangents, candidates.dt_s[lights] * ~absent)
-    rates = terms.motion.rates if terms.motion.rates.any() else None
+    shifts = shifts_of(seen.dt_s, terms.motion.rates)
     bodies = levels[0].lights_m, levels[1].lights_m
     across = _basis(sensors.down_a)
     weight = np.eye(8)
     for step in range(_STEPS):
-        r, J, along = residuals(t, R, seen, bodies, rates)
+        r, J, along = residuals(t, R, seen, bodies, shifts)
         r_s, J_s, sigma = _sensor_rows(sensors, across, levels, t, R)
         if step == 0:
             weight = weight_of(J, seen.dt_s, terms.motion)
@@ -208,7 +215,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         H = JtW @ J + JtW_s @ J_s
         unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
         scale = unit[:, :, None] * unit[:, None, :]
-        covariance = np.linalg.inv(H * scale + 1e-13 * np.eye(6)) * scale
+        covariance = np.linalg.inv(H * scale + DAMPING) * scale
         g = JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]
         move = (covariance @ g)[:, :, 0]
         column = r[:, :, None]
@@ -269,7 +276,7 @@ def _basis(down: Floats) -> Floats:
     """Give two unit vectors (2, 3) across a third."""
     first = np.array((0.0, -down[2], down[1])) if abs(down[0]) < 0.9 else np.array((down[1], -down[0], 0.0))
     first = first / math.sqrt(float(first @ first))
-    return np.array((first, np.cross(down, first)))
+    return np.array((first, skew(down) @ first))
 
 
 def _log_ratio(

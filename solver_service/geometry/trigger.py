@@ -213,8 +213,8 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
 def _spread(readings: Readings, k: int, weights: Floats) -> Floats:
     """Give the covariance of pose k, which may as well be one of its near neighbours; weights: (K,) theirs."""
     covariance: Floats = readings.covariance[k]
-    near = np.flatnonzero(weights > _NEGLIGIBLE * weights[k])
-    for i in near[near != k]:
+    near = (weights > _NEGLIGIBLE * weights[k]).nonzero()[0]
+    for i in near[near != k] if len(near) > 1 else ():
         away = np.concatenate(
             (readings.t_a_b_m[i] - readings.t_a_b_m[k], rotation_log(readings.R_a_b[i] @ readings.R_a_b[k].T))
         )
