@@ -1,0 +1,245 @@
+"""A node as systemd and a diver meet it: ready, watched, stopped, on a disk that runs full, on a clock that is set."""
+
+import contextlib
+import json
+import logging
+import queue
+import signal
+import socket
+import threading
+import time
+from itertools import pairwise
+
+import pytest
+
+from node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, SensorsConfig
+from node.images import Turn
+from node.service import NodeService
+from protocol.clock import MS_NS, S_NS, SystemClock
+from protocol.divelog import DiveLogReader
+from protocol.messages import NodeStatus, decode
+from tests.disks import small_disk
+from tests.processes import Process, free_endpoint
+
+END_WITHIN_S = 2.0
+PATIENCE_S = 15.0
+CONFIG = """
+node = "a"
+connect = "{endpoint}"
+rate_hz = 5.0
+status_file = "{status}"
+[camera]
+name = "stalling"
+width_px = 160
+height_px = 120
+[sensors]
+name = "stalling"
+[preview]
+rate_hz = 0.0
+[record]
+directory = "{directory}"
+images_hz = {images_hz}
+min_free_mb = 0
+"""
+
+
+class Manager:
+    """The end of the socket at which systemd listens; it listens all the time."""
+
+    def __init__(self, path):
+        self.path = path
+        self._said = queue.SimpleQueue()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _listen(self):
+        while said := self._socket.recv(4096):
+            self._said.put(said.decode())
+
+    def hear(self):
+        return self._said.get(timeout=PATIENCE_S)
+
+    def hear_until(self, wanted):
+        """Listen until a datagram is as wanted; return it."""
+        ends_s = time.monotonic() + PATIENCE_S
+        while not wanted(said := self.hear()):
+            assert time.monotonic() < ends_s, said
+        return said
+
+    def close(self):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
+            last.sendto(b"", str(self.path))
+        self._thread.join(PATIENCE_S)
+        self._socket.close()
+
+
+def fed(said):
+    return "WATCHDOG=1" in said.split("\n")
+
+
+@contextlib.contextmanager
+def node(tmp_path, directory, images_hz=0.0):
+    """A real node process, its manager, and where its status file is."""
+    status = tmp_path / "status.json"
+    config = tmp_path / "a.toml"
+    config.write_text(CONFIG.format(endpoint=free_endpoint(), status=status, directory=directory, images_hz=images_hz))
+    manager = Manager(tmp_path / "notify")
+    prefix = ("env", f"NOTIFY_SOCKET={manager.path}", f"STALL_IN={tmp_path}")
+    process = Process("node", "--config", config, prefix=prefix, module="tests.node.stalling_node")
+    try:
+        yield process, manager, status
+    finally:
+        process.end()
+        manager.close()
+
+
+def until(condition):
+    deadline, pause = time.monotonic() + PATIENCE_S, threading.Event()
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come"
+        pause.wait(0.02)
+
+
+def problems(status):
+    """What the status file says is wrong; None before there is a status."""
+    content = json.loads(status.read_bytes()) if status.exists() else {"status": None}
+    return None if content["status"] is None else "; ".join(content["problems"])
+
+
+def end_in_time(process):
+    began_s = time.monotonic()
+    assert process.end(signal.SIGTERM) == 0
+    assert time.monotonic() - began_s < END_WITHIN_S
+
+
+def test_the_watchdog_is_fed_only_while_frames_and_sensors_go_on(tmp_path):
+    with node(tmp_path, tmp_path / "dives") as (process, manager, status):
+        assert manager.hear() == "READY=1"
+        assert fed(manager.hear())
+        for name in ("camera", "imu"):
+            manager.hear_until(fed)
+            stall = tmp_path / name
+            stall.touch()
+            manager.hear_until(lambda said, name=name: not fed(said) and f"{name}: nothing for" in said)
+            assert not any(fed(manager.hear()) for _ in range(3))
+            assert f"{name}: nothing for" in problems(status)
+            stall.unlink()
+            manager.hear_until(fed)
+        end_in_time(process)
+        assert manager.hear_until(lambda said: not fed(said)) == "STOPPING=1"
+        assert not status.exists()
+    (log,) = (tmp_path / "dives").glob("a-*.mcap")
+    with DiveLogReader(log) as reader:
+        assert reader.damage == []
+        said = [decode(r.payload, NodeStatus).problem for r in reader.records(lambda key: key.endswith("/status"))]
+    assert any("camera: nothing for" in problem for problem in said)
+    assert any("imu: nothing for" in problem for problem in said)
+
+
+def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
+    with (
+        small_disk(tmp_path / "disk", 2048) as disk,
+        node(tmp_path, disk, images_hz=5.0) as (process, manager, status),
+    ):
+        until(lambda: any(disk.glob("*.pictures/*")))
+        ballast = disk / "ballast"
+        # Again and again: pictures are deleted to make room for the log.
+        with open(ballast, "wb", buffering=0) as file:
+
+            def named():
+                with contextlib.suppress(OSError):
+                    file.write(bytes(65536))
+                return "No space left" in (problems(status) or "")
+
+            until(named)
+        assert "pictures" in problems(status)
+        assert fed(manager.hear_until(fed))
+        ballast.unlink()
+        until(lambda: "No space left" not in (problems(status) or ""))
+        end_in_time(process)
+        (log,) = disk.glob("a-*.mcap")
+        with DiveLogReader(log) as reader:
+            assert reader.damage == []
+            frames = [r.decode().seq for r in reader.records(lambda key: key.endswith("/candidates"))]
+            said = [r.decode().problem for r in reader.records(lambda key: key.endswith("/status"))]
+    assert frames == list(range(len(frames)))
+    assert any("No space left" in problem for problem in said)
+    assert process.wait_for("written again")
+
+
+def test_a_read_only_disk_is_refused_at_the_start_in_one_line(tmp_path):
+    with (
+        small_disk(tmp_path / "disk", 64, "ro") as disk,
+        node(tmp_path, disk) as (process, _manager, _status),
+    ):
+        assert process.wait(20.0) == 2
+        assert [line for line in process.lines if "Read-only file system" in line]
+        assert not [line for line in process.lines if "Traceback" in line]
+
+
+class Settable(SystemClock):
+    """The machine's clock, as if it had been set."""
+
+    shift_ns = 0
+
+    def now_ns(self):
+        return super().now_ns() + self.shift_ns
+
+    def wait_until_ns(self, instant_ns, stop):
+        return super().wait_until_ns(instant_ns - self.shift_ns, stop)
+
+
+@pytest.mark.parametrize("step_s", [1, -1])
+def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, caplog, step_s):
+    config = NodeConfig(
+        node="a",
+        connect=free_endpoint(),
+        camera=CameraConfig(width_px=160, height_px=120),
+        sensors=SensorsConfig(name="simulated"),
+        preview=PreviewConfig(rate_hz=0.0),
+        record=RecordConfig(directory=str(tmp_path), images_hz=5.0),
+    )
+    clock = Settable()
+    service = NodeService(config, clock)
+    service.open()
+    with caplog.at_level(logging.WARNING):
+        try:
+            service.start()
+            until(lambda: service.outlet.sent["candidates"] > 2)
+            clock.shift_ns = step_s * S_NS
+            until(lambda: service.status_message and "in mid-dive" in service.status_message.problem)
+            pictures, frames = service.outlet.sent["image"], service.outlet.sent["candidates"]
+            until(lambda: service.outlet.sent["image"] > pictures and service.outlet.sent["candidates"] > frames)
+        finally:
+            assert service.close() == 0
+    assert f"clock: was set by {step_s:+d}.0" in caplog.text or f"clock: was set by {step_s - 1:+d}.9" in caplog.text
+    assert service.recorder.error is None
+
+
+@pytest.mark.parametrize("step_ns", [-3600 * S_NS, -S_NS, 0, S_NS])
+def test_pictures_keep_their_rate_when_the_clock_is_set(step_ns):
+    turn = Turn(2.0)
+    taken = [i for i in range(40) if turn.has_come(i * 100 * MS_NS + 7200 * S_NS + (step_ns if i >= 20 else 0))]
+    assert all(4 <= later - earlier <= 6 or earlier < 20 <= later for earlier, later in pairwise(taken))
+    assert len(taken) in (8, 9)
+
+
+class Silent:
+    """A sensor that gives nothing."""
+
+    name = "depth"
+    retries = 7
+
+    def __init__(self, problem):
+        self.problem = problem
+
+
+@pytest.mark.parametrize(("problem", "progresses"), [("", False), ("no answer: check the chip's wiring", True)])
+def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, monkeypatch, problem, progresses):
+    monkeypatch.setattr("node.service.FIRST_S", -10.0)
+    config = NodeConfig(node="a", camera=CameraConfig(name="stored"), record=RecordConfig(directory=str(tmp_path)))
+    service = NodeService(config)
+    service.sources = [Silent(problem)]
+    assert service.progressing() is progresses
