@@ -70,7 +70,7 @@ def measure(campaign, seed, directory, figures):
     figures["legs lost"].append(lost)
     if lost:
         # It is said, and on the leg after it; what becomes of its stations is a person's to mark.
-        figures["lost and not said"].append(not any("makes no leg" in problem.text for problem in derived.problems))
+        figures["lost and not said"].append(not any("NO LEG" in problem.text for problem in derived.problems))
         return
     _legs(legs, at, figures)
     _cavern(derived.legs, directory, figures)

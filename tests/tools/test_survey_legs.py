@@ -141,7 +141,7 @@ def test_a_rest_too_short_for_a_leg_is_said(messages):
     ]
     found = derived(cut)
     assert len(found.legs) == 4
-    assert any("makes no leg" in problem.text for problem in found.problems)
+    assert any("NO LEG" in problem.text for problem in found.problems)
     assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
 
 
@@ -163,7 +163,7 @@ def test_a_rest_in_which_poses_were_refused_is_said(messages):
     found = derived(refused)
     assert len(found.legs) == 4
     (problem,) = found.problems
-    assert "makes no leg" in problem.text
+    assert "NO LEG" in problem.text
     assert "refused: range_gap" in problem.text
     assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
 

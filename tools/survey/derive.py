@@ -83,7 +83,7 @@ class _OneDive:
         for one in every:
             if one.too_short:
                 least = f"a leg takes {self.settings.rest_s:g} s with {self.settings.rest_fixes} fixes"
-                self._say(f"rest at {_time_text(one.start_ns)} makes no leg: {one.too_short}; {least}")
+                self._say(f"NO LEG: rest at {_time_text(one.start_ns)}: {one.too_short}; {least}")
         shots = [shoot(self.readings, self.seen, one.chosen, self.settings, one.unused) for one in found]
         named = self._named(found)
         stops = [

@@ -163,6 +163,9 @@ def profile(adjusted: Adjusted, title: str) -> Drawing:
         drawing.line([scale.at(x0, z0), scale.at(x1, z1)], "alarm" if alarm else "line")
         x, y = scale.at(x1, z1)
         drawing.text(x + 3, y - 3, name)
+    if segments:
+        x, y = scale.at(*segments[0][:2])
+        drawing.text(x + 3, y - 3, adjusted.lines[0].leg.from_)
     return drawing
 
 

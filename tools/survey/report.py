@@ -13,9 +13,12 @@ from tools.survey.lines import bearing_of
 from tools.survey.network import Adjusted
 from tools.survey.project import Project
 
+CLASS_ALARM = ' class="alarm"'
 STYLE = (
-    "body{font:14px/1.4 sans-serif;margin:2em;max-width:60em}table{border-collapse:collapse}"
-    "td,th{border:1px solid #ccc;padding:2px 6px;text-align:right}.alarm{color:#c00000}svg{max-width:100%;height:auto}"
+    "body{font:14px/1.4 sans-serif;margin:2em auto;padding:0 1em;max-width:72em}table{border-collapse:collapse}"
+    "td,th{border:1px solid #ccc;padding:2px 6px;text-align:right;white-space:nowrap}"
+    "td:last-child{text-align:left;white-space:normal;min-width:16em}.wide{overflow-x:auto}"
+    ".alarm{color:#c00000}svg{max-width:100%;height:auto}"
 )
 
 
@@ -60,7 +63,8 @@ def page(project: Project, adjusted: Adjusted) -> str:
     rows = []
     for leg in project.leg + project.point:
         bearing = bearing_of(leg, project)
-        gap = "" if bearing is None or bearing.gap is None else f"{math.degrees(bearing.gap):+.1f}"
+        # Rounded first, so that there is no -0.0.
+        gap = "" if bearing is None or bearing.gap is None else f"{round(math.degrees(bearing.gap), 1) + 0.0:+.1f}"
         value = chi2.get(id(leg))
         cells = [
             leg.name,
@@ -74,9 +78,9 @@ def page(project: Project, adjusted: Adjusted) -> str:
             str(leg.fixes),
             str(leg.grade),
             "" if value is None else f"{value:.1f}",
-            html.escape("; ".join([*leg.alarms, leg.note]).strip("; ")),
+            "<br>".join(html.escape(said) for said in [*leg.alarms, leg.note] if said),
         ]
-        kind = ' class="alarm"' if leg.alarms else ""
+        kind = CLASS_ALARM if leg.alarms else ""
         rows.append(f"<tr{kind}>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
     names = "leg,distance m,foresight°,backsight°,gap°,± °,depth from,depth to,fixes,grade,residual χ²,alarms and notes"
     head = "".join(f"<th>{name}</th>" for name in names.split(","))
@@ -85,18 +89,24 @@ def page(project: Project, adjusted: Adjusted) -> str:
     return "\n".join(
         [
             "<!doctype html><html><head><meta charset='utf-8'>",
+            "<meta name='viewport' content='width=device-width'>",
             f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
             "<p>" + "<br>".join(html.escape(fact) for fact in [*facts, *heading.notes] if fact) + "</p><ul>",
-            *(f"<li>{html.escape(line)}</li>" for line in summary(project, adjusted)),
+            *(_item(line) for line in summary(project, adjusted)),
             "</ul>",
             plan(adjusted, heading.title).svg(),
             profile(adjusted, heading.title).svg(),
-            f"<table><tr>{head}</tr>",
+            f"<div class='wide'><table><tr>{head}</tr>",
             *rows,
-            "</table></body></html>",
+            "</table></div></body></html>",
             "",
         ]
     )
+
+
+def _item(line: str) -> str:
+    wrong = line.startswith(("ALARM", "BLUNDER", "left out", "NO LEG"))
+    return f"<li{CLASS_ALARM if wrong else ''}>{html.escape(line)}</li>"
 
 
 def _number(value: object, digits: int) -> str:
