@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol, Self, TypeAlias
 
 from protocol.clock import Clock
 from protocol.delivery import FailureLatch, RateCap, ThreadDiedError
@@ -21,6 +21,8 @@ from protocol.topics import Topic, parse_key
 
 CACHE_S: Final = 60.0
 MAX_TRIGGER_HZ: Final = 30.0
+
+KeyExprs: TypeAlias = str | tuple[str, ...]
 
 _ALIVE_NAME = re.compile(r"[a-z0-9_]{1,64}(/[a-z0-9_]{1,64})*\Z")
 
@@ -106,13 +108,13 @@ class Bus(ABC):
 
     @abstractmethod
     def subscribe(
-        self, key_expr: str, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on key_expr (`*`: one chunk, `**`: any number) to handle, one at a time.
+        """Hand every message on these keys (`*`: one chunk, `**`: any number) to handle, one at a time.
 
         With history, nothing that publishers still hold is missed: what they sent before is queued before this
         returns, first the newest of each topic with latest_only, then the last minute of the others, all
-        publishers' in order of their stamps; and what a fault of the link took is fetched when it is back.
+        publishers' and keys' in order of their stamps; and what a fault of the link took is fetched when it is back.
         Each publisher's samples come in order and once. Images are never kept.
         Without history: only what comes from now on, as it comes.
         Past capacity the oldest is dropped and counted. An exception in handle ends the subscription's
@@ -178,6 +180,11 @@ def cache_depth(topic: Topic, cache_s: float) -> int:
     if topic.latest_only:
         return 1
     return max(math.ceil(max(topic.rate_hz, MAX_TRIGGER_HZ) * cache_s), 1)
+
+
+def each_of(keys: KeyExprs) -> tuple[str, ...]:
+    """Return the key expressions, of which no two may match the same key."""
+    return (keys,) if isinstance(keys, str) else keys
 
 
 def held_order(key: str, payload: bytes) -> tuple[bool, int]:

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name, held_order
+from protocol.bus import (
+    CACHE_S,
+    Bus,
+    KeyExprs,
+    Publisher,
+    Received,
+    Subscription,
+    cache_depth,
+    check_alive_name,
+    each_of,
+    held_order,
+)
 from protocol.clock import Clock, SystemClock
 from protocol.delivery import Delivery, RateCap
 from protocol.topics import Topic
@@ -71,7 +82,7 @@ class LocalPublisher(Publisher):
             if self.topic.retained:
                 self._network.newest[self.key] = self.topic, payload
             for subscription in self._network.subscriptions:
-                if key_matches(subscription.key_expr, self.key):
+                if subscription.takes(self.key):
                     subscription.offer(self, payload)
         return True
 
@@ -88,8 +99,8 @@ class LocalSubscription:
 
     missed = 0
 
-    def __init__(self, network: LocalNetwork, key_expr: str, delivery: Delivery[Received]) -> None:
-        self.key_expr = key_expr
+    def __init__(self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received]) -> None:
+        self._key_exprs = key_exprs
         self._network = network
         self._delivery = delivery
 
@@ -97,6 +108,10 @@ class LocalSubscription:
     def dropped(self) -> int:
         """How many were dropped because the handler was too slow."""
         return self._delivery.dropped
+
+    def takes(self, key: str) -> bool:
+        """Return whether key is one of those asked for."""
+        return any(key_matches(key_expr, key) for key_expr in self._key_exprs)
 
     def offer(self, publisher: LocalPublisher, payload: bytes) -> None:
         """Queue one of publisher's messages."""
@@ -153,14 +168,14 @@ class LocalBus(Bus):
         return publisher
 
     def subscribe(
-        self, key_expr: str, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on key_expr to handle, one at a time (protocol.bus.Bus has the contract)."""
-        delivery = Delivery(f"bus {key_expr}", handle, capacity, self._failures)
-        subscription = LocalSubscription(self._network, key_expr, delivery)
+        """Hand every message on these keys to handle, one at a time (protocol.bus.Bus has the contract)."""
+        delivery = Delivery(f"bus {' '.join(each_of(keys))}", handle, capacity, self._failures)
+        subscription = LocalSubscription(self._network, each_of(keys), delivery)
         with self._network.lock:
             if history:
-                publishers = [p for p in self._network.publishers if key_matches(key_expr, p.key)]
+                publishers = [p for p in self._network.publishers if subscription.takes(p.key)]
                 held = [(publisher, payload) for publisher in publishers for payload in publisher.cache]
                 for publisher, payload in sorted(held, key=lambda item: held_order(item[0].key, item[1])):
                     subscription.offer(publisher, payload)

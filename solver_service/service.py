@@ -37,6 +37,7 @@ REPORTED_OFFSET_SIGMA_S: Final = 0.003
 TOLERATED_OFFSET_S: Final = 0.005
 ALIGN_EVERY_S: Final = 10.0
 BUFFERED_BEFORE_PAIR: Final = 4096
+SOLVED_FROM: Final = (INFO, ATTITUDE, DEPTH, CANDIDATES)
 
 
 class SolverService(Service):
@@ -102,10 +103,8 @@ class SolverService(Service):
         self._said = _said_before(bus)
         if self._core is not None:
             self._declare(self._core)
-        bus.subscribe(INFO.key_any(), self.receive, capacity=64)
-        bus.subscribe(ATTITUDE.key_any(), self.receive, capacity=16384)
-        bus.subscribe(DEPTH.key_any(), self.receive, capacity=4096)
-        bus.subscribe(CANDIDATES.key_any(), self.receive, capacity=4096)
+        # In one, so that what the caches hold comes in order: a frame would not wait for an attitude a minute behind.
+        bus.subscribe(tuple(topic.key_any() for topic in SOLVED_FROM), self.receive, capacity=32768)
         self._joined_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:
@@ -124,14 +123,22 @@ class SolverService(Service):
                 log.warning("solver: %s (%d so far)", self._reported_bad, self.bad_messages)
             return
         with self._lock:
+            if isinstance(message, Candidates):
+                self._take_frame(message, new=self._joined_ns is not None and received.receive_ns > self._joined_ns)
+                return
             self._publish(self._handle(message, node))
-            joined_ns = self._joined_ns
-            if isinstance(message, Candidates) and joined_ns is not None and received.receive_ns > joined_ns:
-                self._publish(self._answered.saw_new_frame(message.trigger))
-            if self._health is not None and isinstance(message, Candidates):
-                self._health.saw_frame(node, message.stamp_ns, time.monotonic())
-            elif self._health is not None and isinstance(message, NodeInfo):
+            if self._health is not None and isinstance(message, NodeInfo):
                 self._health.saw_period(node, message.trigger_period_ns)
+
+    def _take_frame(self, frame: Candidates, *, new: bool) -> None:
+        """Handle a frame; new: it came after this solver had joined, and not out of a cache."""
+        if self._health is not None:
+            self._health.saw_frame(frame.node, frame.stamp_ns, time.monotonic())
+        if not new and self._answered.is_over(frame.stamp_ns, self.clock.now_ns()):
+            return
+        self._publish(self._handle(frame, frame.node))
+        if new:
+            self._publish(self._answered.saw_new_frame(frame.trigger))
 
     def _watch(self, name: str, alive: bool) -> None:
         """Say at once that a node has come or gone."""

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             return service.join()
         with bus:
             bus.on_failure(lambda error: service.fail("bus", error))
-            subscriber = bus.subscribe(EVERYTHING, sink.receive, capacity=16384)
+            subscriber = bus.subscribe(EVERYTHING, sink.receive, capacity=65536)
             log.info("record: %s into %s; Ctrl-C ends", config.connect, args.output)
             began_s = time.monotonic()
             while not service.stop.wait(0.5):

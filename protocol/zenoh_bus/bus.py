@@ -10,7 +10,17 @@ from typing import Any, Final
 import zenoh
 import zenoh.ext
 
-from protocol.bus import CACHE_S, Bus, Publisher, Received, Subscription, cache_depth, check_alive_name
+from protocol.bus import (
+    CACHE_S,
+    Bus,
+    KeyExprs,
+    Publisher,
+    Received,
+    Subscription,
+    cache_depth,
+    check_alive_name,
+    each_of,
+)
 from protocol.clock import Clock, SystemClock
 from protocol.delivery import Delivery, RateCap
 from protocol.endpoint import DEFAULT_ENDPOINT, client_settings
@@ -133,12 +143,13 @@ class ZenohBus(Bus):
         return wrapped
 
     def subscribe(
-        self, key_expr: str, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
+        self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on key_expr to handle, one at a time (protocol.bus.Bus has the contract)."""
-        delivery = Delivery(f"bus {key_expr}", handle, capacity, self._failures)
+        """Hand every message on these keys to handle, one at a time (protocol.bus.Bus has the contract)."""
+        key_exprs = each_of(keys)
+        delivery = Delivery(f"bus {' '.join(key_exprs)}", handle, capacity, self._failures)
         subscription = ZenohSubscription(
-            self._session, key_expr, delivery, history=history, clock=self.clock, failures=self._failures
+            self._session, key_exprs, delivery, history=history, clock=self.clock, failures=self._failures
         )
         with self._lock:
             self._subscriptions.append(subscription)

@@ -20,7 +20,10 @@ MAX_RETAINED_BYTES: Final = 65536
 
 
 class Retained:
-    """The newest message of each key whose topic is retained, for those that ask (protocol.bus.Bus.newest)."""
+    """The newest message of each key whose topic is retained, for those that ask (protocol.bus.Bus.newest).
+
+    Nothing is recovered: what passes unheard, as the first of a publisher may, is made up for by the next.
+    """
 
     def __init__(self, session: zenoh.Session) -> None:
         self._samples: dict[str, zenoh.Sample] = {}

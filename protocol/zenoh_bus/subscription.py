@@ -1,9 +1,9 @@
-"""Samples of a key expression in order, each once, with what a fault of the link took."""
+"""Samples of some key expressions in order, each once, with what a fault of the link took."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import zenoh
@@ -12,7 +12,8 @@ import zenoh.ext
 from protocol.bus import Received, held_order
 from protocol.clock import Clock
 from protocol.delivery import CLOSE_S, Delivery, FailureLatch
-from protocol.sequence import Gap, Sequence, Source
+from protocol.sequence import Gap, Source
+from protocol.sequence import Sequence as Numbers
 from protocol.topics import parse_key
 from protocol.zenoh_bus.intake import INTAKE, AnySubscriber, Intake
 from protocol.zenoh_bus.session import RETRY_S
@@ -32,7 +33,7 @@ class ZenohSubscription:
     def __init__(
         self,
         session: zenoh.Session,
-        key_expr: str,
+        key_exprs: Sequence[str],
         delivery: Delivery[Received],
         *,
         history: bool,
@@ -45,22 +46,27 @@ class ZenohSubscription:
         self._clock = clock
         self._failures = failures
         self._lock = threading.Lock()
-        self._sequence = Sequence(self._deliver)
+        self._sequence = Numbers(self._deliver)
         self._fetching: set[threading.Thread] = set()
         self._stop = threading.Event()
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
-        subscriber: AnySubscriber
+        subscribers = [self._declare(key_expr) for key_expr in key_exprs]
         if history:
-            recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, recovery=recovery)
-            held = list(self._query(f"{key_expr}/@adv/pub/**"))
+            held = [sample for key_expr in key_exprs for sample in self._query(f"{key_expr}/@adv/pub/**")]
             for sample in sorted(held, key=_number):
                 self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
-        else:
-            subscriber = session.declare_subscriber(key_expr, ring)
-        self._intake = Intake(key_expr, subscriber, self._accept, failures)
+        self._intakes = [
+            Intake(key_expr, subscriber, self._accept, failures)
+            for key_expr, subscriber in zip(key_exprs, subscribers, strict=True)
+        ]
+
+    def _declare(self, key_expr: str) -> AnySubscriber:
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
+        if not self._history:
+            return self._session.declare_subscriber(key_expr, ring)
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        return zenoh.ext.declare_advanced_subscriber(self._session, key_expr, ring, recovery=recovery)
 
     @property
     def dropped(self) -> int:
@@ -75,7 +81,8 @@ class ZenohSubscription:
     def close(self) -> None:
         """Let the handler finish what is queued, one second at most, and end the threads."""
         self._stop.set()
-        self._intake.close()
+        for intake in self._intakes:
+            intake.close()
         self._delivery.close()
         with self._lock:
             threads = list(self._fetching)

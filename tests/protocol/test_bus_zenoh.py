@@ -197,8 +197,8 @@ def test_namespaces_keep_two_systems_apart() -> None:
         assert (one.wait_for(1), two.wait_for(1)) == ([1], [2])
         assert one.received[0].key == "buddyline/node/a/depth"
         assert not second.is_alive("node/a")
-        first.publisher(topics.POSE, "a", "b").put_bytes(b"3")
-        until(lambda: first.newest(topics.POSE) != [])
+        poses = first.publisher(topics.POSE, "a", "b")
+        until(lambda: poses.put_bytes(b"3") and first.newest(topics.POSE) != [])
         assert [(r.key, r.payload) for r in first.newest(topics.POSE)] == [("buddyline/pair/a/b/pose", b"3")]
         assert second.newest(topics.POSE) == []
 
@@ -206,14 +206,18 @@ def test_namespaces_keep_two_systems_apart() -> None:
 def test_the_hub_remembers_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MAX_RETAINED", 2)
     with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
-        for name in ("x", "y", "z"):
-            bus.publisher(topics.POSE, "a", name).put_bytes(b"0")
-            if name != "z":
-                until(lambda name=name: len(bus.newest(topics.POSE)) == "xyz".index(name) + 1)
-        big = bus.publisher(topics.POSE, "a", "x")
-        big.put_bytes(b"1" * (hub_module.MAX_RETAINED_BYTES + 1))
-        big.put_bytes(b"2")
-        until(lambda: b"2" in [r.payload for r in bus.newest(topics.POSE)])
+        poses = {name: bus.publisher(topics.POSE, "a", name) for name in ("x", "y", "z")}
+
+        def held(name: str, payload: bytes) -> bool:
+            poses[name].put_bytes(payload)
+            return (topics.POSE.key("a", name), payload) in [(r.key, r.payload) for r in bus.newest(topics.POSE)]
+
+        until(lambda: held("x", b"0"))
+        until(lambda: held("y", b"0"))
+        for _ in range(3):
+            assert not held("z", b"0")
+            assert not held("x", b"1" * (hub_module.MAX_RETAINED_BYTES + 1))
+        until(lambda: held("x", b"2"))
         assert sorted((r.key[-6:], r.payload) for r in bus.newest(topics.POSE)) == [("x/pose", b"2"), ("y/pose", b"0")]
 
 

@@ -1,5 +1,6 @@
 """A solver that is started again says what has not been said, and nothing twice."""
 
+from protocol.clock import S_NS
 from protocol.messages import Rejected
 from solver_service.answered import Answered
 
@@ -43,3 +44,12 @@ def test_what_was_said_for_certain_stays_so_when_another_dive_begins():
     assert triggers(answered.unsaid([outcome(6), outcome(8)])) == [8]
     assert answered.saw_new_frame(2) == []
     assert triggers(answered.unsaid([outcome(2)])) == [2]
+
+
+def test_of_a_live_dive_only_the_last_moments_are_solved_again():
+    now_ns = 10**18
+    said = Rejected(node_a="a", node_b="b", stamp_ns=now_ns - 20 * S_NS, trigger=7, reason="ambiguous")
+    for age_s, over in ((60, True), (31, True), (29, False), (20, False), (1, False)):
+        assert Answered([said]).is_over(now_ns - age_s * S_NS, now_ns) is over
+        assert not Answered([said]).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
+        assert not Answered().is_over(now_ns - age_s * S_NS, now_ns)
