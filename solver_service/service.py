@@ -124,7 +124,11 @@ class SolverService(Service):
             return
         with self._lock:
             if isinstance(message, Candidates):
-                self._take_frame(message, new=self._joined_ns is not None and received.receive_ns > self._joined_ns)
+                new = self._joined_ns is not None and received.receive_ns > self._joined_ns
+                if new:
+                    # So are all after it, whatever becomes of the clock.
+                    self._joined_ns = 0
+                self._take_frame(message, new=new)
                 return
             self._publish(self._handle(message, node))
             if self._health is not None and isinstance(message, NodeInfo):
