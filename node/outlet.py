@@ -44,6 +44,11 @@ class Outlet:
             if publish and self._bus is not None:
                 self._publisher(topic).put_bytes(payload)
 
+    @property
+    def connected(self) -> bool:
+        """Whether there is a bus to publish on."""
+        return self._bus is not None
+
     def connect(self, bus: Bus) -> None:
         """Publish from now on."""
         with self._lock:

@@ -8,6 +8,7 @@ import threading
 import time
 import uuid
 from collections import Counter, deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -52,12 +53,19 @@ REFUSED_RETRY_S: Final = 5.0
 
 
 class NodeService(Service):
-    """Captures, detects, publishes and records until it is stopped."""
+    """Captures, detects, publishes and records until it is stopped. camera, sensors: what opens them."""
 
-    def __init__(self, config: NodeConfig, clock: Clock | None = None) -> None:
+    def __init__(
+        self,
+        config: NodeConfig,
+        clock: Clock | None = None,
+        camera: Callable[[NodeConfig, Clock], Camera] = open_camera,
+        sensors: Callable[[NodeConfig, Clock], list[Source]] = open_sensors,
+    ) -> None:
         super().__init__(f"node {config.node}", StatusFile.of(f"node-{config.node}", config.status_file))
         self.config = config
         self.clock = clock or SystemClock()
+        self._open_camera, self._open_sensors = camera, sensors
         self.boot = uuid.uuid4().hex[:12]
         self.drops: Counter[str] = Counter()
         self._sha256 = config_sha256(config)
@@ -80,8 +88,8 @@ class NodeService(Service):
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError where one cannot be had."""
-        self.camera: Camera = open_camera(self.config, self.clock)
-        self.sources: list[Source] = open_sensors(self.config, self.clock)
+        self.camera: Camera = self._open_camera(self.config, self.clock)
+        self.sources: list[Source] = self._open_sensors(self.config, self.clock)
         info = self._info()
         self.pipeline = Pipeline(
             self.config.node,

@@ -1,0 +1,293 @@
+"""What a whole node costs: from a picture in memory to its candidates on the bus, processor, memory, log.
+
+A node as on a Pi, in this process: pictures of the simulated camera at each trigger, an inertial unit at 100 Hz with
+its attitude filter, depth at 20 Hz, detector, log, recorded pictures and previews, and a real hub on loopback. The
+pictures are rendered before, by another process, and are copied out of memory as the camera's driver does: a time
+begins where that copy does, and ends when the bus has taken the candidates. Exposure, readout and the camera's own
+pipeline come on top.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import resource
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from node.attitude import VqfAttitude
+from node.config import CalibrationConfig, CameraConfig, NodeConfig, RecordConfig, SensorsConfig, SimulationConfig
+from node.devices import Frame, Source
+from node.drivers.devices import ImuSource
+from node.drivers.i2c import I2cBus
+from node.drivers.samples import ImuSample
+from node.geomagnetism import MagnetometerCalibration
+from node.service import NodeService
+from protocol.clock import S_NS, Clock
+from protocol.errors import BuddylineError
+from protocol.messages import Candidates, Message, NodeInfo
+
+PICTURES: Final = 24
+WARM_UP_S: Final = 5.0
+CONNECT_S: Final = 20.0
+IMU_NOISE: Final = (0.01, 0.001, 3e-7)
+FORCE_MPS2: Final = np.array([0.0, 0.0, -9.81])
+FIELD_T: Final = np.array([2.2e-5, 0.0, 4.4e-5])
+
+
+def main(argv: list[str]) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m tools.bench node", description=__doc__)
+    parser.add_argument("--environment", default="cavern")
+    parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="default: 60, after 5 to warm up")
+    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="default: 10")
+    parser.add_argument("--width", type=int, default=1640, metavar="PX", help="default: 1640, by 1232")
+    parser.add_argument("--images", type=float, default=2.0, metavar="HZ", help="recorded pictures; default: 2")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(argv)
+    if args.seconds < 2 or args.rate <= 0 or args.width < 64:
+        raise BuddylineError("--seconds: at least 2; --rate: above 0; --width: at least 64")
+    figures = measure(args.environment, args.seconds, args.rate, args.width, args.images)
+    if args.json:
+        json.dump(figures, sys.stdout, indent=1)
+        sys.stdout.write("\n")
+    else:
+        sys.stdout.write(table(figures))
+    return 0
+
+
+def measure(environment: str, seconds: float, rate_hz: float, width_px: int, images_hz: float) -> dict[str, Any]:
+    """Run one node for so long; return its figures."""
+    endpoint = _free_endpoint()
+    height_px = round(width_px * 1232 / 1640)
+    config = NodeConfig(
+        node="a",
+        connect=endpoint,
+        rate_hz=rate_hz,
+        camera=CameraConfig(name="bench", width_px=width_px, height_px=height_px),
+        sensors=SensorsConfig(name="bench"),
+        simulation=SimulationConfig(environment=environment),
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        pictures, info = _prepared(config, Path(folder) / "pictures.npy")
+        config = _on_this_disk(config, info, Path(folder) / "dives", images_hz)
+        camera = PreparedCamera(pictures, config.trigger_period_ns)
+        service = MeasuredNode(config, camera)
+        hub = subprocess.Popen(
+            [sys.executable, "-m", "tools", "hub", "--listen", endpoint],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            service.open()
+            service.start()
+            figures = _watch(service, seconds)
+        finally:
+            status = service.close()
+            hub.terminate()
+            hub.wait()
+        if status:
+            raise BuddylineError(f"the node ended with status {status}")
+        log_bytes = service.recorder.path.stat().st_size
+        figures["log_kb_per_s"] = log_bytes / 1e3 / (seconds + WARM_UP_S)
+        return figures | {"environment": environment, "width_px": width_px, "rate_hz": rate_hz, "images_hz": images_hz}
+
+
+def table(figures: dict[str, Any]) -> str:
+    """Return the figures for a person."""
+    rss = ", ".join(f"{mib:.1f} MiB after {minutes:g} min" for minutes, mib in figures["rss_mib"])
+    lines = [
+        f"{figures['environment']}, {figures['width_px']} px wide, {figures['rate_hz']:g} Hz, "
+        f"{figures['images_hz']:g} pictures a second recorded; {figures['frames']} frames",
+        f"capture to candidates published   median {figures['median_ms']:.1f} ms, p99 {figures['p99_ms']:.1f} ms, "
+        f"most {figures['most_ms']:.1f} ms",
+        f"processor, of one core            {100 * figures['cpu']:.1f} %",
+        f"memory (RSS)                      {rss}",
+        f"log without pictures              {figures['log_kb_per_s']:.1f} kB/s",
+        "rates, Hz                         "
+        + ", ".join(f"{name} {rate:.1f}" for name, rate in sorted(figures["rates_hz"].items())),
+        f"dropped                           {figures['dropped']}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+class PreparedCamera:
+    """Gives prepared pictures at the trigger instants, each a copy out of memory. taken_s: when, by stamp."""
+
+    row_time_ns = 0
+    problem = ""
+
+    def __init__(self, pictures: NDArray[np.uint8], period_ns: int) -> None:
+        self.skipped: Counter[str] = Counter()
+        self.taken_s: dict[int, float] = {}
+        self._pictures = pictures
+        self._period_ns = period_ns
+        self._number = 0
+
+    def info(self) -> NodeInfo | None:
+        """Return None: the calibration stands in the configuration."""
+        return None
+
+    def next_frame(self, stop: threading.Event) -> Frame | None:
+        """Wait for the next instant."""
+        now_ns = time.time_ns()
+        instant_ns = (now_ns // self._period_ns + 1) * self._period_ns
+        if stop.wait((instant_ns - now_ns) / S_NS):
+            return None
+        self.taken_s[instant_ns] = time.perf_counter()
+        self._number += 1
+        return Frame(np.array(self._pictures[self._number % len(self._pictures)]), instant_ns)
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class PreparedImu:
+    """An inertial unit at rest, with noise, at no cost of a bus."""
+
+    name = "prepared"
+    problem = ""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(1)
+        self._noise = rng.normal(size=(1000, 3, 3)) * np.array(IMU_NOISE)[:, None]
+        self._number = 0
+
+    def read(self) -> ImuSample:
+        """Return a sample of now."""
+        self._number += 1
+        accel, gyro, mag = self._noise[self._number % len(self._noise)]
+        return ImuSample(time.time_ns(), accel + FORCE_MPS2, gyro, mag + FIELD_T)
+
+
+class NoBus:
+    """Stands for the I2C bus of a device that has none."""
+
+    retries = 0
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+class MeasuredNode(NodeService):
+    """A node that takes down how long each frame took. times_s: from a copy's begin until the bus had taken it."""
+
+    def __init__(self, config: NodeConfig, camera: PreparedCamera) -> None:
+        super().__init__(config, camera=lambda _config, _clock: camera, sensors=_sensors)
+        self.times_s: list[float] = []
+        self._prepared = camera
+
+    def open(self) -> None:
+        """Open as a node does, and listen to what it sends."""
+        super().open()
+        plain = self.outlet.send
+
+        def send(message: Message, *, record: bool = True, publish: bool = True) -> None:
+            plain(message, record=record, publish=publish)
+            if isinstance(message, Candidates):
+                self.times_s.append(time.perf_counter() - self._prepared.taken_s.pop(message.stamp_ns))
+
+        self.outlet.send = send  # type: ignore[method-assign]
+
+
+def _sensors(config: NodeConfig, clock: Clock) -> list[Source]:
+    from node.sim.devices import SimulatedSensor, scenario_of
+    from node.sim.world import World
+
+    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    calibrated = MagnetometerCalibration(np.full(3, 1e-12), np.eye(3))
+    imu = ImuSource(config.node, cast(I2cBus, NoBus()), PreparedImu, VqfAttitude(calibrated), clock)
+    depth = SimulatedSensor("depth", 20, lambda stamp_ns: world.depth(config.node, stamp_ns), clock)
+    return [imu, depth]
+
+
+def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
+    """Wait for the hub, warm up, and measure."""
+    ends_s = time.monotonic() + CONNECT_S
+    while not service.outlet.connected:
+        if service.stop.wait(0.05) or time.monotonic() > ends_s:
+            raise BuddylineError("the node did not come to its hub")
+    service.stop.wait(WARM_UP_S)
+    first, sent = len(service.times_s), service.outlet.sent.copy()
+    began_s, used_s = time.monotonic(), _used_s()
+    rss_mib: list[tuple[float, float]] = []
+    while (passed_s := time.monotonic() - began_s) < seconds:
+        if passed_s >= 60.0 and not rss_mib:
+            rss_mib.append((1.0, _rss_mib()))
+        if service.stop.wait(min(1.0, seconds - passed_s)):
+            raise BuddylineError("the node ended")
+    cpu = (_used_s() - used_s) / passed_s
+    rss_mib.append((round(passed_s / 60.0, 1), _rss_mib()))
+    times_ms = 1e3 * np.array(service.times_s[first:])
+    if not len(times_ms):
+        raise BuddylineError("not one frame came through")
+    return {
+        "frames": len(times_ms),
+        "median_ms": float(np.median(times_ms)),
+        "p99_ms": float(np.percentile(times_ms, 99)),
+        "most_ms": float(times_ms.max()),
+        "cpu": cpu,
+        "rss_mib": rss_mib,
+        "rates_hz": {name: (count - sent[name]) / passed_s for name, count in service.outlet.sent.copy().items()},
+        "dropped": service.drops["frame"] + service.recorder.dropped,
+    }
+
+
+def _prepared(config: NodeConfig, path: Path) -> tuple[NDArray[np.uint8], NodeInfo]:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as other:
+        info = other.submit(_render, config, str(path)).result()
+    return np.load(path), info
+
+
+def _render(config: NodeConfig, path: str) -> NodeInfo:
+    """Render what the camera's driver would give: luminance."""
+    import cv2
+
+    from node.sim.devices import scenario_of
+    from node.sim.world import World
+
+    cv2.setNumThreads(1)
+    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    start_ns = config.simulation.start_ns
+    stamps_ns = [start_ns + round((1.0 + 1.7 * i) * S_NS) for i in range(PICTURES)]
+    pictures = [cv2.cvtColor(world.render(config.node, stamp_ns), cv2.COLOR_BGR2GRAY) for stamp_ns in stamps_ns]
+    np.save(path, np.stack(pictures))
+    return world.info(config.node, start_ns, config.trigger_period_ns)
+
+
+def _on_this_disk(config: NodeConfig, info: NodeInfo, directory: Path, images_hz: float) -> NodeConfig:
+    from msgspec.structs import replace
+
+    calibration = CalibrationConfig(
+        camera=info.camera, light_left_m=info.light_left_m, light_right_m=info.light_right_m, sigma_px=info.sigma_px
+    )
+    record = RecordConfig(directory=str(directory), images_hz=images_hz)
+    return replace(config, calibration=calibration, record=record)
+
+
+def _free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _used_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _rss_mib() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
