@@ -1,0 +1,30 @@
+"""The node's benchmark runs, and prints what it claims to measure."""
+
+import json
+
+import pytest
+
+from tools.bench import node
+from tools.bench.__main__ import main
+
+pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
+
+
+@pytest.mark.slow
+def test_a_whole_node_is_measured(capsys, monkeypatch):
+    monkeypatch.setattr(node, "WARM_UP_S", 0.2)
+    monkeypatch.setattr(node, "PICTURES", 2)
+    assert main(["node", "--seconds", "2", "--width", "164", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["frames"] > 5
+    assert 0 < figures["median_ms"] <= figures["p99_ms"] <= figures["most_ms"]
+    assert figures["cpu"] > 0
+    assert figures["rss_mib"][-1][1] > 20
+    assert {"candidates", "imu", "depth"} <= set(figures["rates_hz"])
+    assert "p99" in node.table(figures)
+
+
+@pytest.mark.parametrize("argv", [["--seconds", "0"], ["--rate", "0"], ["--width", "1"]])
+def test_what_cannot_be_measured_is_one_line(argv, capsys):
+    assert main(["node", *argv]) == 2
+    assert capsys.readouterr().err.startswith("bench: ")
