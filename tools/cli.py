@@ -100,7 +100,7 @@ COMMANDS: Final = (
         "calibrate",
         "tools.calibrate",
         "calibrate camera, lights or magnetometer, and say whether the result is good",
-        ("buddyline calibrate board board.pdf", "buddyline calibrate camera pictures/ -o a.camera.json"),
+        ("buddyline calibrate board -o board.pdf", "buddyline calibrate camera pictures/"),
     ),
     Command(
         "simulate",
