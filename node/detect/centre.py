@@ -17,10 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from node.detect.lights import Lights
 from node.detect.rings import (
     RAY_HARMONICS,
     RAYS,
@@ -33,19 +35,24 @@ from node.detect.rings import (
 
 _RINGS = 16
 _CLIPPED = 249.0
-# What the errors on rendered dives were, against what the equations alone expect.
-_FLOOR_PX = 0.05
-_NOISE_SCALE = 0.3
-_GROWTH_SCALE = 1.3
-_MOVED_SHARE = 0.1
-_SCATTERED_PX = 1.5
+_WIDTH_OF_MODEL_PX = 820
 _ROBUST_SD = 3.0
+
+# Sigma: what the errors on pictures rendered in many waters (this project's simulator, and dives kept for tuning)
+# were, by what they follow from; a little more than they were on average, as other waters will be different.
+_FLOOR_PX: Final = 0.05
+_NOISE_SCALE: Final = 0.155
+_GROWTH_SCALE: Final = 0.45
+# Of the way from the region's centre to the source; where nothing is clipped, the way itself is in doubt.
+_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
+# Of the core's radius, times by how much it is longer than wide: something stands before it, or another light beside.
+_ELONGATED_SHARE: Final = 0.15
+_SCATTERED_PX: Final = 2.0
 
 MODEL: Mapping[str, float] = {
     "growth": 0.7,
-    "growth_veil": 0.45,
+    "growth_veil": 0.55,
     "growth_size": 0.45,
-    "growth_scatter": 1.0,
     "growth_sd": 0.35,
     "steepness": 0.75,
     "inner": 0.6,
@@ -69,22 +76,9 @@ class Centres:
     lean: Floats
 
 
-def locate_sources(
-    image: NDArray[np.uint8],
-    start_px: Floats,
-    radius_px: Floats,
-    ground: Floats,
-    weakest: NDArray[np.bool_],
-    scattered: Floats,
-    model: Mapping[str, float] = MODEL,
-) -> Centres:
-    """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture.
-
-    start_px: (N, 2) centres and radius_px: (N,) radii of their brightest regions. ground: (N,) what the water itself
-    shows there. weakest: (N,) whether the weakest channel is used, which clips last, or the luminance, which is
-    sharper (JPEG halves the resolution of colour). scattered: (N,) 0-1, whether a dim light shows no core of its own
-    but only what the water scatters.
-    """
+def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str, float] = MODEL) -> Centres:
+    """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture."""
+    start_px, radius_px, ground, weakest = lights.centre_px, lights.core_px, lights.ground, lights.weakest
     prior_sd = model["core_share"] * radius_px + 0.5
     centre: Floats = start_px.astype(np.float32)
     radius = geometric_radii(
@@ -93,8 +87,7 @@ def locate_sources(
         _RINGS,
     )
     log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
-    growth = _growth(radius_px * 820.0 / model.get("width_px", image.shape[1]), ground, model)
-    growth -= np.asarray(model["growth_scatter"] * scattered, np.float32)
+    growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), ground, model)
     prior = np.zeros((len(centre), 4, 4))
     prior[:, (0, 1), (0, 1)] = 1.0 / prior_sd[:, None] ** 2
     prior[:, (2, 3), (2, 3)] = 1.0 / model["lean_sd"] ** 2
@@ -107,10 +100,14 @@ def locate_sources(
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
     moved = found - start_px
     holds = first.solvable & again.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
-    moved *= holds[:, None]
-    own_px2 = np.where(holds, _FLOOR_PX**2 + (_SCATTERED_PX * scattered) ** 2, prior_sd**2)
+    moved *= (holds * (1.0 - lights.scattered))[:, None]
+    own_px2 = (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2 + np.where(
+        holds, _FLOOR_PX**2 + (_SCATTERED_PX * lights.scattered) ** 2, prior_sd**2
+    )
     covariance = covariance * holds[:, None, None] + own_px2[:, None, None] * np.eye(2)
-    covariance += _MOVED_SHARE**2 * moved[:, :, None] * moved[:, None, :]
+    share = _MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped
+    moved_px = share[:, None] * moved
+    covariance += moved_px[:, :, None] * moved_px[:, None, :]
     return Centres(start_px + moved, covariance, x[:, 2:] * holds[:, None])
 
 

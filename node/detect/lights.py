@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -24,7 +24,11 @@ _CORE_RINGS: Final = 7
 _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
 _LEVELS: Final = np.array([0.9, 0.7, 0.5, 0.3], np.float32)
-_HALF: Final = 2
+_CORE, _HALF = 1, 2
+_UNCLIPPED, _UNCLIPPED_OVER = 240.0, 40.0
+VEIL: Final = 40.0
+"""Level of the weakest channel from which on the water counts as veiled."""
+_GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +36,10 @@ class Lights:
     """N bright regions.
 
     centre_px (N, 2), core_px (N,): the rim, in the channel that locates. ground: (N,) what the water itself shows in
-    that channel. weakest: (N,) whether it is the weakest one, else the luminance. scattered: (N,) 0-1, see
-    _scattered. peak, height: (N,) luminance. edge_px: (N, K) outline at half height around edge_at_px (N, 2), of
+    that channel. weakest: (N,) whether it is the weakest one, which clips last, or the luminance, which is sharper
+    (JPEG halves the resolution of colour). core_elongation: (N,) in it, near the top. unclipped: (N,) 0-1. scattered:
+    (N,) 0-1, see _scattered; the centre of those is extrapolated to where their glow begins. peak, height: (N,)
+    luminance. edge_px: (N, K) outline at half height around edge_at_px (N, 2), of
     area_px, elongation and open_share (of rays that find no edge). contrast, clutter: (N,) as proposed.
     """
 
@@ -41,6 +47,8 @@ class Lights:
     core_px: Floats
     ground: Floats
     weakest: NDArray[np.bool_]
+    core_elongation: Floats
+    unclipped: Floats
     scattered: Floats
     peak: Floats
     height: Floats
@@ -51,6 +59,10 @@ class Lights:
     open_share: Floats
     contrast: Floats
     clutter: Floats
+
+    def at(self, index: NDArray[np.intp]) -> Lights:
+        """Give some of them."""
+        return Lights(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 def measure_lights(
@@ -67,19 +79,24 @@ def measure_lights(
         level[1] = weakest_channel(rings.pixels)
     peak = np.minimum(level[:, :, :_CORE_RINGS].max(axis=(2, 3)), _CLIPPED)
     ground = _low(level[:, :, -4:], 0.2)
+    water = _water_level(image)
     if colour:
-        np.minimum(ground[1], _water_level(image), out=ground[1])
+        np.minimum(ground[1], water, out=ground[1])
     height = peak - ground
     shapes = find_shapes(level, rings.inside, radius, ground[:, None] + _LEVELS[:, None] * height[:, None])
     rim_px, core_px = _rims(shapes)
-    # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
     weakest = shapes.radius_px[-1, :2].mean(axis=0) >= _WEAKEST_FROM_PX if colour else np.zeros(len(radius), bool)
+    unclipped = np.clip((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0, 1.0)
+    scattered = _scattered(shapes, unclipped, water)
+    rim = np.where(weakest[:, None], rim_px[-1], rim_px[0])
     return Lights(
-        centre + np.where(weakest[:, None], rim_px[-1], rim_px[0]),
+        centre + rim + scattered[:, None] * (_where_glow_begins(shapes) - rim),
         np.where(weakest, core_px[-1], core_px[0]),
         np.where(weakest, ground[-1], ground[0]),
         weakest,
-        _scattered(shapes, peak[0]),
+        np.where(weakest, shapes.elongation[-1, _CORE], shapes.elongation[0, _CORE]),
+        unclipped,
+        scattered,
         peak[0],
         height[0],
         shapes.edge_px[0, _HALF],
@@ -95,11 +112,15 @@ def measure_lights(
 def distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
     """Leave out what lies inside an earlier one; give the indices of the rest. centre_px: (N, 2); radius_px: (N,)."""
     apart = np.hypot(centre_px[:, None, 0] - centre_px[:, 0], centre_px[:, None, 1] - centre_px[:, 1])
-    same = (apart < np.maximum(0.7 * np.maximum(radius_px[:, None], radius_px), 2.0)).tolist()
+    same = apart < np.maximum(0.7 * np.maximum(radius_px[:, None], radius_px), 2.0)
+    # Each row as the bits of one number.
+    rows = (same @ (np.uint64(1) << np.arange(len(same), dtype=np.uint64))).tolist()
     kept: list[int] = []
-    for i, row in enumerate(same):
-        if not any(row[k] for k in kept):
+    taken = 0
+    for i, row in enumerate(rows):
+        if not row & taken:
             kept.append(i)
+            taken |= 1 << i
     return np.array(kept, np.intp)
 
 
@@ -146,19 +167,30 @@ def _rims(shapes: Shapes) -> tuple[Floats, Floats]:
     )
 
 
-def _scattered(shapes: Shapes, peak: Floats) -> Floats:
-    """Tell dim lights that show only what the water scatters, (N,) 0-1: not clipped, and yet with a halo.
+def _scattered(shapes: Shapes, unclipped: Floats, water: Floats) -> Floats:
+    """Tell lights in veiled water that show only what the water scatters, (N,) 0-1: not clipped, and with a halo.
 
     A core's own profile falls as steeply below half its height as above it; a glow flattens out.
     """
     flattening = shapes.radius_px[0, _HALF + 1] / shapes.radius_px[0, _HALF]
     halo = np.clip((flattening - 1.35) / 0.2, 0.0, 1.0)
-    dim = np.clip((240.0 - peak) / 40.0, 0.0, 1.0)
-    return np.asarray(halo * dim, np.float32)
+    return np.asarray(halo * unclipped * np.minimum(water / VEIL, 1.0), np.float32)
+
+
+def _where_glow_begins(shapes: Shapes) -> Floats:
+    """Give where a glow without a core comes from, (N, 2): against the way in which its fainter parts lie.
+
+    A beam that passes the camera by shines where it has spread; its source lies behind the brightest part.
+    """
+    back = _GLOW_BACK * (shapes.centre_px[0, 0] - shapes.centre_px[0, -1])
+    length = np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-6)
+    back *= np.minimum(_GLOW_BACK_MOST * shapes.radius_px[0, _HALF] / length, 1.0)[:, None]
+    return np.asarray(shapes.centre_px[0, 0] + back, np.float32)
 
 
 def _water_level(image: NDArray[np.uint8]) -> Floats:
-    """Give what a fifth of a BGR picture lies below, in the weakest channel."""
-    weak = weakest_channel(image[::16, ::16]).ravel()
+    """Give what a fifth of a picture lies below, in the weakest channel."""
+    some = image[::16, ::16]
+    weak = (some if image.ndim == 2 else weakest_channel(some)).ravel()
     k = len(weak) // 5
     return np.asarray(np.partition(weak, k)[k], np.float32)

@@ -47,30 +47,30 @@ class Proposals:
 
 @dataclass(frozen=True, slots=True)
 class _Octave:
-    """Working memory of one octave. contrast and marks are parts of arrays that hold all octaves, end to end."""
+    """Working memory of one octave. All but level are parts of arrays that hold all octaves, end to end."""
 
     level: NDArray[np.uint8]
-    surround: NDArray[np.uint8]
     contrast: NDArray[np.uint8]
-    marks: NDArray[np.uint8]
+    highest: NDArray[np.uint8]
     clutter: NDArray[np.uint8]
 
-    def mark_maxima(self, contrast_min: float, below: NDArray[np.uint8] | None) -> None:
-        """Mark the local maxima of centre minus surround, and measure the neighbourhoods' mean contrast.
+    def measure(self, below: NDArray[np.uint8] | None) -> None:
+        """Measure centre minus surround, its highest value around each place, and the neighbourhoods' mean.
 
         below: the level of the next octave, of which the surround is made.
         """
-        cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.contrast)
+        surround = self.highest
         if below is None:
-            cv2.blur(self.level, (9, 9), dst=self.surround)
+            cv2.blur(self.level, (9, 9), dst=surround)
         else:
-            cv2.pyrUp(cv2.blur(below, (5, 5)), dst=self.surround, dstsize=self.level.shape[::-1])
-        cv2.subtract(self.contrast, self.surround, dst=self.contrast)
-        cv2.blur(halve(halve(self.contrast)), (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
-        cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.surround)
-        cv2.compare(self.contrast, self.surround, cv2.CMP_EQ, dst=self.marks)
-        cv2.threshold(self.contrast, contrast_min - 0.5, 255, cv2.THRESH_BINARY, dst=self.surround)
-        cv2.bitwise_and(self.marks, self.surround, dst=self.marks)
+            cv2.pyrUp(cv2.blur(below, (5, 5)), dst=surround, dstsize=self.level.shape[::-1])
+        cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.contrast)
+        cv2.subtract(self.contrast, surround, dst=self.contrast)
+        rows, columns = self.clutter.shape
+        whole = self.contrast[: _CLUTTER_CELL * rows, : _CLUTTER_CELL * columns]
+        cells = halve(halve(whole))
+        cv2.blur(cells, (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
+        cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.highest)
 
 
 class ProposalFinder:
@@ -84,8 +84,9 @@ class ProposalFinder:
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
-        self._marks = np.zeros(0, np.uint8)
+        self._marks = np.zeros(0, np.bool_)
         self._contrast = np.zeros(0, np.uint8)
+        self._highest = np.zeros(0, np.uint8)
         self._clutter = np.zeros(0, np.uint8)
         self._table = np.zeros((0, 5), np.int64)
         self._base_step_px = 1.0
@@ -104,7 +105,7 @@ class ProposalFinder:
         """Estimate the noise at the pyramid's base, 1 sd in grey levels, from neighbouring pixels of some rows."""
         if not self._octaves:
             return 0.0
-        some = self._octaves[0].level[::32].astype(np.int16)
+        some = self._octaves[0].level[::48].astype(np.int16)
         steps = np.abs(some[:, 1:] - some[:, :-1]).ravel()
         # What is not noise (edges, texture) stands in the upper half; below it, noise is as good as normal.
         lower = np.partition(steps, len(steps) // 2)[: len(steps) // 2 + 1]
@@ -118,12 +119,14 @@ class ProposalFinder:
         """
         below: NDArray[np.uint8] | None = None
         for octave in reversed(self._octaves):
-            octave.mark_maxima(contrast_min, below)
+            octave.measure(below)
             below = octave.level
+        np.equal(self._contrast, self._highest, out=self._marks)
+        self._marks &= self._contrast >= np.uint8(np.clip(np.ceil(contrast_min), 1.0, 255.0))
 
         # Empty places are passed over a machine word at a time.
         places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()
-        places = places[self._marks[places] > 0]
+        places = places[self._marks[places]]
         which = np.searchsorted(self._table[:, 0], places, side="right") - 1
         start, width, cell_start, last_cell_row, cell_columns = self._table[which].T
         rows, columns = np.divmod(places - start, width)
@@ -155,17 +158,18 @@ class ProposalFinder:
         while width > _BASE_WIDTH_PX and height >= 2 * _SMALLEST_PX:
             height, width = height // 2, width // 2
             self._base_step_px *= 2.0
-            colours = shape[2:] if not self._halves else ()
-            self._halves.append(np.empty((height, width, *colours), np.uint8))
+            self._halves.append(np.empty((height, width), np.uint8))
         sizes: list[tuple[int, int]] = []
         while min(height, width) >= _SMALLEST_PX and len(sizes) < _OCTAVES:
             sizes.append((height, width))
             height, width = height // 2, width // 2
-        cells = [(max(h // 2 // 2, 1), max(w // 2 // 2, 1)) for h, w in sizes]
+        cells = [(max(h // _CLUTTER_CELL, 1), max(w // _CLUTTER_CELL, 1)) for h, w in sizes]
         starts = np.cumsum([0, *(h * w for h, w in sizes)])
         cell_starts = np.cumsum([0, *(h * w for h, w in cells)])
-        self._marks = np.zeros(-(-int(starts[-1]) // _WORD) * _WORD, np.uint8)
-        self._contrast = np.zeros(int(starts[-1]), np.uint8)
+        whole_words = -(-int(starts[-1]) // _WORD) * _WORD
+        self._marks = np.zeros(whole_words, np.bool_)
+        self._contrast = np.zeros(whole_words, np.uint8)
+        self._highest = np.zeros(whole_words, np.uint8)
         self._clutter = np.zeros(int(cell_starts[-1]), np.uint8)
         self._table = np.array(
             [(s, w, cs, c[0] - 1, c[1]) for s, (_, w), cs, c in zip(starts, sizes, cell_starts, cells, strict=False)],
@@ -174,16 +178,15 @@ class ProposalFinder:
         self._octaves = [
             _Octave(
                 np.empty(size, np.uint8),
-                np.empty(size, np.uint8),
                 self._contrast[start : start + size[0] * size[1]].reshape(size),
-                self._marks[start : start + size[0] * size[1]].reshape(size),
+                self._highest[start : start + size[0] * size[1]].reshape(size),
                 self._clutter[cell_start : cell_start + cell[0] * cell[1]].reshape(cell),
             )
             for start, size, cell_start, cell in zip(starts, sizes, cell_starts, cells, strict=False)
         ]
 
     def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
-        """Halve down to the pyramid's base; colours merge after the first halving.
+        """Halve down to the pyramid's base.
 
         Where the picture is to be quartered or less, every other row will do: the blur of a lens that resolves so
         many pixels is wider than two of them.
@@ -195,9 +198,10 @@ class ProposalFinder:
             level = halve(_grey(level[: 4 * height : 2, : 4 * width]))
             level = np.asarray(cv2.resize(level, (width, height), dst=halves[1]), np.uint8)
             halves = halves[2:]
+        level = _grey(level)
         for half in halves:
-            level = _grey(halve(level, half))
-        base[...] = _grey(level)
+            level = halve(level, half)
+        base[...] = level
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

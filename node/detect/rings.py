@@ -83,18 +83,21 @@ def find_shapes(level: Floats, inside: NDArray[np.bool_], radius_px: Floats, thr
 
     level: (C, N, M, K) grey levels on rings of radius_px (N, M); inside: (N, M, K); threshold: (C, S, N).
     """
-    below = (level[:, None] < threshold[..., None, None]) | ~inside
-    first = below.argmax(axis=3)
-    is_open = (first == 0) & ~below[..., 0, :]
-    first[is_open] = level.shape[2] - 1
+    channels, places, rings = level.shape[:3]
+    # Rings last: what follows runs along them.
+    outward = np.ascontiguousarray(level.swapaxes(2, 3))
+    below = outward[:, None] < threshold[..., None, None]
+    below |= ~inside.swapaxes(1, 2)
+    first = below.argmax(axis=4)
+    is_open = (first == 0) & ~below[..., 0]
+    first[is_open] = rings - 1
     before = np.maximum(first - 1, 0)
-    channel = np.arange(level.shape[0])[:, None, None, None]
-    place = np.arange(level.shape[1])[:, None]
-    ray = np.arange(RAYS)
-    outer, inner = level[channel, place, first, ray], level[channel, place, before, ray]
+    start = np.arange(0, outward.size, rings).reshape(channels, 1, places, RAYS)
+    inner, outer = outward.take(start + before), outward.take(start + first)
     share = (inner - threshold[..., None]) / np.maximum(inner - outer, 1e-3)
     np.clip(share, 0.0, 1.0, out=share)
-    near, far = radius_px[place, before], radius_px[place, first]
+    start = np.arange(0, radius_px.size, rings)[:, None]
+    near, far = radius_px.take(start + before), radius_px.take(start + first)
     edge = near + share * (far - near)
     edge[is_open] = far[is_open]
     edge[first == 0] *= 0.5

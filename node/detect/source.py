@@ -65,15 +65,8 @@ class SourceDetector:
         order = np.argsort(-score, kind="stable")
         order = order[distinct(lights.centre_px[order], lights.core_px[order])]
         chosen = order[: max(min(many, int(np.count_nonzero(score[order] >= least))) for many, least in _KEPT)]
-        found = locate_sources(
-            image,
-            lights.centre_px[chosen],
-            lights.core_px[chosen],
-            lights.ground[chosen],
-            lights.weakest[chosen],
-            lights.scattered[chosen],
-        )
-        return _detections(lights, found, score, chosen, image.shape)
+        likely = lights.at(chosen)
+        return _detections(likely, locate_sources(image, likely), score[chosen], image.shape)
 
     def _adapt(self) -> float:
         """Give the contrast that counts as one: above this picture's noise and that of those before it."""
@@ -93,34 +86,27 @@ def _score(lights: Lights) -> Floats:
     return np.asarray(1.0 / (1.0 + np.exp(-logit)), np.float32)
 
 
-def _detections(
-    lights: Lights, found: Centres, score: Floats, chosen: NDArray[np.intp], shape: tuple[int, ...]
-) -> list[Detection]:
+def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:
     """Put the findings into words and figures; what lies outside the picture is dropped."""
     centre = found.centre_px.astype(np.float64)
-    edge = lights.edge_px[chosen]
+    edge = lights.edge_px
     outline = np.empty((*edge.shape, 2))
-    outline[..., 0] = edge * RAY_COS + lights.edge_at_px[chosen, :1]
-    outline[..., 1] = edge * RAY_SIN + lights.edge_at_px[chosen, 1:]
+    outline[..., 0] = edge * RAY_COS + lights.edge_at_px[:, :1]
+    outline[..., 1] = edge * RAY_SIN + lights.edge_at_px[:, 1:]
     ahead = ((outline - centre[:, None]) @ found.lean[:, :, None])[:, :, 0]
-    far = outline[np.arange(len(chosen)), ahead.argmax(axis=1)]
+    far = outline[np.arange(len(outline)), ahead.argmax(axis=1)]
     variance = found.covariance_px2
     table = np.stack(
         [
             np.sqrt(0.5 * (variance[:, 0, 0] + variance[:, 1, 1])),
             np.hypot(found.lean[:, 0], found.lean[:, 1]),
-            *(
-                values[chosen]
-                for values in (
-                    lights.area_px,
-                    lights.peak,
-                    lights.elongation,
-                    score,
-                    lights.contrast / (4.0 + lights.clutter),
-                    lights.height,
-                    lights.core_px,
-                )
-            ),
+            lights.area_px,
+            lights.peak,
+            lights.elongation,
+            score,
+            lights.contrast / (4.0 + lights.clutter),
+            lights.height,
+            lights.core_px,
         ],
         axis=1,
     ).tolist()
