@@ -111,6 +111,29 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         assert [received.payload for received in remembered] == [b'{"stamp_ns":1}']
 
 
+def test_a_node_taken_from_the_hubs_list_is_neither_heard_nor_told_anything(keys: Path) -> None:
+    endpoint = tls_endpoint()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"])),
+        join(endpoint, tls(keys, "node-a")) as a,
+        join(endpoint, tls(keys, "node-b")) as shut_out,
+        join(endpoint, tls(keys, "viewer")) as viewer,
+    ):
+        inbox, nothing = Inbox(), Inbox()
+        viewer.subscribe(topics.EVERYTHING, inbox)
+        shut_out.subscribe(topics.EVERYTHING, nothing)
+        for bus, node in ((shut_out, "b"), (a, "a")):
+            bus.declare_alive(f"node/{node}")
+            assert bus.publisher(topics.CANDIDATES, node).put_bytes(b'{"stamp_ns":1}')
+        inbox.wait_for("buddyline/node/a/candidates")
+        assert viewer.is_alive("node/a")
+        assert not viewer.is_alive("node/b")
+        assert not shut_out.is_alive("node/a")
+        assert inbox.keys == ["buddyline/node/a/candidates"]
+        # What it says itself, a session hears without the hub.
+        assert nothing.keys == ["buddyline/node/b/candidates"]
+
+
 def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> None:
     endpoint = tls_endpoint()
     with (
