@@ -1,8 +1,18 @@
 """A solver that is started again says what has not been said, and nothing twice."""
 
-from protocol.clock import S_NS
-from protocol.messages import Rejected
+import time
+from collections import Counter
+
+import pytest
+
+from protocol.clock import S_NS, ManualClock
+from protocol.local_bus import LocalNetwork
+from protocol.messages import Candidates, Rejected, decode
+from protocol.topics import key_of, parse_key
 from solver_service.answered import Answered
+from solver_service.config import SolverConfig
+from solver_service.service import SolverService
+from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 
 def outcome(trigger, reason="ambiguous"):
@@ -53,3 +63,53 @@ def test_of_a_live_dive_only_the_last_moments_are_solved_again():
         assert Answered([said]).is_over(now_ns - age_s * S_NS, now_ns) is over
         assert not Answered([said]).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
         assert not Answered().is_over(now_ns - age_s * S_NS, now_ns)
+
+
+@pytest.mark.parametrize("live", [True, False], ids=["live", "stored"])
+def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
+    """The first is gone between two frames; the second comes some frames later, and finds them in the caches."""
+    messages, _ = dive_messages(seconds=14.0, sensors=False, period_ns=2 * PERIOD_NS)
+    gone_at, back_at = len(messages) * 8 // 10, len(messages) * 9 // 10
+    clock = ManualClock(START_NS if live else START_NS + 86_400 * S_NS)
+    network, outcomes = LocalNetwork(clock), []
+    with network.connect() as nodes, network.connect() as viewer:
+        publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
+        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
+
+        def publish(part):
+            for message in part:
+                clock.set_ns(max(clock.now_ns() + 1, message.stamp_ns))
+                publishers[key_of(message)].put(message)
+
+        def solver(bus, part):
+            service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
+            service.attach(bus)
+            publish(part)
+            until(lambda: (service._core.newest_ns[part[-1].node == "b"] or 0) >= part[-1].stamp_ns)
+            return service
+
+        with network.connect() as bus:
+            solver(bus, messages[:gone_at])
+        publish(messages[gone_at:back_at])
+        with network.connect() as bus:
+            service = solver(bus, messages[back_at:])
+            with service._lock:
+                service._publish(service._core.flush())
+            # Of a dive of now, what was answered long ago is not even looked at.
+            frames = sum(isinstance(message, Candidates) for message in messages)
+            assert (sum(service._core.received) < frames) is live
+        until(lambda: any(payload_trigger(one) == messages[-1].trigger for one in outcomes))
+    counts = Counter(payload_trigger(one) for one in outcomes)
+    assert set(counts) == {message.trigger for message in messages if isinstance(message, Candidates)}
+    assert set(counts.values()) == {1}
+
+
+def payload_trigger(received):
+    return decode(received.payload, parse_key(received.key)[0].schema).trigger
+
+
+def until(condition):
+    ends_s = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < ends_s
+        time.sleep(0.005)
