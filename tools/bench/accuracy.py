@@ -1,6 +1,8 @@
 """How good the solver is, on simulated triggers: errors over the Cramer-Rao bound, and the choice of the four lights.
 
-Bound: of the eight coordinates, by numeric derivatives of the projection. Choice: the right four lights of all
+Bound: of the eight coordinates, by numeric derivatives of the projection. Beside the solver's methods: OpenCV's
+solvePnP and SQPnP on A's picture alone. Two lights are too few for them: they are given four, B's bar doubled to a
+square. Choice: the right four lights of all
 triggers, with so many false candidates in each picture, by the range gap alone (the paper's test: the pairs whose
 ranges agree best), by pictures alone, and with attitude and depth; then wrong poses (more than 10 % of the range off).
 """
@@ -13,6 +15,7 @@ import math
 import sys
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +29,7 @@ Floats = NDArray[np.float64]
 
 RANGES_M: Final = (1.5, 2.0, 4.0, 6.0, 10.0, 15.0, 20.0)
 SIGMAS_PX: Final = (0.3, 1.0)
+PNP: Final = {"solvePnP": cv2.SOLVEPNP_ITERATIVE, "SQPnP": cv2.SOLVEPNP_SQPNP}
 METHODS: Final = ("refined", "exact", "paper", "paper_midpoint", "paper_literal")
 BANDS_M: Final = ((1.5, 4.0), (4.0, 10.0), (10.0, 20.0))
 FALSE: Final = (1, 2, 4, 8, 16)
@@ -54,7 +58,7 @@ def main(argv: list[str]) -> int:
 def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
     """Return RMSE over the bound, position and rotation, of every method, and the covariance's normalized error."""
     rng = np.random.default_rng(round(100 * range_m))
-    bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in METHODS}, []
+    bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in (*METHODS, *PNP)}, []
     for _ in range(count):
         trigger = simulate(rng, (range_m, range_m), sigma_px=sigma_px)
         bound += limit(trigger, sigma_px)
@@ -63,19 +67,41 @@ def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
             fix = trigger.solve(settings, sensors=False)
             if not isinstance(fix, Fix):
                 raise BuddylineError(f"{method} finds no pose at {range_m:g} m: {fix.detail}")
-            turn = rotation_log(trigger.R_a_b @ matrix_of(fix.q_a_b_xyzw).T)
-            error = np.concatenate((trigger.t_a_b_m - fix.t_a_b_m, turn))
+            error = error_of(trigger, fix.t_a_b_m, matrix_of(fix.q_a_b_xyzw))
             squares[method] += error[:3] @ error[:3], error[3:] @ error[3:]
             if method == "refined":
                 nees.append(float(error @ np.linalg.solve(fix.covariance, error)) / 6.0)
+        for name, (t_a_b_m, R_a_b) in one_view(trigger, sigma_px, rng).items():
+            error = error_of(trigger, t_a_b_m, R_a_b)
+            squares[name] += error[:3] @ error[:3], error[3:] @ error[3:]
     return {
         "range_m": range_m,
         "sigma_px": sigma_px,
         "bound_m": math.sqrt(bound[0] / count),
         "bound_rad": math.sqrt(bound[1] / count),
-        "over_bound": {method: np.sqrt(squares[method] / bound).tolist() for method in METHODS},
+        "over_bound": {name: np.sqrt(square / bound).tolist() for name, square in squares.items()},
         "nees": float(np.mean(nees)),
     }
+
+
+def error_of(trigger: Trigger, t_a_b_m: Floats, R_a_b: Floats) -> Floats:
+    """Return the error (6,): position, then the small rotation."""
+    return np.concatenate((trigger.t_a_b_m - t_a_b_m, rotation_log(trigger.R_a_b @ R_a_b.T)))
+
+
+def one_view(trigger: Trigger, sigma_px: float, rng: np.random.Generator) -> dict[str, tuple[Floats, Floats]]:
+    """Return t_a_b_m and R_a_b by OpenCV from A's picture of four lights at the corners of a square on B."""
+    left, right = RIG.lights_m
+    up = np.array([0.0, 0.5 * RIG.length_m, 0.0])
+    corners_m = np.array((left - up, right - up, right + up, left + up))
+    points_m = corners_m @ trigger.R_a_b.T + trigger.t_a_b_m
+    matrix = np.array(((CAMERA.fx_px, 0.0, CAMERA.cx_px), (0.0, CAMERA.fy_px, CAMERA.cy_px), (0.0, 0.0, 1.0)))
+    pixels = (points_m / points_m[:, 2:] @ matrix.T)[:, :2] + sigma_px * rng.standard_normal((4, 2))
+    poses = {}
+    for name, flag in PNP.items():
+        _, turn, t_a_b_m = cv2.solvePnP(corners_m, pixels[:, None], matrix, None, flags=flag)
+        poses[name] = np.asarray(t_a_b_m, np.float64).ravel(), rotation_exp(np.asarray(turn, np.float64).ravel())
+    return poses
 
 
 def limit(trigger: Trigger, sigma_px: float) -> tuple[float, float]:
@@ -133,7 +159,7 @@ def table(errors: list[dict[str, Any]], choices: list[dict[str, Any]]) -> str:
     """Return both tables for a person."""
     lines = [
         "RMSE over the bound, position / rotation",
-        "range sigma    bound          " + "  ".join(METHODS) + "  NEES",
+        "range sigma    bound          " + "  ".join((*METHODS, *PNP)) + "  NEES",
     ]
     for row in errors:
         ratios = "  ".join(f"{position:.3f}/{rotation:.3f}" for position, rotation in row["over_bound"].values())
