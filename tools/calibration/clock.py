@@ -1,0 +1,173 @@
+"""The offset between two nodes' clocks, out of their beacons: ways there and back, the quickest count most.
+
+B's clock minus A's is half the difference of a way there and a way back, as their stamps have them; it is off by at
+most half their sum, the round trip, however unequal they truly are (Mills, RFC 5905, section 8).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.clock import S_NS
+from protocol.messages import ClockBeacon
+
+# A way there and one back belong to one exchange where they are not farther apart: 40 ppm make 40 us of it.
+APART_NS: Final = 1 * S_NS
+# Two crystals, each off by 50 ppm and pulled by chrony a little: what moves faster was set.
+FASTEST: Final = 200e-6
+SLACK_S: Final = 50e-6
+GAP_S: Final = 10.0
+WINDOW_S: Final = 60.0
+MIN_EXCHANGES: Final = 8
+# Of an exchange as quick as the quickest: stamps are taken by threads that wait for one another.
+QUICKEST_SIGMA_S: Final = 20e-6
+MIN_DRIFT_SPAN_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Exchanges:
+    """Pairs of a way there and a way back, by time. stamp_ns: (N,) int64, A's clock. offset_s: (N,) B minus A."""
+
+    stamp_ns: NDArray[np.int64]
+    offset_s: NDArray[np.float64]
+    round_trip_s: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def part(self, begin: int, end: int) -> Exchanges:
+        """Return those from begin to end."""
+        return Exchanges(self.stamp_ns[begin:end], self.offset_s[begin:end], self.round_trip_s[begin:end])
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """B's clock minus A's at stamp_ns (A's clock), of exchanges from begin_ns to end_ns.
+
+    sigma_s: 1 sd, with what the two ways may differ by; scatter_s: 1 sd without it. bound_s: half the quickest round
+    trip. drift: of B's clock against A's, seconds a second; None where the time was too short to tell.
+    """
+
+    stamp_ns: int
+    begin_ns: int
+    end_ns: int
+    offset_s: float
+    sigma_s: float
+    scatter_s: float
+    bound_s: float
+    drift: float | None
+    drift_sigma: float | None
+    exchanges: int
+
+
+class Legs:
+    """Ways from node to node as their beacons tell them, each once."""
+
+    def __init__(self) -> None:
+        self._ways: dict[tuple[str, str], dict[int, int]] = {}
+
+    def add(self, beacon: ClockBeacon) -> None:
+        """Take a beacon."""
+        for heard in beacon.heard:
+            if heard.node != beacon.node:
+                self._ways.setdefault((heard.node, beacon.node), {})[heard.sent_ns] = heard.received_ns
+
+    def pairs(self) -> list[tuple[str, str]]:
+        """Return the pairs of nodes that hear each other, each once, sorted."""
+        return sorted((a, b) for a, b in self._ways if a < b and (b, a) in self._ways)
+
+    def exchanges(self, node_a: str, node_b: str) -> Exchanges:
+        """Pair each way back with the nearest way there, by A's clock alone: B's may be off by years."""
+        there = np.array(sorted(self._ways.get((node_a, node_b), {}).items()), np.int64).reshape(-1, 2)
+        back = np.array(sorted(self._ways.get((node_b, node_a), {}).items(), key=lambda way: way[1]), np.int64)
+        back = back.reshape(-1, 2)
+        if not len(there) or not len(back):
+            return Exchanges(np.empty(0, np.int64), np.empty(0), np.empty(0))
+        after = np.searchsorted(there[:, 0], back[:, 1]).clip(1, max(len(there) - 1, 1))
+        before = after - 1
+        after = after.clip(max=len(there) - 1)
+        nearer = np.abs(there[after, 0] - back[:, 1]) < np.abs(there[before, 0] - back[:, 1])
+        chosen = there[np.where(nearer, after, before)]
+        near = np.abs(chosen[:, 0] - back[:, 1]) <= APART_NS
+        chosen, back = chosen[near], back[near]
+        way_there_ns, way_back_ns = chosen[:, 1] - chosen[:, 0], back[:, 1] - back[:, 0]
+        return Exchanges(back[:, 1], (way_there_ns - way_back_ns) / (2 * S_NS), (way_there_ns + way_back_ns) / S_NS)
+
+
+def steps(exchanges: Exchanges) -> list[int]:
+    """Return before which exchanges one of the clocks was set: two neighbours that cannot both be true.
+
+    A round trip that took less than no time is one of them.
+    """
+    passed_s = np.diff(exchanges.stamp_ns) / S_NS
+    bounds_s = np.abs(exchanges.round_trip_s) / 2
+    moved_s = np.abs(np.diff(exchanges.offset_s))
+    allowed_s = bounds_s[1:] + bounds_s[:-1] + FASTEST * passed_s + SLACK_S
+    impossible = (exchanges.round_trip_s < -SLACK_S)[1:]
+    return [int(i) + 1 for i in np.flatnonzero((moved_s > allowed_s) | impossible)]
+
+
+def windows(exchanges: Exchanges) -> list[Exchanges]:
+    """Cut at gaps and where a clock was set, and what is left into a minute at most; too few exchanges are left out."""
+    gaps = np.flatnonzero(np.diff(exchanges.stamp_ns) > GAP_S * S_NS) + 1
+    cuts = sorted({0, len(exchanges), *gaps.tolist(), *steps(exchanges)})
+    found = []
+    for begin, end in pairwise(cuts):
+        if end - begin < MIN_EXCHANGES:
+            continue
+        span_s = float(exchanges.stamp_ns[end - 1] - exchanges.stamp_ns[begin]) / S_NS
+        count = min(max(math.ceil(span_s / WINDOW_S), 1), (end - begin) // MIN_EXCHANGES)
+        edges = np.linspace(begin, end, count + 1).round().astype(int)
+        found += [exchanges.part(int(first), int(last)) for first, last in pairwise(edges)]
+    return found
+
+
+def estimate(exchanges: Exchanges) -> ClockOffset:
+    """Fit offset and drift to exchanges without a step; raise ValueError where there are none.
+
+    Each is weighted by how much longer than the quickest it took: half of that may be its error. What the quickest
+    one's two ways differ by nobody can see: sigma_s takes any share of the round trip as equally likely.
+    """
+    if not len(exchanges):
+        raise ValueError("no exchanges")
+    quickest_s = max(float(exchanges.round_trip_s.min()), 0.0)
+    weights = (QUICKEST_SIGMA_S + (exchanges.round_trip_s - quickest_s).clip(0) / 2) ** -2.0
+    weights /= weights.sum()
+    first_ns = int(exchanges.stamp_ns[0])
+    times_s = (exchanges.stamp_ns - first_ns) / S_NS
+    middle_s = float(weights @ times_s)
+    offset_s = float(weights @ exchanges.offset_s)
+    lever_s = times_s - middle_s
+    spread_s2 = float(weights @ lever_s**2)
+    drift: float | None = None
+    drift_sigma: float | None = None
+    residuals_s = exchanges.offset_s - offset_s
+    if times_s[-1] >= MIN_DRIFT_SPAN_S and len(exchanges) >= MIN_EXCHANGES and spread_s2 > 0:
+        drift = float(weights @ (lever_s * exchanges.offset_s)) / spread_s2
+        residuals_s = residuals_s - drift * lever_s
+        drift_sigma = math.sqrt(float((weights * lever_s) ** 2 @ residuals_s**2)) / spread_s2
+    scatter_s = math.sqrt(float(weights**2 @ residuals_s**2))
+    return ClockOffset(
+        stamp_ns=first_ns + round(middle_s * S_NS),
+        begin_ns=first_ns,
+        end_ns=int(exchanges.stamp_ns[-1]),
+        offset_s=offset_s,
+        sigma_s=math.hypot(scatter_s, quickest_s / math.sqrt(12)),
+        scatter_s=scatter_s,
+        bound_s=quickest_s / 2,
+        drift=drift,
+        drift_sigma=drift_sigma,
+        exchanges=len(exchanges),
+    )
+
+
+def drift_between(first: ClockOffset, last: ClockOffset) -> tuple[float, float]:
+    """Return the drift from one estimate to a later one, and its sd: ways that differ alike in both cancel."""
+    passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
+    return (last.offset_s - first.offset_s) / passed_s, math.hypot(first.scatter_s, last.scatter_s) / passed_s
