@@ -28,6 +28,8 @@ RETRY_NS: Final = 200 * MS_NS
 PERIOD_NS: Final = 50 * MS_NS
 OVERSAMPLING: Final = 5  # of 0..5: 8192 samples, 0.2 mbar of noise on the 30BA
 CONVERSION_NS: Final = (600_000, 1_170_000, 2_280_000, 4_540_000, 9_040_000, 18_080_000)
+# A conversion begins once its command is on the wire: after a read and, at 100 kHz, what the inertial unit has there.
+TRANSFERS_NS: Final = 1_500_000
 
 Model = Literal["30ba", "02ba"]
 
@@ -204,7 +206,7 @@ class Ms5837:
             self._d1 = self._read_adc()
             self._pressure_stamp_ns = self._since_ns + CONVERSION_NS[OVERSAMPLING] // 2
             self._bus.command(ADDRESS, CONVERT_TEMPERATURE + 2 * OVERSAMPLING)
-            self._enter(_State.TEMPERATURE, now_ns, CONVERSION_NS[OVERSAMPLING])
+            self._enter(_State.TEMPERATURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
         else:
             sample = self._compensate(self._read_adc())
             self._enter(_State.IDLE, now_ns, max(0, self._cycle_ns + PERIOD_NS - now_ns))
@@ -219,7 +221,7 @@ class Ms5837:
     def _convert_pressure(self, now_ns: int) -> None:
         self._bus.command(ADDRESS, CONVERT_PRESSURE + 2 * OVERSAMPLING)
         self._cycle_ns = now_ns
-        self._enter(_State.PRESSURE, now_ns, CONVERSION_NS[OVERSAMPLING])
+        self._enter(_State.PRESSURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
 
     def _read_prom(self) -> None:
         words = [int.from_bytes(self._bus.read(ADDRESS, PROM + 2 * i, 2), "big") for i in range(7)]

@@ -268,3 +268,15 @@ def test_a_clock_that_steps_leaves_no_gap_and_no_wrong_value(bus, chip, adapter,
         chip.clock.set_ns(chip.clock.now_ns() + 10 * MS_NS)
     assert len(samples) >= 9
     assert all(sample.pressure_pa == 399980.0 for sample in samples)
+
+
+@pytest.mark.parametrize("bit_hz", [100_000, 400_000])
+def test_a_bus_that_takes_its_time_is_allowed_for(bus: I2cBus, adapter: Adapter, chip: Ms5837Wire, clock, bit_hz):
+    """The conversion begins when the command has gone out, which is after the reading before it."""
+    adapter.bit_hz = bit_hz
+    device = Ms5837.open(bus, None, clock)
+    samples = []
+    for _ in range(100):
+        clock.set_ns(max(clock.now_ns(), device.next_due_ns))
+        samples.append(device.step(clock.now_ns()))
+    assert sum(sample is not None for sample in samples) >= 33
