@@ -80,7 +80,6 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
     """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture."""
     start_px, radius_px, ground, weakest = lights.centre_px, lights.core_px, lights.ground, lights.weakest
     prior_sd = model["core_share"] * radius_px + 0.5
-    centre: Floats = start_px.astype(np.float32)
     radius = geometric_radii(
         np.maximum(model["inner"] * radius_px, 0.7),
         np.maximum(model["outer"] * radius_px, model["outer_min_px"]),
@@ -88,18 +87,16 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
     )
     log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
     growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), ground, model)
-    prior = np.zeros((len(centre), 4, 4))
+    prior = np.zeros((len(radius), 4, 4))
     prior[:, (0, 1), (0, 1)] = 1.0 / prior_sd[:, None] ** 2
     prior[:, (2, 3), (2, 3)] = 1.0 / model["lean_sd"] ** 2
-    first = _Equations(image, centre, radius, log_step, ground, weakest, growth, model)
-    x, _ = first.solve(prior)
-    centre = np.where(first.solvable[:, None], centre + x[:, :2], centre)
-    again = _Equations(image, centre, radius, log_step, ground, weakest, growth, model)
-    x, covariance = again.solve_robust(x[:, 2:], prior, start_px - centre)
-    found = centre + x[:, :2]
+    guess = lights.guess_px
+    equations = _Equations(image, guess, radius, log_step, ground, weakest, growth, model)
+    x, covariance = equations.solve(prior, start_px - guess)
+    found = guess + x[:, :2]
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
     moved = found - start_px
-    holds = first.solvable & again.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
+    holds = equations.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
     moved *= (holds * (1.0 - lights.scattered))[:, None]
     own_px2 = (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2 + np.where(
         holds, _FLOOR_PX**2 + (_SCATTERED_PX * lights.scattered) ** 2, prior_sd**2
@@ -150,7 +147,9 @@ class _Equations:
         rings = sample_rings(image, centre_px, radius)
         level = _one_channel(rings.pixels, weakest)
         above = level - ground[:, None, None]
-        usable = rings.inside & (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        if rings.inside is not None:
+            usable &= rings.inside
         np.maximum(above, 1.0, out=above)
         self._y = np.log(above)
         np.divide(model["noise"], above, out=above)
@@ -174,28 +173,21 @@ class _Equations:
         self._growth = growth[:, None] + model["steepness"] * plain
         self.solvable = seen.sum(axis=1) >= 4
 
-    def solve(self, prior: Floats) -> tuple[Floats, Floats]:
+    def solve(self, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
         """Solve for the step to the source and the lean, (N, 4), and the step's covariance (N, 2, 2).
 
-        prior: (N, 4, 4) information on both, about zero.
-        """
-        share = self._glow_share(np.zeros(1, np.float32))
-        x, covariance = self._least_squares(share, prior, np.zeros(2))
-        return x[0], covariance[0]
-
-    def solve_robust(self, lean: Floats, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
-        """Solve again, near the solution: as `solve`, with less weight for what the model does not explain.
-
-        That is something in front, or another light. lean: (N, 2) as found before; prior_px: (N, 2) where the prior
-        expects the source. The covariance contains the growth's own uncertainty.
+        prior: (N, 4, 4) information on both, about prior_px (N, 2) for the step and none for the lean. What the model
+        does not explain, something in front or another light, has less weight the second time. The covariance
+        contains the growth's own uncertainty.
         """
         sd = self._model["growth_sd"]
         share = self._glow_share(np.array([0.0, -sd, sd], np.float32))
+        x, _ = self._least_squares(share[:1], prior, prior_px)
         mean = (self._weight * self._y) @ RAY_HARMONICS[:, 0]
         mean /= np.maximum(self._weight @ RAY_HARMONICS[:, 0], 1e-6)
         expected = np.empty((*mean.shape, 3), np.float32)
         expected[..., 0] = mean
-        expected[..., 1:] = share[0][..., None] * lean[:, None]
+        expected[..., 1:] = self._shift[..., None] * x[0, :, None, :2] + share[0][..., None] * x[0, :, None, 2:]
         residual = self._y - expected @ _FIRST_HARMONICS
         self._weight /= 1.0 + self._weight * residual**2 * (1.0 / _ROBUST_SD**2)
         x, covariance = self._least_squares(share, prior, prior_px)

@@ -29,22 +29,24 @@ _UNCLIPPED, _UNCLIPPED_OVER = 240.0, 40.0
 VEIL: Final = 40.0
 """Level of the weakest channel from which on the water counts as veiled."""
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
+_GUESS, _GUESS_MOST = 0.5, 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class Lights:
     """N bright regions.
 
-    centre_px (N, 2), core_px (N,): the rim, in the channel that locates. ground: (N,) what the water itself shows in
-    that channel. weakest: (N,) whether it is the weakest one, which clips last, or the luminance, which is sharper
-    (JPEG halves the resolution of colour). core_elongation: (N,) in it, near the top. unclipped: (N,) 0-1. scattered:
-    (N,) 0-1, see _scattered; the centre of those is extrapolated to where their glow begins. peak, height: (N,)
-    luminance. edge_px: (N, K) outline at half height around edge_at_px (N, 2), of
-    area_px, elongation and open_share (of rays that find no edge). contrast, clutter: (N,) as proposed.
+    centre_px (N, 2), core_px (N,): the rim, in the channel that locates. guess_px: (N, 2) about where the source is.
+    ground: (N,) what the water itself shows in that channel. weakest: (N,) whether it is the weakest one, else the
+    luminance. core_elongation: (N,) in it, near the top. unclipped: (N,) 0-1. scattered: (N,) 0-1, see _scattered;
+    the centre of those is where their glow begins. peak, height: (N,) luminance. edge_px: (N, K) outline at half
+    height around edge_at_px (N, 2), of area_px, elongation and open_share (of rays that find no edge). contrast,
+    clutter: (N,) as proposed.
     """
 
     centre_px: Floats
     core_px: Floats
+    guess_px: Floats
     ground: Floats
     weakest: NDArray[np.bool_]
     core_elongation: Floats
@@ -73,7 +75,7 @@ def measure_lights(
     radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), 16)
     rings = sample_rings(image, centre, radius)
     colour = image.ndim == 3
-    level = np.empty((1 + colour, *rings.inside.shape), np.float32)
+    level = np.empty((1 + colour, *rings.pixels.shape[:3]), np.float32)
     level[0] = luminance(rings.pixels)
     if colour:
         level[1] = weakest_channel(rings.pixels)
@@ -84,17 +86,23 @@ def measure_lights(
         np.minimum(ground[1], water, out=ground[1])
     height = peak - ground
     shapes = find_shapes(level, rings.inside, radius, ground[:, None] + _LEVELS[:, None] * height[:, None])
-    rim_px, core_px = _rims(shapes)
+    elongation = shapes.elongation()
+    # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
     weakest = shapes.radius_px[-1, :2].mean(axis=0) >= _WEAKEST_FROM_PX if colour else np.zeros(len(radius), bool)
+    own = weakest.astype(np.intp), np.arange(len(radius))
+    rim_px, core_px = (values[own] for values in _rims(shapes))
     unclipped = np.clip((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0, 1.0)
     scattered = _scattered(shapes, unclipped, water)
-    rim = np.where(weakest[:, None], rim_px[-1], rim_px[0])
+    rim_px += scattered[:, None] * (_where_glow_begins(shapes) - rim_px)
+    centroid_px = shapes.centre_px.swapaxes(1, 2)[own]
+    guess_px = rim_px + _at_most(_GUESS * (centroid_px[:, 0] - centroid_px[:, _HALF]), _GUESS_MOST * core_px)
     return Lights(
-        centre + rim + scattered[:, None] * (_where_glow_begins(shapes) - rim),
-        np.where(weakest, core_px[-1], core_px[0]),
-        np.where(weakest, ground[-1], ground[0]),
+        centre + rim_px,
+        core_px,
+        centre + guess_px,
+        ground[own],
         weakest,
-        np.where(weakest, shapes.elongation[-1, _CORE], shapes.elongation[0, _CORE]),
+        elongation.swapaxes(1, 2)[own][:, _CORE],
         unclipped,
         scattered,
         peak[0],
@@ -102,7 +110,7 @@ def measure_lights(
         shapes.edge_px[0, _HALF],
         centre,
         np.pi * shapes.radius_px[0, _HALF] ** 2,
-        shapes.elongation[0, _HALF],
+        elongation[0, _HALF],
         shapes.open_share[0, _HALF],
         proposals.contrast,
         proposals.clutter,
@@ -182,10 +190,15 @@ def _where_glow_begins(shapes: Shapes) -> Floats:
 
     A beam that passes the camera by shines where it has spread; its source lies behind the brightest part.
     """
-    back = _GLOW_BACK * (shapes.centre_px[0, 0] - shapes.centre_px[0, -1])
-    length = np.maximum(np.hypot(back[:, 0], back[:, 1]), 1e-6)
-    back *= np.minimum(_GLOW_BACK_MOST * shapes.radius_px[0, _HALF] / length, 1.0)[:, None]
-    return np.asarray(shapes.centre_px[0, 0] + back, np.float32)
+    top, low = shapes.centre_px[0, 0], shapes.centre_px[0, -1]
+    back = _at_most(_GLOW_BACK * (top - low), _GLOW_BACK_MOST * shapes.radius_px[0, _HALF])
+    return np.asarray(top + back, np.float32)
+
+
+def _at_most(step_px: Floats, length_px: Floats) -> Floats:
+    """Shorten steps (N, 2) to lengths (N,) where they are longer."""
+    own_px = np.maximum(np.hypot(step_px[:, 0], step_px[:, 1]), 1e-6)
+    return np.asarray(step_px * np.minimum(length_px / own_px, 1.0)[:, None], np.float32)
 
 
 def _water_level(image: NDArray[np.uint8]) -> Floats:

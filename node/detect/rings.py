@@ -29,15 +29,18 @@ _MEAN = np.full(RAYS, 1.0 / RAYS, np.float32)
 
 @dataclass(frozen=True, slots=True)
 class Rings:
-    """Samples around N places. radius_px: (N, M). pixels: (N, M, K, C) grey levels, C 1 or 3. inside: (N, M, K)."""
+    """Samples around N places. radius_px: (N, M). pixels: (N, M, K, C) grey levels, C 1 or 3.
+
+    inside: (N, M, K), which lie in the picture; None where all do.
+    """
 
     radius_px: Floats
     pixels: Floats
-    inside: NDArray[np.bool_]
+    inside: NDArray[np.bool_] | None
 
 
 def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats) -> Rings:
-    """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), both in px."""
+    """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), growing, both in px."""
     n, m = radius_px.shape
     u = radius_px[:, :, None] * RAY_COS
     v = radius_px[:, :, None] * RAY_SIN
@@ -51,7 +54,10 @@ def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats)
         borderMode=cv2.BORDER_REPLICATE,
     )
     height, width = image.shape[:2]
-    inside = (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
+    inside = None
+    reach_px, last_px = radius_px[:, -1:], (width - 1, height - 1)
+    if ((centre_px < reach_px) | (centre_px > last_px - reach_px)).any():
+        inside = (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
     return Rings(radius_px, np.asarray(pixels, np.float32).reshape(n, m, RAYS, -1), inside)
 
 
@@ -68,26 +74,37 @@ class Shapes:
 
     edge_px: (C, S, N, K) distance to the outline along each ray; open_share: (C, S, N) share of rays without one.
     centre_px: (C, S, N, 2) centroid relative to the place. radius_px: (C, S, N) of the circle of equal area.
-    elongation: (C, S, N) long over short axis.
     """
 
     edge_px: Floats
     open_share: Floats
     centre_px: Floats
     radius_px: Floats
-    elongation: Floats
+
+    def elongation(self) -> Floats:
+        """Measure the long over the short axis, (C, S, N)."""
+        square = self.edge_px * self.edge_px
+        u, v = self.centre_px[..., 0], self.centre_px[..., 1]
+        second = (square * square) @ RAY_HARMONICS[:, 3:] / (2.0 * RAYS * (self.radius_px * self.radius_px)[..., None])
+        uu, uv, vv = second[..., 0] - u * u, second[..., 1] - u * v, second[..., 2] - v * v
+        mean = 0.5 * (uu + vv)
+        spread = np.hypot(0.5 * (uu - vv), uv)
+        ratio: Floats = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
+        return ratio
 
 
-def find_shapes(level: Floats, inside: NDArray[np.bool_], radius_px: Floats, threshold: Floats) -> Shapes:
+def find_shapes(level: Floats, inside: NDArray[np.bool_] | None, radius_px: Floats, threshold: Floats) -> Shapes:
     """Follow each ray outward to where it first falls below a threshold, or leaves the picture.
 
-    level: (C, N, M, K) grey levels on rings of radius_px (N, M); inside: (N, M, K); threshold: (C, S, N).
+    level: (C, N, M, K) grey levels on rings of radius_px (N, M); inside: (N, M, K), None: all; threshold:
+    (C, S, N).
     """
     channels, places, rings = level.shape[:3]
     # Rings last: what follows runs along them.
     outward = np.ascontiguousarray(level.swapaxes(2, 3))
     below = outward[:, None] < threshold[..., None, None]
-    below |= ~inside.swapaxes(1, 2)
+    if inside is not None:
+        below |= ~inside.swapaxes(1, 2)
     first = below.argmax(axis=4)
     is_open = (first == 0) & ~below[..., 0]
     first[is_open] = rings - 1
@@ -101,22 +118,10 @@ def find_shapes(level: Floats, inside: NDArray[np.bool_], radius_px: Floats, thr
     edge = near + share * (far - near)
     edge[is_open] = far[is_open]
     edge[first == 0] *= 0.5
-    return _measure_shapes(edge, is_open @ _MEAN)
-
-
-def _measure_shapes(edge_px: Floats, open_share: Floats) -> Shapes:
-    """Measure regions from their outlines' distances along the rays, (C, S, N, K) px."""
-    square = edge_px * edge_px
-    area = np.maximum(square @ _MEAN * 0.5, 1e-6)
-    centre = (square * edge_px) @ RAY_HARMONICS[:, 1:3] / (3.0 * RAYS * area[..., None])
-    second = (square * square) @ RAY_HARMONICS[:, 3:] / (4.0 * RAYS * area[..., None])
-    uu = second[..., 0] - centre[..., 0] ** 2
-    uv = second[..., 1] - centre[..., 0] * centre[..., 1]
-    vv = second[..., 2] - centre[..., 1] ** 2
-    mean = 0.5 * (uu + vv)
-    spread = np.hypot(0.5 * (uu - vv), uv)
-    elongation = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
-    return Shapes(edge_px, open_share, centre, np.sqrt(2.0 * area), elongation)
+    square = edge * edge
+    area = np.maximum(square @ _MEAN, 1e-6)
+    centre = (square * edge) @ (RAY_HARMONICS[:, 1:3] / (1.5 * RAYS)) / area[..., None]
+    return Shapes(edge, is_open @ _MEAN, centre, np.sqrt(area))
 
 
 def luminance(pixels: Floats) -> Floats:
