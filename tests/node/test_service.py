@@ -4,8 +4,10 @@ import contextlib
 import json
 import logging
 import queue
+import shutil
 import signal
 import socket
+import subprocess
 import threading
 import time
 from itertools import pairwise
@@ -19,7 +21,7 @@ from protocol.clock import MS_NS, S_NS, SystemClock
 from protocol.divelog import DiveLogReader
 from protocol.messages import NodeStatus, decode
 from tests.disks import small_disk
-from tests.processes import Process, free_endpoint
+from tests.processes import REPOSITORY, Process, free_endpoint
 
 END_WITHIN_S = 2.0
 PATIENCE_S = 15.0
@@ -243,3 +245,13 @@ def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, mo
     service = NodeService(config)
     service.sources = [Silent(problem)]
     assert service.progressing() is progresses
+
+
+@pytest.mark.skipif(shutil.which("chronyd") is None, reason="chrony is not on this machine")
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_chrony_takes_the_examples(name):
+    """-p reads a configuration and prints it."""
+    path = REPOSITORY / "node/examples" / f"chrony-{name}.conf"
+    done = subprocess.run([shutil.which("chronyd"), "-p", "-f", str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "driftfile" in done.stdout
