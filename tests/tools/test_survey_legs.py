@@ -168,6 +168,12 @@ def test_a_rest_in_which_poses_were_refused_is_said(messages):
     assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
 
 
+def test_a_compass_that_states_more_may_wander_more_while_its_node_rests():
+    course = world.line(np.random.default_rng(11), 8)
+    found = derived(world.dive(course, np.random.default_rng(11), world.Flaws(compass_deg=5.0), rest_s=6.0, swim_s=2.0))
+    assert len(found.legs) == 8
+
+
 def test_rests_that_follow_at_once_are_two_legs():
     messages = world.dive(COURSE, np.random.default_rng(3), rest_s=8.0, swim_s=0.0)
     shorter = [m for m in messages if not _approaching(m)]

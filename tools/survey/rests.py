@@ -13,9 +13,10 @@ from tools.survey.readings import Node, Readings, Stamps
 from tools.survey.settings import SurveySettings
 from tools.survey.sights import Sights
 
-# A speed is the slope over this long; attitude filters wander by a degree or so within it.
+# A speed is the slope over this long; headings wander within it, by a share of what they state, or by this.
 SLOPE_NS: Final = 4_000_000_000
 WANDER_RADPS: Final = 0.006
+WANDER_SHARE_HZ: Final = 0.23
 # Fixes further apart than this are of two rests, unless the line between the nodes is still the same.
 PAUSE_NS: Final = 5_000_000_000
 # Two lines are the same if they differ by less than this, and this share of the range.
@@ -50,7 +51,9 @@ def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Re
     makes up for the fixes in being one, though not in making a leg.
     """
     held = handled(readings.a, seen.stamps_ns, settings), handled(readings.b, seen.stamps_ns, settings)
-    still = (speeds_mps(seen) < settings.rest_speed_mps + WANDER_RADPS * seen.range_m) & ~held[0] & ~held[1]
+    yaw_rad = np.nan_to_num(np.maximum(seen.sigma_a_rad[:, 2], seen.sigma_b_rad[:, 2]))
+    wander_mps = np.maximum(WANDER_RADPS, WANDER_SHARE_HZ * yaw_rad) * seen.range_m
+    still = (speeds_mps(seen) < settings.rest_speed_mps + wander_mps) & ~held[0] & ~held[1]
     runs = _merged(_runs(seen, still), seen)
     found: list[Rest] = []
     for run in runs:
