@@ -1,4 +1,4 @@
-"""`python -m tools.bench solve | accuracy | detect | node`: one benchmark each, imported when it is called."""
+"""`python -m tools.bench solve | accuracy | detect | monitor | node`: one benchmark each, imported when it is called."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
     "accuracy": "the solver: errors over the Cramer-Rao bound, and the right lights among false ones",
     "detect": "the detector: time per picture",
+    "monitor": "the monitor: processor and memory with viewers, latency beside it, weight of the page",
     "node": "a whole node: capture to candidates published, processor, memory",
 }
 
