@@ -1,4 +1,4 @@
-"""`python -m tools.bench solve | accuracy | detect | monitor | node`: one benchmark each, imported when it is called."""
+"""`python -m tools.bench BENCHMARK`: one each, imported when it is called."""
 
 from __future__ import annotations
 
