@@ -19,7 +19,7 @@ from node.detect.rings import (
     weakest_channel,
 )
 
-_ALWAYS_MEASURED, _MAX_MEASURED = 12, 24
+_ALWAYS_MEASURED, _MAX_MEASURED = 8, 24
 _CORE_RINGS: Final = 7
 _WEAKEST_FROM_PX: Final = 3.0
 _CLIPPED: Final = 249.0
