@@ -15,6 +15,9 @@ from protocol.security import Tls
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
+# How far a principal point may be from the middle, of the picture's size: real lenses stay within a third of that.
+OFF_CENTRE = 0.15
+
 
 class CameraConfig(Config, frozen=True, kw_only=True):
     """[camera]: which one, and its fixed settings. path: pictures of the `stored` camera."""
@@ -132,6 +135,18 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             return here.declination_rad
         return self.calibration.declination_rad if self.calibration else 0.0
 
+    def _check_resolution(self, camera: CameraModel) -> None:
+        """Refuse intrinsics of pictures of another size, which their principal point gives away."""
+        for name, found_px, size_px in (
+            ("cx_px", camera.cx_px, self.camera.width_px),
+            ("cy_px", camera.cy_px, self.camera.height_px),
+        ):
+            if abs(found_px - (size_px - 1) / 2) > OFF_CENTRE * size_px:
+                raise ConfigError(
+                    f"node {self.node}: calibration.camera.{name} = {found_px:g} is not near the middle of pictures "
+                    f"of {self.camera.width_px}x{self.camera.height_px}: calibrate in the mode that dives"
+                )
+
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
         """Return NodeInfo out of [calibration]; raise ConfigError where there is none."""
         calibration = self.calibration
@@ -140,6 +155,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
                 f"node {self.node}: camera {self.camera.name!r} needs a [calibration] table "
                 "(camera, light_left_m, light_right_m); see node/examples"
             )
+        self._check_resolution(calibration.camera)
         return NodeInfo(
             node=self.node,
             stamp_ns=stamp_ns,
