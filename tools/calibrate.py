@@ -1,4 +1,4 @@
-"""`buddyline calibrate`: camera, lights and magnetometer of a node, each with a picture, or a refusal."""
+"""`buddyline calibrate`: camera, lights and magnetometer of a node, each with a picture, or a refusal; two clocks."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from protocol.clock import SystemClock
 from protocol.errors import BuddylineError
 from protocol.messages import CameraModel, NodeInfo, Vector3, encode
+from tools.client import add_client_arguments, client_config
 from tools.dives import load_info
 
 log = logging.getLogger(__name__)
@@ -62,11 +63,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     magnetometer.add_argument("--picture", default="calibrate-magnetometer.png", metavar="OUT.png")
     magnetometer.set_defaults(calibrate=_magnetometer)
 
+    clock = kinds.add_parser("clock", help="offset and drift between two nodes' clocks, before and after a dive")
+    clock.add_argument(
+        "dives", nargs="*", metavar="DIVE.mcap", help="a dive's logs, both nodes'; default: the nodes that run now"
+    )
+    clock.add_argument("--seconds", type=float, default=10.0, metavar="S", help="listen for this long; default 10")
+    clock.add_argument(
+        "--nodes", nargs=2, metavar=("A", "B"), help="this pair alone; default: all that hear each other"
+    )
+    clock.add_argument("--json", action="store_true", help="print everything as JSON")
+    add_client_arguments(clock)
+    clock.set_defaults(calibrate=_clock)
+
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; what goes into the node's TOML file is printed."""
-    args.calibrate(args)
-    return 0
+    status: int | None = args.calibrate(args)
+    return status or 0
 
 
 def _board_arguments(parser: argparse.ArgumentParser) -> None:
@@ -196,6 +209,18 @@ def _magnetometer(args: argparse.Namespace) -> None:
             f"magnetometer_matrix = [{rows}]",
         ]
     )
+
+
+def _clock(args: argparse.Namespace) -> int:
+    from tools.calibration.clock_report import as_json, as_text, listen, read, reports
+
+    if not 3.0 <= args.seconds <= 3600.0:
+        raise BuddylineError(f"--seconds {args.seconds:g}: 3 to 3600")
+    heard = read(args.dives) if args.dives else listen(client_config(args), args.seconds)
+    found = reports(heard, args.nodes)
+    print(as_json(found, heard) if args.json else as_text(found, heard))
+    # A dive that is over is what it is: its clocks need not agree, they need to be known.
+    return 0 if args.dives else int(any(one.problem() for one in found))
 
 
 def _camera_table(camera: CameraModel, size: tuple[int, int]) -> list[str]:

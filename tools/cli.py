@@ -99,8 +99,8 @@ COMMANDS: Final = (
     Command(
         "calibrate",
         "tools.calibrate",
-        "calibrate camera, lights or magnetometer, and say whether the result is good",
-        ("buddyline calibrate board -o board.pdf", "buddyline calibrate camera pictures/"),
+        "calibrate camera, lights, magnetometer or clocks, and say whether the result is good",
+        ("buddyline calibrate board -o board.pdf", "buddyline calibrate camera pictures/", "buddyline calibrate clock"),
     ),
     Command(
         "simulate",

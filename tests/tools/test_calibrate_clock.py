@@ -1,13 +1,24 @@
 """Two clocks compared by beacons: what is estimated, what is refused, and that sigmas are honest."""
 
+import json
 import math
+import threading
 
 import numpy as np
 import pytest
 
 from protocol.clock import S_NS
-from protocol.messages import ClockBeacon, HeardClock
+from protocol.divelog import DiveLogWriter
+from protocol.errors import BuddylineError
+from protocol.local_bus import LocalNetwork
+from protocol.messages import ClockBeacon, HeardClock, NodeStatus
+from protocol.topics import CLOCK
+from tests.processes import free_endpoint
+from tools.calibration import clock_report
 from tools.calibration.clock import Legs, drift_between, estimate, steps, windows
+from tools.calibration.clock_report import Heard, as_json, as_text, reports
+from tools.cli import main
+from tools.client import ClientConfig
 
 START_NS = 1_764_000_000_000_000_000
 
@@ -126,3 +137,107 @@ def test_too_few_are_no_window():
     short = estimate(exchanges_of(beacons(seconds=3)))
     assert short.drift is None
     assert math.isfinite(short.sigma_s)
+
+
+def heard_of(said, *statuses):
+    heard = Heard()
+    for message in [*said, *statuses]:
+        heard.add(message)
+    return heard
+
+
+def status(**clock):
+    return NodeStatus(
+        node="a", stamp_ns=START_NS, boot="x", software="", uptime_s=1.0, rates_hz={}, drops={}, ages_s={}, **clock
+    )
+
+
+def test_a_good_pair_is_told_with_chronys_figures():
+    follows = status(clock_source="192.0.2.1", clock_offset_s=1e-5, clock_rms_s=2e-5, clock_bound_s=3e-4)
+    heard = heard_of(beacons(offset_s=0.0005), follows)
+    found = reports(heard, None)
+    assert [(one.node_a, one.node_b, one.problem()) for one in found] == [("a", "b", "")]
+    text = as_text(found, heard)
+    assert "b minus a: +0.5" in text
+    assert "a: chrony follows 192.0.2.1: off by +0.010 ms, RMS 0.020 ms, at most 0.300 ms" in text
+    said = json.loads(as_json(found, heard))
+    assert said["pairs"][0]["offsets"][0]["offset_s"] == found[0].offsets[0].offset_s
+    assert said["chrony"]["a"][0]["clock_source"] == "192.0.2.1"
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        ({"offset_s": 0.05}, "differ by more than 2 ms"),
+        ({"offset_s": 0.0, "step": (5.0, 1.0)}, "a clock was set during the measurement"),
+        ({"offset_s": 0.0, "base_s": (0.02, 0.0)}, "too slow to tell: the clocks may differ by 10.0 ms more"),
+    ],
+)
+def test_what_stands_against_a_pair_is_named(pair, words):
+    heard = heard_of(beacons(excess_s=1e-5, **pair))
+    (found,) = reports(heard, None)
+    assert words in found.problem()
+    assert words in as_text([found], heard)
+
+
+def test_a_dive_without_a_link_tells_what_to_solve_with():
+    said = beacons(seconds=30, drift=10e-6, offset_s=0.0) + beacons(
+        1, seconds=30, drift=10e-6, offset_s=0.0, begin_s=600.0
+    )
+    heard = heard_of(said, status(clock_source=""), status(clock_source="local"))
+    text = as_text(reports(heard, ["a", "b"]), heard)
+    assert "before" in text
+    assert "after" in text
+    assert "--clock-offset 0.003" in text
+    assert "chrony is not synchronised" in text
+    assert "serves this clock as it stands" in text
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ([], "no node's clock was heard"),
+        ([m for m in beacons() if m.node == "a"], "only node a's clock"),
+        (beacons(seconds=1.0), "did not hear each other long enough"),
+    ],
+)
+def test_nothing_to_compare_is_an_error_that_says_what_to_do(said, words):
+    with pytest.raises(BuddylineError, match=words):
+        reports(heard_of(said), None)
+
+
+def test_a_node_that_falls_silent_meanwhile_is_named(monkeypatch):
+    monkeypatch.setattr(clock_report, "SILENT_S", 0.2)
+    network = LocalNetwork()
+    with network.connect() as node, network.connect() as tool:
+        publisher, ended = node.publisher(CLOCK, "b"), threading.Event()
+
+        def say_once():
+            while not network.subscriptions and not ended.wait(0.01):
+                continue
+            publisher.put(ClockBeacon(node="b", stamp_ns=START_NS, boot="x", heard=[]))
+
+        thread = threading.Thread(target=say_once)
+        thread.start()
+        with pytest.raises(BuddylineError, match="node b fell silent"):
+            clock_report.hear(tool, 1.0)
+        ended.set()
+        thread.join()
+
+
+def test_no_hub_is_said_within_the_time():
+    with pytest.raises(BuddylineError, match="no hub at tcp"):
+        clock_report.listen(ClientConfig(connect=free_endpoint()), 3.0, connect_within_s=0.2)
+
+
+def test_logs_of_a_dive(tmp_path, capsys):
+    said = beacons(seconds=12, offset_s=0.0)
+    for node in "ab":
+        with DiveLogWriter(tmp_path / f"{node}.mcap") as writer:
+            for beacon in said:
+                if beacon.node == node:
+                    writer.write_message(beacon)
+    assert main(["calibrate", "clock", *(str(tmp_path / f"{node}.mcap") for node in "ab")]) == 0
+    assert "b minus a" in capsys.readouterr().out
+    assert main(["calibrate", "clock", str(tmp_path / "a.mcap")]) == 2
+    assert "only node a" in capsys.readouterr().err

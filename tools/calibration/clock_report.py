@@ -1,0 +1,223 @@
+"""`buddyline calibrate clock`: listens to a running pair, or reads a dive's logs, and says how the clocks stand."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+from msgspec import UNSET
+
+from protocol.bus import Bus, Received
+from protocol.clock import S_NS
+from protocol.errors import BuddylineError
+from protocol.messages import ClockBeacon, Message, MessageError, NodeStatus, decode
+from protocol.topics import CLOCK, NODE_STATUS, check_sender
+from tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
+from tools.client import ClientConfig
+from tools.dives import Dive
+from tools.progress import Progress
+
+log = logging.getLogger(__name__)
+
+HUB_WITHIN_S: Final = 5.0
+SILENT_S: Final = 2.0
+# At half a radian a second a light moves by a candidate's own noise in this time.
+LIMIT_S: Final = 2e-3
+
+
+@dataclass
+class Heard:
+    """What two nodes said of their clocks. statuses: the first and the last of each node that has chrony's figures."""
+
+    legs: Legs = field(default_factory=Legs)
+    statuses: dict[str, tuple[NodeStatus, NodeStatus]] = field(default_factory=dict)
+    last_s: dict[str, float] = field(default_factory=dict)
+
+    def add(self, message: Message | None, now_s: float = 0.0) -> None:
+        """Take a beacon or a status; others are passed over."""
+        if isinstance(message, ClockBeacon):
+            self.legs.add(message)
+            self.last_s[message.node] = now_s
+        elif isinstance(message, NodeStatus) and message.clock_source is not UNSET:
+            first, _ = self.statuses.get(message.node, (message, message))
+            self.statuses[message.node] = first, message
+
+
+def listen(config: ClientConfig, seconds: float, connect_within_s: float = HUB_WITHIN_S) -> Heard:
+    """Hear the bus for this long; raise BuddylineError where there is no hub, or a node falls silent meanwhile."""
+    from protocol.zenoh_bus import connect
+
+    stop = threading.Event()
+    giving_up = threading.Timer(connect_within_s, stop.set)
+    giving_up.start()
+    try:
+        bus = connect(
+            config.connect, namespace=config.namespace or None, stop=stop, on_wait=lambda _: None, tls=config.tls
+        )
+    finally:
+        giving_up.cancel()
+    if bus is None:
+        raise BuddylineError(f"no hub at {config.connect}: start it with `buddyline hub`, or give --connect")
+    with bus:
+        return hear(bus, seconds)
+
+
+def hear(bus: Bus, seconds: float) -> Heard:
+    """Hear a bus for this long; raise BuddylineError where a node falls silent meanwhile."""
+    heard, began_s = Heard(), time.monotonic()
+
+    def take(received: Received) -> None:
+        schema = ClockBeacon if received.key.endswith("/clock") else NodeStatus
+        try:
+            message = decode(received.payload, schema)
+            check_sender(received.key, message)
+        except MessageError:
+            return
+        heard.add(message, time.monotonic() - began_s)
+
+    subscriptions = [bus.subscribe(CLOCK.key_any(), take, history=False), bus.subscribe(NODE_STATUS.key_any(), take)]
+    over = threading.Event()
+    with Progress("listening to both clocks", seconds) as progress:
+        while (passed_s := time.monotonic() - began_s) < seconds:
+            progress.show(passed_s)
+            over.wait(min(0.2, seconds - passed_s))
+    for subscription in subscriptions:
+        subscription.close()
+    for node, last_s in heard.last_s.items():
+        if seconds - last_s > SILENT_S:
+            raise BuddylineError(
+                f"node {node} fell silent {last_s:.1f} s after the beginning: measure again when it is back"
+            )
+    return heard
+
+
+def read(paths: list[str]) -> Heard:
+    """Return what a dive's logs hold of the clocks."""
+    heard = Heard()
+    with Dive(paths) as dive:
+        for record in dive.records(CLOCK.name, NODE_STATUS.name):
+            try:
+                heard.add(record.decode())
+            except MessageError:
+                continue
+    return heard
+
+
+@dataclass(frozen=True)
+class Report:
+    """The clocks of a pair: estimates by time, and how often one was set."""
+
+    node_a: str
+    node_b: str
+    offsets: list[ClockOffset]
+    set_times: list[int]
+
+    def problem(self) -> str:
+        """Say what stands against trusting the pair's clocks, "" where nothing does."""
+        last = self.offsets[-1]
+        if self.set_times:
+            return f"a clock was set during the measurement ({len(self.set_times)} times): let chrony settle, repeat"
+        if last.sigma_s > LIMIT_S:
+            return f"the link is too slow to tell: the clocks may differ by {1e3 * last.bound_s:.1f} ms more"
+        if abs(last.offset_s) > LIMIT_S:
+            return (
+                f"the clocks differ by more than {1e3 * LIMIT_S:g} ms: let chrony bring them together before the dive"
+            )
+        return ""
+
+
+def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
+    """Compare the clocks of each pair; raise BuddylineError where there is nothing to compare."""
+    pairs = heard.legs.pairs() if nodes is None else [(nodes[0], nodes[1])]
+    found = []
+    for a, b in pairs:
+        exchanges = heard.legs.exchanges(a, b)
+        offsets = [estimate(part) for part in windows(exchanges)]
+        if offsets:
+            found.append(Report(a, b, offsets, [int(exchanges.stamp_ns[i]) for i in steps(exchanges)]))
+    if found:
+        return found
+    present = sorted(heard.last_s)
+    if not present:
+        raise BuddylineError("no node's clock was heard: start both nodes, and with logs give both nodes' own")
+    if len(present) == 1:
+        raise BuddylineError(f"only node {present[0]}'s clock was heard: it takes two nodes, or both nodes' logs")
+    raise BuddylineError(
+        f"nodes {', '.join(present)} did not hear each other long enough to compare their clocks; after a dive in "
+        "which they moved, `buddyline align` finds the offset out of the dive itself"
+    )
+
+
+def as_json(found: Iterable[Report], heard: Heard) -> str:
+    """Return everything as one JSON object."""
+    pairs = [
+        {
+            "node_a": one.node_a,
+            "node_b": one.node_b,
+            "problem": one.problem(),
+            "set_times_ns": one.set_times,
+            "offsets": [asdict(offset) for offset in one.offsets],
+        }
+        for one in found
+    ]
+    chrony = {node: [_chrony(status) for status in both] for node, both in heard.statuses.items()}
+    return json.dumps({"pairs": pairs, "chrony": chrony})
+
+
+def as_text(found: Iterable[Report], heard: Heard) -> str:
+    """Return it for a person: first and last comparison, the drift between, and what chrony says."""
+    lines = []
+    for one in found:
+        first, last = one.offsets[0], one.offsets[-1]
+        name = f"{one.node_b} minus {one.node_a}"
+        lines.append(f"{name}: {_offset(last)}" if first is last else f"{name}, before: {_offset(first)}")
+        if first is not last:
+            drift, sigma = drift_between(first, last)
+            lines.append(f"{name}, after:  {_offset(last)}")
+            middle_s = (first.offset_s + last.offset_s) / 2
+            passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
+            lines.append(
+                f"{name}: {1e6 * drift:+.3f} ppm +- {1e6 * sigma:.3f} over {passed_s:.0f} s;"
+                f" solve with --clock-offset {middle_s:.5f}, right within {1e3 * abs(last.offset_s - middle_s):.2f} ms"
+            )
+        elif last.drift is not None and last.drift_sigma is not None:
+            lines.append(f"{name}: {1e6 * last.drift:+.1f} ppm +- {1e6 * last.drift_sigma:.1f}")
+        if one.problem():
+            lines.append(f"{name}: {one.problem()}")
+    for node, both in sorted(heard.statuses.items()):
+        lines += [f"{node}: {text}" for text in dict.fromkeys(_chrony_text(status) for status in both)]
+    if not heard.statuses:
+        lines.append("no node has chrony's figures: install chrony on both (node/README.md)")
+    return "\n".join(lines)
+
+
+def _offset(offset: ClockOffset) -> str:
+    at = time.strftime("%H:%M:%S", time.gmtime(offset.stamp_ns / S_NS))
+    return (
+        f"{1e3 * offset.offset_s:+.3f} ms (1 sd {1e3 * offset.sigma_s:.3f}, at most {1e3 * offset.bound_s:.3f} from "
+        f"unequal ways) at {at} UTC, {offset.exchanges} exchanges"
+    )
+
+
+def _chrony(status: NodeStatus) -> dict[str, Any]:
+    figures = {name: getattr(status, name) for name in status.__struct_fields__ if name.startswith("clock_")}
+    return {"stamp_ns": status.stamp_ns, **{name: value for name, value in figures.items() if value is not UNSET}}
+
+
+def _chrony_text(status: NodeStatus) -> str:
+    at = time.strftime("%H:%M:%S", time.gmtime(status.stamp_ns / S_NS))
+    if not status.clock_source:
+        return f"chrony is not synchronised at {at} UTC"
+    if status.clock_offset_s is UNSET:
+        return f"chrony serves this clock as it stands, at {at} UTC"
+    figures = [f"off by {1e3 * status.clock_offset_s:+.3f} ms"]
+    if status.clock_rms_s is not UNSET:
+        figures.append(f"RMS {1e3 * status.clock_rms_s:.3f} ms")
+    if status.clock_bound_s is not UNSET:
+        figures.append(f"at most {1e3 * status.clock_bound_s:.3f} ms")
+    return f"chrony follows {status.clock_source}: {', '.join(figures)}, at {at} UTC"
