@@ -40,7 +40,9 @@ _ROBUST_SD = 3.0
 
 # Sigma: what the errors on pictures rendered in many waters (this project's simulator, and dives kept for tuning)
 # were, by what they follow from; a little more than they were on average, as other waters will be different.
-_FLOOR_PX: Final = 0.05
+_FLOOR_PX: Final = 0.045
+# Of the core's radius: the rim of what is clipped is no perfect circle.
+_RIM_SHARE: Final = 0.008
 _NOISE_SCALE: Final = 0.155
 _GROWTH_SCALE: Final = 0.45
 # Of the way from the region's centre to the source; where nothing is clipped, the way itself is in doubt.
@@ -99,7 +101,7 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
     holds = equations.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
     moved *= (holds * (1.0 - lights.scattered))[:, None]
     own_px2 = (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2 + np.where(
-        holds, _FLOOR_PX**2 + (_SCATTERED_PX * lights.scattered) ** 2, prior_sd**2
+        holds, _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2, prior_sd**2
     )
     covariance = covariance * holds[:, None, None] + own_px2[:, None, None] * np.eye(2)
     share = _MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped
