@@ -43,6 +43,7 @@ GRIDS: Final[Mapping[str, Sequence[float]]] = {
 }
 FIRST: Final = 8
 NEAR_WIDTHS: Final = 0.01
+CLOSE_PX: Final = 2.0
 COST_OF_FALSE: Final = 0.01
 LIKELY: Final = 0.5
 ROUNDS: Final = 2
@@ -59,10 +60,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class Judged:
-    """How a set of values does: share of lights among the first candidates, false candidates a picture."""
+    """How a set of values does: share of lights near one of the first candidates, false candidates a picture.
+
+    close: share of lights within 2 px of any candidate.
+    """
 
     recall: float
     false: float
+    close: float
 
     @property
     def worth(self) -> float:
@@ -90,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     cv2.setNumThreads(1)
     if args.pictures < 1:
         raise BuddylineError("--pictures: at least 1")
-    pictures, by = _load(args.inputs, args.truth, args.pictures)
+    pictures, by = load_pictures(args.inputs, args.truth, args.pictures)
     lights = sum(len(picture.lights_px) for picture in pictures)
     if lights == 0:
         raise BuddylineError("no lights in these pictures to tune on; give pictures with the lamps on, or --truth")
@@ -144,19 +149,20 @@ def propose(
 def judge(method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Judged:
     """Return how a set of values does on these pictures."""
     detector = make_detector(method, environment, values)
-    found = lights = false = 0
+    found = close = lights = false = 0
     for picture in pictures:
         blobs = [d.blob for d in detector.detect(picture.pixels)]
         at_px = np.array([(blob.u_px, blob.v_px) for blob in blobs]).reshape(-1, 2)
         apart = np.hypot(*(at_px[:, None] - picture.lights_px).transpose(2, 0, 1))
         near = apart < NEAR_WIDTHS * picture.pixels.shape[1]
+        close += int((apart <= CLOSE_PX).any(axis=0).sum())
         found += int(near[:FIRST].any(axis=0).sum())
         false += int((~near.any(axis=1)).sum())
         lights += len(picture.lights_px)
-    return Judged(found / max(lights, 1), false / max(len(pictures), 1))
+    return Judged(found / max(lights, 1), false / max(len(pictures), 1), close / max(lights, 1))
 
 
-def _load(inputs: Sequence[str], truth: str | None, limit: int) -> tuple[list[Picture], str]:
+def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple[list[Picture], str]:
     """Return the pictures to judge by, and by what."""
     dives = [name for name in inputs if Path(name).suffix == ".mcap"]
     if dives and len(dives) != len(inputs):

@@ -1,8 +1,9 @@
 """How fast the detectors are beside others' feature finders: milliseconds per picture, on one thread, as ratios.
 
-The same pictures for all: those of the dives named, or else rendered by this project's simulator. Each finder goes
-over all pictures of an environment before the next begins, as it would in a camera's loop. pupil-apriltags is measured
-in a process of its own, where it is installed: its releases corrupt the heap now and then.
+The same pictures for all: those of the dives named, or else rendered by this project's simulator. In each round every
+finder goes over all pictures of an environment before the next begins, as it would in a camera's loop; ratios are of
+the same round, as a machine's speed changes from minute to minute, and the median round counts. pupil-apriltags is
+measured in a process of its own, where it is installed: its releases corrupt the heap now and then.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -36,7 +38,9 @@ OURS: Final = METHODS[0]
 WIDTHS_PX: Final = (820, 1640)
 ASPECT: Final = 616 / 820
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
-APRILTAGS: Final = """
+ROUNDS: Final = 5
+APRILTAGS: Final = "pupil-apriltags"
+APRILTAGS_PROGRAM: Final = """
 import sys, time
 import numpy as np
 from pupil_apriltags import Detector
@@ -61,17 +65,17 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--pictures", type=int, default=12, metavar="N", help="of each environment; default: 12")
     parser.add_argument("--width", type=int, nargs="+", default=list(WIDTHS_PX), metavar="PX")
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="only: how the memory of ours grows over this many pictures"
+        "--frames", type=int, metavar="N", help="only: how the memory of ours grows up to this many pictures"
     )
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)
-    if args.pictures < 1 or min(args.width) < 64 or (args.frames is not None and args.frames < 100):
-        raise BuddylineError("--pictures: at least 1; --width: at least 64; --frames: at least 100")
+    if args.pictures < 1 or min(args.width) < 64 or (args.frames is not None and args.frames < 10):
+        raise BuddylineError("--pictures: at least 1; --width: at least 64; --frames: at least 10")
     cv2.setNumThreads(1)
     sources = args.dives or list(ENVIRONMENTS)
     if args.frames:
         figures: Any = growth(_pictures(sources[0], args.width[0], args.pictures), args.frames)
-        text = f"{figures['frames']} pictures: {figures['grown_kib']} KiB more than after the first hundred\n"
+        text = "".join(f"after {frames:>6s} pictures: {kib} KiB resident\n" for frames, kib in figures.items())
     else:
         figures = measure(sources, args.width, args.pictures)
         text = table(figures)
@@ -84,14 +88,20 @@ def main(argv: list[str]) -> int:
 
 
 def measure(sources: list[str], widths_px: list[int], count: int) -> list[dict[str, Any]]:
-    """Return a row for each source and width: the mean ms per picture by finder."""
+    """Return a row for each source and width: ms per picture by finder, and the time of ours over each one's."""
     rows = []
     for source in sources:
         for width_px in widths_px:
             pictures = _pictures(source, width_px, count)
-            times: dict[str, float | None] = {n: _mean_ms(finder, pictures) for n, finder in _finders().items()}
-            times["pupil-apriltags"] = _apriltags_ms(pictures)
-            rows.append({"source": Path(source).stem, "width_px": width_px, "ms": times})
+            rounds = _rounds(_finders(), pictures)
+            ms: dict[str, float | None] = {name: float(np.median(times)) for name, times in rounds.items()}
+            ratio: dict[str, float | None] = {
+                name: float(np.median(rounds[OURS] / times)) for name, times in rounds.items() if name != OURS
+            }
+            apriltags_ms = _apriltags_ms(pictures)
+            ms[APRILTAGS] = apriltags_ms
+            ratio[APRILTAGS] = _over(ms[OURS], apriltags_ms)
+            rows.append({"source": Path(source).stem, "width_px": width_px, "ms": ms, "ratio": ratio})
     return rows
 
 
@@ -100,35 +110,41 @@ def table(rows: list[dict[str, Any]]) -> str:
     names = list(rows[0]["ms"])
     lines = [f"{'ms per picture':24s}" + "".join(f"{name:>17s}" for name in names)]
 
-    def line(title: str, ms: dict[str, float | None]) -> str:
+    def line(title: str, ms: dict[str, float | None], ratio: dict[str, float | None]) -> str:
         cells = []
         for name in names:
-            value = ms[name]
-            ratio = f" ({ms[OURS] / value:4.2f})" if value and name != OURS else " " * 7  # type: ignore[operator]
-            cells.append(f"{value:8.2f}{ratio}" if value is not None else f"{'-':>8s}{' ' * 7}")
+            value, share = ms[name], ratio.get(name)
+            after = f" ({share:4.2f})" if share is not None else " " * 7
+            cells.append(f"{value:8.2f}{after}" if value is not None else f"{'-':>8s}{' ' * 7}")
         return f"{title:24s}" + "".join(f"{cell:>17s}" for cell in cells)
 
-    lines += [line(f"{row['source']} {row['width_px']} px", row["ms"]) for row in rows]
+    lines += [line(f"{row['source']} {row['width_px']} px", row["ms"], row["ratio"]) for row in rows]
     for width_px in sorted({row["width_px"] for row in rows}):
         of_width = [row["ms"] for row in rows if row["width_px"] == width_px]
-        pooled = {
-            name: None if any(ms[name] is None for ms in of_width) else sum(ms[name] for ms in of_width) / len(of_width)
-            for name in names
-        }
-        lines.append(line(f"all {width_px} px", pooled))
+        known = [name for name in names if all(ms[name] is not None for ms in of_width)]
+        mean = dict.fromkeys(names) | {name: sum(ms[name] for ms in of_width) / len(of_width) for name in known}
+        pooled = {name: _over(mean[OURS], mean[name]) for name in known if name != OURS}
+        lines.append(line(f"all {width_px} px", mean, pooled))
     lines.append(f"in parentheses: the time of {OURS} over that finder's")
+    if find_spec("pupil_apriltags") is None:
+        lines.append(f"{APRILTAGS}: not installed")
     return "\n".join(lines) + "\n"
 
 
+def _over(ours_ms: float | None, other_ms: float | None) -> float | None:
+    return ours_ms / other_ms if ours_ms and other_ms else None
+
+
 def growth(pictures: Pictures, frames: int) -> dict[str, int]:
-    """Return by how much the process's peak memory grows after the first hundred pictures."""
+    """Return the process's resident memory in KiB by the number of pictures that ours has gone over."""
     detector = make_detector(OURS)
-    before_kib = 0
-    for i in range(frames):
+    resident_kib = {}
+    for i in range(1, frames + 1):
         detector.detect(pictures[i % len(pictures)])
-        if i == 99:
-            before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"frames": frames, "grown_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib}
+        if i in (frames // 10, frames):
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            resident_kib[str(i)] = pages * resource.getpagesize() // 1024
+    return resident_kib
 
 
 def _finders() -> dict[str, Finder]:
@@ -139,24 +155,31 @@ def _finders() -> dict[str, Finder]:
     return finders | {"cv2.aruco 36h11": aruco.detectMarkers, "SimpleBlob": blobs.detect}
 
 
-def _mean_ms(finder: Finder, pictures: Pictures) -> float:
-    """Return the mean over the pictures of the faster of two rounds, after a first one to warm up."""
-    times = np.empty((3, len(pictures)))
-    for i in range(3):
-        for j, picture in enumerate(pictures):
+def _rounds(finders: dict[str, Finder], pictures: Pictures) -> dict[str, NDArray[np.float64]]:
+    """Return each finder's mean ms per picture in each round, after a first one to warm up."""
+    times = {name: np.empty(ROUNDS + 1) for name in finders}
+    for i in range(ROUNDS + 1):
+        for name, finder in finders.items():
             start = time.thread_time()
-            finder(picture)
-            times[i, j] = time.thread_time() - start
-    return 1e3 * float(times[1:].min(axis=0).mean())
+            for picture in pictures:
+                finder(picture)
+            times[name][i] = 1e3 * (time.thread_time() - start) / len(pictures)
+    return {name: of_rounds[1:] for name, of_rounds in times.items()}
 
 
 def _apriltags_ms(pictures: Pictures) -> float | None:
     """Return pupil-apriltags' mean ms in a process of its own; None where it is missing or dies."""
+    if find_spec("pupil_apriltags") is None:
+        return None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "pictures.npy"
         np.save(path, np.stack([cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) for picture in pictures]))
         done = subprocess.run(
-            [sys.executable, "-c", APRILTAGS, str(path)], capture_output=True, text=True, check=False, timeout=600
+            [sys.executable, "-c", APRILTAGS_PROGRAM, str(path)],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=600,
         )
     return 1e3 * float(np.mean([float(word) for word in done.stdout.split()])) if done.returncode == 0 else None
 

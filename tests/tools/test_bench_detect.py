@@ -1,0 +1,53 @@
+"""The detector's benchmarks run and print what they claim to measure."""
+
+import json
+
+import pytest
+
+from tools.bench import detect, presets
+from tools.bench.__main__ import main
+
+
+@pytest.fixture(autouse=True)
+def one_round(monkeypatch):
+    monkeypatch.setattr(detect, "ROUNDS", 1)
+    monkeypatch.setattr(detect, "ENVIRONMENTS", ("cavern",))
+    monkeypatch.setattr(detect, "find_spec", lambda name: None)
+
+
+def test_times_stand_beside_those_of_other_finders(capsys):
+    assert main(["detect", "--pictures", "2", "--width", "205", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["source"] == "cavern"
+    assert row["ms"]["source"] > 0
+    assert row["ratio"]["cv2.aruco 36h11"] == pytest.approx(row["ms"]["source"] / row["ms"]["cv2.aruco 36h11"])
+    assert row["ms"]["pupil-apriltags"] is None
+    table = detect.table([row])
+    assert "SimpleBlob" in table
+    assert "pupil-apriltags: not installed" in table
+
+
+def test_memory_after_a_tenth_and_after_all_pictures(capsys):
+    assert main(["detect", "--frames", "20", "--pictures", "2", "--width", "205", "--json"]) == 0
+    resident_kib = json.loads(capsys.readouterr().out)
+    assert list(resident_kib) == ["2", "20"]
+    assert resident_kib["20"] - resident_kib["2"] < 20_000
+
+
+def test_auto_stands_beside_every_preset(capsys, monkeypatch):
+    monkeypatch.setattr(presets, "RENDERED", ("night_reef",))
+    assert main(["presets", "--pictures", "3", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["recall"]["auto"] >= max(row["recall"].values()) - 0.02
+    assert row["recall"]["auto"] > 0.5
+    assert "auto - best" in presets.table([row])
+
+
+@pytest.mark.parametrize(
+    "words", [["detect", "--pictures", "0"], ["detect", "--frames", "1"], ["presets", "--pictures", "0"]]
+)
+def test_what_cannot_be_measured_is_one_line(words, capsys):
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("bench: ")
+    assert error.count("\n") == 1
