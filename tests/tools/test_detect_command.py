@@ -96,14 +96,14 @@ def test_a_configuration_overrides_a_preset(tmp_path):
 
 
 def test_tune_proposes_what_finds_the_lights_and_shows_its_pictures(tmp_path, capsys):
-    dim = [lamp_picture([AT], size=(200, 150), core=170.0, core_px=2.5, seed=k) for k in range(2)]
+    dim = [lamp_picture([AT], size=(200, 150), core=140.0, core_px=2.5, seed=k) for k in range(2)]
     dive = write_dive(tmp_path / "d.mcap", [encoded(picture) for picture in dim])
-    words = ["tune", str(dive), "--method", "paper", "--environment", "cavern", "--draw", str(tmp_path / "t")]
+    words = ["tune", str(dive), "--method", "paper", "--environment", "night_reef", "--draw", str(tmp_path / "t")]
     assert main([*words, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["judged_by"] == "truth"
     assert report["lights"] == 2
-    # The cavern's threshold is for brighter lights.
+    # The preset is for brighter lights.
     assert report["present"]["recall"] == 0.0
     assert report["proposed"]["recall"] == 1.0
     assert report["proposed"]["value_min"] < report["present"]["value_min"]
