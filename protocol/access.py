@@ -5,22 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from protocol.security import PLAYER, SOLVER, SURVEYOR, VIEWER, node_name
+from protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
+# What `ros2` publishes: domain, topic, type and its hash. Longer than any key of ours behind a namespace is.
+_ROS_KEYS: Final = [
+    *("*/buddyline/*/attitude/*/*", "*/buddyline/*/depth/*/*", "*/buddyline/*/*/pose/*/*", "*/tf/*/*"),
+    "@ros2_lv/**",
+]
 _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
 
 
 def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
     """Return Zenoh's `access_control`: a node publishes its own keys, the solver its pair's, all read all.
 
-    A surveyor marks where any node stands; a player stands in for all the nodes of a stored dive. Everything else
-    is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do not match: they are named beside each
-    key, or history would be lost in silence.
+    A surveyor marks where any node stands; a player stands in for all the nodes of a stored dive; a bridge to ROS
+    publishes ROS's keys. Everything else is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do
+    not match: they are named beside each key, or history would be lost in silence.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
-    everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**"]
-    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER, SURVEYOR, PLAYER]
+    everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**", *_ROS_KEYS]
+    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER, SURVEYOR, PLAYER, ROS]
     rules: list[dict[str, object]] = [
         _rule("ask", ["ingress", "egress"], _ASK, everything),
         _rule("hear", ["egress"], _SAY, everything),
@@ -36,6 +41,8 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
         own = [f"{root}/@alive/{alive}/**"] + [f"{root}/{key}{end}" for key in keys for end in ("", "/@adv/**")]
         rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))
         policies.append({"rules": [f"say {name}"], "subjects": [name]})
+    rules.append(_rule(f"say {ROS}", ["ingress"], _SAY, _ROS_KEYS))
+    policies.append({"rules": [f"say {ROS}"], "subjects": [ROS]})
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -23,6 +23,7 @@ SOLVER: Final = "solver"
 VIEWER: Final = "viewer"
 SURVEYOR: Final = "surveyor"
 PLAYER: Final = "player"
+ROS: Final = "ros2"
 
 PROBE_S: Final = 1.0
 

@@ -12,7 +12,7 @@ from protocol.security import VIEWER, Tls, check_identity
 
 
 class ClientConfig(Config, frozen=True, kw_only=True):
-    """The TOML file of a command on the bus (`buddyline keys viewer`, `surveyor` and `player` write one)."""
+    """The TOML file of a command on the bus (`buddyline keys viewer`, `surveyor`, `player` and `ros2` write one)."""
 
     connect: str = DEFAULT_ENDPOINT
     namespace: str = ""

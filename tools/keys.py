@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from protocol.endpoint import host_and_port
 from protocol.errors import BuddylineError
-from protocol.security import HUB, PLAYER, SOLVER, SURVEYOR, VIEWER, node_name
+from protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 from protocol.topics import check_node_id
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
 
-ROLES: Final = (SOLVER, VIEWER, SURVEYOR, PLAYER)
+ROLES: Final = (SOLVER, VIEWER, SURVEYOR, PLAYER, ROS)
 
 _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
 
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--directory", default=DIRECTORY, metavar="DIR", help=f"where all of it is: {DIRECTORY}/")
     parser.add_argument("--days", type=int, metavar="N", help=f"how long it is valid; {DAYS}, the authority 10 years")
-    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer|surveyor|player")
+    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer|surveyor|player|ros2")
     first = whose.add_parser("init", help="make the authority and the hub's certificate")
     first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find the hub; 127.0.0.1")
     node = whose.add_parser("node", help="make a node's certificate, and let it publish what is its own")
@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     whose.add_parser("solver", help="make the solver's certificate, which may publish poses")
     whose.add_parser("viewer", help="make the certificate of all that only read: record, monitor")
     whose.add_parser("surveyor", help="make the certificate of who marks stations: mark, survey watch; reads, too")
+    whose.add_parser(ROS, help="make the certificate of `ros2`, which may publish what it makes for ROS; reads, too")
     whose.add_parser("player", help="make the certificate of `play`, which may publish what any node publishes")
 
 

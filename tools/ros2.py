@@ -21,6 +21,7 @@ import numpy as np
 from protocol.clock import S_NS, Clock, SystemClock
 from protocol.errors import BuddylineError
 from protocol.messages import Attitude, Depth, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.security import ROS
 from protocol.service import Service
 from protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
 from solver_service.geometry.rotation import matrix_of, quaternion_of
@@ -49,7 +50,7 @@ TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add_client_arguments(parser)
+    add_client_arguments(parser, ROS)
     parser.add_argument("--domain", type=int, default=0, metavar="ID", help="ROS_DOMAIN_ID; default: 0")
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
 
@@ -242,7 +243,7 @@ def type_store() -> Any:
 def run(args: argparse.Namespace) -> int:
     """Translate until stopped."""
     store = type_store()
-    config = client_config(args)
+    config = client_config(args, ROS)
     service = Service("ros2")
     service.handle_signals()
 

@@ -12,7 +12,8 @@ from tools.cli import main
 
 def make_keys(directory: Path, *nodes: str) -> Path:
     """Make an authority and everyone's certificates, as a person does."""
-    for words in (["init"], *(["node", node] for node in nodes), ["solver"], ["viewer"], ["surveyor"], ["player"]):
+    roles = (["solver"], ["viewer"], ["surveyor"], ["player"], ["ros2"])
+    for words in (["init"], *(["node", node] for node in nodes), *roles):
         assert main(["keys", "--directory", str(directory), *words]) == 0
     return directory
 

@@ -48,13 +48,14 @@ def test_private_keys_are_private(keys):
         "viewer.key",
         "surveyor.key",
         "player.key",
+        "ros2.key",
     }
     assert set(found.values()) == {0o600}
 
 
 def test_nothing_is_overwritten(keys):
     before = {path.name: path.read_bytes() for path in keys.iterdir()}
-    for words in (["init"], ["node", "a"], ["solver"], ["viewer"], ["surveyor"], ["player"]):
+    for words in (["init"], ["node", "a"], ["solver"], ["viewer"], ["surveyor"], ["player"], ["ros2"]):
         assert main(["keys", "--directory", str(keys), *words]) == 2
     assert {path.name: path.read_bytes() for path in keys.iterdir()} == before
 

@@ -6,6 +6,7 @@ import math
 import socket
 import struct
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 from protocol.clock import S_NS, ManualClock
 from protocol.messages import Message
 from solver_service.geometry.rotation import matrix_of
+from tests.processes import free_endpoint
 from tests.tools.evaluated import INFOS, pose
 from tests.tools.watched import at, attitude, depth
 from tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
@@ -156,3 +158,45 @@ def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any
         f"@ros2_lv/3/{zid}/0/0/NN/%/%/buddyline",
         f"@ros2_lv/3/{zid}/0/1/MP/%/%/buddyline/%buddyline%a%depth/{kind}/{hashed}/::,10:,:,:,,",
     ]
+
+
+def test_a_secured_hub_lets_the_bridge_publish_for_ros_and_nobody_else(store: Any, tmp_path: Path) -> None:
+    pytest.importorskip("cryptography", reason="cryptography is not installed")
+    from protocol.access import access_rules
+    from protocol.zenoh_bus import open_hub, open_session
+    from tests.tools.identities import make_keys, tls
+
+    keys = make_keys(tmp_path, "a")
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    came: list[str] = []
+    enough = threading.Event()
+
+    def take(sample: Any) -> None:
+        came.append(f"{sample.key_expr} {sample.payload.to_bytes()[:2]!r}")
+        if any("/depth/" in key for key in came):
+            enough.set()
+
+    (first,) = translated(store, depth("a", at(0), 12.5))
+    with open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"], "team")):
+        sessions: dict[str, Any] = {
+            name: open_session(endpoint, stop=threading.Event(), on_wait=lambda _: None, tls=tls(keys, name))
+            for name in ("ros2", "viewer", "node-a")
+        }
+        try:
+            for expression in ("*/buddyline/*/depth/*/*", "team/buddyline/**"):
+                sessions["viewer"].declare_subscriber(expression, take)
+            graph = RosGraph(sessions["ros2"], store, ManualClock(5), domain=0)
+            sent = 0
+            while not enough.wait(0.02) and sent < 500:
+                # What is denied goes first, so that it would come before.
+                for name, key in (("node-a", "0/buddyline/a/depth/x/y"), ("ros2", "team/buddyline/pair/a/b/pose")):
+                    sessions[name].put(key, b"no")
+                graph.publish(first)
+                sent += 1
+            assert enough.is_set()
+            tokens = [str(one.ok.key_expr) for one in sessions["viewer"].liveliness().get("@ros2_lv/**", timeout=5.0)]
+        finally:
+            for session in sessions.values():
+                session.close()
+    assert not any(key.endswith("b'no'") for key in came)
+    assert len(tokens) == 2
