@@ -49,6 +49,12 @@ COMMANDS: Final = (
         "write the systemd unit of node, hub or solver",
         ("sudo .venv/bin/buddyline install-service node --config pi.toml", "buddyline install-service hub --print"),
     ),
+    Command(
+        "doctor",
+        "tools.doctor.command",
+        "check what a diver would forget, and say what to do about it",
+        ("buddyline doctor --config a.toml", "buddyline doctor", "buddyline doctor --config a.toml --json"),
+    ),
     Command("solver", "solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)),
     Command(
         "play",

@@ -1,0 +1,308 @@
+"""The doctor: each judgement over given facts, the files they come from, and the program as a diver runs it."""
+
+import json
+import threading
+import time
+
+import msgspec
+import numpy as np
+import pytest
+
+from node.chrony import decode_tracking
+from node.config import NodeConfig, load_node_config
+from node.detect import Detection
+from protocol.errors import BuddylineError
+from protocol.local_bus import LocalNetwork
+from protocol.messages import Attitude, Blob, Depth, Imu, NodeStatus
+from protocol.topics import INFO, NODE_STATUS
+from tests.node.test_chrony import FOLLOWS, LOST, SERVES
+from tests.processes import REPOSITORY
+from tools.cli import main
+from tools.client import ClientConfig
+from tools.doctor import bus, checks, command, machine, rig
+from tools.doctor.finding import Finding, status_of
+
+EXAMPLES = REPOSITORY / "node" / "examples"
+STAMP_NS = 1_764_000_000_000_000_000
+CALIBRATION = load_node_config(EXAMPLES / "pi.toml")
+INFO_A = CALIBRATION.node_info(STAMP_NS, "", "", 0)
+
+
+def camera(**changes):
+    return msgspec.structs.replace(INFO_A, camera=msgspec.structs.replace(INFO_A.camera, **changes))
+
+
+@pytest.mark.parametrize(
+    ("line", "error", "timesyncd", "stamps", "level"),
+    [
+        (FOLLOWS, "", False, True, "ok"),
+        (SERVES, "", False, True, "ok"),
+        (LOST, "", False, True, "problem"),
+        (LOST, "", False, False, "warning"),
+        (FOLLOWS.replace("0.000000683", "0.010"), "", False, True, "problem"),
+        (FOLLOWS.replace("0.000000947", "0.010"), "", False, True, "problem"),
+        (None, "chronyc gave no answer", False, True, "problem"),
+        (None, "", True, True, "warning"),
+        (None, "", False, True, "warning"),
+    ],
+)
+def test_clock(line, error, timesyncd, stamps, level):
+    tracking = None if line is None else decode_tracking(line)
+    found = checks.clock(tracking, error, timesyncd, stamps=stamps)
+    assert found.level == level
+    assert bool(found.advice) == (level != "ok")
+
+
+@pytest.mark.parametrize(("degc", "level"), [(None, "skipped"), (45.0, "ok"), (72.0, "warning"), (80.0, "problem")])
+def test_temperature(degc, level):
+    assert checks.temperature(degc).level == level
+
+
+@pytest.mark.parametrize(
+    ("bits", "level", "word"),
+    [
+        (None, "skipped", "not tell"),
+        (0, "ok", "no undervoltage"),
+        (0x50005, "problem", "undervoltage now"),
+        (0x40004, "problem", "slowed down now"),
+        (0x50000, "warning", "undervoltage since"),
+        (0x40000, "warning", "slowed down since"),
+    ],
+)
+def test_power(bits, level, word):
+    found = checks.power(bits)
+    assert (found.level, word in found.text) == (level, True)
+
+
+@pytest.mark.parametrize(
+    ("free_bytes", "rate_px", "error", "level"),
+    [
+        (60_000_000_000, 4e6, "", "ok"),
+        (9_000_000_000, 4e6, "", "warning"),
+        (100_000_000, 0.0, "", "problem"),
+        (60_000_000_000, 0.0, "cannot be written: Read-only file system", "problem"),
+    ],
+)
+def test_disk(free_bytes, rate_px, error, level):
+    assert checks.disk("/d", free_bytes, 200_000_000, rate_px, error).level == level
+
+
+@pytest.mark.parametrize(
+    ("info", "shape", "level", "word"),
+    [
+        (None, None, "problem", "none"),
+        (INFO_A, (616, 820, 3), "problem", "1640x1232 pixels, the camera gives 820x616"),
+        (camera(cx_px=400.0), None, "problem", "centre"),
+        (camera(fx_px=200.0, fy_px=200.0), None, "problem", "focal"),
+        (INFO_A, (1232, 1640), "warning", "without distortion"),
+        (
+            msgspec.structs.replace(INFO_A, light_left_m=(0.4, 0.0, 0.0), light_right_m=(-0.4, 0.0, 0.0)),
+            None,
+            "problem",
+            "swapped",
+        ),
+    ],
+)
+def test_calibration(info, shape, level, word):
+    found = checks.calibration(CALIBRATION.calibration, info, shape)
+    assert (found.level, word in found.text) == (level, True), found
+
+
+def test_a_calibration_of_this_camera_is_well():
+    assert checks.calibration(None, INFO_A, (1232, 1640)).level == "ok"
+
+
+@pytest.mark.parametrize(("grey", "level"), [(0, "warning"), (30, "ok"), (255, "warning")])
+def test_picture(grey, level):
+    assert checks.picture(np.full((20, 30), grey, np.uint8)).level == level
+
+
+def detection(score):
+    blob = Blob(u_px=1.0, v_px=1.0, sigma_px=1.0, area_px=9.0, peak=200.0, elongation=1.0, score=score)
+    return Detection(blob=blob, outline_px=np.zeros((3, 2)), axis_px=np.zeros((2, 2)), why="")
+
+
+@pytest.mark.parametrize(("scores", "level"), [([[0.9, 0.8]], "ok"), ([[0.9], [0.1, 0.9]], "warning"), ([], "warning")])
+def test_lights(scores, level):
+    assert checks.lights([[detection(score) for score in frame] for frame in scores]).level == level
+
+
+NODE = {"node": "a", "stamp_ns": STAMP_NS}
+REST = Imu(**NODE, accel_mps2=(0.0, 0.1, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, 4e-5))
+
+
+@pytest.mark.parametrize(
+    ("messages", "problem", "level", "word"),
+    [
+        ([REST], "", "ok", "9.80 m/s2, 45 uT"),
+        ([REST], "the bus hangs", "problem", "hangs"),
+        ([], "", "problem", "nothing"),
+        ([msgspec.structs.replace(REST, accel_mps2=(0.0, 0.0, 0.0))], "", "problem", "not the Earth's"),
+        ([msgspec.structs.replace(REST, mag_t=(0.0, 0.0, 0.0))], "", "problem", "not the Earth's"),
+        ([Depth(**NODE, depth_m=-40.0, sigma_m=0.1)], "", "problem", "not where"),
+        ([Depth(**NODE, depth_m=0.02, sigma_m=0.1)], "", "ok", "+0.02 m"),
+        ([Attitude(**NODE, q_ned_body_xyzw=(0.0, 0.0, 0.0, 1.0), sigma_rad=(0.1, 0.1, 0.1))], "", "ok", "6 degrees"),
+    ],
+)
+def test_sensor(messages, problem, level, word):
+    found = checks.sensor("imu", messages, problem)
+    assert (found.level, word in found.text) == (level, True), found
+
+
+def test_the_files_of_a_pi(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert machine.temperature_degc(tmp_path) is None
+    assert machine.throttled(tmp_path) is None
+    assert not machine.timesyncd(tmp_path)
+    files = {
+        "sys/class/thermal/thermal_zone0/temp": "48312\n",
+        "sys/class/thermal/thermal_zone1/temp": "cold\n",
+        "sys/class/hwmon/hwmon1/name": "rpi_volt\n",
+        "sys/class/hwmon/hwmon1/in0_lcrit_alarm": "1\n",
+        "run/systemd/timesync/synchronized": "",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert machine.temperature_degc(tmp_path) == pytest.approx(48.312)
+    assert machine.throttled(tmp_path) == 1
+    assert machine.timesyncd(tmp_path)
+    script = tmp_path / "vcgencmd"
+    script.write_text("#!/bin/sh\necho throttled=0x50000\n")
+    script.chmod(0o755)
+    assert machine.throttled(tmp_path) == 0x50000
+    firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
+    firmware.parent.mkdir(parents=True)
+    firmware.write_text("50005\n")
+    assert machine.throttled(tmp_path) == 0x50005
+
+
+def test_space_is_that_of_the_nearest_place_that_is_there(tmp_path):
+    free_bytes, error = machine.space(tmp_path / "not" / "yet")
+    assert free_bytes > 0
+    assert error == ""
+    (tmp_path / "file").write_text("")
+    assert "cannot be written" in machine.space(tmp_path / "file")[1]
+
+
+def status(problem=""):
+    return NodeStatus(**NODE, boot="x", software="", uptime_s=5.0, rates_hz={}, drops={}, ages_s={}, problem=problem)
+
+
+def levels(findings):
+    return {finding.name: finding.level for finding in findings}
+
+
+def test_hub_and_nodes():
+    absent = bus.check_bus(bus.Seen(error="no hub at tcp/x"), "tcp/x", None)
+    assert levels(absent) == {"hub": "warning", "nodes": "skipped"}
+    refused = bus.check_bus(bus.Seen(error="certificate expired"), "tcp/x", None)
+    assert levels(refused)["hub"] == "problem"
+    seen = bus.Seen(infos={"a": INFO_A}, statuses={"a": status()}, alive={"node/a", "solver"})
+    assert levels(bus.check_bus(seen, "tcp/x", None)) == {"hub": "ok", "node a": "ok"}
+    assert levels(bus.check_bus(seen, "tcp/x", "a"))["nodes"] == "warning"
+    seen = bus.Seen(infos={"a": INFO_A}, statuses={"a": status("camera: gone")}, alive={"node/a", "node/b"})
+    assert levels(bus.check_bus(seen, "tcp/x", "a")) == {
+        "hub": "ok",
+        "node a": "problem",
+        "node b": "problem",
+        "solver": "warning",
+    }
+
+
+def test_a_bus_is_seen_for_a_moment():
+    network = LocalNetwork()
+    with network.connect() as node, network.connect() as doctor:
+        node.declare_alive("node/a")
+        node.publisher(INFO, "a").put(INFO_A)
+        node.publisher(NODE_STATUS, "a").put(status("hot"))
+        node.publisher(NODE_STATUS, "b").put_bytes(b"{}")
+        seen = bus.watch(doctor, 0.2)
+    assert (seen.alive, seen.infos["a"].node, seen.statuses["a"].problem) == ({"node/a"}, "a", "hot")
+
+
+def test_what_hangs_or_fails_is_named_and_hides_nothing(capsys, monkeypatch):
+    monkeypatch.setattr(command, "SAY_AFTER_S", 0.05)
+    forever = threading.Event()
+
+    def fails():
+        raise BuddylineError("the cable is out")
+
+    findings = command.together(
+        {
+            "camera": lambda: [Finding("camera", "ok", str(forever.wait()))],
+            "bus": fails,
+            "disk": lambda: [Finding("disk", "ok", "x")],
+        },
+        time.monotonic() + 0.2,
+    )
+    forever.set()
+    assert [(f.name, f.level) for f in findings] == [("camera", "problem"), ("bus", "problem"), ("disk", "ok")]
+    assert "the cable is out" in findings[1].text
+    assert "still looking at camera" in capsys.readouterr().err
+    assert status_of(findings) == 1
+    assert status_of(findings[2:]) == 0
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_a_simulated_rig_is_well(name, monkeypatch):
+    monkeypatch.setattr(rig, "LISTEN_S", 0.3)
+    config = load_node_config(EXAMPLES / f"{name}.toml")
+    assert levels(rig.check_camera(config)) == {"camera": "ok", "calibration": "ok", "lights": "ok"}
+    assert levels(rig.check_sensors(config)) == {"attitude": "ok", "depth": "ok", "imu": "ok", "compass": "skipped"}
+
+
+def test_a_pi_without_anything_attached_names_each():
+    config = load_node_config(EXAMPLES / "pi.toml")
+    config = msgspec.structs.replace(config, sensors=msgspec.structs.replace(config.sensors, i2c_bus=250))
+    found = rig.check_camera(config)
+    assert levels(found) == {"camera": "problem", "calibration": "warning", "lights": "skipped"}
+    assert levels(rig.check_sensors(config)) == {"sensors": "problem"}
+
+
+def test_a_camera_that_gives_nothing(monkeypatch):
+    class Silent:
+        problem = ""
+
+        def info(self):
+            return INFO_A
+
+        def next_frame(self, stop):
+            stop.wait()
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(rig, "open_camera", lambda *_: Silent())
+    monkeypatch.setattr(rig, "FRAMES_WITHIN_S", 0.05)
+    assert levels(rig.check_camera(NodeConfig(node="a")))["camera"] == "problem"
+
+
+def test_a_node_that_runs_is_not_disturbed(monkeypatch):
+    def refuse(_):
+        raise AssertionError("its devices are in use")
+
+    running = bus.Seen(infos={"a": INFO_A}, statuses={"a": status()}, alive={"node/a"})
+    monkeypatch.setattr(command.bus, "look", lambda *_: running)
+    monkeypatch.setattr(rig, "check_camera", refuse)
+    found = command.diagnose(NodeConfig(node="a"), ClientConfig())
+    assert found[-1].level == "skipped"
+    assert "in use" in found[-1].text
+
+
+def test_the_program(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(command.bus, "look", lambda *_: bus.Seen(error="no hub at tcp/x"))
+    monkeypatch.setattr(command, "read_tracking", lambda: None)
+    monkeypatch.setattr(rig, "LISTEN_S", 0.3)
+    monkeypatch.chdir(tmp_path)
+    assert main(["doctor", "--config", str(EXAMPLES / "a.toml")]) == 0
+    assert "-> start it: buddyline hub" in capsys.readouterr().out
+    status_ = main(["doctor", "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert said["status"] == status_
+    assert {"clock", "disk", "temperature", "power", "hub"} <= {finding["name"] for finding in said["findings"]}
+    (tmp_path / "viewer.toml").write_text('connect = "tcp/127.0.0.1:1"\n')
+    assert command.load(str(tmp_path / "viewer.toml")) == (None, ClientConfig(connect="tcp/127.0.0.1:1"))
+    (tmp_path / "bad.toml").write_text('node = "a"\nrate = 3\n')
+    assert main(["doctor", "--config", str(tmp_path / "bad.toml")]) == 2
+    assert "unknown key `rate`" in capsys.readouterr().err
