@@ -25,7 +25,7 @@ def test_loops_close_as_their_sigmas_say():
     assert len(figures["V: auto, readings"]) >= 40
     # Half a centimetre is what Survex rounds away; of held depths that is all.
     assert max(figures["cavern off, m: auto, absolute"]) <= 0.0055
-    assert max(figures["cavern off, m: auto, readings"]) <= 0.015
+    assert max(figures["cavern off, m: auto, readings"]) <= 0.02
     assert not any(value for name, values in figures.items() if "warnings" in name for value in values)
     # The rms of 40 such ratios has a standard deviation of about 0.1.
     for name in ("H: auto, absolute", "H: auto, readings", "V: auto, readings", "H: diving, readings"):
