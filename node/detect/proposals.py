@@ -17,7 +17,7 @@ _WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
 _CLEAR = 5.0
-_ALWAYS, _AT_MOST = 12, 64
+_ALWAYS, _AT_MOST = 16, 64
 _MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
@@ -112,7 +112,7 @@ class ProposalFinder:
         return float(lower.mean()) / _MEAN_OF_LOWER_HALF
 
     def find(self, contrast_min: float, clutter_gain: float) -> Proposals:
-        """Find places in the picture that was loaded: the most outstanding 12, and up to 64 that clearly stand out.
+        """Find places in the picture that was loaded: the most outstanding 16, and up to 64 that clearly stand out.
 
         A place counts from a contrast of contrast_min grey levels, plus clutter_gain times the mean contrast of its
         neighbourhood.
