@@ -79,21 +79,24 @@ def free_port() -> int:
 @contextmanager
 def running(*words: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a `buddyline` command until left."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "tools", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        yield child
-    finally:
-        child.terminate()
+    with tempfile.TemporaryFile() as said:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "tools", *words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
+        )
         try:
-            child.wait(10)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait(10)
+            yield child
+        finally:
+            early = child.poll()
+            child.terminate()
+            try:
+                child.wait(10)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait(10)
+            if early is not None:
+                said.seek(0)
+                last = said.read().decode(errors="replace").splitlines()[-5:]
+                print(f"buddyline {words[0]} ended with {early}: {' | '.join(last)}", file=sys.stderr)
 
 
 @contextmanager
@@ -257,15 +260,15 @@ def measure_servers(endpoint: str, viewers: list[int], minutes: float) -> list[d
             time.sleep(max(began_s + at_s - time.monotonic(), 1.0))
             for (count, pid, taken), (cpu_s, taken_before, then_s) in zip(started, before, strict=True):
                 span_s = time.monotonic() - then_s
-                rows.append(
-                    {
-                        "viewers": count,
-                        "minutes": at_s / 60,
-                        "cpu_share": (_cpu_s(pid) - cpu_s) / span_s,
-                        "rss_mib": _rss_mib(pid),
-                        "to_each_kbyte_s": (sum(one[0] for one in taken) - taken_before) / count / span_s / 1e3,
-                    }
-                )
+                row = {
+                    "viewers": count,
+                    "minutes": at_s / 60,
+                    "cpu_share": (_cpu_s(pid) - cpu_s) / span_s,
+                    "rss_mib": _rss_mib(pid),
+                    "to_each_kbyte_s": (sum(one[0] for one in taken) - taken_before) / count / span_s / 1e3,
+                }
+                rows.append(row)
+                print(json.dumps(row), file=sys.stderr, flush=True)
     return rows
 
 
@@ -275,8 +278,10 @@ def _cpu_s(pid: int) -> float:
 
 
 def _rss_mib(pid: int) -> float:
-    (row,) = (row for row in _proc(pid, "status").splitlines() if row.startswith("VmRSS:"))
-    return int(row.split()[1]) / 1024
+    rows = [row for row in _proc(pid, "status").splitlines() if row.startswith("VmRSS:")]
+    if not rows:
+        raise BuddylineError(f"process {pid} has ended")
+    return int(rows[0].split()[1]) / 1024
 
 
 def _proc(pid: int, name: str) -> str:
