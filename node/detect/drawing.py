@@ -50,11 +50,16 @@ def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: floa
     cv2.circle(marked, fine, max(8, round(3 * blob.sigma_px * 8)), colour, 1, cv2.LINE_AA, 3)
     cv2.drawMarker(marked, (round(blob.u_px), round(blob.v_px)), colour, cv2.MARKER_CROSS, round(16 * size), 1)
     text = f"{rank}: {score:.2f} s{blob.sigma_px:.1f}"
-    corner = detection.outline_px.max(axis=0)
-    where = (round(float(corner[0])) + 3, round(float(corner[1])) + 3)
-    cv2.putText(marked, text, where, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+    corner = detection.outline_px.max(axis=0) + 3
+    _write(marked, text, (float(corner[0]), float(corner[1])), size, colour)
     if rank <= 3:
-        below = (where[0], where[1] + round(26 * size))
-        cv2.putText(
-            marked, detection.why, below, cv2.FONT_HERSHEY_SIMPLEX, max(0.35, 0.7 * size), colour, 1, cv2.LINE_AA
-        )
+        below = float(corner[0]), float(corner[1]) + 26 * size
+        _write(marked, detection.why, below, max(0.35, 0.7 * size), colour)
+
+
+def _write(marked: NDArray[np.uint8], text: str, at: tuple[float, float], size: float, colour: tuple[int, ...]) -> None:
+    """Write a line, moved into the picture where it would leave it."""
+    (width_px, height_px), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    u = max(min(round(at[0]), marked.shape[1] - width_px - 2), 0)
+    v = max(min(round(at[1]), marked.shape[0] - 3), height_px)
+    cv2.putText(marked, text, (u, v), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
