@@ -58,14 +58,18 @@ def headline(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
     return block(banner, _figures(picture, now_ns))
 
 
+# Smaller than a figure, which it is not.
+UNKNOWN: Final = "<span class='dim'>unknown</span>"
+
+
 def _figures(picture: PairPicture, now_ns: int) -> str:
     pose, age_ns = picture.pose, picture.pose_age_ns(now_ns)
     if pose is None or age_ns is None:
         return '<div class="dim">No pose yet.</div>'
     stale = age_ns > STALE_NS
     sigma_m = math.sqrt(sum(max(pose.covariance[i], 0.0) for i in (0, 7, 14)))
-    azimuth = "unknown" if pose.azimuth_rad is UNSET else f"{math.degrees(pose.azimuth_rad):.1f}°"
-    inclination = "unknown" if pose.inclination_rad is UNSET else f"{math.degrees(pose.inclination_rad):+.1f}°"
+    azimuth = UNKNOWN if pose.azimuth_rad is UNSET else f"{math.degrees(pose.azimuth_rad):.1f}°"
+    inclination = UNKNOWN if pose.inclination_rad is UNSET else f"{math.degrees(pose.inclination_rad):+.1f}°"
     cells = "".join(
         f'<div><div class="dim">{name}</div><div class="big">{value}</div></div>'
         for name, value in (("range", f"{pose.range_m:.2f} m"), ("azimuth", azimuth), ("inclination", inclination))
