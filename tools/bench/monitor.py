@@ -145,25 +145,26 @@ def _previews(bus: Bus, stop: threading.Event) -> None:
 class Listener:
     """How long each pose takes to come after the later of its two candidates, s, as a third party hears both."""
 
-    latencies_s: list[float] = field(default_factory=list)
-    _later_ns: dict[int, int] = field(default_factory=dict)
-    _nodes: dict[int, set[str]] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _frames_ns: dict[int, dict[str, int]] = field(default_factory=dict)
+    _poses_ns: dict[int, int] = field(default_factory=dict)
 
     def candidates(self, received: Received) -> None:
         """Take a frame's candidates."""
         message = decode(received.payload, Candidates)
-        with self._lock:
-            self._later_ns[message.trigger] = max(received.receive_ns, self._later_ns.get(message.trigger, 0))
-            self._nodes.setdefault(message.trigger, set()).add(message.node)
+        self._frames_ns.setdefault(message.trigger, {})[message.node] = received.receive_ns
 
     def pose(self, received: Received) -> None:
         """Take a pose."""
-        trigger = decode(received.payload, RelativePose).trigger
-        with self._lock:
-            later_ns = self._later_ns.pop(trigger, None)
-            if later_ns is not None and len(self._nodes.pop(trigger, ())) == 2:
-                self.latencies_s.append((received.receive_ns - later_ns) / 1e9)
+        self._poses_ns[decode(received.payload, RelativePose).trigger] = received.receive_ns
+
+    @property
+    def latencies_s(self) -> list[float]:
+        """All so far. Threads take frames and poses in any order, so they are matched here."""
+        return [
+            (pose_ns - max(frames_ns.values())) / 1e9
+            for trigger, pose_ns in self._poses_ns.items()
+            if len(frames_ns := self._frames_ns.get(trigger, {})) == 2
+        ]
 
 
 def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dict[str, list[float]]:
@@ -183,10 +184,11 @@ def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dic
                 time.sleep(round_s)
                 for subscription in subscriptions:
                     subscription.close()
-            if not listener.latencies_s:
+            latencies_s = listener.latencies_s
+            if not latencies_s:
                 raise BuddylineError("no poses came")
-            result[f"{name}_s"].append(statistics.median(listener.latencies_s))
-            result[f"{name}_p99_s"].append(float(np.percentile(listener.latencies_s, 99)))
+            result[f"{name}_s"].append(statistics.median(latencies_s))
+            result[f"{name}_p99_s"].append(float(np.percentile(latencies_s, 99)))
     return result
 
 
