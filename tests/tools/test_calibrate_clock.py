@@ -87,7 +87,8 @@ def test_sigmas_cover_the_errors_and_not_by_far():
         drifts.append((found.drift - 5e-6) / found.drift_sigma)
         assert abs(error_s) < found.bound_s + 5 * found.scatter_s
     assert 0.5 < np.std(offsets) < 1.5
-    assert 0.5 < np.std(drifts) < 1.6
+    # On the safe side: how late the quickest itself was is guessed, not known.
+    assert 0.3 < np.std(drifts) < 1.3
     assert max(errors_s) > 1e-4  # ways that differ cannot be seen: the bound is what says so
 
 
@@ -119,6 +120,17 @@ def test_before_and_after_a_dive_without_a_link():
     assert abs(drift - 10e-6) < 4 * sigma
     assert sigma < 1e-7
     assert parts[-1].offset_s == pytest.approx(0.003 + 36e-3, abs=5e-4)
+
+
+def test_one_lucky_exchange_does_not_make_the_drift_certain():
+    """On a machine with far too much to do, one exchange in a window is much quicker than the rest."""
+    pulls = []
+    for seed in range(40):
+        said = beacons(seed, seconds=15, excess_s=0.03) + beacons(1000 + seed, 15, excess_s=0.03, begin_s=60.0)
+        parts = [estimate(part) for part in windows(exchanges_of(said))]
+        drift, sigma = drift_between(parts[0], parts[-1])
+        pulls.append(drift / sigma)
+    assert 0.3 < np.std(pulls) < 1.3
 
 
 def test_one_way_alone_tells_nothing():

@@ -198,7 +198,7 @@ def test_hub_and_nodes():
     assert levels(absent) == {"hub": "warning", "nodes": "skipped"}
     refused = bus.check_bus(bus.Seen(error="certificate expired"), "tcp/x", None)
     assert levels(refused)["hub"] == "problem"
-    seen = bus.Seen(infos={"a": INFO_A}, statuses={"a": status()}, alive={"node/a", "solver"})
+    seen = bus.Seen(infos={"a": INFO_A}, statuses={"a": status()}, alive={"node/a", "solver/a_b"})
     assert levels(bus.check_bus(seen, "tcp/x", None)) == {"hub": "ok", "node a": "ok"}
     assert levels(bus.check_bus(seen, "tcp/x", "a"))["nodes"] == "warning"
     seen = bus.Seen(infos={"a": INFO_A}, statuses={"a": status("camera: gone")}, alive={"node/a", "node/b"})

@@ -27,6 +27,7 @@ WINDOW_S: Final = 60.0
 MIN_EXCHANGES: Final = 8
 # Of an exchange as quick as the quickest: stamps are taken by threads that wait for one another.
 QUICKEST_SIGMA_S: Final = 20e-6
+NEXT_FEW: Final = 3
 MIN_DRIFT_SPAN_S: Final = 5.0
 
 
@@ -137,7 +138,10 @@ def estimate(exchanges: Exchanges) -> ClockOffset:
     if not len(exchanges):
         raise ValueError("no exchanges")
     quickest_s = max(float(exchanges.round_trip_s.min()), 0.0)
-    weights = (QUICKEST_SIGMA_S + (exchanges.round_trip_s - quickest_s).clip(0) / 2) ** -2.0
+    # The quickest itself was late by about as much as the next few were later still.
+    next_s = float(np.sort(exchanges.round_trip_s)[: NEXT_FEW + 1][-1]) - quickest_s
+    sigmas_s = QUICKEST_SIGMA_S + (next_s + (exchanges.round_trip_s - quickest_s).clip(0)) / 2
+    weights = sigmas_s**-2.0
     weights /= weights.sum()
     first_ns = int(exchanges.stamp_ns[0])
     times_s = (exchanges.stamp_ns - first_ns) / S_NS
@@ -151,8 +155,8 @@ def estimate(exchanges: Exchanges) -> ClockOffset:
     if times_s[-1] >= MIN_DRIFT_SPAN_S and len(exchanges) >= MIN_EXCHANGES and spread_s2 > 0:
         drift = float(weights @ (lever_s * exchanges.offset_s)) / spread_s2
         residuals_s = residuals_s - drift * lever_s
-        drift_sigma = math.sqrt(float((weights * lever_s) ** 2 @ residuals_s**2)) / spread_s2
-    scatter_s = math.sqrt(float(weights**2 @ residuals_s**2))
+        drift_sigma = _spread(weights * lever_s, residuals_s, sigmas_s) / spread_s2
+    scatter_s = _spread(weights, residuals_s, sigmas_s)
     return ClockOffset(
         stamp_ns=first_ns + round(middle_s * S_NS),
         begin_ns=first_ns,
@@ -167,7 +171,17 @@ def estimate(exchanges: Exchanges) -> ClockOffset:
     )
 
 
+def _spread(weights: NDArray[np.float64], residuals_s: NDArray[np.float64], sigmas_s: NDArray[np.float64]) -> float:
+    """Return the sd of a weighted sum: as the residuals have it, or as expected where one exchange outweighs all."""
+    return math.sqrt(max(float(weights**2 @ residuals_s**2), float(weights**2 @ sigmas_s**2)))
+
+
 def drift_between(first: ClockOffset, last: ClockOffset) -> tuple[float, float]:
-    """Return the drift from one estimate to a later one, and its sd: ways that differ alike in both cancel."""
+    """Return the drift from one estimate to a later one, and its sd.
+
+    Ways that differ alike in both cancel; by what one's quickest round trip is longer, its ways may differ by more.
+    """
     passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
-    return (last.offset_s - first.offset_s) / passed_s, math.hypot(first.scatter_s, last.scatter_s) / passed_s
+    longer_s = (first.bound_s - last.bound_s) / math.sqrt(3)
+    sigma_s = math.hypot(first.scatter_s, last.scatter_s, longer_s)
+    return (last.offset_s - first.offset_s) / passed_s, sigma_s / passed_s

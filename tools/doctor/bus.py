@@ -91,7 +91,7 @@ def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
     if not [node for node in present if node != own]:
         who = "no other node" if own else "no node"
         findings.append(Finding("nodes", "warning", f"{who} is on the bus", "start it: a pose needs two"))
-    if "solver" not in seen.alive:
+    if not any(name.partition("/")[0] == "solver" for name in seen.alive):
         findings.append(Finding("solver", "warning", "none is on the bus", "for live poses: buddyline solver"))
     return findings
 
