@@ -6,6 +6,7 @@ import faulthandler
 import logging
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -81,7 +82,8 @@ class Service:
     def handle_signals(self) -> None:
         """Stop on SIGINT, SIGTERM and a terminal that closes; for the main thread of a process."""
         # systemd's watchdog ends a process with SIGABRT: what each thread was at is then in the journal.
-        faulthandler.enable()
+        if sys.__stderr__ is not None:
+            faulthandler.enable(sys.__stderr__)
 
         def interrupt(number: int, _frame: object) -> None:
             self.interrupted = number == signal.SIGINT
