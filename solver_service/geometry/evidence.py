@@ -37,7 +37,7 @@ _UPRIGHT_DOWN: Final = np.array([0.0, 1.0, 0.0])
 _DEPTH_SIGMA_M: Final = 0.02
 # A diver who is not known to lie otherwise is upright to about this (1 sd).
 _UPRIGHT_SIGMA_RAD: Final = 0.45
-# How often one light is missing, to being seen; and chance alone, to all four being seen.
+# How often one light is missing, to being seen, and the other where one is; and chance alone, to all four being seen.
 MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
 # Eight coordinates leave two residuals: of a light's two, the other three leave a quarter of the variance open each.
@@ -45,7 +45,7 @@ CHANCE_ODDS: Final = 0.3
 _FORETOLD_VARIANCE: Final = 4.0
 # What chance gives: the spread of relative pitch (rad) and heading (rad), and of depth differences (m).
 PITCH_SPREAD: Final = 1.1
-_HEADING_SPREAD: Final = 1.5
+HEADING_SPREAD: Final = 1.5
 DEPTH_SPREAD_M: Final = 6.0
 # A prediction from earlier poses is wrong this often, and where it is right it is believed this much at most (log).
 _PRIOR_WRONG: Final = 0.15
@@ -245,9 +245,9 @@ def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
     flat = R_a_b.reshape(9, -1)
     sine, cosine = (skew(down) @ predicted).ravel() @ flat, 1.0 + predicted.ravel() @ flat
     turn = 2.0 * np.arctan2(sine, cosine)
-    density = (_HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
+    density = (HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
     log_ratio: Floats = np.log(
-        density / np.sqrt(2.0 * math.pi * variance) + _HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi)
+        density / np.sqrt(2.0 * math.pi * variance) + HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi)
     )
     return log_ratio
 

@@ -97,6 +97,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             twist_gap_rad=twist_gap_rad[best],
             clutter=_clutter(terms, found.lights[:, best]) if gaps == 2 else np.zeros(len(best)),
             log_prior=support.log_prior[best],
+            lone_odds=np.zeros(len(best)),
         ),
         others=float(ratio.sum() - ratio[best].sum()),
     )

@@ -18,7 +18,8 @@ class Readings:
     (K, 3, 3), covariance (K, 6, 6), chi2 (K,). log_ratio: (K,) against chance, -inf where the pose is not sound.
     tilt_chi2, depth_chi2: (K,) of the sensors. range_m: (K, 2) by A's bar and by B's, twist_gap_rad (K,); both by
     the closed form. clutter: (K,) candidates that chance puts in the place of one of the lights, per variance of its
-    position, 0 where all would be missed. log_prior: (K,) the prediction's part in log_ratio.
+    position, 0 where all would be missed. log_prior: (K,) the prediction's part in log_ratio. lone_odds: (K,) that the
+    only light of a node is another lamp, 0 where both are seen.
     """
 
     lights: NDArray[np.intp]
@@ -33,6 +34,7 @@ class Readings:
     twist_gap_rad: Floats
     clutter: Floats
     log_prior: Floats
+    lone_odds: Floats
 
     def __len__(self) -> int:
         """Count them."""

@@ -19,6 +19,7 @@ from solver_service.geometry.evidence import (
     DEPTH_SPREAD_M,
     GROSS_PROBABILITY,
     GROSS_SCALE,
+    HEADING_SPREAD,
     MISSING_ODDS,
     PITCH_SPREAD,
     Sensors,
@@ -231,7 +232,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     sound &= np.isfinite(covariance.sum((1, 2)))
     if not sound.any():
         return None
-    log_ratio, log_prior = _log_ratio(terms, lights, t, R, covariance, chi2, sigma)
+    log_ratio, log_prior, lone_odds = _log_ratio(terms, lights, t, R, covariance, chi2, sigma)
     range_m = np.sqrt(range2)
     none = np.zeros(len(chi2))
     return Readings(
@@ -247,6 +248,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         twist_gap_rad=none,
         clutter=none,
         log_prior=log_prior,
+        lone_odds=lone_odds,
     )
 
 
@@ -281,8 +283,11 @@ def _basis(down: Floats) -> Floats:
 
 def _log_ratio(
     terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats, covariance: Floats, chi2: Floats, sigma: Floats
-) -> tuple[Floats, Floats]:
-    """Give the log likelihood ratio against chance, by Laplace's approximation about the pose, and the prior's part."""
+) -> tuple[Floats, Floats, Floats]:
+    """Give the log likelihood ratio against chance, by Laplace's approximation about the pose, and the prior's part.
+
+    And the odds that the lone light is another lamp.
+    """
     settings, candidates = terms.settings, terms.candidates
     range_m = np.sqrt((t * t).sum(1))
     # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
@@ -301,10 +306,27 @@ def _log_ratio(
     total = prior + fit - chance + math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS)
     R_last, u = R.transpose(1, 2, 0), (t / range_m[:, None]).T
     turn_variance = np.einsum("ik,kij,jk->k", u, covariance[:, 3:, 3:], u)
-    total += weigh_heading(R_last, terms.sensors, turn_variance)
+    heading = weigh_heading(R_last, terms.sensors, turn_variance)
+    total += heading
     log_prior = np.zeros(len(t))
     if terms.prediction is not None:
         log_prior = weigh_prediction(R_last, t.T, terms.prediction)
     if candidates.log_score is not None:
         total += np.where(lights < 0, 0.0, candidates.log_score[lights]).sum(1)
-    return total + log_prior, log_prior
+    # The pair and the attitudes foretell where the lone light stands: across by the tilts, along by the headings.
+    rise = ((R @ terms.sensors.down_b - terms.sensors.down_a) * u.T).sum(1)
+    density = np.exp(heading - 0.5 * rise * rise / terms.sensors.tilt_variance + log_prior)
+    density /= HEADING_SPREAD * math.sqrt(2.0 * math.pi * terms.sensors.tilt_variance)
+    return total + log_prior, log_prior, MISSING_ODDS * _others_per_sr(terms, lights) / density
+
+
+def _others_per_sr(terms: Terms, lights: NDArray[np.intp]) -> Floats:
+    """Give how dense candidates that look as much like a light as the lone one stand in its picture, itself counted."""
+    candidates, (in_a, in_b) = terms.candidates, terms.candidates.counts
+    seer = (lights[:, 0] < 0) | (lights[:, 1] < 0)
+    lone = np.where(seer, lights[:, :2].max(1), lights[:, 2:].max(1))
+    log_odds = np.zeros(in_a + in_b) if candidates.log_score is None else 2.0 * candidates.log_score
+    alike = np.minimum(np.exp(log_odds - log_odds[lone][:, None]), 1.0)
+    of_a, of_b = (rig.camera.solid_angle_sr for rig in terms.rigs.rigs)
+    density: Floats = np.where(seer, alike[:, :in_a].sum(1) / of_a, alike[:, in_a:].sum(1) / of_b)
+    return density

@@ -137,8 +137,8 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     if short and sigma_m > _SURE_POSITION * range_m:
         return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
     # A false candidate in a light's place is off by as much as the covariance has been widened for.
-    intruder = 0.0
-    if sigma_m > _SURE_POSITION * range_m:
+    intruder = float(ratio[k] * readings.lone_odds[k])
+    if not short and sigma_m > _SURE_POSITION * range_m:
         intruder = float(ratio[k]) * intruder_odds(chi2, float(readings.clutter[k]))
     probability = float(ratio[same].sum() / (CHANCE_ODDS + ratio.sum() + others + intruder))
     if probability >= (max(settings.min_probability, _THREE_PROBABILITY) if short else settings.min_probability):

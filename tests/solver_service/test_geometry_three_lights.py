@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from solver_service.geometry.rotation import matrix_of, rotation_log
-from solver_service.geometry.trigger import Fix, NoFix, Sensed, Settings, solve_trigger
-from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, random_scene, view
+from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, solve_trigger
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, view
 
 SETTINGS = Settings()
 
@@ -20,8 +20,16 @@ def without(scene, missing, rng, sigma_px=1.0):
     return views
 
 
-def solve(scene, views, sensed, settings=SETTINGS):
-    return solve_trigger(*views, scene.rig_a, scene.rig_b, *sensed, settings)
+def solve(scene, views, sensed, settings=SETTINGS, prior=None):
+    return solve_trigger(*views, scene.rig_a, scene.rig_b, *sensed, settings, prior)
+
+
+def followed(scene, rng):
+    """What a pair that was seen just before is foretold to be."""
+    sigma = np.repeat((0.1, 0.05), 3)
+    off = sigma * rng.standard_normal(6)
+    R = rotation_exp(off[3:]) @ scene.R
+    return Prior(scene.t + off[:3], quaternion_of(R), np.diag(sigma**2))
 
 
 def error(fix, scene):
@@ -59,7 +67,8 @@ def test_the_error_is_within_the_covariance_which_is_larger_than_that_of_four():
         sensed = scene.sensed(rng)
         views = [v for v, _ in scene.views(rng, 0.7)]
         four = solve(scene, views, sensed)
-        three = solve(scene, [views[0], view(views[1].pixels[:1], 0.7)], sensed)
+        lone = [views[0], view(views[1].pixels[:1], 0.7)]
+        three = solve(scene, lone, sensed, prior=followed(scene, rng))
         if isinstance(three, Fix) and isinstance(four, Fix):
             e = error(three, scene)
             squares.append(e @ np.linalg.solve(three.covariance, e) / 6)
@@ -96,12 +105,32 @@ def test_a_false_candidate_does_not_pass_for_the_missing_light():
         scene = random_scene(rng, (1.5, 8.0))
         views = without(scene, int(rng.integers(4)), rng, 1.0)
         views = [view(np.concatenate((v.pixels, rng.uniform((0, 0), (1640, 1232), (3, 2))))) for v in views]
-        fix = solve(scene, views, scene.sensed(rng))
+        fix = solve(scene, views, scene.sensed(rng), prior=followed(scene, rng))
         if isinstance(fix, Fix):
             poses += 1
             wrong += np.linalg.norm(fix.t_a_b_m - scene.t) > 0.1 * np.linalg.norm(scene.t)
     assert poses >= 5
     assert wrong <= 1
+
+
+def test_another_lamp_does_not_pass_for_a_light_whose_node_is_not_in_view():
+    """B sees a lamp at A's height, 29 degrees off where A is: only heading and earlier poses are against it."""
+    rng = np.random.default_rng(8)
+    tried = 0
+    while tried < 12:
+        # Far enough for the angle to be no bar's length.
+        scene = random_scene(rng, (5.0, 8.0))
+        turn = rotation_exp(np.array([0.0, rng.choice((-0.5, 0.5)), 0.0]))
+        elsewhere = Scene(scene.rig_a, scene.rig_b, scene.t, scene.R @ turn, scene.R_ned_a)
+        if not elsewhere.visible:
+            continue
+        (seen_by_a, _), (lamp_of_b, _) = elsewhere.views(rng, 0.3)
+        views = [seen_by_a, view(lamp_of_b.pixels[:1], 0.3)]
+        if isinstance(solve(elsewhere, views, elsewhere.sensed(rng), prior=followed(elsewhere, rng)), Fix):
+            tried += 1
+            sensed = scene.sensed(rng)
+            assert isinstance(solve(scene, views, sensed), NoFix)
+            assert isinstance(solve(scene, views, sensed, prior=followed(scene, rng)), NoFix)
 
 
 def test_two_lights_are_no_pose():
