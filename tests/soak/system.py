@@ -182,7 +182,8 @@ def _compare(result: Result, directory: Path, viewer: Streams) -> None:
             if stream.disordered and stamps is not None:
                 result.failures.append(f"{key}: {name}: {stream.disordered} out of order")
     for name, streams in seen.items():
-        due = {trigger for trigger in streams.triggers if trigger <= max(streams.triggers) - 2 * RATE_HZ}
+        complete_to = max(streams.triggers, default=0) - 2 * RATE_HZ
+        due = {trigger for trigger in streams.triggers if trigger <= complete_to}
         outcomes = Counter(streams.outcomes)
         result.triggers = len(due)
         without, doubled = len(due - outcomes.keys()), sum(outcomes.values()) - len(outcomes)
