@@ -20,7 +20,10 @@ OFF_CENTRE = 0.15
 
 
 class CameraConfig(Config, frozen=True, kw_only=True):
-    """[camera]: which one, and its fixed settings. path: pictures of the `stored` camera."""
+    """[camera]: which one, and its fixed settings. path: pictures of the `stored` camera.
+
+    colour: of the Pi's camera. Luminance alone is a third of the memory; in caverns and lakes it loses lights.
+    """
 
     name: str = "simulated"
     path: str = ""
@@ -28,6 +31,7 @@ class CameraConfig(Config, frozen=True, kw_only=True):
     height_px: Annotated[int, Meta(ge=1, le=65535)] = 616
     exposure_us: Annotated[int, Meta(ge=1)] = 4000
     gain: Positive = 2.0
+    colour: bool = True
     sync: Literal["off", "server", "client"] = "off"
 
 

@@ -46,7 +46,7 @@ CAMERA_ERRORS: Final = (RuntimeError, OSError, ValueError, LookupError, Assertio
 class Picamera2Camera:
     """One camera.
 
-    colour: BGR pictures, else luminance alone. problem: what is wrong, "" where nothing is. row_time_ns: from
+    Its pictures are BGR, or luminance alone. problem: what is wrong, "" where nothing is. row_time_ns: from
     one row to the next. skipped: frames that were not given out, by reason.
     """
 
@@ -54,14 +54,12 @@ class Picamera2Camera:
         self,
         config: CameraConfig,
         trigger_period_ns: int,
-        colour: bool,
         clock: Clock,
         boottime: Callable[[], int] = boottime_ns,
     ) -> None:
         self.row_time_ns = 0
         self.skipped: Counter[str] = Counter()
         self._config = config
-        self._colour = colour
         self._trigger_period_ns = trigger_period_ns
         self._frames = frames_per_trigger(trigger_period_ns)
         self._frame_period_ns = trigger_period_ns // self._frames
@@ -132,7 +130,7 @@ class Picamera2Camera:
         mode = choose_mode(camera.sensor_modes, size)
         camera.configure(
             camera.create_preview_configuration(
-                main={"format": "RGB888" if self._colour else "YUV420", "size": size},
+                main={"format": "RGB888" if config.colour else "YUV420", "size": size},
                 raw=None,
                 buffer_count=BUFFERS,
                 display=None,
@@ -281,5 +279,5 @@ def _close(camera: Any) -> None:
 
 
 def open_camera(config: NodeConfig, clock: Clock) -> Picamera2Camera:
-    """Open the camera; raise DeviceError where there is none. Detection by colour alone needs colour pictures."""
-    return Picamera2Camera(config.camera, config.trigger_period_ns, config.detector.method == "paper", clock)
+    """Open the camera; raise DeviceError where there is none."""
+    return Picamera2Camera(config.camera, config.trigger_period_ns, clock)

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from node.config import CameraConfig, DetectorConfig, NodeConfig
+from node.config import CameraConfig, NodeConfig
 from node.devices import Frame
 from node.drivers.camera_picamera2 import Picamera2Camera, choose_mode, open_camera
 from node.drivers.samples import DeviceError
@@ -45,8 +45,8 @@ def sensor(monkeypatch: pytest.MonkeyPatch) -> standin.Sensor:
     return sensor
 
 
-def make(sensor: standin.Sensor, config: CameraConfig | None = None, period_ns: int = PERIOD_NS, colour: bool = False):
-    return Picamera2Camera(config or CameraConfig(), period_ns, colour, Wall(sensor), sensor.boottime_ns)
+def make(sensor: standin.Sensor, config: CameraConfig | None = None, period_ns: int = PERIOD_NS):
+    return Picamera2Camera(config or CameraConfig(colour=False), period_ns, Wall(sensor), sensor.boottime_ns)
 
 
 def frames(camera: Picamera2Camera, n: int) -> list[Frame]:
@@ -96,16 +96,16 @@ def test_luminance_comes_without_padding_and_outlives_the_buffer(sensor, padding
 
 
 def test_colour_comes_as_bgr(sensor):
-    camera = make(sensor, colour=True)
+    camera = make(sensor, CameraConfig())
     (frame,) = frames(camera, 1)
     assert frame.image.shape == (616, 820, 3)
     assert frame.image.max() == frame.image.min()
 
 
-def test_colour_is_only_asked_for_where_it_is_needed(sensor, monkeypatch):
+def test_pictures_are_in_colour_where_nothing_else_is_asked_for(sensor, monkeypatch):
     monkeypatch.setattr("node.drivers.camera_picamera2.boottime_ns", sensor.boottime_ns)
-    for method, dimensions in (("source", 2), ("paper", 3)):
-        config = NodeConfig(node="a", camera=CameraConfig(name="picamera2"), detector=DetectorConfig(method=method))
+    for asked, dimensions in (({}, 3), ({"colour": False}, 2)):
+        config = NodeConfig(node="a", camera=CameraConfig(name="picamera2", **asked))
         camera = open_camera(config, Wall(sensor))
         camera._boottime = sensor.boottime_ns
         (frame,) = frames(camera, 1)
