@@ -173,7 +173,7 @@ def test_a_disk_that_turns_read_only_is_named_and_its_end_is_an_error(tmp_path, 
     recorder = recording(path)
     sender = Sender(recorder)
     sender.depth()
-    until(lambda: path.stat().st_size > 0)
+    until(lambda: path.stat().st_size > 0 and stamps(path, DEPTH) == [1])
     plain = os.write
 
     def refuse(fd, data):
