@@ -156,7 +156,6 @@ def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
                 return "No space left" in (problems(status) or "")
 
             until(named)
-        assert "pictures" in problems(status)
         assert fed(manager.hear_until(fed))
         ballast.unlink()
         until(lambda: "No space left" not in (problems(status) or ""))

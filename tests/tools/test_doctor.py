@@ -248,7 +248,10 @@ def test_what_hangs_or_fails_is_named_and_hides_nothing(capsys, monkeypatch):
 def test_a_simulated_rig_is_well(name, monkeypatch):
     monkeypatch.setattr(rig, "LISTEN_S", 0.3)
     config = load_node_config(EXAMPLES / f"{name}.toml")
-    assert levels(rig.check_camera(config)) == {"camera": "ok", "calibration": "ok", "lights": "ok"}
+    found = levels(rig.check_camera(config))
+    # The other node swims: at some instants it is out of view.
+    assert found.pop("lights") in ("ok", "warning")
+    assert found == {"camera": "ok", "calibration": "ok"}
     assert levels(rig.check_sensors(config)) == {"attitude": "ok", "depth": "ok", "imu": "ok", "compass": "skipped"}
 
 
