@@ -51,8 +51,7 @@ class Refined:
     """K poses: t_a_b_m (K, 3), R_a_b (K, 3, 3), covariance (K, 6, 6), chi2 (K,) of two degrees of freedom.
 
     covariance: of position in A's camera frame, then of the small rotation w with R_true = exp(w) R_a_b, in A's
-    camera frame. sound: (K,), False where the pose is not determined or lies behind a camera. freedom: (K, 4)
-    what of each sighting the other three leave open: the determinant of its residual's covariance, 0 to 1.
+    camera frame. sound: (K,), False where the pose is not determined or lies behind a camera.
     """
 
     t_a_b_m: Floats

@@ -156,6 +156,8 @@ def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
                 return "No space left" in (problems(status) or "")
 
             until(named)
+        # Said once the log has been refused: the first to make room are the pictures.
+        until(lambda: "pictures" in (problems(status) or ""))
         assert fed(manager.hear_until(fed))
         ballast.unlink()
         until(lambda: "No space left" not in (problems(status) or ""))
