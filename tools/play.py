@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Final
 
 from msgspec import UNSET
@@ -34,10 +34,13 @@ log = logging.getLogger(__name__)
 NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status", "clock"})
 # Pictures go out as previews: the bus is for what the solver needs.
 IMAGES_HZ: Final = 2.0
-# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time:
-# more than a solver waits for a frame that is lost.
-AHEAD_NS: Final = 2_200_000_000
-SOLVER_SILENT_S: Final = 1.0
+# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time: less than
+# a solver waits for a node that is silent (2 s), so that a sample which is fetched late does not count as lost ...
+AHEAD_NS: Final = 1_500_000_000
+# ... and more where the dive itself has nothing of a node for so long, since there it does wait.
+AHEAD_OF_SILENT_NS: Final = 2_200_000_000
+# A solver that answers nothing for so long waits for something that the dive has not.
+SOLVER_SILENT_S: Final = 5.0
 # Calibration goes ahead of the frames, which have a higher priority on the bus.
 INFO_AHEAD_S: Final = 0.3
 
@@ -55,12 +58,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class SolverFollower:
     """Knows how far a solver on the bus has come, so that a fast playback does not outrun it."""
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, nodes: Iterable[str]) -> None:
         self._changed = threading.Condition()
         self._resolved_ns = -1
-        self._heard_s: float | None = None
+        self._heard_s = time.monotonic()
+        self._solvers: set[str] = set()
+        self._sent_ns = dict.fromkeys(nodes, -1)
         for topic in (POSE, REJECTED):
             bus.subscribe(topic.key_any(), self._hear, capacity=4096, history=False)
+        bus.watch_alive(self._watch)
 
     def _hear(self, received: Received) -> None:
         from protocol.divelog import payload_stamp_ns
@@ -70,23 +76,35 @@ class SolverFollower:
             self._heard_s = time.monotonic()
             self._changed.notify_all()
 
-    def wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
-        """Wait until the solver is close behind stamp_ns; not at all where none answers."""
+    def _watch(self, name: str, alive: bool) -> None:
         with self._changed:
-            if self._heard_s is None:
+            if name.startswith("solver/"):
+                (self._solvers.add if alive else self._solvers.discard)(name)
                 self._heard_s = time.monotonic()
+            self._changed.notify_all()
+
+    def wait_to_send(self, node: str, stamp_ns: int, stop: threading.Event) -> None:
+        """Wait until the solver is close behind a frame at stamp_ns that goes out next; not at all without a solver."""
+        with self._changed:
+            if self._resolved_ns < 0:
+                # All before the first frame counts as resolved.
+                self._resolved_ns = stamp_ns
+            silent = min(self._sent_ns.values(), default=-1) < stamp_ns - AHEAD_NS
+            ahead_ns = AHEAD_OF_SILENT_NS if silent else AHEAD_NS
             while (
-                self._resolved_ns < stamp_ns - AHEAD_NS
+                self._solvers
+                and self._resolved_ns < stamp_ns - ahead_ns
                 and time.monotonic() - self._heard_s < SOLVER_SILENT_S
                 and not stop.is_set()
             ):
                 self._changed.wait(0.1)
+            self._sent_ns[node] = stamp_ns
 
 
 class Player:
     """Sends a dive's records in order, each when its time has come."""
 
-    def __init__(self, bus: Bus, speed: float, clock: Clock, stop: threading.Event) -> None:
+    def __init__(self, bus: Bus, nodes: Iterable[str], speed: float, clock: Clock, stop: threading.Event) -> None:
         self.sent = 0
         self.bad = 0
         self._bus = bus
@@ -94,7 +112,7 @@ class Player:
         self._clock = clock
         self._stop = stop
         self._publishers: dict[str, Publisher] = {}
-        self._follower = SolverFollower(bus) if speed == 0 else None
+        self._follower = SolverFollower(bus, nodes) if speed == 0 else None
         self._image_due_ns: dict[str, int] = {}
         self._first_ns: int | None = None
         self._began_ns = 0
@@ -138,7 +156,7 @@ class Player:
                 log.warning("play: %s: %s (%d so far)", record.key, error, self.bad)
             return
         if self._follower is not None and parsed[0] is CANDIDATES:
-            self._follower.wait_for(time_ns, self._stop)
+            self._follower.wait_to_send(parsed[1][0], time_ns, self._stop)
         self._publishers[record.key].put_bytes(payload)
         self.sent += 1
 
@@ -187,7 +205,7 @@ def run(args: argparse.Namespace) -> int:
         with bus:
             bus.on_failure(lambda error: service.fail("bus", error))
             bus.declare_alive("player")
-            player = Player(bus, args.speed, SystemClock(), service.stop)
+            player = Player(bus, dive.nodes("candidates"), args.speed, SystemClock(), service.stop)
             player.declare(dive.keys)
             player.send_infos(dive.records(INFO.name))
             period_ns = max((info.trigger_period_ns for info in dive.infos().values()), default=S_NS)

@@ -1,6 +1,7 @@
 """Playback: what is sent, when, and how a dive goes round and round."""
 
 import threading
+import time
 
 import pytest
 
@@ -9,10 +10,10 @@ from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
 from protocol.local_bus import LocalNetwork
 from protocol.messages import Candidates, NodeInfo, Rejected, decode
-from protocol.topics import EVERYTHING, parse_key
+from protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 from tools.dives import Dive
-from tools.play import Player, _selected, _span
+from tools.play import SOLVER_SILENT_S, Player, _selected, _span
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ class Played:
         network = LocalNetwork()
         with Dive([log]) as dive, network.connect() as bus, network.connect() as listener:
             listener.subscribe(EVERYTHING, self.received.append, capacity=10_000)
-            player = Player(bus, speed, self.clock, threading.Event())
+            player = Player(bus, dive.nodes("candidates"), speed, self.clock, threading.Event())
             player.declare(dive.keys)
             start_ns, stop_ns = _span(dive, start_s, end_s)
             for lap in range(laps):
@@ -75,6 +76,62 @@ def test_laps_carry_times_and_triggers_on(log):
         assert other.stamp_ns - one.stamp_ns == 30 * PERIOD_NS
         assert other.trigger - one.trigger == 30
         assert other.blobs == one.blobs
+
+
+class LateSolver:
+    """Answers every trigger once both nodes' frames have come, and in its own time."""
+
+    def __init__(self, bus, wait_s):
+        self.wait_s = wait_s
+        self.answered_ns = None
+        self.ahead_ns = []
+        self._seen = set()
+        self._publisher = bus.publisher(REJECTED, "a", "b")
+        bus.subscribe(CANDIDATES.key_any(), self.hear, capacity=1000)
+        bus.subscribe(CANDIDATES.key_any(), self.measure, capacity=1000)
+        bus.declare_alive("solver/a_b")
+
+    def measure(self, received):
+        stamp_ns = decode(received.payload, Candidates).stamp_ns
+        self.answered_ns = self.answered_ns or stamp_ns
+        self.ahead_ns.append(stamp_ns - self.answered_ns)
+
+    def hear(self, received):
+        frame = decode(received.payload, Candidates)
+        if frame.trigger not in self._seen:
+            self._seen.add(frame.trigger)
+            return
+        if self.wait_s:
+            # What the link took comes now, and all at once.
+            time.sleep(self.wait_s)
+            self.wait_s = 0.0
+        self.answered_ns = frame.stamp_ns
+        stamp_ns, trigger = frame.stamp_ns, frame.trigger
+        self._publisher.put(Rejected(node_a="a", node_b="b", stamp_ns=stamp_ns, trigger=trigger, reason="late"))
+
+
+def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
+    path = tmp_path / "long.mcap"
+    with DiveLogWriter(path) as writer:
+        for message in dive_messages(seconds=8.0)[0]:
+            if isinstance(message, NodeInfo | Candidates):
+                writer.write_message(message)
+    network = LocalNetwork()
+    with Dive([path]) as dive, network.connect() as bus, network.connect() as listener:
+        solver = LateSolver(listener, wait_s=1.5)
+        player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), threading.Event())
+        player.declare(dive.keys)
+        for record in dive.records():
+            player.send(record)
+    assert len(solver.ahead_ns) > 140
+    # A solver gives up a silent node after two seconds of the dive.
+    assert max(solver.ahead_ns) < 1_700_000_000
+
+
+def test_fast_playback_without_a_solver_waits_for_nobody(log):
+    began_s = time.monotonic()
+    assert Played(log, speed=0.0).sent > 0
+    assert time.monotonic() - began_s < SOLVER_SILENT_S
 
 
 @pytest.mark.parametrize(("start_s", "end_s"), [(-1.0, None), (99.0, None), (1.0, 0.5)])
