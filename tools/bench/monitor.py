@@ -39,6 +39,8 @@ PREVIEW_S: Final = 0.5
 PREVIEW_PX: Final = (410, 308)
 WINDOW_S: Final = 30.0
 READY_S: Final = 60.0
+# What starting a monitor costs is not what it costs while it runs.
+SETTLE_S: Final = 5.0
 # As long as the page draws its first picture in software.
 BROWSER_MS: Final = 120_000
 SOLVED: Final = "the solver finds the pose"
@@ -176,6 +178,7 @@ def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dic
                 if name == "with":
                     address = stack.enter_context(monitor(endpoint))[1]
                     stack.enter_context(viewer(address))
+                time.sleep(SETTLE_S)
                 listener = Listener()
                 subscriptions = [
                     bus.subscribe(CANDIDATES.key_any(), listener.candidates, history=False),
