@@ -35,17 +35,7 @@ def run(args: argparse.Namespace) -> int:
     recorded = load_for_evaluation(args.logs, args.truth, args.pair)
     for problem in recorded.problems:
         log.warning("%s", problem)
-    result = evaluate(
-        recorded.poses,
-        recorded.rejected,
-        recorded.truths,
-        recorded.candidates,
-        recorded.light_truths,
-        recorded.infos,
-        recorded.attitudes_a,
-        nodes=recorded.nodes,
-        environment=recorded.environment,
-    )
+    result = evaluate(recorded)
     if result.poses and result.without_truth == result.poses:
         raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")
     print(json.dumps(as_dict(result), allow_nan=False) if args.json else as_text(result))

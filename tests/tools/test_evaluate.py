@@ -31,6 +31,7 @@ from tests.tools.evaluated import (
 )
 from tools.evaluation.lights import project
 from tools.evaluation.poses import nees
+from tools.evaluation.recorded import Recorded
 from tools.evaluation.result import Result, evaluate
 from tools.evaluation.rotation import interpolate, multiply, normalized, rotate, rotation_vector
 from tools.evaluation.truth import inverted
@@ -46,16 +47,17 @@ def q_exp(w_rad: np.ndarray) -> np.ndarray:
 
 
 def measure(poses=(), rejected=(), truths=(), candidates=(), light_truths=(), infos=INFOS, attitudes=()) -> Result:
-    return evaluate(
-        list(poses),
-        list(rejected),
-        list(truths),
-        list(candidates),
-        list(light_truths),
-        infos,
-        list(attitudes),
+    recorded = Recorded(
         nodes=("a", "b"),
+        poses=list(poses),
+        rejected=list(rejected),
+        truths=list(truths),
+        candidates=list(candidates),
+        light_truths=list(light_truths),
+        attitudes_a=list(attitudes),
+        infos=infos,
     )
+    return evaluate(recorded)
 
 
 @settings(max_examples=50, deadline=None)

@@ -36,11 +36,7 @@ def test_errors_of_simulated_dives_are_those_of_the_plan(tmp_path, capsys):
     assert main(["simulate", dive, *words]) == 0
     assert main(["solve", dive, "-o", out]) == 0
     capsys.readouterr()
-    recorded = load([out])
-    errors = evaluate(
-        recorded.poses, recorded.rejected, recorded.truths, recorded.candidates, recorded.light_truths, recorded.infos,
-        nodes=recorded.nodes,
-    ).errors  # fmt: skip
+    errors = evaluate(load([out])).errors
     assert len(errors) > 40
     planned = expected(info, 0.7, np.array(plan.RANGES_M))
     for measured, column in ((errors.range_m, 0), (errors.translation_m, 1)):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from typing import Final
 
 from protocol.divelog import DiveLogReader
@@ -21,34 +20,14 @@ from protocol.messages import (
     Truth,
 )
 from protocol.topics import ARTAG, ATTITUDE, CANDIDATES, INFO, LIGHT_TRUTH, POSE, REJECTED, TRUTH, Topic, parse_key
+from tools.evaluation.recorded import Pair, Recorded
 from tools.evaluation.truth import inverted
 from tools.progress import Progress
-
-Pair = tuple[str, str]
 
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.
 _TAGS: Final = (ARTAG,)
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH)
-
-
-@dataclass
-class Recorded:
-    """One pair's messages; truths are of T_a_b whichever way the log has them. problems: for a person, a line each.
-
-    environment: the water, where a log names it.
-    """
-
-    nodes: Pair
-    poses: list[RelativePose] = field(default_factory=list)
-    rejected: list[Rejected] = field(default_factory=list)
-    truths: list[Truth] = field(default_factory=list)
-    candidates: list[Candidates] = field(default_factory=list)
-    light_truths: list[LightTruth] = field(default_factory=list)
-    attitudes_a: list[Attitude] = field(default_factory=list)
-    infos: dict[str, NodeInfo] = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    environment: str = ""
 
 
 def parse_pair(text: str) -> Pair:

@@ -9,11 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from protocol.messages import Attitude, Candidates, LightTruth, NodeInfo, Rejected, RelativePose, Truth
+from protocol.messages import Candidates, LightTruth
 from tools.evaluation.detection import Detection, detection_figures
 from tools.evaluation.lights import Blobs, is_right_pair, true_lights
 from tools.evaluation.pairing import Pairing, Sighting, pairing_figures, sightings_of
 from tools.evaluation.poses import PoseErrors, pose_errors
+from tools.evaluation.recorded import Recorded
 from tools.evaluation.statistics import Stats, share
 from tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
 from tools.evaluation.truth import Track, TruthTrack
@@ -104,35 +105,24 @@ def _bins(errors: PoseErrors, sightings: Sequence[Sighting]) -> list[RangeBin]:
     return bins
 
 
-def evaluate(
-    poses: Sequence[RelativePose],
-    rejected: Sequence[Rejected],
-    truths: Sequence[Truth],
-    candidates: Sequence[Candidates],
-    light_truths: Sequence[LightTruth],
-    infos: Mapping[str, NodeInfo],
-    attitudes_a: Iterable[Attitude] = (),
-    *,
-    nodes: tuple[str, str],
-    environment: str = "",
-) -> Result:
+def evaluate(recorded: Recorded) -> Result:
     """Measure one pair's poses, rejections and candidates.
 
-    nodes: a and b; all poses, rejections and truths are of T_a_b; messages of other nodes are left out. Of several
-    Candidates of one node and trigger the first counts. attitudes_a: node a's, for azimuth and inclination.
+    Of several Candidates of one node and trigger the first counts; those of other nodes are left out.
     """
-    track = TruthTrack(truths)
+    nodes, poses, rejected, infos = recorded.nodes, recorded.poses, recorded.rejected, recorded.infos
+    track = TruthTrack(recorded.truths)
     frames: dict[tuple[str, int], Candidates] = {}
-    for frame in candidates:
+    for frame in recorded.candidates:
         if frame.node in nodes:
             frames.setdefault((frame.node, frame.trigger), frame)
     blobs = {key: Blobs.of(frame) for key, frame in frames.items()}
-    lights = true_lights(nodes, frames.values(), light_truths, infos, track)
+    lights = true_lights(nodes, frames.values(), recorded.light_truths, infos, track)
     errors = pose_errors(
-        poses, track, lambda pose: is_right_pair(pose, blobs, lights), Track.of_attitudes(attitudes_a), infos
+        poses, track, lambda pose: is_right_pair(pose, blobs, lights), Track.of_attitudes(recorded.attitudes_a), infos
     )
     ranges_m: dict[int, float] = {}
-    for (_, trigger), stamp_ns in _stamps_ns(frames, light_truths).items():
+    for (_, trigger), stamp_ns in _stamps_ns(frames, recorded.light_truths).items():
         known = track.at(stamp_ns, trigger)
         if known is not None:
             ranges_m[trigger] = float(np.linalg.norm(known[0]))
@@ -151,7 +141,7 @@ def evaluate(
         pairing=pairing_figures(sightings),
         detection=detection_figures(lights, blobs),
         errors=errors,
-        environment=environment,
+        environment=recorded.environment,
     )
 
 

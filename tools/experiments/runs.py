@@ -65,18 +65,7 @@ def call(module: str, *words: str) -> None:
 
 def measured(path: Path) -> Result:
     """Return a solved log's errors."""
-    recorded = load_for_evaluation([str(path)])
-    return evaluate(
-        recorded.poses,
-        recorded.rejected,
-        recorded.truths,
-        recorded.candidates,
-        recorded.light_truths,
-        recorded.infos,
-        recorded.attitudes_a,
-        nodes=recorded.nodes,
-        environment=recorded.environment,
-    )
+    return evaluate(load_for_evaluation([str(path)]))
 
 
 @dataclass(frozen=True)

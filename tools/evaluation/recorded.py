@@ -1,0 +1,29 @@
+"""What dive logs hold of one pair of nodes: what is evaluated, or exported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from protocol.messages import Attitude, Candidates, LightTruth, NodeInfo, Rejected, RelativePose, Truth
+
+Pair = tuple[str, str]
+
+
+@dataclass
+class Recorded:
+    """One pair's messages; truths are of T_a_b whichever way the log has them.
+
+    nodes: a and b. attitudes_a: node a's, for azimuth and inclination. problems: for a person, a line each.
+    environment: the water, where a log names it.
+    """
+
+    nodes: Pair
+    poses: list[RelativePose] = field(default_factory=list)
+    rejected: list[Rejected] = field(default_factory=list)
+    truths: list[Truth] = field(default_factory=list)
+    candidates: list[Candidates] = field(default_factory=list)
+    light_truths: list[LightTruth] = field(default_factory=list)
+    attitudes_a: list[Attitude] = field(default_factory=list)
+    infos: dict[str, NodeInfo] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    environment: str = ""
