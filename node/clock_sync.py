@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from node.chrony import ChronyError, Tracking, read_tracking
 from protocol.clock import Clock
-from protocol.messages import MAX_HEARD, ClockBeacon, HeardClock, MessageError, decode
+from protocol.codec import decode
+from protocol.errors import MessageError
+from protocol.messages import MAX_HEARD, ClockBeacon, HeardClock
 from protocol.topics import CLOCK, check_sender
 
 if TYPE_CHECKING:

@@ -7,7 +7,8 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from protocol.clock import Clock
-from protocol.messages import Message, encode
+from protocol.codec import encode
+from protocol.messages import Message
 from protocol.topics import Topic, key_of, topic_of
 
 if TYPE_CHECKING:

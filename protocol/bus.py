@@ -15,8 +15,9 @@ from types import TracebackType
 from typing import Final, Protocol, Self, TypeAlias
 
 from protocol.clock import Clock
+from protocol.codec import encode, payload_stamp_ns
 from protocol.delivery import FailureLatch, RateCap, ThreadDiedError
-from protocol.messages import Message, encode, payload_stamp_ns
+from protocol.messages import Message
 from protocol.topics import Topic, parse_key
 
 CACHE_S: Final = 60.0

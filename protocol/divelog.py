@@ -18,8 +18,9 @@ from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 from protocol import topics
+from protocol.codec import decode, encode, payload_stamp_ns
 from protocol.errors import BuddylineError
-from protocol.messages import Message, MessageError, decode, encode, payload_stamp_ns
+from protocol.messages import Message
 from protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
 from protocol.schemas import json_schema
 from protocol.spool import Spool
@@ -340,6 +341,3 @@ def read_logs(
 ) -> Iterator[Record]:
     """Yield the records of several logs as one, by log time, from since_ns on."""
     return heapq.merge(*(reader.records(wanted, since_ns) for reader in readers), key=lambda record: record.log_time_ns)
-
-
-__all__ = ["DiveLogReader", "DiveLogWriter", "MessageError", "Record", "payload_stamp_ns", "read_logs"]

@@ -6,8 +6,8 @@ import ipaddress
 import re
 from typing import TYPE_CHECKING, Final
 
+from protocol.codec import MAX_MESSAGE_BYTES
 from protocol.errors import BuddylineError
-from protocol.messages import MAX_MESSAGE_BYTES
 
 if TYPE_CHECKING:
     from protocol.security import Tls

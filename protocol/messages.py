@@ -1,25 +1,18 @@
 """The messages of the bus and of dive logs, as validated structures.
 
-One JSON object a message, UTF-8. A message that decodes is sound: types, lengths, finite numbers, unit
-quaternions, blobs inside their picture. `encode` lets nothing out that `decode` would refuse, and
-writes every number that is not an integer by nature as a float.
+What `codec.decode` gives is sound: types, lengths, finite numbers, unit quaternions, blobs inside their picture.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar
+from typing import Annotated, Final, Literal, TypeAlias
 
-import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
-
-from protocol.errors import BuddylineError
 
 NODE_ID_PATTERN: Final = r"^[a-z0-9_]{1,32}\Z"
 MAX_BLOBS: Final = 64
 MAX_HEARD: Final = 16
-MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 
 NodeId: TypeAlias = Annotated[str, Meta(pattern=NODE_ID_PATTERN)]
 StampNs: TypeAlias = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -43,10 +36,6 @@ Reason: TypeAlias = Literal[
     "late",
     "duplicate",
 ]
-
-
-class MessageError(BuddylineError):
-    """A payload that is not a sound message; the text names the field."""
 
 
 def _check_unit(field: str, q_xyzw: Quaternion) -> None:
@@ -403,87 +392,3 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     latency_p99_s: float | UnsetType = UNSET
     clock_skew_s: float | UnsetType = UNSET
     problem: str = ""
-
-
-M = TypeVar("M", bound=Message)
-
-
-def _plain(value: object) -> object:
-    """Give numpy scalars and arrays as Python's own numbers and lists."""
-    to_list = getattr(value, "tolist", None)
-    if to_list is None:
-        raise TypeError(f"cannot encode {type(value).__name__}")
-    return to_list()
-
-
-_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
-_DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
-
-
-def decode(payload: bytes, schema: type[M]) -> M:
-    """Decode and validate one message; raise MessageError naming the field."""
-    if len(payload) > MAX_MESSAGE_BYTES:
-        raise MessageError(f"{schema.__name__}: {len(payload)} bytes, at most {MAX_MESSAGE_BYTES}")
-    decoder = _DECODERS.get(schema)
-    if decoder is None:
-        decoder = _DECODERS.setdefault(schema, msgspec.json.Decoder(schema))
-    try:
-        message: M = decoder.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        where = _non_finite_field(payload)
-        raise MessageError(f"{schema.__name__}: {where or error}") from error
-    return message
-
-
-def _non_finite_field(payload: bytes) -> str | None:
-    """Name the NaN or infinity that makes a payload malformed JSON, where that is what ails it."""
-    if not any(word in payload for word in (b"NaN", b"Infinity")):
-        return None
-    try:
-        root = json.loads(payload)
-    except (ValueError, RecursionError):
-        return None
-    stack: list[tuple[str, object]] = [("$", root)]
-    while stack:
-        path, value = stack.pop()
-        if isinstance(value, float) and not math.isfinite(value):
-            return f"not a finite number: {value} - at `{path}`"
-        if isinstance(value, dict):
-            stack.extend((f"{path}.{key}", item) for key, item in value.items())
-        elif isinstance(value, list):
-            stack.extend((f"{path}[{i}]", item) for i, item in enumerate(value))
-    return None
-
-
-class _Stamp(Struct):
-    """The measurement time of any message of ours."""
-
-    stamp_ns: int | None = None
-    timestamp: FoxgloveTime | None = None
-
-
-_STAMP_DECODER = msgspec.json.Decoder(_Stamp)
-
-
-def payload_stamp_ns(payload: bytes) -> int | None:
-    """Return the measurement time that a payload carries, or None."""
-    try:
-        stamp = _STAMP_DECODER.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return None
-    if stamp.timestamp is not None:
-        return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
-    return stamp.stamp_ns
-
-
-def encode(message: Message) -> bytes:
-    """Encode one message; raise MessageError where it is not sound.
-
-    What goes out is read back first: a NaN, an integer in place of a float or a numpy scalar never reaches
-    the bus.
-    """
-    try:
-        first = _ENCODER.encode(message)
-    except (TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-        raise MessageError(f"{type(message).__name__}: {error}") from error
-    return _ENCODER.encode(decode(first, type(message)))

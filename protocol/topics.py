@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Final, Literal
 
 from protocol import messages
-from protocol.errors import BuddylineError
+from protocol.errors import BuddylineError, MessageError
 from protocol.messages import NODE_ID_PATTERN, Message
 
 Priority = Literal["interactive_high", "data_high", "data", "data_low", "background"]
@@ -226,7 +226,7 @@ def check_sender(key: str, message: Message) -> None:
     said = tuple(getattr(message, field, None) for field in fields)
     if parsed is not None and said[0] is not None and said != parsed[1]:
         words = ", ".join(f"{field} {value!r}" for field, value in zip(fields, said, strict=True))
-        raise messages.MessageError(f"{parsed[0].schema_name}: {words} on key {key}")
+        raise MessageError(f"{parsed[0].schema_name}: {words} on key {key}")
 
 
 def topic_of(message: Message) -> Topic:

@@ -13,7 +13,9 @@ from msgspec import UNSET
 
 from protocol import __version__
 from protocol.clock import S_NS, Clock, SystemClock
-from protocol.messages import Candidates, Message, MessageError, NodeInfo, Rejected, RelativePose, SolverStatus, decode
+from protocol.codec import decode
+from protocol.errors import MessageError
+from protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus
 from protocol.service import Service
 from protocol.statusfile import StatusFile
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key

@@ -9,8 +9,7 @@ from dataclasses import asdict
 from typing import Final
 
 from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import MessageError
+from protocol.errors import BuddylineError, MessageError
 from solver_service.alignment import ClockAlignment, ClockOffset
 from solver_service.config import SolveConfig
 from solver_service.core import SolverCore

@@ -14,9 +14,10 @@ from msgspec import UNSET
 
 from node.drivers.stored import PictureError, decode_picture
 from protocol.clock import trigger_index
+from protocol.codec import encode
 from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import Attitude, CompressedImage, MessageError, NodeInfo, RelativePose, encode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, CompressedImage, NodeInfo, RelativePose
 from protocol.topics import ARTAG, check_node_id, parse_key
 from tools.dives import Dive
 from tools.evaluation.rotation import Floats, multiply, normalized, rotate

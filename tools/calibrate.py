@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 
 from protocol.clock import SystemClock
+from protocol.codec import encode
 from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, NodeInfo, Vector3, encode
+from protocol.messages import CameraModel, NodeInfo, Vector3
 from tools.client import add_client_arguments, client_config
 from tools.dives import load_info
 

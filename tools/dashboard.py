@@ -15,7 +15,9 @@ from msgspec import UNSET
 from node.sim.scenario import Environment, Scenario
 from node.sim.world import World
 from protocol.clock import S_NS
-from protocol.messages import MessageError, NodeStatus, Rejected, RelativePose, SolverStatus
+from protocol.codec import decode
+from protocol.errors import MessageError
+from protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus
 from protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, parse_key
 from solver_service.geometry.rotation import matrix_of
 
@@ -54,8 +56,6 @@ class Dashboard:
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus."""
-        from protocol.messages import decode
-
         parsed = parse_key(received.key)
         if parsed is None:
             return

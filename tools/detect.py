@@ -16,9 +16,10 @@ from node.devices import Frame
 from node.drivers.stored import PictureError, decode_picture, picture_files
 from node.pipeline import Pipeline
 from protocol.clock import trigger_index
+from protocol.codec import encode
 from protocol.divelog import DiveLogWriter, Record
-from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, Message, MessageError, NodeInfo, encode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Candidates, CompressedImage, Message, NodeInfo
 from protocol.topics import parse_key
 from tools.dives import Dive
 from tools.progress import Progress

@@ -10,10 +10,11 @@ from types import TracebackType
 
 import msgspec
 
+from protocol.codec import decode
 from protocol.config import ConfigError
 from protocol.divelog import DiveLogReader, Record, read_logs
-from protocol.errors import BuddylineError
-from protocol.messages import MessageError, NodeInfo, decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import NodeInfo
 from protocol.pictures import with_pictures
 from protocol.topics import INFO, parse_key
 

@@ -14,18 +14,8 @@ from typing import Any, Final
 import numpy as np
 
 from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import (
-    Attitude,
-    Blob,
-    Candidates,
-    CompressedImage,
-    Depth,
-    Message,
-    MessageError,
-    NodeInfo,
-    RelativePose,
-)
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, Blob, Candidates, CompressedImage, Depth, Message, NodeInfo, RelativePose
 from protocol.topics import parse_key
 from solver_service.geometry.rotation import matrix_of, quaternion_of
 from tools.dives import Dive

@@ -14,9 +14,10 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from protocol.clock import S_NS, Clock, SystemClock
+from protocol.codec import encode, payload_stamp_ns
 from protocol.divelog import Record
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, FoxgloveTime, Message, MessageError, encode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import CompressedImage, FoxgloveTime, Message
 from protocol.security import PLAYER
 from protocol.service import Service
 from protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
@@ -69,8 +70,6 @@ class SolverFollower:
         bus.watch_alive(self._watch)
 
     def _hear(self, received: Received) -> None:
-        from protocol.divelog import payload_stamp_ns
-
         with self._changed:
             self._resolved_ns = max(self._resolved_ns, payload_stamp_ns(received.payload) or -1)
             self._heard_s = time.monotonic()

@@ -9,7 +9,8 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from protocol.messages import MessageError, decode
+from protocol.codec import decode
+from protocol.errors import MessageError
 from protocol.recorder import Recorder
 from protocol.service import Service
 from protocol.topics import EVERYTHING, check_sender, parse_key

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from protocol.clock import S_NS, Clock, SystemClock
-from protocol.errors import BuddylineError
-from protocol.messages import Attitude, Depth, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
 from protocol.security import ROS
 from protocol.service import Service
 from protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key

@@ -9,18 +9,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from protocol.codec import encode
 from protocol.config import ConfigError
 from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import (
-    CompressedImage,
-    Message,
-    MessageError,
-    NodeInfo,
-    Rejected,
-    RelativePose,
-    encode,
-)
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import CompressedImage, Message, NodeInfo, Rejected, RelativePose
 from protocol.topics import CANDIDATES, check_node_id, parse_key
 from solver_service.config import CHECKS, METHODS, SolveConfig
 from solver_service.core import SolverCore

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from node.detect import ENVIRONMENTS, METHODS, draw, make_detector, presets
 from node.drivers.stored import PictureError, decode_picture, picture_files
 from protocol.clock import trigger_index
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, LightTruth, MessageError, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import CompressedImage, LightTruth
 from protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
 from tools.dives import Dive
 from tools.progress import Progress

@@ -23,8 +23,8 @@ from node.devices import Frame
 from protocol.clock import Clock
 from protocol.config import ConfigError
 from protocol.divelog import DiveLogReader, read_logs
-from protocol.errors import BuddylineError
-from protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, MessageError, NodeInfo
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, NodeInfo
 from protocol.pictures import with_pictures
 from protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from protocol.bus import Bus, Received
 from protocol.clock import S_NS
+from protocol.codec import decode
 from protocol.divelog import DiveLogReader
-from protocol.messages import Candidates, Message, Rejected, RelativePose, decode
+from protocol.messages import Candidates, Message, Rejected, RelativePose
 from protocol.topics import CANDIDATES, POSE, REJECTED, parse_key
 from protocol.zenoh_bus import connect
 

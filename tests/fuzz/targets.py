@@ -18,20 +18,11 @@ from hypothesis import strategies as st
 
 from node.config import NodeConfig
 from protocol.bus import Received
+from protocol.codec import decode, encode, payload_stamp_ns
 from protocol.config import Config, ConfigError, parse_config
 from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import (
-    Candidates,
-    Message,
-    MessageError,
-    NodeInfo,
-    Rejected,
-    RelativePose,
-    decode,
-    encode,
-    payload_stamp_ns,
-)
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose
 from protocol.topics import TOPICS, Topic, key_of
 from solver_service.config import SolverConfig
 from solver_service.service import SolverService

@@ -9,8 +9,10 @@ from node.chrony import ChronyError, decode_tracking
 from node.clock_sync import HEARD_FOR_S, Beacons, ClockSync
 from protocol.bus import Received
 from protocol.clock import ManualClock
+from protocol.codec import decode, encode
+from protocol.errors import MessageError
 from protocol.local_bus import LocalNetwork
-from protocol.messages import MAX_HEARD, ClockBeacon, MessageError, decode, encode
+from protocol.messages import MAX_HEARD, ClockBeacon
 from protocol.topics import CLOCK
 from tests.node.test_chrony import FOLLOWS, LOST
 

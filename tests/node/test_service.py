@@ -18,8 +18,9 @@ from node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, S
 from node.images import Turn
 from node.service import NodeService
 from protocol.clock import MS_NS, S_NS, SystemClock
+from protocol.codec import decode
 from protocol.divelog import DiveLogReader
-from protocol.messages import NodeStatus, decode
+from protocol.messages import NodeStatus
 from tests.disks import small_disk
 from tests.processes import REPOSITORY, Process, free_endpoint
 

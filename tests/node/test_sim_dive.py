@@ -11,8 +11,9 @@ from node.sim.dive import Plan, messages
 from node.sim.scenario import Scenario
 from node.sim.world import World
 from protocol.clock import S_NS
+from protocol.codec import encode
 from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth, encode
+from protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth
 
 START_NS = 1_764_000_000 * S_NS
 

@@ -12,8 +12,9 @@ from node.sim.rig import R_BODY_CAMERA
 from node.sim.scenario import ENVIRONMENTS, Scenario
 from node.sim.sensors import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRAVITY_MPS2
 from node.sim.world import World
+from protocol.codec import decode, encode
 from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, Candidates, decode, encode
+from protocol.messages import CameraModel, Candidates
 
 S_NS = 1_000_000_000
 START_NS = 1_764_000_000 * S_NS

@@ -13,18 +13,10 @@ import pytest
 from protocol import topics
 from protocol.bus import Bus, Received
 from protocol.clock import ManualClock
+from protocol.codec import decode, payload_stamp_ns
+from protocol.errors import MessageError
 from protocol.local_bus import LocalNetwork, key_matches
-from protocol.messages import (
-    Candidates,
-    CompressedImage,
-    Depth,
-    FoxgloveTime,
-    MessageError,
-    NodeStatus,
-    Rejected,
-    decode,
-    payload_stamp_ns,
-)
+from protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
 from protocol.zenoh_bus import connect, open_hub
 
 WAIT_S = 10.0

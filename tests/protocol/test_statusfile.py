@@ -5,7 +5,8 @@ import logging
 
 import pytest
 
-from protocol.messages import NodeStatus, decode
+from protocol.codec import decode
+from protocol.messages import NodeStatus
 from protocol.statusfile import StatusFile
 
 STATUS = NodeStatus(

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, FoxgloveTime, Mark, MessageError, Rejected
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import CompressedImage, FoxgloveTime, Mark, Rejected
 from protocol.schemas import json_schema
 from protocol.topics import CANDIDATES, POSE, TOPICS, check_sender, key_of, parse_key
 

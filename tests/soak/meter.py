@@ -11,8 +11,9 @@ from pathlib import Path
 
 from protocol.bus import Received
 from protocol.clock import S_NS
-from protocol.divelog import DiveLogReader, payload_stamp_ns
-from protocol.messages import Candidates, RelativePose, decode
+from protocol.codec import decode, payload_stamp_ns
+from protocol.divelog import DiveLogReader
+from protocol.messages import Candidates, RelativePose
 from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, NODE_STATUS, POSE, REJECTED, Topic, parse_key
 from protocol.zenoh_bus import connect
 

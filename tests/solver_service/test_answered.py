@@ -6,8 +6,9 @@ from collections import Counter
 import pytest
 
 from protocol.clock import S_NS, ManualClock
+from protocol.codec import decode
 from protocol.local_bus import LocalNetwork
-from protocol.messages import Candidates, Rejected, decode
+from protocol.messages import Candidates, Rejected
 from protocol.topics import key_of, parse_key
 from solver_service.answered import Answered
 from solver_service.config import SolverConfig

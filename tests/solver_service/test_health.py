@@ -5,8 +5,9 @@ import time
 
 import pytest
 
+from protocol.codec import decode, encode
 from protocol.local_bus import LocalNetwork
-from protocol.messages import NodeInfo, decode, encode
+from protocol.messages import NodeInfo
 from protocol.topics import INFO, SOLVER_STATUS
 from solver_service.config import SolverConfig
 from solver_service.health import NodeHealth

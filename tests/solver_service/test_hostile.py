@@ -6,7 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from protocol.bus import Received
-from protocol.messages import MAX_MESSAGE_BYTES, Candidates, NodeInfo, Rejected, RelativePose, encode
+from protocol.codec import MAX_MESSAGE_BYTES, encode
+from protocol.messages import Candidates, NodeInfo, Rejected, RelativePose
 from protocol.topics import key_of
 from solver_service.config import SolverConfig
 from solver_service.service import SolverService

@@ -2,8 +2,9 @@
 
 import pytest
 
+from protocol.codec import encode
 from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.messages import CompressedImage, FoxgloveTime, Mark, encode
+from protocol.messages import CompressedImage, FoxgloveTime, Mark
 from protocol.topics import key_of
 from tests.solver_service.conftest import dive_messages
 from tools.cli import main

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from node.config import CalibrationConfig
+from protocol.codec import decode, encode
 from protocol.config import parse_config
 from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, NodeInfo, decode, encode
+from protocol.messages import CameraModel, NodeInfo
 from tests.tools import boards
 from tools import calibrate
 from tools.calibration import camera

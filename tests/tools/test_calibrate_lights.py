@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from protocol.codec import decode, encode
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
-from protocol.messages import Blob, CameraModel, Candidates, NodeInfo, RelativePose, decode, encode
+from protocol.messages import Blob, CameraModel, Candidates, NodeInfo, RelativePose
 from protocol.topics import CANDIDATES, INFO, POSE
 from solver_service.geometry.camera import Camera
 from solver_service.geometry.rotation import quaternion_of, rotation_exp

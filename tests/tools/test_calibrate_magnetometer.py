@@ -11,10 +11,11 @@ import pytest
 
 from node.config import SensorsConfig
 from node.geomagnetism import MagnetometerCalibration
+from protocol.codec import encode
 from protocol.config import parse_config
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
-from protocol.messages import Imu, encode
+from protocol.messages import Imu
 from protocol.topics import IMU
 from tools import calibrate
 from tools.calibration.ellipsoid import CoverageError, coverage, fit

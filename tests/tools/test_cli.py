@@ -105,7 +105,7 @@ def test_dive_without_calibration(capsys, tmp_path):
     assert status == 2
     assert "--info a=FILE" in err
     info = next(m for m in messages if hasattr(m, "camera"))
-    from protocol.messages import encode
+    from protocol.codec import encode
 
     for node in ("a", "b"):
         import msgspec

@@ -14,7 +14,8 @@ from msgspec.structs import replace
 
 from protocol.bus import Received
 from protocol.clock import S_NS, ManualClock
-from protocol.messages import Message, encode
+from protocol.codec import encode
+from protocol.messages import Message
 from protocol.topics import POSE, key_of
 from tests.tools.evaluated import FACING, INFOS, OFFSET_PX, frame, pose, rejection
 from tests.tools.watched import at, attitude, feed, image, solver_status, status, watched

@@ -6,10 +6,11 @@ import time
 import pytest
 
 from protocol.clock import ManualClock
+from protocol.codec import decode
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
 from protocol.local_bus import LocalNetwork
-from protocol.messages import Candidates, NodeInfo, Rejected, decode
+from protocol.messages import Candidates, NodeInfo, Rejected
 from protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 from tools.dives import Dive

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from protocol.codec import decode
 from protocol.config import ConfigError
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
 from protocol.local_bus import LocalNetwork
-from protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose, decode
+from protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose
 from protocol.topics import MARK, key_of, parse_key
 from tests.tools import survey_world as world
 from tools.survey import command, mark

@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from node.detect import METHODS, make_detector
 from node.drivers.stored import decode_picture
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, MessageError, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import CompressedImage
 from protocol.topics import IMAGE
 from tools.dives import Dive
 

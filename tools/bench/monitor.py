@@ -29,8 +29,9 @@ import numpy as np
 
 from protocol.bus import Bus, Received
 from protocol.clock import S_NS
+from protocol.codec import decode
 from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose, decode
+from protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
 from protocol.topics import CANDIDATES, IMAGE, POSE
 
 RATE_HZ: Final = 30

@@ -14,8 +14,9 @@ from msgspec import UNSET
 
 from protocol.bus import Bus, Received
 from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import ClockBeacon, Message, MessageError, NodeStatus, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import ClockBeacon, Message, NodeStatus
 from protocol.topics import CLOCK, NODE_STATUS, check_sender
 from tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
 from tools.client import ClientConfig

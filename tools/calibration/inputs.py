@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from node.drivers.stored import decode_picture, picture_files
 from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, Imu, MessageError, NodeInfo, RelativePose
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
 from solver_service.geometry.rotation import matrix_of
 from tools.calibration.lights import Station
 from tools.dives import Dive

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from protocol.bus import Bus, Received
-from protocol.errors import BuddylineError
-from protocol.messages import MessageError, NodeInfo, NodeStatus, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import NodeInfo, NodeStatus
 from protocol.security import Tls
 from protocol.topics import INFO, NODE_STATUS, check_sender
 from tools.doctor.finding import Finding

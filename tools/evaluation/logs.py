@@ -7,18 +7,8 @@ from contextlib import ExitStack
 from typing import Final
 
 from protocol.divelog import DiveLogReader
-from protocol.errors import BuddylineError
-from protocol.messages import (
-    Attitude,
-    Candidates,
-    LightTruth,
-    Message,
-    MessageError,
-    NodeInfo,
-    Rejected,
-    RelativePose,
-    Truth,
-)
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, Candidates, LightTruth, Message, NodeInfo, Rejected, RelativePose, Truth
 from protocol.topics import ARTAG, ATTITUDE, CANDIDATES, INFO, LIGHT_TRUTH, POSE, REJECTED, TRUTH, Topic, parse_key
 from tools.evaluation.recorded import Pair, Recorded
 from tools.evaluation.truth import inverted

@@ -11,7 +11,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from protocol.messages import MessageError, decode
+from protocol.codec import decode
+from protocol.errors import MessageError
 from protocol.topics import (
     ATTITUDE,
     CANDIDATES,

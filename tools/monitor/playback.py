@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Final, Self
 
 from protocol.clock import S_NS
+from protocol.codec import decode
 from protocol.divelog import DiveLogReader, Record, read_logs
-from protocol.errors import BuddylineError
-from protocol.messages import MessageError, NodeInfo, Rejected, RelativePose, decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import NodeInfo, Rejected, RelativePose
 from protocol.pictures import with_pictures
 from protocol.topics import (
     ATTITUDE,

@@ -11,7 +11,8 @@ import numpy as np
 
 from protocol.clock import S_NS
 from protocol.divelog import Record
-from protocol.messages import Depth, MessageError, NodeInfo, Rejected, RelativePose, Truth
+from protocol.errors import MessageError
+from protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
 from protocol.topics import CANDIDATES, IMAGE, parse_key
 from tools.dives import Dive
 from tools.monitor.coverage import Coverage

@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import Attitude, Depth, Imu, Mark, Message, MessageError, NodeInfo, RelativePose, decode
+from protocol.codec import decode
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
 from protocol.security import SURVEYOR
 from protocol.service import Service
 from protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key

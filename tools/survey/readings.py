@@ -10,18 +10,8 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from protocol.errors import BuddylineError
-from protocol.messages import (
-    Attitude,
-    Depth,
-    Imu,
-    Mark,
-    Message,
-    MessageError,
-    NodeInfo,
-    Rejected,
-    RelativePose,
-)
+from protocol.errors import BuddylineError, MessageError
+from protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
 from tools.dives import Dive
 from tools.survey.averages import Floats
 from tools.survey.rotations import matrices_of

@@ -14,8 +14,9 @@ from node.drivers.devices import Metronome, open_sensors
 from node.drivers.ms5837 import compensate_30ba
 from node.drivers.samples import DeviceError
 from protocol.clock import MS_NS, S_NS, ManualClock
+from protocol.codec import encode
 from protocol.errors import BuddylineError
-from protocol.messages import Attitude, CameraModel, Depth, Imu, encode
+from protocol.messages import Attitude, CameraModel, Depth, Imu
 from tests.node.drivers import wire
 from tests.node.drivers.wire import Adapter, Sky
 

@@ -1,0 +1,101 @@
+"""Messages to and from the bytes of the bus and of dive logs: one JSON object a message, UTF-8.
+
+`encode` lets nothing out that `decode` would refuse, and writes every number that is not an integer by nature as a
+float.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any, Final, TypeVar
+
+import msgspec
+
+from protocol.errors import MessageError
+from protocol.messages import FoxgloveTime, Message
+
+MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+
+M = TypeVar("M", bound=Message)
+
+
+def _plain(value: object) -> object:
+    """Give numpy scalars and arrays as Python's own numbers and lists."""
+    to_list = getattr(value, "tolist", None)
+    if to_list is None:
+        raise TypeError(f"cannot encode {type(value).__name__}")
+    return to_list()
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
+_DECODERS: dict[type[Message], msgspec.json.Decoder[Any]] = {}
+
+
+def decode(payload: bytes, schema: type[M]) -> M:
+    """Decode and validate one message; raise MessageError naming the field."""
+    if len(payload) > MAX_MESSAGE_BYTES:
+        raise MessageError(f"{schema.__name__}: {len(payload)} bytes, at most {MAX_MESSAGE_BYTES}")
+    decoder = _DECODERS.get(schema)
+    if decoder is None:
+        decoder = _DECODERS.setdefault(schema, msgspec.json.Decoder(schema))
+    try:
+        message: M = decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        where = _non_finite_field(payload)
+        raise MessageError(f"{schema.__name__}: {where or error}") from error
+    return message
+
+
+def _non_finite_field(payload: bytes) -> str | None:
+    """Name the NaN or infinity that makes a payload malformed JSON, where that is what ails it."""
+    if not any(word in payload for word in (b"NaN", b"Infinity")):
+        return None
+    try:
+        root = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    stack: list[tuple[str, object]] = [("$", root)]
+    while stack:
+        path, value = stack.pop()
+        if isinstance(value, float) and not math.isfinite(value):
+            return f"not a finite number: {value} - at `{path}`"
+        if isinstance(value, dict):
+            stack.extend((f"{path}.{key}", item) for key, item in value.items())
+        elif isinstance(value, list):
+            stack.extend((f"{path}[{i}]", item) for i, item in enumerate(value))
+    return None
+
+
+class _Stamp(msgspec.Struct):
+    """The measurement time of any message of ours."""
+
+    stamp_ns: int | None = None
+    timestamp: FoxgloveTime | None = None
+
+
+_STAMP_DECODER = msgspec.json.Decoder(_Stamp)
+
+
+def payload_stamp_ns(payload: bytes) -> int | None:
+    """Return the measurement time that a payload carries, or None."""
+    try:
+        stamp = _STAMP_DECODER.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    if stamp.timestamp is not None:
+        return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
+    return stamp.stamp_ns
+
+
+def encode(message: Message) -> bytes:
+    """Encode one message; raise MessageError where it is not sound.
+
+    What goes out is read back first: a NaN, an integer in place of a float or a numpy scalar never reaches
+    the bus.
+    """
+    try:
+        first = _ENCODER.encode(message)
+    except (TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
+        raise MessageError(f"{type(message).__name__}: {error}") from error
+    return _ENCODER.encode(decode(first, type(message)))
