@@ -119,8 +119,10 @@ def measure_lights(
 
 def distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
     """Leave out what lies inside an earlier one; give the indices of the rest. centre_px: (N, 2); radius_px: (N,)."""
-    apart = np.hypot(centre_px[:, None, 0] - centre_px[:, 0], centre_px[:, None, 1] - centre_px[:, 1])
-    same = apart < np.maximum(0.7 * np.maximum(radius_px[:, None], radius_px), 2.0)
+    u, v = centre_px.T
+    apart = np.hypot(u[:, None] - u, v[:, None] - v)
+    reach_px = np.maximum(0.7 * radius_px, 2.0)
+    same = apart < np.maximum(reach_px[:, None], reach_px)
     # Each row as the bits of one number.
     rows = (same @ (np.uint64(1) << np.arange(len(same), dtype=np.uint64))).tolist()
     kept: list[int] = []
@@ -203,7 +205,7 @@ def _at_most(step_px: Floats, length_px: Floats) -> Floats:
 
 def _water_level(image: NDArray[np.uint8]) -> Floats:
     """Give what a fifth of a picture lies below, in the weakest channel."""
-    some = image[::16, ::16]
+    some = np.ascontiguousarray(image[::16, ::16])
     weak = (some if image.ndim == 2 else weakest_channel(some)).ravel()
     k = len(weak) // 5
     return np.asarray(np.partition(weak, k)[k], np.float32)

@@ -24,6 +24,8 @@ RAY_HARMONICS = np.stack([np.ones(RAYS), RAY_COS, RAY_SIN, RAY_COS**2, RAY_COS *
 """(K, 6): 1, c, s, cc, cs, ss of each ray's direction."""
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
+_RAYS = np.stack([RAY_COS, RAY_SIN])[:, None, None]
+_CENTROID = RAY_HARMONICS[:, 1:3] / np.float32(1.5 * RAYS)
 _MEAN = np.full(RAYS, 1.0 / RAYS, np.float32)
 
 
@@ -42,10 +44,8 @@ class Rings:
 def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats) -> Rings:
     """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), growing, both in px."""
     n, m = radius_px.shape
-    u = radius_px[:, :, None] * RAY_COS
-    v = radius_px[:, :, None] * RAY_SIN
-    u += centre_px[:, 0, None, None]
-    v += centre_px[:, 1, None, None]
+    u, v = uv = radius_px[:, :, None] * _RAYS
+    uv += centre_px.T[:, :, None, None]
     pixels = cv2.remap(
         image,
         u.reshape(n * m, RAYS),
@@ -55,8 +55,7 @@ def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats)
     )
     height, width = image.shape[:2]
     inside = None
-    reach_px, last_px = radius_px[:, -1:], (width - 1, height - 1)
-    if ((centre_px < reach_px) | (centre_px > last_px - reach_px)).any():
+    if uv.min() < 0.0 or u.max() > width - 1 or v.max() > height - 1:
         inside = (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
     return Rings(radius_px, np.asarray(pixels, np.float32).reshape(n, m, RAYS, -1), inside)
 
@@ -64,8 +63,7 @@ def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats)
 def geometric_radii(first_px: Floats, last_px: Floats, count: int) -> Floats:
     """Give (N, count) float32 radii that grow by a constant factor from first_px (N,) to last_px (N,)."""
     share = np.arange(count, dtype=np.float32) / np.float32(count - 1)
-    radii = first_px[:, None] * (last_px / first_px)[:, None] ** share
-    return radii.astype(np.float32)
+    return np.asarray(first_px[:, None] * (last_px / first_px)[:, None] ** share, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +110,7 @@ def find_shapes(level: Floats, inside: NDArray[np.bool_] | None, radius_px: Floa
     start = np.arange(0, outward.size, rings).reshape(channels, 1, places, RAYS)
     inner, outer = outward.take(start + before), outward.take(start + first)
     share = (inner - threshold[..., None]) / np.maximum(inner - outer, 1e-3)
-    np.clip(share, 0.0, 1.0, out=share)
+    np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
     start = np.arange(0, radius_px.size, rings)[:, None]
     near, far = radius_px.take(start + before), radius_px.take(start + first)
     edge = near + share * (far - near)
@@ -120,7 +118,7 @@ def find_shapes(level: Floats, inside: NDArray[np.bool_] | None, radius_px: Floa
     edge[first == 0] *= 0.5
     square = edge * edge
     area = np.maximum(square @ _MEAN, 1e-6)
-    centre = (square * edge) @ (RAY_HARMONICS[:, 1:3] / (1.5 * RAYS)) / area[..., None]
+    centre = (square * edge) @ _CENTROID / area[..., None]
     return Shapes(edge, is_open @ _MEAN, centre, np.sqrt(area))
 
 
