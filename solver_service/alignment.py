@@ -27,6 +27,8 @@ MIN_FIXES: Final = 20
 # The motion at a fix is that of the fixes this far before and after it.
 HALF_WINDOW_S: Final = 1.0
 MIN_NEIGHBOURS: Final = 2
+# A diver sways within the window: a straight line through it is a tenth too slow, a cubic is not, and needs more fixes.
+MIN_FOR_CUBIC: Final = 8
 # Beyond this many standard deviations a gap says something else than the time.
 HUBER: Final = 2.0
 ROUNDS: Final = 8
@@ -95,7 +97,7 @@ class ClockAlignment:
             self._make_equations()
 
     def _rates(self, centre: _Sighting) -> Floats | None:
-        """Velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,): the slope through its neighbours."""
+        """Velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,): of a cubic through its neighbours."""
         near = [s for s in self._window if abs(s.time_s - centre.time_s) <= HALF_WINDOW_S]
         times_s = np.array([s.time_s - centre.time_s for s in near])
         if (times_s < 0).sum() < MIN_NEIGHBOURS or (times_s > 0).sum() < MIN_NEIGHBOURS:
@@ -115,8 +117,8 @@ class ClockAlignment:
         )
         angle = np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
         moved = np.hstack((np.array([s.fix.t_a_b_m for s in near]), sine / np.sinc(angle / np.pi)[:, None]))
-        times_s -= times_s.mean()
-        return np.asarray(times_s @ (moved - moved.mean(0)) / (times_s @ times_s))
+        powers = times_s[:, None] ** np.arange(4 if len(near) >= MIN_FOR_CUBIC else 2)
+        return np.asarray(np.linalg.lstsq(powers, moved, rcond=None)[0][1])
 
     def _make_equations(self) -> None:
         """Turn the fixes whose motion is known into rows."""
