@@ -123,8 +123,9 @@ class Watch:
     def attach(self) -> None:
         """Subscribe."""
         self._bus.subscribe(INFO.key_any(), self.receive)
-        for topic in (ATTITUDE, DEPTH, IMU, POSE):
-            self._bus.subscribe(topic.key_any(), self.receive, capacity=4096, history=False)
+        # In one, so that no pose closes a leg ahead of the depths that came before it.
+        keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE))
+        self._bus.subscribe(keys, self.receive, capacity=16384, history=False)
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus."""
