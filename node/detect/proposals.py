@@ -124,9 +124,11 @@ class ProposalFinder:
             below = octave.level
         if self._octaves:
             # As one row of a picture, which OpenCV compares many times faster than numpy.
-            contrasts, highest, marks = self._contrast[None], self._highest[None], self._marks[None]
-            cv2.max(highest, float(min(max(math.ceil(contrast_min), 1), 255)), dst=highest)
-            cv2.compare(contrasts, highest, cv2.CMP_EQ, dst=marks)
+            contrast_row, highest, marks = self._contrast[None], self._highest[None], self._marks[None]
+            cv2.compare(contrast_row, highest, cv2.CMP_EQ, dst=marks)
+            enough = highest
+            cv2.threshold(contrast_row, max(math.ceil(contrast_min), 1) - 1, 255, cv2.THRESH_BINARY, dst=enough)
+            cv2.bitwise_and(marks, enough, dst=marks)
 
         # Empty places are passed over a machine word at a time.
         places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()
@@ -181,7 +183,8 @@ class ProposalFinder:
         ).reshape(-1, 5)
         self._octaves = [
             _Octave(
-                np.empty(size, np.uint8),
+                # The last of the halves is the pyramid's base.
+                self._halves[-1] if self._halves and start == 0 else np.empty(size, np.uint8),
                 self._contrast[start : start + size[0] * size[1]].reshape(size),
                 self._highest[start : start + size[0] * size[1]].reshape(size),
                 self._clutter[cell_start : cell_start + cell[0] * cell[1]].reshape(cell),
@@ -205,7 +208,8 @@ class ProposalFinder:
         level = _grey(level)
         for half in halves:
             level = halve(level, half)
-        base[...] = level
+        if not self._halves:
+            base[...] = level
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
