@@ -36,11 +36,10 @@ class Camera:
         For a direction q near the bearing b, tangent @ q / (b @ q) is how far q's image stands off the
         pixel, in px, to first order. Both are NaN where the model does not reach the pixel.
         """
-        xd = (pixels[:, 0] - self.cx_px) / self.fx_px
-        yd = (pixels[:, 1] - self.cy_px) / self.fy_px
+        distorted = (pixels - self._centre_px) / self._focal_px
         if self.model == "fisheye":
-            return self._fisheye_rays(xd, yd)
-        return self._pinhole_rays(xd, yd)
+            return self._fisheye_rays(distorted[:, 0], distorted[:, 1])
+        return self._pinhole_rays(distorted)
 
     def same_as(self, other: Camera) -> bool:
         """Whether both have the same lens; their pictures' sizes may differ."""
@@ -64,8 +63,17 @@ class Camera:
         return float(self.width_px * self.height_px)
 
     @cached_property
+    def _centre_px(self) -> Floats:
+        return np.array((self.cx_px, self.cy_px))
+
+    @cached_property
     def _focal_px(self) -> Floats:
-        return np.array(((self.fx_px,), (self.fy_px,)))
+        return np.array((self.fx_px, self.fy_px))
+
+    @cached_property
+    def _coefficients(self) -> list[float]:
+        """The distortion, empty where there is none."""
+        return [float(k) for k in self.distortion] if any(self.distortion) else []
 
     @cached_property
     def solid_angle_sr(self) -> float:
@@ -81,11 +89,11 @@ class Camera:
             angle = float(np.nansum(self.width_px * self.height_px / (columns * rows) / px2_per_sr))
         return angle if 0.0 < angle < 13.0 else 1.0
 
-    def _pinhole_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
-        x, y = xd, yd
+    def _pinhole_rays(self, distorted: Floats) -> tuple[Floats, Floats]:
+        x, y = xd, yd = distorted[:, 0], distorted[:, 1]
         tangents = np.zeros((len(x), 2, 3))
-        if any(self.distortion):
-            k1, k2, p1, p2, k3 = self.distortion
+        if self._coefficients:
+            k1, k2, p1, p2, k3 = self._coefficients
             for _ in range(_MAX_STEPS):
                 r2 = x * x + y * y
                 radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -109,20 +117,20 @@ class Camera:
             tangents[:, 0, 2], tangents[:, 1, 2] = -(a00 * x + a01 * y), -(a01 * x + a11 * y)
         else:
             tangents[:, 0, 0] = tangents[:, 1, 1] = 1.0
-            tangents[:, 0, 2], tangents[:, 1, 2] = -x, -y
+            np.negative(distorted, out=tangents[:, :, 2])
         norm = np.sqrt(x * x + y * y + 1.0)
         bearings = np.empty((len(x), 3))
         bearings[:, 0], bearings[:, 1], bearings[:, 2] = x, y, 1.0
         bearings /= norm[:, None]
         tangents *= norm[:, None, None]
-        tangents *= self._focal_px
+        tangents *= self._focal_px[:, None]
         return bearings, tangents
 
     def _fisheye_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
-        k1, k2, k3, k4 = self.distortion if any(self.distortion) else (0.0, 0.0, 0.0, 0.0)
+        k1, k2, k3, k4 = self._coefficients or (0.0, 0.0, 0.0, 0.0)
         rd = np.sqrt(xd * xd + yd * yd)
         theta, slope, step = rd, np.ones_like(rd), np.zeros_like(rd)
-        if any(self.distortion):
+        if self._coefficients:
             for _ in range(_MAX_STEPS):
                 t2 = theta * theta
                 value = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -16,10 +17,11 @@ from solver_service.geometry.rotation import Floats
 # A message holds no more.
 _MAX_CANDIDATES: Final = 64
 _MIN_SIGMA_PX: Final = 0.05
-_MAX_LOG_SCORE: Final = 1.5
+# Scores beyond say no more; half the log odds are then at most 1.5.
+_LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Candidates:
     """The usable candidates, A's first. counts: (A's, B's), their sum N.
 
@@ -46,32 +48,29 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
 
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
     """
-    pixels_a, pixels_b = (np.reshape(view.pixels, (-1, 2))[:_MAX_CANDIDATES] for view in views)
+    view_a, view_b = views
+    rig_a, rig_b = rigs.rigs
+    pixels_a, pixels_b = view_a.pixels.reshape(-1, 2)[:_MAX_CANDIDATES], view_b.pixels.reshape(-1, 2)[:_MAX_CANDIDATES]
     in_a, in_b = len(pixels_a), len(pixels_b)
     pixels = np.concatenate((pixels_a, pixels_b))
-    a, b = slice(0, in_a), slice(in_a, None)
-    rig_a, rig_b = rigs.rigs
+    index, node = _places(in_a, in_b)
     if rigs.one_camera:
         bearings, in_camera = rig_a.camera.rays(pixels)
     else:
         rays = rig_a.camera.rays(pixels_a), rig_b.camera.rays(pixels_b)
         bearings, in_camera = (np.concatenate(parts) for parts in zip(*rays, strict=True))
-    offset_s = 0.5e-9 * (views[0].stamp_ns - views[1].stamp_ns)
-    table, tangents = np.empty((9, in_a + in_b)), np.empty((in_a + in_b, 2, 3))
-    index = np.arange(in_a + in_b)
-    index[b] -= in_a
-    for view, rig, part, n, shift_s in (
-        (views[0], rig_a, a, in_a, offset_s),
-        (views[1], rig_b, b, in_b, -offset_s),
-    ):
-        columns, turn = table[:, part], rig.R_level_camera
-        np.matmul(turn, bearings[part].T, out=columns[:3])
-        np.matmul(in_camera[part], turn.T, out=tangents[part])
-        np.divide(pixels[part].T, rig.camera.size_px, out=columns[3:5])
-        np.add(view.dt_s[:n], shift_s, out=columns[5])
-        columns[6], columns[7], columns[8] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
-    usable = np.isfinite(table[:7].sum(0))
-    if not usable.all():
+    turns = rigs.turns.take(node, 0)
+    tangents = in_camera @ turns
+    table = np.empty((9, in_a + in_b))
+    table[:3] = (bearings[:, None] @ turns)[:, 0].T
+    np.divide(pixels.T, rigs.size_px.take(node, 1), out=table[3:5])
+    offset_s = 0.5e-9 * (view_a.stamp_ns - view_b.stamp_ns)
+    for view, columns, shift_s in ((view_a, table[5:, :in_a], offset_s), (view_b, table[5:, in_a:], -offset_s)):
+        n = columns.shape[1]
+        np.add(view.dt_s[:n], shift_s, out=columns[0])
+        columns[1], columns[2], columns[3] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
+    if not math.isfinite(np.add.reduce(table[:7], None)):
+        usable = np.isfinite(table[:7].sum(0))
         in_a = int(usable[:in_a].sum())
         table, tangents, index = table[:, usable], tangents[usable], index[usable]
     sigma_px = np.maximum(table[6], _MIN_SIGMA_PX)
@@ -91,19 +90,28 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     )
 
 
+@lru_cache(maxsize=64)
+def _places(in_a: int, in_b: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Give the place in its view, and the node, of each of A's candidates and then of B's."""
+    index, node = np.concatenate((np.arange(in_a), np.arange(in_b))), np.repeat((0, 1), (in_a, in_b))
+    index.flags.writeable = node.flags.writeable = False
+    return index, node
+
+
 def _log_score(score: Floats, in_a: int) -> Floats | None:
     """Give half the log odds of scores, within limits; on each picture's average, and where unknown, no evidence.
 
     None where none is known.
     """
     known = np.isfinite(score)
-    if not known.any():
+    count = np.count_nonzero(known)
+    if not count:
         return None
-    odds = np.minimum(np.maximum(np.where(known, score, 0.5), 1e-3), 1.0 - 1e-3)
-    weight = 0.5 * np.log(odds / (1.0 - odds))
-    weight = np.minimum(np.maximum(weight, -_MAX_LOG_SCORE), _MAX_LOG_SCORE)
+    odds = score if count == len(score) else np.where(known, score, 0.5)
+    odds = np.minimum(np.maximum(odds, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
+    weight: Floats = 0.5 * np.log(odds / (1.0 - odds))
     ratio = np.exp(weight)
     for part in (slice(0, in_a), slice(in_a, None)):
         if len(ratio[part]):
-            weight[part] -= math.log(float(ratio[part].sum()) / len(ratio[part]))
+            weight[part] -= math.log(float(np.add.reduce(ratio[part])) / len(ratio[part]))
     return weight

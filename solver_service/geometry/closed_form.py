@@ -22,6 +22,7 @@ Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"
 
 # A round of the split shrinks its error by about alpha^2 / 4, a round of the offset by its ratio to the range.
 _ROUNDS: Final = 9
+_TURN: Final = 2.0 * np.pi
 # Left and right of a middle.
 _ENDS: Final[Floats] = np.array((-1.0, 1.0)).reshape(2, 1, 1, 1)
 
@@ -40,7 +41,7 @@ class Bars:
         return Bars(pair.middle_m[:, :, None], pair.length_m[:, None], pair.offset_m == 0.0)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Spans:
     """The other node's bar as each view sees it: unit bisector c and chord w (2, 3, K) left to right, chord (2, K).
 
@@ -56,8 +57,9 @@ class Spans:
         """Take unit bearings (2, 2, 3, K) of left and right, those on the first axis."""
         left, right = ends
         total, difference = left + right, right - left
-        chord = np.sqrt(dot(difference, difference))
-        return Spans(total / np.sqrt(dot(total, total))[:, None], difference / chord[:, None], chord)
+        chord2 = dot(difference, difference)
+        chord = np.sqrt(chord2)
+        return Spans(total / np.sqrt(4.0 - chord2)[:, None], difference / chord[:, None], chord)
 
     @property
     def ends(self) -> Floats:
@@ -66,36 +68,32 @@ class Spans:
         return self.c * np.sqrt(1.0 - half * half) + _ENDS * (self.w * half)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class ClosedForm:
     """What the closed form says of K hypotheses.
 
     u: (2, 3, K) bearings of the other bar's middle from one's own. range_m: (2, K) l_A and l_B.
-    twist_rad: (2, K) tau_A and tau_B. R_a_b: (3, 3, K), t_a_b_m: (3, K).
+    twist_rad: (2, K) tau_A and tau_B; twist_gap_rad: (K,) the difference, within +-pi. R_a_b: (3, 3, K), t_a_b_m:
+    (3, K).
     """
 
     u: Floats
     range_m: Floats
     twist_rad: Floats
+    twist_gap_rad: Floats
     R_a_b: Floats
     t_a_b_m: Floats
-
-    @property
-    def twist_gap_rad(self) -> Floats:
-        """tau_A - tau_B (K,), within +-pi."""
-        return wrap(self.twist_rad[0] - self.twist_rad[1])
 
 
 def wrap(angle_rad: Floats) -> Floats:
     """Bring angles into [-pi, pi]."""
-    wrapped: Floats = angle_rad - 2.0 * np.pi * np.rint(angle_rad / (2.0 * np.pi))
+    wrapped: Floats = angle_rad - _TURN * np.rint(angle_rad / _TURN)
     return wrapped
 
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar product over the axis before the last."""
-    product = a * b
-    total: Floats = product[..., 0, :] + product[..., 1, :] + product[..., 2, :]
+    total: Floats = np.add.reduce(a * b, -2)
     return total
 
 
@@ -128,12 +126,14 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
         if variant == "paper_literal":
             slant = np.sqrt(np.clip(1.0 - (levels.swapaxes(1, 2) @ u)[:, 2] ** 2, 0.0, 1.0))
         span = spans.w - u * dot(u, spans.w)[:, None]
-        solved = _pose(u, span / np.sqrt(dot(span, span))[:, None], slant, spans.chord, bars, mean_twist=False)
+        span /= np.sqrt(dot(span, span))[:, None]
+        solved = _pose(u, span, slant, _angles(spans.chord), bars, mean_twist=False)
     turn_a, turn_b = levels
     return ClosedForm(
         u=levels.swapaxes(1, 2) @ solved.u,
         range_m=solved.range_m,
         twist_rad=solved.twist_rad,
+        twist_gap_rad=solved.twist_gap_rad,
         R_a_b=np.einsum("ia,ijk,jb->abk", turn_a, solved.R_a_b, turn_b),
         t_a_b_m=turn_a.T @ solved.t_a_b_m,
     )
@@ -142,15 +142,15 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
 def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
     """Solve K hypotheses between the level frames."""
     # What tells only how to move the bearings need not be split as finely.
-    u, span = _split(spans, split_rounds if bars.centred else 1)
-    chord = spans.chord
+    angles = _angles(spans.chord)
+    u, span = _split(spans, angles[0], split_rounds if bars.centred else 1)
     if not bars.centred:
         ends = spans.ends
         for _ in range(offset_rounds):
-            moved = Spans.of(_from_middles(ends, u, span, chord, bars))
-            u, span = _split(moved, split_rounds)
-            chord = moved.chord
-    return _pose(u, span, u[:, 0], chord, bars, mean_twist=True)
+            moved = Spans.of(_from_middles(ends, u, span, angles, bars))
+            angles = _angles(moved.chord)
+            u, span = _split(moved, angles[0], split_rounds)
+    return _pose(u, span, u[:, 0], angles, bars, mean_twist=True)
 
 
 def _angles(chord: Floats) -> tuple[Floats, Floats]:
@@ -159,34 +159,41 @@ def _angles(chord: Floats) -> tuple[Floats, Floats]:
     return 1.0 - 0.5 * chord2, chord * np.sqrt(1.0 - 0.25 * chord2)
 
 
-def _split(spans: Spans, rounds: int) -> tuple[Floats, Floats]:
+def _split(spans: Spans, cos_alpha: Floats, rounds: int) -> tuple[Floats, Floats]:
     """Turn the bisector and the chord to the bar's middle, in their plane."""
     c, w = spans.c, spans.w
-    cos_alpha = 1.0 - 0.5 * spans.chord * spans.chord
-    sin_beta = along_c = c[:, 0]
-    along_w = w[:, 0]
-    for _ in range(rounds):
-        other = sin_beta[::-1]
-        half = 0.5 * (np.arcsin(other) - np.arcsin(other * cos_alpha))
-        cosine, sine = np.cos(half), np.sin(half)
-        sin_beta = along_c * cosine - along_w * sine
+    cosine, sine = _off_bisector(c[:, 0], cos_alpha)
+    for _ in range(rounds - 1):
+        cosine, sine = _off_bisector(c[:, 0] * cosine - w[:, 0] * sine, cos_alpha)
     cosine, sine = cosine[:, None], sine[:, None]
     return c * cosine - w * sine, w * cosine + c * sine
 
 
-def _pose(u: Floats, span: Floats, slant: Floats, chord: Floats, bars: Bars, *, mean_twist: bool) -> ClosedForm:
+def _off_bisector(sin_beta: Floats, cos_alpha: Floats) -> tuple[Floats, Floats]:
+    """Give cos and sin of how far the bars' middles stand off the bisectors; sin_beta: as either node sees them."""
+    other = sin_beta[::-1]
+    half = 0.5 * (np.arcsin(other) - np.arcsin(other * cos_alpha))
+    return np.cos(half), np.sin(half)
+
+
+def _pose(
+    u: Floats, span: Floats, slant: Floats, angles: tuple[Floats, Floats], bars: Bars, *, mean_twist: bool
+) -> ClosedForm:
     """Put a pose together from lines of sight u, the bars across them, and sin beta as Eq. 1 is to take it."""
-    cos_alpha, sin_alpha = _angles(chord)
+    cos_alpha, sin_alpha = angles
     range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], slant, bars.length_m)
-    cos_beta = np.sqrt(1.0 - u[:, 0] * u[:, 0])
-    # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
-    side = np.zeros_like(u)
-    side[:, 1], side[:, 2] = u[:, 2] / cos_beta, -u[:, 1] / cos_beta
-    twist = np.arctan2(u[:, 2] * span[:, 1] - u[:, 1] * span[:, 2], span[:, 0])
+    ux, uy, uz = u.swapaxes(0, 1)
+    twist = np.arctan2(uz * span[:, 1] - uy * span[:, 2], span[:, 0])
+    twist_gap = wrap(twist[0] - twist[1])
     # The paper uses one of the two twists only.
-    mean = twist[0] - 0.5 * wrap(twist[0] - twist[1]) if mean_twist else twist[0]
-    own = u * (-u[:, 0] / cos_beta)[:, None]
-    own[:, 0] += 1.0 / cos_beta
+    mean = twist[0] - 0.5 * twist_gap if mean_twist else twist[0]
+    # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
+    cos_beta = np.sqrt(1.0 - ux * ux)
+    side = np.zeros(u.shape)
+    np.divide(uz, cos_beta, out=side[:, 1])
+    np.divide(uy, -cos_beta, out=side[:, 2])
+    own = u * (ux / -cos_beta)[:, None]
+    own[:, 0] = cos_beta
     cosine, sine = np.cos(mean), np.sin(mean)
     y = own[0] * cosine + side[0] * sine
     z = side[0] * cosine - own[0] * sine
@@ -194,13 +201,13 @@ def _pose(u: Floats, span: Floats, slant: Floats, chord: Floats, bars: Bars, *, 
     R = y[:, None] * own[1] - u[0][:, None] * u[1] - z[:, None] * side[1]
     t = u[0] * (0.5 * (range_m[0] + range_m[1]))
     if not bars.centred:
-        t = t + bars.middle_m[0] - (R * bars.middle_m[1]).sum(1)
-    return ClosedForm(u, range_m, twist, R, t)
+        t = t + bars.middle_m[0] - bars.middle_m[1, :, 0] @ R
+    return ClosedForm(u, range_m, twist, twist_gap, R, t)
 
 
-def _from_middles(ends: Floats, u: Floats, span: Floats, chord: Floats, bars: Bars) -> Floats:
+def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, Floats], bars: Bars) -> Floats:
     """Move the bearings (2, 2, 3, K) from the cameras to the middles of their own bars, by the distances so far."""
-    cos_alpha, sin_alpha = _angles(chord)
+    cos_alpha, sin_alpha = angles
     sin_beta = u[:, 0]
     of_a_m, of_b_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, bars.length_m)
     range_m = 0.5 * (of_a_m + of_b_m)

@@ -50,11 +50,13 @@ DEPTH_SPREAD_M: Final = 6.0
 # A prediction from earlier poses is wrong this often, and where it is right it is believed this much at most (log).
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
+# The matrices whose products with a rotation, summed, are the vector part sin(angle) axis, and the trace.
+_TURNS: Final = np.concatenate((0.5 * skew(np.eye(3)), np.eye(3)[None]))
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
 AGREES: Final = 20.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Sensors:
     """What attitude and depth of both nodes say, in the terms that a pose can be tried against.
 
@@ -74,7 +76,7 @@ class Sensors:
     fall_variance: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Support:
     """Log likelihood ratios (K,) of hypotheses without their gaps.
 
@@ -87,15 +89,16 @@ class Support:
     depth_chi2: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Prediction:
-    """Where earlier poses put this one: t_a_b_m (3,), R_a_b (3, 3), and the information (6, 6) of a pose against it.
+    """Where earlier poses put this one: t_a_b_m (3,), and the information (6, 6) of a pose against it.
 
+    turns: (4, 9), times a pose's R_a_b (9,): the vector part of its turn R_a_b R_predicted^T, and the trace of that.
     log_gain: of a pose that is exactly there, against chance.
     """
 
     t_a_b_m: Floats
-    R_a_b: Floats
+    turns: Floats
     information: Floats
     log_gain: float
 
@@ -112,7 +115,7 @@ class Prediction:
         range2 = float(t_a_b_m @ t_a_b_m) + 1e-6
         sight = t_a_b_m[:, None] * (t_a_b_m / range2)
         # Of ln range and of the twist, by both pictures.
-        relative = bearing_variance * range2 * 0.5 * float((rigs.length_m**-2.0).sum())
+        relative = bearing_variance * range2 * rigs.gap_per_bearing_m2
         total = covariance.copy()
         total[:3, :3] += relative * range2 * sight
         total[3:, 3:] += relative * sight
@@ -121,7 +124,7 @@ class Prediction:
         log_chance = -math.log(range2 * math.sqrt(range2) * spread * rigs.views_sr * 2.0 * math.pi)
         log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
         information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
-        return Prediction(t_a_b_m, R_a_b, information, -log_area - log_chance)
+        return Prediction(t_a_b_m, (_TURNS @ R_a_b).reshape(4, 9), information, -log_area - log_chance)
 
 
 def combine(
@@ -167,8 +170,8 @@ def combine(
 def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
     """Give the log density of the gaps: Gaussian, with a share of gross errors."""
     usual = (1.0 - GROSS_PROBABILITY) * np.exp(-0.5 * chi2)
-    gross = GROSS_PROBABILITY * GROSS_SCALE**-gaps * np.exp(-0.5 * chi2 / GROSS_SCALE**2)
-    density: Floats = np.log(usual + gross) - 0.5 * gaps * np.log(2.0 * math.pi * variance)
+    gross = (GROSS_PROBABILITY * GROSS_SCALE**-gaps) * np.exp((-0.5 / GROSS_SCALE**2) * chi2)
+    density: Floats = np.log(usual + gross) - (0.5 * gaps) * np.log((2.0 * math.pi) * variance)
     return density
 
 
@@ -205,7 +208,7 @@ def weigh(
 
     variance: (K,) of the gaps of ln range and of twist.
     """
-    down_b = (R_a_b * sensors.down_b[:, None]).sum(1)
+    down_b = sensors.down_b @ R_a_b
     if "attitude" in checks:
         # The picture's own noise turns B about the line of sight by half the twist gap's.
         spread2 = sensors.tilt_variance + 0.125 * variance
@@ -216,14 +219,14 @@ def weigh(
         log_ratio += weigh_heading(R_a_b, sensors, 0.25 * variance)
     else:
         # The reading is upright; of half a turn nothing is known.
-        tilt_chi2 = np.zeros_like(variance)
+        tilt_chi2 = np.zeros(len(variance))
         log_ratio = tilt_chi2 - math.log(math.pi)
-    depth_chi2 = np.zeros_like(variance)
+    depth_chi2 = np.zeros(len(variance))
     if sensors.depth_m is not None and "depth" in checks:
-        level_a, level_b = rigs.levels
         below = t_a_b_m
-        if level_a.depth_port_m.any() or level_b.depth_port_m.any():
-            below = below - level_a.depth_port_m[:, None] + (R_a_b * level_b.depth_port_m[:, None]).sum(1)
+        if rigs.ported:
+            level_a, level_b = rigs.levels
+            below = below - level_a.depth_port_m[:, None] + level_b.depth_port_m @ R_a_b
         fall = sensors.down_a @ below if sensors.attitude_a else dot(down_b, below)
         square = fall * fall
         spread2 = sensors.depth_variance + sensors.fall_variance * (dot(below, below) - square)
@@ -231,7 +234,7 @@ def weigh(
         depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
         density = (DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
         log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
-    log_prior = np.zeros_like(variance)
+    log_prior = np.zeros(len(variance))
     if prediction is not None:
         log_prior = weigh_prediction(R_a_b, t_a_b_m, prediction)
     return Support(log_ratio + log_prior, log_prior, tilt_chi2, depth_chi2)
@@ -242,9 +245,8 @@ def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
     if sensors.R_a_b is None:
         return np.zeros(R_a_b.shape[2])
     predicted, down, variance = sensors.R_a_b, sensors.down_a, sensors.heading_variance + variance
-    flat = R_a_b.reshape(9, -1)
-    sine, cosine = (skew(down) @ predicted).ravel() @ flat, 1.0 + predicted.ravel() @ flat
-    turn = 2.0 * np.arctan2(sine, cosine)
+    sine, cosine = np.array((skew(down) @ predicted, predicted)).reshape(2, 9) @ R_a_b.reshape(9, -1)
+    turn = 2.0 * np.arctan2(sine, 1.0 + cosine)
     density = (HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
     log_ratio: Floats = np.log(
         density / np.sqrt(2.0 * math.pi * variance) + HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi)
@@ -254,15 +256,11 @@ def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
 
 def weigh_prediction(R_a_b: Floats, t_a_b_m: Floats, prediction: Prediction) -> Floats:
     """Weigh K poses against a prediction from earlier ones: a bounded gain and a bounded loss."""
-    # [i, j] holds R_a_b R_predicted^T.
-    turned = prediction.R_a_b @ R_a_b
-    e = np.empty((6, t_a_b_m.shape[1]))
-    e[:3] = t_a_b_m - prediction.t_a_b_m[:, None]
-    e[3], e[4], e[5] = turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]
-    e[3:] *= 0.5
-    chi2 = (e * (prediction.information @ e)).sum(0)
+    turns = prediction.turns @ R_a_b.reshape(9, -1)
+    e = np.concatenate((t_a_b_m - prediction.t_a_b_m[:, None], turns[:3]))
+    chi2 = np.add.reduce(e * (prediction.information @ e))
     # Half a turn away the vector is short again.
-    near = turned[0, 0] + turned[1, 1] + turned[2, 2] > 1.0
+    near = turns[3] > 1.0
     log_gain = np.where(near, np.minimum(prediction.log_gain - 0.5 * chi2, _MAX_LOG_PRIOR), -np.inf)
     gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
     return gain

@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from solver_service.geometry.candidates import Candidates
 from solver_service.geometry.closed_form import Bars, dot, solve_exact
 from solver_service.geometry.evidence import log_chance, log_gaps, weigh
-from solver_service.geometry.hypotheses import Hypotheses, Pairs, search
+from solver_service.geometry.hypotheses import Pairs, search
 from solver_service.geometry.observation import Reason
 from solver_service.geometry.readings import Readings
 from solver_service.geometry.refinement import Sightings, refine
@@ -28,7 +29,7 @@ _SPLIT_ROUNDS: Final = 2
 _SMALL_OFFSET: Final = 0.02
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class FourLights:
     """The best readings; others: the sum of all other likelihood ratios. why: the reason where there are none."""
 
@@ -58,12 +59,12 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     t, variance = solved.t_a_b_m, found.variance
     support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
     base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
-    twist_gap_rad = solved.twist_gap_rad
-    chi2 = np.zeros(len(variance))
+    gap2 = np.zeros(len(variance))
     if "range" in settings.checks:
-        chi2 += np.log(solved.range_m[0] / solved.range_m[1]) ** 2 / variance
+        gap2 = gap2 + np.log(solved.range_m[0] / solved.range_m[1]) ** 2
     if "twist" in settings.checks:
-        chi2 += twist_gap_rad**2 / variance
+        gap2 = gap2 + solved.twist_gap_rad**2
+    chi2 = gap2 / variance
     gaps = len(settings.checks & {"range", "twist"})
     range2 = dot(t, t)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
@@ -73,11 +74,12 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
         what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
         return FourLights(None, why=("out_of_range", what))
     best = best[log_ratio[best] > log_ratio[best[0]] - _NEGLIGIBLE]
+    lights = found.lights.take(best, 1).T
     ratio = np.exp(log_ratio)
     refined = refine(
-        t[:, best].T,
-        solved.R_a_b[:, :, best].transpose(2, 0, 1),
-        _sightings(terms, found, best),
+        t.take(best, 1).T,
+        solved.R_a_b.take(best, 2).transpose(2, 0, 1),
+        _sightings(terms.candidates, lights),
         *terms.rigs.levels,
         terms.motion,
     )
@@ -85,7 +87,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     chi2 = refined.chi2 if gaps == 2 else chi2[best]
     return FourLights(
         Readings(
-            lights=found.lights[:, best].T,
+            lights=lights,
             t_a_b_m=refined.t_a_b_m,
             R_a_b=refined.R_a_b,
             covariance=refined.covariance,
@@ -93,36 +95,36 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, variance[best], gaps), -np.inf),
             tilt_chi2=support.tilt_chi2[best],
             depth_chi2=support.depth_chi2[best],
-            range_m=solved.range_m[:, best].T,
-            twist_gap_rad=twist_gap_rad[best],
-            clutter=_clutter(terms, found.lights[:, best]) if gaps == 2 else np.zeros(len(best)),
+            range_m=solved.range_m.take(best, 1).T,
+            twist_gap_rad=solved.twist_gap_rad[best],
+            clutter=_clutter(terms, lights) if gaps == 2 else np.zeros(len(best)),
             log_prior=support.log_prior[best],
             lone_odds=np.zeros(len(best)),
         ),
-        others=float(ratio.sum() - ratio[best].sum()),
+        others=float(np.add.reduce(ratio) - np.add.reduce(ratio[best])),
     )
 
 
-def _sightings(terms: Terms, found: Hypotheses, best: NDArray[np.intp]) -> Sightings:
-    candidates, lights = terms.candidates, found.lights[:, best].T
-    return Sightings(candidates.bearings.T[lights], candidates.tangents[lights], candidates.dt_s[lights])
+def _sightings(candidates: Candidates, lights: NDArray[np.intp]) -> Sightings:
+    bearings = candidates.bearings.T.take(lights, 0)
+    return Sightings(bearings, candidates.tangents.take(lights, 0), candidates.dt_s[lights])
 
 
 def _clutter(terms: Terms, lights: NDArray[np.intp]) -> Floats:
-    """Give how many candidates chance puts into the variance of the four lights' positions (K,)."""
+    """Give how many candidates chance puts into the variance of the positions of K times four lights (K, 4)."""
     in_a, in_b = terms.candidates.counts
     per_px2 = np.array((in_a, in_a, in_b, in_b)) / terms.rigs.area_px2
-    clutter: Floats = per_px2 @ terms.candidates.sigma_px[lights] ** 2
+    clutter: Floats = terms.candidates.sigma_px[lights] ** 2 @ per_px2
     return clutter
 
 
 def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:
     """Give what relative motion between the exposures may add to ln range and twist of A's pairs, rad^2."""
     dt_s, split, motion = terms.candidates.dt_s, terms.candidates.counts[0], terms.motion
-    square_s2 = float(dt_s[:split].sum() / split - dt_s[split:].sum() / (len(dt_s) - split)) ** 2
-    square_s2 += motion.skew_sigma_s**2
-    rates2 = motion.covariance.diagonal() + motion.rates**2
-    speed2, turn2 = float(rates2[:3].sum()) / 3.0, float(rates2[3:].sum()) / 3.0
+    mean_a_s, mean_b_s = np.add.reduce(dt_s[:split]) / split, np.add.reduce(dt_s[split:]) / (len(dt_s) - split)
+    square_s2 = float(mean_a_s - mean_b_s) ** 2 + motion.skew_sigma_s**2
+    rates2 = (motion.covariance.diagonal() + motion.rates**2).tolist()
+    speed2, turn2 = sum(rates2[:3]) / 3.0, sum(rates2[3:]) / 3.0
     per_range = pairs.chord[: pairs.split] / float(terms.rigs.length_m[1])
     variance: Floats = square_s2 * (speed2 * per_range * per_range + turn2)
     return variance

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from solver_service.geometry.candidates import Candidates
-from solver_service.geometry.closed_form import Spans
+from solver_service.geometry.closed_form import Spans, dot
 from solver_service.geometry.evidence import GROSS_SCALE
 from solver_service.geometry.observation import Settings
 from solver_service.geometry.rig import RigPair
@@ -44,6 +44,8 @@ _LIKE_LOG_AREA, _ANY_LOG_AREA = 0.8, 1.2
 _LIKE_GAIN: Final = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA)
 _LIKE_SLOPE: Final = 0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2
 _MAX_UNLIKE: Final = 1.0
+# Of so few combinations of pairs all are looked at: sorting costs more.
+_FEW: Final = 2000
 # Of so many combinations of pairs the gates are widened for gross errors; beyond, chance hides the right one.
 _MAX_WIDE: Final = 60_000
 # Gravity across the line of sight (product of both) below which both readings of left and right are weighed.
@@ -52,11 +54,11 @@ _UNDECIDED: Final = 0.3
 _NEARLY_HALF_PI: Final = 1.57
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Pairs:
     """The pairs of candidates of either image that may be the other node's bar; P in all, `split` of them A's.
 
-    first, second: (P,) candidates. c, w: (3, P) unit bisector, and unit chord from first to second, level frame.
+    ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and unit chord, first to second, level frame.
     key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's own bar to the direction first -> second.
     variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2). log_weight: how rarely chance puts two candidates
     so near each other. tan2_beta: of the widest. down: (2, P) gravity across the line of sight, along one's own bar
@@ -64,8 +66,7 @@ class Pairs:
     """
 
     split: int
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
+    ends: NDArray[np.intp]
     c: Floats
     w: Floats
     key: Floats
@@ -82,7 +83,7 @@ class Pairs:
         return self.split, len(self.key) - self.split
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Hypotheses:
     """K hypotheses: candidates (4, K) as B's left and right in A's image, A's left and right in B's.
 
@@ -97,63 +98,67 @@ class Hypotheses:
 
 
 @lru_cache(maxsize=64)
-def _combinations(count_a: int, count_b: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Give all pairs of A's candidates, then of B's: first, second, and whose they are."""
+def _combinations(count_a: int, count_b: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Give all pairs (2, P) of A's candidates, then of B's, and whose they are (P,)."""
     of_a, of_b = np.triu_indices(count_a, 1), np.triu_indices(count_b, 1)
-    first = np.concatenate((of_a[0], of_b[0] + count_a))
-    second = np.concatenate((of_a[1], of_b[1] + count_a))
+    ends = np.concatenate((of_a, np.add(of_b, count_a)), axis=1)
     node = np.repeat((0, 1), (len(of_a[0]), len(of_b[0])))
-    for array in (first, second, node):
-        array.flags.writeable = False
-    return first, second, node
+    ends.flags.writeable = node.flags.writeable = False
+    return ends, node
+
+
+@lru_cache(maxsize=64)
+def _bounds(rigs: RigPair, counts: tuple[int, int], range_min_m: float, range_max_m: float) -> Floats:
+    """Give the least and the largest chord^2 of all pairs, and the length^2 of the bar they are seen from (3, P)."""
+    _, node = _combinations(*counts)
+    own_m2, other_m2 = rigs.length_m**2, rigs.length_m[::-1] ** 2
+    shortest = (_FORESHORTENING / range_max_m) ** 2 * other_m2
+    longest = np.minimum((_NEAREST / range_min_m) ** 2 * other_m2, _MAX_CHORD2)
+    bounds = np.array((shortest, longest, own_m2)).take(node, axis=1)
+    bounds.flags.writeable = False
+    return bounds
 
 
 def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats], settings: Settings) -> Pairs:
     """Give the pairs whose angle fits the other node's bar within the range limits; down: in each level frame."""
-    first, second, node = _combinations(*candidates.counts)
-    in_a = candidates.counts[0]
-    table = np.empty((7, len(candidates.index)))
+    ends, node = _combinations(*candidates.counts)
+    shortest2, longest2, own_m2 = _bounds(rigs, candidates.counts, settings.range_min_m, settings.range_max_m)
+    table = np.empty((6, len(candidates.index)))
     table[:3], table[3:5], table[5] = candidates.bearings, candidates.shares, candidates.variance
-    for part, fall in ((slice(0, in_a), down[0]), (slice(in_a, None), down[1])):
-        table[6, part] = fall @ candidates.bearings[:, part]
-    one, two = table.take(first, axis=1), table.take(second, axis=1)
+    one, two = table.take(ends[0], 1), table.take(ends[1], 1)
     w, total = two - one, two + one
     # Of the cross product of the two, what turns about the bar.
     about = one[1] * two[2] - one[2] * two[1]
     chord2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     variance = total[5] / chord2
-    other_m = rigs.length_m[::-1]
-    shortest = (_FORESHORTENING / settings.range_max_m * other_m) ** 2
-    longest = np.minimum((_NEAREST / settings.range_min_m * other_m) ** 2, _MAX_CHORD2)
-    keep = (chord2 >= shortest.take(node)) & (chord2 <= longest.take(node)) & (variance < _MAX_RELATIVE_VARIANCE)
-    if not keep.all():
-        first, second, node = first[keep], second[keep], node[keep]
-        w, total, about = w[:, keep], total[:, keep], about[keep]
-        chord2, variance = chord2[keep], variance[keep]
+    keep = (chord2 >= shortest2) & (chord2 <= longest2) & (variance < _MAX_RELATIVE_VARIANCE)
+    if np.count_nonzero(keep) < len(keep):
+        kept = keep.nonzero()[0]
+        ends, node, own_m2 = ends.take(kept, 1), node[kept], own_m2[kept]
+        w, total, about = w.take(kept, 1), total.take(kept, 1), about[kept]
+        chord2, variance = chord2[kept], variance[kept]
     chord = np.sqrt(chord2)
     norm = np.sqrt(4.0 - chord2)
     total /= norm
     sin_beta = total[0]
     cos_beta2 = np.maximum(1.0 - sin_beta * sin_beta, 1e-6)
     room = 1.0 - np.abs(w[3:5])
-    own_m = rigs.length_m.take(node)
-    falls = np.array(down).T.take(node, axis=1)
+    falls = np.array(down).T.take(node, 1)
     # Gravity along the bar and along its perpendicular, both as seen across the line of sight.
     across = np.empty((2, len(chord)))
-    across[0] = falls[0] - sin_beta * total[6]
+    across[0] = falls[0] - sin_beta * dot(falls, total[:3])
     across[1] = falls[1] * total[2] - falls[2] * total[1]
     return Pairs(
         split=int(node.searchsorted(1)),
-        first=first,
-        second=second,
+        ends=ends,
         c=total[:3],
         w=w[:3] / chord,
-        key=0.5 * np.log(chord2 * cos_beta2 * own_m * own_m) + 0.125 * chord2,
+        key=0.5 * np.log(chord2 * cos_beta2 * own_m2) + 0.125 * chord2,
         twist_rad=np.arctan2(-2.0 * about / norm, w[0]),
         variance=variance,
         chord=chord,
         log_weight=-np.log(chord2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
-        tan2_beta=1.0 / float(cos_beta2.min(initial=1.0)) - 1.0,
+        tan2_beta=1.0 / float(np.minimum.reduce(cos_beta2, initial=1.0)) - 1.0,
         down=across / np.sqrt(cos_beta2),
     )
 
@@ -175,7 +180,7 @@ def join(
     swap: the twists agree where one of the two pairs is read second -> first.
     """
     split, in_b = pairs.counts
-    chord, variance = pairs.chord[:split], pairs.variance[:split] + motion_variance
+    chord, variance, variance_b = pairs.chord[:split], pairs.variance[:split] + motion_variance, pairs.variance[split:]
     key_a, key_b = pairs.key[:split], pairs.key[split:]
     length_a_m, length_b_m = rigs.length_m.tolist()
     slack = (_OFFSET_SLOPE * rigs.offset_m / length_b_m) * chord
@@ -185,36 +190,48 @@ def join(
     if by_range:
         # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
         least2 = np.exp(2.0 * key_a) / length_b_m**2
-        worst = variance + (pairs.variance[split:] * pairs.chord[split:] ** 2).max() / least2
+        worst = variance + np.maximum.reduce(variance_b * pairs.chord[split:] ** 2) / least2
     else:
-        worst = variance + pairs.variance[split:].max()
-    if by_twist:
+        worst = variance + np.maximum.reduce(variance_b)
+    reach = np.minimum(gate_sigma * np.sqrt(worst) + slack_twist, _NEARLY_HALF_PI)
+    if by_range and by_twist and split * in_b <= _FEW:
+        off = np.abs(key_a[:, None] - key_b)
+        ia, ib = (off < gate_sigma * np.sqrt(variance[:, None] + variance_b) + slack_range[:, None]).nonzero()
+        ib += split
+    elif by_twist:
         # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
-        of_a, of_b = pairs.twist_rad[:split] % np.pi, pairs.twist_rad[split:] % np.pi
-        reach = np.minimum(gate_sigma * np.sqrt(worst) + slack_twist, _NEARLY_HALF_PI)
+        twist_rad = pairs.twist_rad % np.pi
+        ia, ib = _near(twist_rad[:split], reach, twist_rad[split:], period=np.pi)
+        ib += split
+        if by_range:
+            off = np.abs(pairs.key[ia] - pairs.key[ib])
+            keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_range[ia]
+            ia, ib = ia[keep], ib[keep]
     else:
-        of_a, of_b = key_a, key_b
-        reach = gate_sigma * np.sqrt(worst) + slack_range if by_range else np.full(split, np.inf)
-    order = of_b.argsort(kind="stable")
-    values = of_b[order]
-    if by_twist:
-        values = np.concatenate((values - np.pi, values, values + np.pi))
-    low = values.searchsorted(of_a - reach)
-    count = values.searchsorted(of_a + reach, side="right") - low
-    ia = np.arange(split).repeat(count)
-    ib = np.arange(len(ia)) - (count.cumsum() - count - low).repeat(count)
-    ib = order[ib % in_b if by_twist else ib] + split
-    if by_range and by_twist:
-        off = np.abs(pairs.key[ia] - pairs.key[ib])
-        keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_range[ia]
-        ia, ib = ia[keep], ib[keep]
+        ia, ib = _near(key_a, gate_sigma * np.sqrt(worst) + slack_range if by_range else np.full(split, np.inf), key_b)
+        ib += split
     off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - np.pi)
     swap = off_half_turn < 0.5 * np.pi
     if by_twist:
-        off = np.where(swap, off_half_turn, np.pi - off_half_turn)
-        keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_twist[ia]
+        off = np.minimum(off_half_turn, np.pi - off_half_turn)
+        gate = gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_twist[ia]
+        keep = off < np.minimum(gate, reach[ia])
         ia, ib, swap = ia[keep], ib[keep], swap[keep]
     return ia, ib, swap
+
+
+def _near(
+    of_a: Floats, reach: Floats, of_b: Floats, *, period: float | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Join two lists: give the places in both of all that are no further apart than reach, which belongs to of_a."""
+    order = of_b.argsort(kind="stable")
+    values = of_b[order]
+    if period is not None:
+        values, order = np.concatenate((values - period, values, values + period)), np.tile(order, 3)
+    low = values.searchsorted(of_a - reach)
+    count = values.searchsorted(of_a + reach, side="right") - low
+    ia = np.arange(len(of_a)).repeat(count)
+    return ia, order[np.arange(len(ia)) - (count.cumsum() - count - low).repeat(count)]
 
 
 def search(
@@ -234,7 +251,7 @@ def search(
     # With first -> second as left -> right in A, and B read to agree with it, B's gravity turned into A's frame;
     # across the line of sight the two count the other way round.
     cosine, sine = np.cos(pairs.twist_rad[ia]), np.sin(pairs.twist_rad[ia])
-    da, db = pairs.down[:, ia], pairs.down[:, ib]
+    da, db = pairs.down.take(ia, 1), pairs.down.take(ib, 1)
     upright = da[0] * (cosine * db[0] + sine * db[1]) + da[1] * (sine * db[0] - cosine * db[1])
     flip = upright < 0.0
     undecided = (np.abs(upright) < _UNDECIDED).nonzero()[0]
@@ -242,20 +259,19 @@ def search(
         both = np.concatenate((np.arange(len(ia)), undecided))
         ia, ib, swap = ia[both], ib[both], swap[both]
         flip = np.concatenate((flip, ~flip[undecided]))
-    swap = swap != flip
-    lights = np.empty((4, len(ia)), dtype=np.intp)
-    first_a, second_a, first_b, second_b = pairs.first[ia], pairs.second[ia], pairs.first[ib], pairs.second[ib]
-    lights[0], lights[1] = np.where(flip, second_a, first_a), np.where(flip, first_a, second_a)
-    lights[2], lights[3] = np.where(swap, second_b, first_b), np.where(swap, first_b, second_b)
+    # Of A's pair, then of B's: whether its second is the left light.
+    left = np.array((flip, swap != flip), dtype=np.intp)
     both = np.array((ia, ib))
-    w = pairs.w.take(both, axis=1) * (1.0 - 2.0 * np.array((flip, swap)))
+    lights = np.empty((4, len(ia)), dtype=np.intp)
+    lights[::2], lights[1::2] = pairs.ends[left, both], pairs.ends[1 - left, both]
+    w = pairs.w.take(both, 1) * (1.0 - 2.0 * left)
     log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
     log_weight += _alike(candidates.log_area[lights])
     if candidates.log_score is not None:
-        log_weight += candidates.log_score[lights].sum(0)
+        log_weight += np.add.reduce(candidates.log_score[lights])
     return Hypotheses(
         lights=lights,
-        spans=Spans(pairs.c.take(both, axis=1).swapaxes(0, 1), w.swapaxes(0, 1), pairs.chord[both]),
+        spans=Spans(pairs.c.take(both, 1).swapaxes(0, 1), w.swapaxes(0, 1), pairs.chord[both]),
         variance=pairs.variance[ia] + pairs.variance[ib] + motion_variance[ia],
         log_weight=log_weight,
     )

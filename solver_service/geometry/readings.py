@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from solver_service.geometry.rotation import Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Readings:
     """K poses between the level frames, and the candidates they read as lights.
 

@@ -17,11 +17,12 @@ _SMALL: Final = 5e-4
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
 DAMPING: Final = 1e-13 * np.eye(6)
+_EYE: Final = np.eye(8)
 # Which sightings a later clock of B moves, and where to.
 _SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Sightings:
     """Four lights as K hypotheses read them: B's left and right in A's image, A's left and right in B's.
 
@@ -34,7 +35,7 @@ class Sightings:
     dt_s: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Motion:
     """How the pose moves: d/dt of t_a_b (m/s), then of the small rotation w (rad/s), in A's camera frame.
 
@@ -46,7 +47,7 @@ class Motion:
     skew_sigma_s: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Refined:
     """K poses: t_a_b_m (K, 3), R_a_b (K, 3, 3), covariance (K, 6, 6), chi2 (K,) of two degrees of freedom.
 
@@ -72,7 +73,7 @@ def refine(
     """Refine K poses, t_a_b_m (K, 3) and R_a_b (K, 3, 3)."""
     t, R = t_a_b_m, R_a_b
     lights = rig_a.lights_m, rig_b.lights_m
-    timed = bool(seen.dt_s.any())
+    timed = bool(np.count_nonzero(seen.dt_s))
     shifts = shifts_of(seen.dt_s, motion.rates) if timed else None
     weight = None
     steps = 0
@@ -91,27 +92,40 @@ def refine(
         column = r[:, :, None]
         g = JtW @ column
         rw = column if weight is None else weight @ column
-        chi2 = (column * rw).sum((1, 2))
+        chi2 = (r[:, None] @ rw)[:, 0, 0]
         if steps == _MAX_STEPS:
             break
-        move = covariance @ g
-        chi2 = chi2 - (g * move).sum((1, 2))
-        t, R = t - move[:, :3, 0], rotation_near(-move[:, 3:, 0]) @ R
+        move = (covariance @ g)[:, :, 0]
+        chi2 = chi2 - (move[:, None] @ g)[:, 0, 0]
+        t, R = moved(t, R, move)
         steps += 1
-        move[:, :3] /= np.sqrt((t * t).sum(1))[:, None, None]
-        if not (np.abs(move) > _SMALL).any():
+        if not is_larger(move, t, _SMALL):
             break
-    determined = inverse.diagonal(0, 1, 2).max(1) < _UNDETERMINED
-    sound = determined & (depth > 0.0).all(1) & np.isfinite(covariance.sum((1, 2)) + chi2 + t.sum(1))
+    determined = np.maximum.reduce(inverse.diagonal(0, 1, 2), 1) < _UNDETERMINED
+    finite = np.isfinite(np.add.reduce(covariance, (1, 2)) + chi2 + np.add.reduce(t, 1))
+    sound = determined & (np.minimum.reduce(depth, 1) > 0.0) & finite
     return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
+
+
+def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
+    """Take steps (K, 6) off K poses."""
+    return t - move[:, :3], rotation_near(-move[:, 3:]) @ R
+
+
+def is_larger(move: Floats, t: Floats, limit: float) -> bool:
+    """Whether any of the steps (K, 6) that led to t (K, 3) is larger than this, relative to the range and in rad."""
+    range_m = np.sqrt(np.add.reduce(t * t, 1))
+    size = np.abs(move)
+    size[:, :3] /= range_m[:, None]
+    return bool(np.fmax.reduce(size, None, initial=0.0) > limit)
 
 
 def shifts_of(dt_s: Floats, rates: Floats) -> tuple[Floats, Floats] | None:
     """Give how far (K, 4, 3) the pose has moved and turned (K, 4, 3, 3) at each sighting, None where it rests."""
-    if not rates.any():
+    if not np.count_nonzero(rates):
         return None
-    moved = dt_s[:, :, None] * rates
-    return moved[:, :, :3], rotation_near(moved[:, :, 3:])
+    shift = dt_s[:, :, None] * rates
+    return shift[:, :, :3], rotation_near(shift[:, :, 3:])
 
 
 def residuals(
@@ -136,25 +150,26 @@ def residuals(
     q[:, 2:] = y[:, 2:] @ R
     if shifts is not None:
         q[:, :2] += shift[:, :2]
-    depth = (seen.bearings * q).sum(2)
+    depth = np.add.reduce(seen.bearings * q, 2)
     G = seen.tangents / depth[:, :, None, None]
     r = G @ q[..., None]
     D = G - r * (seen.bearings / depth[:, :, None])[:, :, None]
     D[:, 2:] = D[:, 2:] @ -Rt[:, None]
     J = np.empty((K, 4, 2, 6))
     J[..., :3] = D
-    # A turn w moves y by w x y = -[y]x w; for A's lights both signs are already turned.
-    J[..., 3:] = D @ -skew(y)
+    # A turn w moves y by w x y = -[y]x w = [y]x^T w; for A's lights both signs are already turned.
+    np.matmul(D, skew(y).swapaxes(2, 3), out=J[..., 3:])
     return r.reshape(K, 8), J.reshape(K, 8, 6), depth
 
 
 def weight_of(J: Floats, dt_s: Floats, motion: Motion) -> Floats:
     """Give the inverse covariance (K, 8, 8) of the residuals: pixel noise, and what is not known of the motion."""
-    by_rate = J * np.repeat(dt_s, 2, axis=1)[:, :, None]
-    total: Floats = np.eye(8) + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
+    by_rate = J * dt_s.repeat(2, 1)[:, :, None]
+    total: Floats = _EYE + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
     if motion.skew_sigma_s > 0.0:
         square = motion.covariance + np.outer(motion.rates, motion.rates)
         by_skew = J * (motion.skew_sigma_s * _SKEW_SIGNS)
         total += by_skew @ square @ by_skew.swapaxes(1, 2)
-    total[~np.isfinite(total.sum(axis=(1, 2)))] = np.eye(8)
+    if not np.isfinite(np.add.reduce(total, None)):
+        total[~np.isfinite(total.sum(axis=(1, 2)))] = _EYE
     return np.asarray(np.linalg.inv(total), dtype=np.float64)

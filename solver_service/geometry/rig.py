@@ -78,7 +78,7 @@ class Rig:
             declination_rad=self.declination_rad,
         )
 
-    @property
+    @cached_property
     def usable(self) -> bool:
         """Whether the lights are finite and apart."""
         return bool(np.isfinite(self.lights_m).all()) and self.length_m >= 1e-3
@@ -91,7 +91,9 @@ class RigPair:
     levels: the rigs in their level frames. length_m (2,): of the bars. area_px2 (4,): of
     the picture that each of B's left and right light and A's left and right light is seen in. views_sr: product of
     both solid angles. middle_m (2, 3): of the bars, level frames; offset_m: of both together. one_camera:
-    whether both cameras have the same parameters.
+    whether both cameras have the same parameters. ported: whether a depth port stands off its camera.
+    gap_per_bearing_m2: half the sum of the bars' lengths^-2, the variance of a gap over that of a bearing and range^2.
+    turns (2, 3, 3): from the level frames to the cameras'. size_px (2, 2): width and height of A's and of B's picture.
     """
 
     rigs: tuple[Rig, Rig]
@@ -102,6 +104,10 @@ class RigPair:
     views_sr: float
     offset_m: float
     one_camera: bool
+    ported: bool
+    gap_per_bearing_m2: float
+    turns: Floats
+    size_px: Floats
 
 
 @lru_cache(maxsize=16)
@@ -118,4 +124,8 @@ def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
         views_sr=rig_a.camera.solid_angle_sr * rig_b.camera.solid_angle_sr,
         offset_m=rig_a.offset_m + rig_b.offset_m,
         one_camera=rig_a.camera.same_as(rig_b.camera),
+        ported=any(bool(rig.depth_port_m.any()) for rig in (rig_a, rig_b)),
+        gap_per_bearing_m2=0.5 * (rig_a.length_m**-2 + rig_b.length_m**-2),
+        turns=np.array((rig_a.R_level_camera.T, rig_b.R_level_camera.T)),
+        size_px=np.hstack((rig_a.camera.size_px, rig_b.camera.size_px)),
     )

@@ -30,13 +30,15 @@ def matrix_of(q_xyzw: Floats) -> Floats:
     """Turn one quaternion (4,), of any length but zero, into its matrix (3, 3)."""
     x, y, z, w = np.asarray(q_xyzw, dtype=np.float64).tolist()
     s = 2.0 / (x * x + y * y + z * z + w * w)
-    return np.array(
-        (
-            (1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)),
-            (s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w)),
-            (s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y)),
-        )
-    )
+    return _rodrigues(x, y, z, s * w, s)
+
+
+def _rodrigues(x: float, y: float, z: float, first: float, second: float) -> Floats:
+    """Give 1 + first K + second K^2, K the matrix of the cross product (x, y, z) x."""
+    a, b, c = first * x, first * y, first * z
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    xx, yy, zz = second * x * x, second * y * y, second * z * z
+    return np.array(((1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)))
 
 
 def quaternion_of(R: Floats) -> Floats:
@@ -61,6 +63,11 @@ def quaternion_of(R: Floats) -> Floats:
 def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
     # sin(x)/x and (1 - cos x)/x^2, without a division by zero.
+    if w_rad.ndim == 1:
+        x, y, z = w_rad.tolist()
+        angle = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
+        sinc = math.sin(angle) / angle
+        return _rodrigues(x, y, z, sinc * math.cos(angle), 0.5 * sinc * sinc)
     half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)
     sine = np.sin(half) / half
     first, second = sine * np.cos(half), 0.5 * sine * sine
@@ -73,7 +80,7 @@ def rotation_near(w_rad: Floats) -> Floats:
     """Turn small rotation vectors (..., 3) into matrices (..., 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
     half = 0.5 * w_rad
     K = skew(half)
-    scale = 2.0 / (1.0 + (half * half).sum(-1))
+    scale = 2.0 / (1.0 + np.add.reduce(half * half, -1))
     R: Floats = _EYE + scale[..., None, None] * (K + K @ K)
     return R
 

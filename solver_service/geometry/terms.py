@@ -20,7 +20,7 @@ from solver_service.geometry.rotation import Floats, matrix_of
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class Terms:
     """What a trigger is solved from."""
 
@@ -62,7 +62,7 @@ def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
     if value is None:
         return None
     array = np.asarray(value, dtype=np.float64)
-    return array if array.shape == shape and math.isfinite(array.sum()) else None
+    return array if array.shape == shape and math.isfinite(np.add.reduce(array, None)) else None
 
 
 def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
@@ -90,7 +90,7 @@ def _prediction(prior: Prior | None, pair: RigPair, candidates: Candidates, sett
     rig_a, rig_b = pair.rigs
     turn_a, turn_b, both = rig_a.R_level_camera, rig_b.R_level_camera, rig_a.both_level_camera
     covariance = both @ covariance @ both.T + _LEAST_KNOWN
-    noise = float(candidates.variance.sum()) / len(candidates.variance)
+    noise = float(np.add.reduce(candidates.variance)) / len(candidates.variance)
     return Prediction.of(turn_a @ t, turn_a @ matrix_of(q) @ turn_b.T, covariance, noise, pair, settings)
 
 

@@ -139,7 +139,7 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     keep = keep[np.argsort(score[keep], kind="stable")[:_KEPT]]
     pair, single, side, seer = pair[keep], single[keep], side[keep], seer[keep]
     swapped = dot(w[:, keep], pairs.w[:, pair]) < 0.0
-    first, second = pairs.first[pair], pairs.second[pair]
+    first, second = pairs.ends.take(pair, 1)
     lights, rows = np.full((len(keep), 4), -1), np.arange(len(keep))
     lights[rows, 2 * seer] = np.where(swapped, second, first)
     lights[rows, 2 * seer + 1] = np.where(swapped, first, second)

@@ -59,9 +59,9 @@ class NoFix:
     detail: str
 
 
-# Poses nearer than this, relative to the range and in rad, are one pose.
+# Poses nearer than this, relative to the range, and turned by less than 0.1 rad (their trace) are one pose.
 _SAME_POSITION: Final = 0.04
-_SAME_ROTATION: Final = 0.1
+_SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
 # Three lights have no gap to check them: they must be likelier than four.
 _THREE_PROBABILITY: Final = 0.98
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
@@ -127,20 +127,21 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     if not settings.range_min_m <= range_m <= settings.range_max_m:
         return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {terms.range_limits}")
     ratio = np.exp(readings.log_ratio)
-    same = ((t - t[k]) ** 2).sum(1) < (_SAME_POSITION * range_m) ** 2
-    same &= (R * R[k]).sum((1, 2)) > 1.0 + 2.0 * math.cos(_SAME_ROTATION)
-    short = bool((readings.lights[k] < 0).any())
+    same = np.add.reduce((t - t[k]) ** 2, 1) < (_SAME_POSITION * range_m) ** 2
+    same &= R.reshape(-1, 9) @ R[k].ravel() > _SAME_TRACE
+    short = min(readings.lights[k].tolist()) < 0
     chi2 = float(readings.chi2[k])
     # One of four lights may be off by more than its noise; which one, two residuals cannot tell.
     widened = 0.5 * chi2 if chi2 > _GROSS_CHI2 and not short else 1.0
-    sigma_m = math.sqrt(widened * float(readings.covariance[k].diagonal()[:3].sum()))
+    sigma_m = math.sqrt(widened * sum(readings.covariance[k].diagonal()[:3].tolist()))
     if short and sigma_m > _SURE_POSITION * range_m:
         return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
     # A false candidate in a light's place is off by as much as the covariance has been widened for.
     intruder = float(ratio[k] * readings.lone_odds[k])
     if not short and sigma_m > _SURE_POSITION * range_m:
         intruder = float(ratio[k]) * intruder_odds(chi2, float(readings.clutter[k]))
-    probability = float(ratio[same].sum() / (CHANCE_ODDS + ratio.sum() + others + intruder))
+    total = CHANCE_ODDS + float(np.add.reduce(ratio)) + others + intruder
+    probability = float(np.add.reduce(ratio[same])) / total
     if probability >= (max(settings.min_probability, _THREE_PROBABILITY) if short else settings.min_probability):
         # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
         alone = np.exp(readings.log_ratio - readings.log_prior)
@@ -164,7 +165,7 @@ def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
     """Name what speaks for the pose."""
     settings, sensors = terms.settings, terms.sensors
     checks: list[str] = []
-    if (readings.lights[k] >= 0).all():
+    if min(readings.lights[k].tolist()) >= 0:
         checks += [name for name in ("range", "twist") if name in settings.checks]
     if sensors.R_a_b is None or "attitude" not in settings.checks:
         checks.append("upright_assumed")
@@ -178,7 +179,7 @@ def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
 def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probability: float) -> Fix:
     """Publish reading k, between the cameras' frames."""
     method, (rig_a, rig_b) = terms.settings.method, terms.rigs.rigs
-    lights = readings.lights[k]
+    lights, found = readings.lights[k], readings.lights[k].tolist()
     range_a_m, range_b_m = readings.range_m[k].tolist()
     twist_gap_rad = float(readings.twist_gap_rad[k])
     t = rig_a.R_level_camera.T @ readings.t_a_b_m[k]
@@ -191,7 +192,7 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
         range_a_m, range_b_m = solved.range_m[:, 0].tolist()
         twist_gap_rad = float(solved.twist_gap_rad[0])
     covariance = rig_a.both_level_camera.T @ covariance @ rig_a.both_level_camera
-    index = np.where(lights < 0, -1, terms.candidates.index[lights]).tolist()
+    index = [int(terms.candidates.index[light]) if light >= 0 else -1 for light in found]
     return Fix(
         t_a_b_m=t,
         q_a_b_xyzw=quaternion_of(R),
@@ -204,7 +205,7 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
         hypotheses=math.prod(n * (n - 1) for n in terms.candidates.counts),
         pair_a=(index[0], index[1]),
         pair_b=(index[2], index[3]),
-        method=method if (lights >= 0).all() else "three_lights",
+        method=method if min(found) >= 0 else "three_lights",
         checks=_checks(terms, readings, k),
         probability=probability,
     )
@@ -218,5 +219,6 @@ def _spread(readings: Readings, k: int, weights: Floats) -> Floats:
         away = np.concatenate(
             (readings.t_a_b_m[i] - readings.t_a_b_m[k], rotation_log(readings.R_a_b[i] @ readings.R_a_b[k].T))
         )
-        covariance = covariance + weights[i] / weights[near].sum() * np.outer(away, away)
+        share = weights[i] / np.add.reduce(weights[near])
+        covariance = covariance + share * away[:, None] * away
     return covariance

@@ -14,11 +14,12 @@ GATE = 4.5
 
 
 @pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
-def test_every_combination_within_both_gates_is_found(rigs):
+@pytest.mark.parametrize(("count", "triggers"), [(9, 200), (14, 25)], ids=["few", "many"])
+def test_every_combination_within_both_gates_is_found(rigs, count, triggers):
     rng = np.random.default_rng(1)
     passing = 0
-    for _ in range(25):
-        views = tuple(view(rng.uniform((0, 0), (1640, 1232), (14, 2)), 1.0) for _ in range(2))
+    for _ in range(triggers):
+        views = tuple(view(rng.uniform((0, 0), (1640, 1232), (count, 2)), 1.0) for _ in range(2))
         terms = Terms.of(views, rigs, (Sensed(), Sensed()), Settings(), None)
         pairs = find_pairs(terms.candidates, terms.rigs, (terms.sensors.down_a, terms.sensors.down_b), terms.settings)
         none = np.zeros(pairs.split)
@@ -26,13 +27,13 @@ def test_every_combination_within_both_gates_is_found(rigs):
         found = set(zip(ia.tolist(), ib.tolist(), strict=True))
         of_a, of_b = np.arange(pairs.split), np.arange(pairs.split, len(pairs.key))
         a, b, swap = (grid.ravel() for grid in np.meshgrid(of_a, of_b, (False, True), indexing="ij"))
-        bearings = terms.candidates.bearings
-        first, second = np.where(swap, pairs.second[b], pairs.first[b]), np.where(swap, pairs.first[b], pairs.second[b])
+        (of_first, of_second), bearings = pairs.ends, terms.candidates.bearings
+        first, second = np.where(swap, of_second[b], of_first[b]), np.where(swap, of_first[b], of_second[b])
         levels = terms.rigs.levels
         with np.errstate(all="ignore"):
             solved = closed_form(
-                np.stack((bearings[:, pairs.first[a]], bearings[:, first])),
-                np.stack((bearings[:, pairs.second[a]], bearings[:, second])),
+                np.stack((bearings[:, of_first[a]], bearings[:, first])),
+                np.stack((bearings[:, of_second[a]], bearings[:, second])),
                 *levels,
             )
             gap = np.log(solved.range_m[0] / solved.range_m[1])
