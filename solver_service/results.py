@@ -79,7 +79,7 @@ def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a
         t_a_b_m=tuple(fix.t_a_b_m.tolist()),
         q_a_b_xyzw=tuple(fix.q_a_b_xyzw.tolist()),
         covariance=fix.covariance.ravel().tolist(),
-        range_m=float(np.linalg.norm(fix.t_a_b_m)),
+        range_m=math.sqrt(float(fix.t_a_b_m @ fix.t_a_b_m)),
         range_a_m=float(fix.range_a_m),
         range_b_m=float(fix.range_b_m),
         range_gap_m=float(fix.range_gap_m),

@@ -127,14 +127,15 @@ def depth_at(stream: SampleStream[Depth], stamp_ns: int) -> tuple[float, float] 
     if newest is None or newest.stamp_ns < end_ns - DEPTH_STALE_NS:
         return None
     samples = stream.between(newest.stamp_ns - DEPTH_FIT_NS, end_ns)
-    ages_s = np.array([(sample.stamp_ns - stamp_ns) / S_NS for sample in samples])
-    depths_m = np.array([sample.depth_m for sample in samples])
+    ages_s = [(sample.stamp_ns - stamp_ns) / S_NS for sample in samples]
+    depths_m = [sample.depth_m for sample in samples]
     sigma_m = max(sample.sigma_m for sample in samples)
-    drift_m = DEPTH_DRIFT_MPS * -float(ages_s[-1])
-    if len(samples) < 3:
-        return float(depths_m[-1]), math.hypot(sigma_m, 2 * drift_m)
-    middle_s = float(ages_s.mean())
-    spread = float(((ages_s - middle_s) ** 2).sum())
-    slope_mps = float(((ages_s - middle_s) * depths_m).sum()) / spread
-    variance = sigma_m**2 * (1 / len(samples) + middle_s**2 / spread)
-    return float(depths_m.mean()) - slope_mps * middle_s, math.hypot(math.sqrt(variance), drift_m)
+    drift_m = DEPTH_DRIFT_MPS * -ages_s[-1]
+    count = len(samples)
+    if count < 3:
+        return depths_m[-1], math.hypot(sigma_m, 2 * drift_m)
+    middle_s = sum(ages_s) / count
+    spread = sum((age_s - middle_s) ** 2 for age_s in ages_s)
+    slope_mps = sum((age_s - middle_s) * depth_m for age_s, depth_m in zip(ages_s, depths_m, strict=True)) / spread
+    variance = sigma_m**2 * (1 / count + middle_s**2 / spread)
+    return sum(depths_m) / count - slope_mps * middle_s, math.hypot(math.sqrt(variance), drift_m)

@@ -45,27 +45,22 @@ class Bars:
 class Spans:
     """The other node's bar as each view sees it: unit bisector c and chord w (2, 3, K) left to right, chord (2, K).
 
-    The chord's length is 2 sin(alpha / 2).
+    The chord's length is 2 sin(alpha / 2). ends: (2, 2, 3, K) unit bearings of left and right, those on the first axis.
     """
 
+    ends: Floats
     c: Floats
     w: Floats
     chord: Floats
 
     @staticmethod
     def of(ends: Floats) -> Spans:
-        """Take unit bearings (2, 2, 3, K) of left and right, those on the first axis."""
+        """Take the ends."""
         left, right = ends
         total, difference = left + right, right - left
         chord2 = dot(difference, difference)
         chord = np.sqrt(chord2)
-        return Spans(total / np.sqrt(4.0 - chord2)[:, None], difference / chord[:, None], chord)
-
-    @property
-    def ends(self) -> Floats:
-        """The bearings (2, 2, 3, K) of left and right."""
-        half = 0.5 * self.chord[:, None]
-        return self.c * np.sqrt(1.0 - half * half) + _ENDS * (self.w * half)
+        return Spans(ends, total / np.sqrt(4.0 - chord2)[:, None], difference / chord[:, None], chord)
 
 
 @dataclass(eq=False, slots=True)
@@ -145,9 +140,8 @@ def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset
     angles = _angles(spans.chord)
     u, span = _split(spans, angles[0], split_rounds if bars.centred else 1)
     if not bars.centred:
-        ends = spans.ends
         for _ in range(offset_rounds):
-            moved = Spans.of(_from_middles(ends, u, span, angles, bars))
+            moved = Spans.of(_from_middles(spans.ends, u, span, angles, bars))
             angles = _angles(moved.chord)
             u, span = _split(moved, angles[0], split_rounds)
     return _pose(u, span, u[:, 0], angles, bars, mean_twist=True)

@@ -265,13 +265,14 @@ def search(
     lights = np.empty((4, len(ia)), dtype=np.intp)
     lights[::2], lights[1::2] = pairs.ends[left, both], pairs.ends[1 - left, both]
     w = pairs.w.take(both, 1) * (1.0 - 2.0 * left)
+    ends = candidates.bearings.take(lights, 1).reshape(3, 2, 2, -1).transpose(2, 1, 0, 3)
     log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
     log_weight += _alike(candidates.log_area[lights])
     if candidates.log_score is not None:
         log_weight += np.add.reduce(candidates.log_score[lights])
     return Hypotheses(
         lights=lights,
-        spans=Spans(pairs.c.take(both, 1).swapaxes(0, 1), w.swapaxes(0, 1), pairs.chord[both]),
+        spans=Spans(ends, pairs.c.take(both, 1).swapaxes(0, 1), w.swapaxes(0, 1), pairs.chord[both]),
         variance=pairs.variance[ia] + pairs.variance[ib] + motion_variance[ia],
         log_weight=log_weight,
     )

@@ -28,9 +28,9 @@ from solver_service.geometry.evidence import (
 )
 from solver_service.geometry.hypotheses import Pairs
 from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import DAMPING, Sightings, residuals, shifts_of, weight_of
+from solver_service.geometry.refinement import DAMPING, Sightings, is_larger, moved, residuals, shifts_of, weight_of
 from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, rotation_near, skew
+from solver_service.geometry.rotation import Floats, skew
 from solver_service.geometry.terms import Terms
 
 # More combinations than this are not tried: among so many, three lights are never certain.
@@ -50,10 +50,12 @@ _SMALL: Final = 1e-3
 # How far a bar may rise more than its attitude says, and the middle stand off the bisector: shares of alpha.
 _BAR_RISE: Final = 0.15
 _SPLIT_SHARE: Final = 0.1
+_YZX: Final = np.array((1, 2, 0))
+_ZXY: Final = np.array((2, 0, 1))
 _X: Final = np.array(((1.0,), (0.0,), (0.0,)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class _Guesses:
     """M poses T_a_b between the level frames: lights (M, 4), t (M, 3), R (M, 3, 3), score (M,), the less the better."""
 
@@ -74,7 +76,7 @@ def read_three_lights(terms: Terms, pairs: Pairs) -> Readings | None:
     score = guesses.score
     if terms.prediction is not None and len(score):
         score = score - 2.0 * weigh_prediction(guesses.R_a_b.transpose(1, 2, 0), guesses.t_a_b_m.T, terms.prediction)
-    best = np.argsort(score, kind="stable")[:_REFINED]
+    best = score.argsort(kind="stable")[:_REFINED]
     best = best[np.isfinite(score[best])]
     return _refined(terms, guesses.lights[best], guesses.t_a_b_m[best], guesses.R_a_b[best]) if len(best) else None
 
@@ -97,8 +99,8 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     middle = each(levels[0].middle_m, levels[1].middle_m)
     length_m = terms.rigs.length_m.take(own_other[1])
     arm = np.array((levels[0].lights_m, levels[1].lights_m))[seer, side].T - middle[0]
-    c, w, chord = pairs.c[:, pair], pairs.w[:, pair], pairs.chord[pair]
-    seen = candidates.bearings[:, single]
+    c, w, chord = pairs.c.take(pair, 1), pairs.w.take(pair, 1), pairs.chord[pair]
+    seen = candidates.bearings.take(single, 1)
     cos_alpha, sin_alpha = 1.0 - 0.5 * chord * chord, chord * np.sqrt(1.0 - 0.25 * chord * chord)
     # Both lines of sight point from the seer to the other.
     sight = np.array((c, -seen))
@@ -116,9 +118,9 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
         sight[0] = c * np.cos(half) - w * np.sin(half)
         range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m)
         own, other = _frames(sight, down)
-    R_own_other = (own[:, :, None] * other[:, None]).sum(0)
+    R_own_other = np.add.reduce(own[:, :, None] * other[:, None])
     u = sight[0]
-    t = middle[0] + u * range_m - (R_own_other * middle[1]).sum(1)
+    t = middle[0] + u * range_m - np.add.reduce(R_own_other * middle[1], 1)
     # Both components of the tilt that remain: along the line of sight, and about it.
     rise_own, rise_other = np.arcsin(dot(down, sight))
     rise = rise_own - rise_other
@@ -126,7 +128,7 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     across = bar - u * dot(u, bar)
     about = dot(u, _cross(across, w)) / np.sqrt(dot(across, across))
     port = each(levels[0].depth_port_m, levels[1].depth_port_m)
-    fall = dot(down[0], t - port[0] + (R_own_other * port[1]).sum(1))
+    fall = dot(down[0], t - port[0] + np.add.reduce(R_own_other * port[1], 1))
     level2 = dot(t, t) - fall * fall
     variance = pairs.variance[pair]
     spread2 = sensors.depth_variance + 0.5 * sensors.tilt_variance * level2 + variance * fall * fall
@@ -135,17 +137,17 @@ def _guess(terms: Terms, pairs: Pairs) -> _Guesses:
     keep = (range_m > settings.range_min_m) & (range_m < settings.range_max_m) & (chi2 < _GATE_CHI2)
     # Chance puts two candidates near each other the more rarely, the nearer.
     score = chi2 + 4.0 * np.log(chord)
-    keep = np.flatnonzero(keep)
-    keep = keep[np.argsort(score[keep], kind="stable")[:_KEPT]]
+    keep = keep.nonzero()[0]
+    keep = keep[score[keep].argsort(kind="stable")[:_KEPT]]
     pair, single, side, seer = pair[keep], single[keep], side[keep], seer[keep]
-    swapped = dot(w[:, keep], pairs.w[:, pair]) < 0.0
+    swapped = dot(w.take(keep, 1), pairs.w.take(pair, 1)) < 0.0
     first, second = pairs.ends.take(pair, 1)
     lights, rows = np.full((len(keep), 4), -1), np.arange(len(keep))
     lights[rows, 2 * seer] = np.where(swapped, second, first)
     lights[rows, 2 * seer + 1] = np.where(swapped, first, second)
     lights[rows, 2 - 2 * seer + side] = single
-    R = R_own_other[:, :, keep].transpose(2, 0, 1).copy()
-    t = t[:, keep].T
+    R = R_own_other.take(keep, 2).transpose(2, 0, 1).copy()
+    t = t.take(keep, 1).T
     turned = seer == 1
     R[turned] = R[turned].swapaxes(1, 2)
     t[turned] = -(R[turned] @ t[turned][:, :, None])[:, :, 0]
@@ -165,16 +167,13 @@ def _opposite(terms: Terms, pairs: Pairs, seer: int) -> tuple[NDArray[np.intp], 
     ratio = float(terms.rigs.length_m[seer] / terms.rigs.length_m[1 - seer])
     share = 0.75 * ratio * (abs(float(down_own[0])) + _BAR_RISE) + _SPLIT_SHARE
     slack = share * pairs.chord[start_pair:end_pair] + math.sqrt(_GATE_CHI2 * sensors.tilt_variance)
-    pair, single = np.nonzero(np.abs(rise[:, None] - fall) < slack[:, None])
+    pair, single = (np.abs(rise[:, None] - fall) < slack[:, None]).nonzero()
     return pair + start_pair, single + start_single
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
     """Give the cross products of vectors (..., 3, M)."""
-    product = np.empty_like(a)
-    product[..., 0, :] = a[..., 1, :] * b[..., 2, :] - a[..., 2, :] * b[..., 1, :]
-    product[..., 1, :] = a[..., 2, :] * b[..., 0, :] - a[..., 0, :] * b[..., 2, :]
-    product[..., 2, :] = a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]
+    product: Floats = a.take(_YZX, -2) * b.take(_ZXY, -2) - a.take(_ZXY, -2) * b.take(_YZX, -2)
     return product
 
 
@@ -187,7 +186,7 @@ def _frames(sight: Floats, down: Floats) -> Floats:
 
 def _turned(of: Floats, to: Floats, v: Floats) -> Floats:
     """Turn vectors (3, M) from the rig that has the axes `of` (3, 3, M) to the rig that has the axes `to`."""
-    turned: Floats = (to * (of * v).sum(1)[:, None]).sum(0)
+    turned: Floats = np.add.reduce(to * np.add.reduce(of * v, 1)[:, None])
     return turned
 
 
@@ -196,13 +195,14 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     candidates, sensors, levels = terms.candidates, terms.sensors, terms.rigs.levels
     absent = lights < 0
     # The missing light has no weight; its bearing only keeps the arithmetic finite.
-    bearings = candidates.bearings.T[lights]
+    bearings = candidates.bearings.T.take(lights, 0)
     q = np.concatenate(
         (levels[1].lights_m @ R.swapaxes(1, 2) + t[:, None], (levels[0].lights_m - t[:, None]) @ R), axis=1
     )
     bearings[absent] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
-    tangents = candidates.tangents[lights] * ~absent[:, :, None, None]
-    seen = Sightings(bearings, tangents, candidates.dt_s[lights] * ~absent)
+    present = ~absent
+    tangents = candidates.tangents.take(lights, 0) * present[:, :, None, None]
+    seen = Sightings(bearings, tangents, candidates.dt_s[lights] * present)
     shifts = shifts_of(seen.dt_s, terms.motion.rates)
     bodies = levels[0].lights_m, levels[1].lights_m
     across = _basis(sensors.down_a)
@@ -217,20 +217,19 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
         scale = unit[:, :, None] * unit[:, None, :]
         covariance = np.linalg.inv(H * scale + DAMPING) * scale
-        g = JtW @ r[:, :, None] + JtW_s @ r_s[:, :, None]
-        move = (covariance @ g)[:, :, 0]
         column = r[:, :, None]
-        chi2 = (column * (weight @ column)).sum((1, 2)) + (r_s * r_s).sum(1) - (g[:, :, 0] * move).sum(1)
-        t, R = t - move[:, :3], rotation_near(-move[:, 3:]) @ R
-        move[:, :3] /= np.sqrt((t * t).sum(1))[:, None]
-        if not (np.abs(move) > _SMALL).any():
+        g = JtW @ column + JtW_s @ r_s[:, :, None]
+        move = (covariance @ g)[:, :, 0]
+        chi2 = (r[:, None] @ (weight @ column) - move[:, None] @ g)[:, 0, 0] + np.add.reduce(r_s * r_s, 1)
+        t, R = moved(t, R, move)
+        if not is_larger(move, t, _SMALL):
             break
-    range2 = (t * t).sum(1)
+    range2 = np.add.reduce(t * t, 1)
     settings = terms.settings
-    sound = np.isfinite(chi2) & (chi2 < _FITS_CHI2) & (along > 0.0).all(1)
+    sound = (chi2 < _FITS_CHI2) & (np.minimum.reduce(along, 1) > 0.0)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    sound &= np.isfinite(covariance.sum((1, 2)))
-    if not sound.any():
+    sound &= np.isfinite(np.add.reduce(covariance, (1, 2)) + chi2)
+    if not np.count_nonzero(sound):
         return None
     log_ratio, log_prior, lone_odds = _log_ratio(terms, lights, t, R, covariance, chi2, sigma)
     range_m = np.sqrt(range2)
@@ -261,16 +260,19 @@ def _sensor_rows(
     port_b = R @ levels[1].depth_port_m
     below = t - levels[0].depth_port_m + port_b
     down = down_a + down_b
-    down = down / np.sqrt((down * down).sum(1, keepdims=True))
-    fall = (down * below).sum(1)
-    sigma_m = np.sqrt(sensors.depth_variance + 0.25 * sensors.tilt_variance * ((below * below).sum(1) - fall * fall))
+    down /= np.sqrt(np.add.reduce(down * down, 1, keepdims=True))
+    fall = np.add.reduce(down * below, 1)
+    level2 = np.add.reduce(below * below, 1) - fall * fall
+    sigma_m = np.sqrt(sensors.depth_variance + (0.25 * sensors.tilt_variance) * level2)
     sigma_rad = math.sqrt(sensors.tilt_variance)
     r, J = np.empty((len(t), 3)), np.zeros((len(t), 3, 6))
-    r[:, :2] = down_b @ across.T / sigma_rad
-    J[:, :2, 3:] = -across @ skew(down_b) / sigma_rad
+    across = across / sigma_rad
+    np.matmul(down_b, across.T, out=r[:, :2])
+    np.matmul(-across, skew(down_b), out=J[:, :2, 3:])
+    down /= sigma_m[:, None]
     r[:, 2] = (fall - (sensors.depth_m or 0.0)) / sigma_m
-    J[:, 2, :3] = down / sigma_m[:, None]
-    J[:, 2, 3:] = (-(down[:, None] @ skew(port_b))[:, 0]) / sigma_m[:, None]
+    J[:, 2, :3] = down
+    J[:, 2, 3:] = -(down[:, None] @ skew(port_b))[:, 0]
     return r, J, sigma_rad**2 * sigma_m
 
 
@@ -289,7 +291,7 @@ def _log_ratio(
     And the odds that the lone light is another lamp.
     """
     settings, candidates = terms.settings, terms.candidates
-    range_m = np.sqrt((t * t).sum(1))
+    range_m = np.sqrt(np.add.reduce(t * t, 1))
     # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
     prior = -3.0 * np.log(range_m)
     prior -= math.log(terms.rigs.views_sr * math.log(settings.range_max_m / settings.range_min_m))
@@ -305,7 +307,7 @@ def _log_ratio(
     fit -= np.log(sigma) + 1.5 * math.log(2.0 * math.pi)
     total = prior + fit - chance + math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS)
     R_last, u = R.transpose(1, 2, 0), (t / range_m[:, None]).T
-    turn_variance = np.einsum("ik,kij,jk->k", u, covariance[:, 3:, 3:], u)
+    turn_variance = np.add.reduce(u * (covariance[:, 3:, 3:] @ u.T[:, :, None])[:, :, 0].T)
     heading = weigh_heading(R_last, terms.sensors, turn_variance)
     total += heading
     log_prior = np.zeros(len(t))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from solver_service.geometry.camera import Camera
 from solver_service.geometry.closed_form import closed_form
@@ -143,9 +144,7 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     total = CHANCE_ODDS + float(np.add.reduce(ratio)) + others + intruder
     probability = float(np.add.reduce(ratio[same])) / total
     if probability >= (max(settings.min_probability, _THREE_PROBABILITY) if short else settings.min_probability):
-        # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
-        alone = np.exp(readings.log_ratio - readings.log_prior)
-        covariance = widened * _spread(readings, k, np.where(same, alone, 0.0))
+        covariance = widened * _spread(readings, k, same)
         return _fix(terms, readings, k, covariance, probability)
     tilt_chi2, depth_chi2 = float(readings.tilt_chi2[k]), float(readings.depth_chi2[k])
     what = f"the best of the hypotheses, at {range_m:.3g} m,"
@@ -211,11 +210,15 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
     )
 
 
-def _spread(readings: Readings, k: int, weights: Floats) -> Floats:
-    """Give the covariance of pose k, which may as well be one of its near neighbours; weights: (K,) theirs."""
+def _spread(readings: Readings, k: int, same: NDArray[np.bool_]) -> Floats:
+    """Give the covariance of pose k, which may as well be one of its near neighbours; same: (K,) whether one is."""
     covariance: Floats = readings.covariance[k]
+    if np.count_nonzero(same) < 2:
+        return covariance
+    # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
+    weights = np.where(same, np.exp(readings.log_ratio - readings.log_prior), 0.0)
     near = (weights > _NEGLIGIBLE * weights[k]).nonzero()[0]
-    for i in near[near != k] if len(near) > 1 else ():
+    for i in near[near != k]:
         away = np.concatenate(
             (readings.t_a_b_m[i] - readings.t_a_b_m[k], rotation_log(readings.R_a_b[i] @ readings.R_a_b[k].T))
         )
