@@ -94,9 +94,12 @@ def dot(a: Floats, b: Floats) -> Floats:
 
 def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m: Floats) -> Floats:
     """Eq. 1: the distance of the bar's middle from the camera that sees the bar of length_m under alpha."""
-    sine2 = sin_beta * sin_beta
-    root = np.sqrt(1.0 - cos_alpha * cos_alpha * sine2)
-    range_m: Floats = length_m / (2.0 * sin_alpha) * (cos_alpha * np.sqrt(1.0 - sine2) + root)
+    return _eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.sqrt(1.0 - sin_beta * sin_beta), length_m)
+
+
+def _eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, cos_beta: Floats, length_m: Floats) -> Floats:
+    shortened = cos_alpha * sin_beta
+    range_m: Floats = length_m / (2.0 * sin_alpha) * (cos_alpha * cos_beta + np.sqrt(1.0 - shortened * shortened))
     return range_m
 
 
@@ -117,7 +120,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
         if variant != "paper":
             u = left / left[:, 2:3] + right / right[:, 2:3]
             u = levels @ (u / np.sqrt(dot(u, u))[:, None])
-        slant = u[:, 0]
+        slant = None
         if variant == "paper_literal":
             slant = np.sqrt(np.clip(1.0 - (levels.swapaxes(1, 2) @ u)[:, 2] ** 2, 0.0, 1.0))
         span = spans.w - u * dot(u, spans.w)[:, None]
@@ -144,7 +147,7 @@ def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset
             moved = Spans.of(_from_middles(spans.ends, u, span, angles, bars))
             angles = _angles(moved.chord)
             u, span = _split(moved, angles[0], split_rounds)
-    return _pose(u, span, u[:, 0], angles, bars, mean_twist=True)
+    return _pose(u, span, None, angles, bars, mean_twist=True)
 
 
 def _angles(chord: Floats) -> tuple[Floats, Floats]:
@@ -171,18 +174,21 @@ def _off_bisector(sin_beta: Floats, cos_alpha: Floats) -> tuple[Floats, Floats]:
 
 
 def _pose(
-    u: Floats, span: Floats, slant: Floats, angles: tuple[Floats, Floats], bars: Bars, *, mean_twist: bool
+    u: Floats, span: Floats, slant: Floats | None, angles: tuple[Floats, Floats], bars: Bars, *, mean_twist: bool
 ) -> ClosedForm:
-    """Put a pose together from lines of sight u, the bars across them, and sin beta as Eq. 1 is to take it."""
-    cos_alpha, sin_alpha = angles
-    range_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], slant, bars.length_m)
+    """Put a pose together from lines of sight u and the bars across them; slant: what Eq. 1 takes for sin beta."""
     ux, uy, uz = u.swapaxes(0, 1)
+    cos_beta = np.sqrt(1.0 - ux * ux)
+    cos_alpha, sin_alpha = angles[0][::-1], angles[1][::-1]
+    if slant is None:
+        range_m = _eq1_range_m(cos_alpha, sin_alpha, ux, cos_beta, bars.length_m)
+    else:
+        range_m = eq1_range_m(cos_alpha, sin_alpha, slant, bars.length_m)
     twist = np.arctan2(uz * span[:, 1] - uy * span[:, 2], span[:, 0])
     twist_gap = wrap(twist[0] - twist[1])
     # The paper uses one of the two twists only.
     mean = twist[0] - 0.5 * twist_gap if mean_twist else twist[0]
     # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
-    cos_beta = np.sqrt(1.0 - ux * ux)
     side = np.zeros(u.shape)
     np.divide(uz, cos_beta, out=side[:, 1])
     np.divide(uy, -cos_beta, out=side[:, 2])
@@ -203,9 +209,10 @@ def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, F
     """Move the bearings (2, 2, 3, K) from the cameras to the middles of their own bars, by the distances so far."""
     cos_alpha, sin_alpha = angles
     sin_beta = u[:, 0]
-    of_a_m, of_b_m = eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, bars.length_m)
+    cos_beta = np.sqrt(1.0 - sin_beta * sin_beta)
+    of_a_m, of_b_m = _eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, cos_beta, bars.length_m)
     range_m = 0.5 * (of_a_m + of_b_m)
-    sin_beta, cos_beta = sin_beta[::-1, None], np.sqrt(1.0 - sin_beta * sin_beta)[::-1, None]
+    sin_beta, cos_beta = sin_beta[::-1, None], cos_beta[::-1, None]
     middle = bars.middle_m + range_m * u
     arm = 0.5 * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
     light = middle + _ENDS * arm

@@ -129,7 +129,7 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
     w, total = two - one, two + one
     # Of the cross product of the two, what turns about the bar.
     about = one[1] * two[2] - one[2] * two[1]
-    chord2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    chord2 = dot(w[:3], w[:3])
     variance = total[5] / chord2
     keep = (chord2 >= shortest2) & (chord2 <= longest2) & (variance < _MAX_RELATIVE_VARIANCE)
     if np.count_nonzero(keep) < len(keep):

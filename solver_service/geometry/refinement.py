@@ -140,14 +140,14 @@ def residuals(
     q = np.empty((K, 4, 3))
     # The lights about the point that the pose turns them about, in A's axes: B's about B, A's seen from B.
     y = np.empty((K, 4, 3))
-    y[:, :2] = lights[1] @ Rt
-    y[:, 2:] = lights[0] - t[:, None]
+    np.matmul(lights[1], Rt, out=y[:, :2])
+    np.subtract(lights[0], t[:, None], out=y[:, 2:])
     if shifts is not None:
         shift, turn = shifts
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
         y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
-    q[:, :2] = y[:, :2] + t[:, None]
-    q[:, 2:] = y[:, 2:] @ R
+    np.add(y[:, :2], t[:, None], out=q[:, :2])
+    np.matmul(y[:, 2:], R, out=q[:, 2:])
     if shifts is not None:
         q[:, :2] += shift[:, :2]
     depth = np.add.reduce(seen.bearings * q, 2)

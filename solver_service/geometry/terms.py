@@ -62,7 +62,7 @@ def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
     if value is None:
         return None
     array = np.asarray(value, dtype=np.float64)
-    return array if array.shape == shape and math.isfinite(np.add.reduce(array, None)) else None
+    return array if array.shape == shape and math.isfinite(sum(array.ravel().tolist())) else None
 
 
 def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
