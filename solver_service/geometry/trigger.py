@@ -63,8 +63,8 @@ class NoFix:
 # Poses nearer than this, relative to the range, and turned by less than 0.1 rad (their trace) are one pose.
 _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
-# Three lights have no gap to check them: they must be likelier than four.
-_THREE_PROBABILITY: Final = 0.98
+# Three lights have no gap to check them: of a thousand poses one may be wrong.
+_THREE_PROBABILITY: Final = 0.999
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
 _GROSS_CHI2: Final = 11.3
 # A position that is known to this share of the range (1 sd) is no wrong one.
