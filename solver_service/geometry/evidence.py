@@ -167,11 +167,11 @@ def combine(
     )
 
 
-def log_gaps(chi2: Floats, variance: Floats, gaps: int) -> Floats:
-    """Give the log density of the gaps: Gaussian, with a share of gross errors."""
+def log_gaps(chi2: Floats, gaps: int) -> Floats:
+    """Give the log density of the gaps over their sds and (2 pi)^(1/2): Gaussian, with a share of gross errors."""
     usual = (1.0 - GROSS_PROBABILITY) * np.exp(-0.5 * chi2)
     gross = (GROSS_PROBABILITY * GROSS_SCALE**-gaps) * np.exp((-0.5 / GROSS_SCALE**2) * chi2)
-    density: Floats = np.log(usual + gross) - (0.5 * gaps) * np.log((2.0 * math.pi) * variance)
+    density: Floats = np.log(usual + gross)
     return density
 
 

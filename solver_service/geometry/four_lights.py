@@ -58,17 +58,18 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     )
     t, variance = solved.t_a_b_m, found.variance
     support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
+    gaps = len(settings.checks & {"range", "twist"})
     base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
+    base -= (0.5 * gaps) * np.log((2.0 * math.pi) * variance)
     gap2 = np.zeros(len(variance))
     if "range" in settings.checks:
         gap2 = gap2 + np.log(solved.range_m[0] / solved.range_m[1]) ** 2
     if "twist" in settings.checks:
         gap2 = gap2 + solved.twist_gap_rad**2
     chi2 = gap2 / variance
-    gaps = len(settings.checks & {"range", "twist"})
     range2 = dot(t, t)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
-    log_ratio = np.where(inside, base + log_gaps(chi2, variance, gaps), -np.inf)
+    log_ratio = np.where(inside, base + log_gaps(chi2, gaps), -np.inf)
     best = (-log_ratio).argsort(kind="stable")[:_REFINED]
     if log_ratio[best[0]] == -np.inf:
         what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
@@ -92,7 +93,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             R_a_b=refined.R_a_b,
             covariance=refined.covariance,
             chi2=chi2,
-            log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, variance[best], gaps), -np.inf),
+            log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, gaps), -np.inf),
             tilt_chi2=support.tilt_chi2[best],
             depth_chi2=support.depth_chi2[best],
             range_m=solved.range_m.take(best, 1).T,

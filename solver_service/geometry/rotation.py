@@ -16,6 +16,7 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_i, _k, _j] = 1.0
     _CROSS[_i, _j, _k] = -1.0
 _CROSS_FLAT: Final[Floats] = _CROSS.reshape(3, 9)
+_HALF_CROSS_FLAT: Final[Floats] = 0.5 * _CROSS_FLAT
 _EYE: Final[Floats] = np.eye(3)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
@@ -78,9 +79,8 @@ def rotation_exp(w_rad: Floats) -> Floats:
 
 def rotation_near(w_rad: Floats) -> Floats:
     """Turn small rotation vectors (..., 3) into matrices (..., 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
-    half = 0.5 * w_rad
-    K = skew(half)
-    scale = 2.0 / (1.0 + np.add.reduce(half * half, -1))
+    K = (w_rad @ _HALF_CROSS_FLAT).reshape(*w_rad.shape, 3)
+    scale = 8.0 / (4.0 + np.add.reduce(w_rad * w_rad, -1))
     R: Floats = _EYE + scale[..., None, None] * (K + K @ K)
     return R
 

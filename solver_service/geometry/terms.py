@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
@@ -20,14 +20,14 @@ from solver_service.geometry.rotation import Floats, matrix_of
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class Terms:
     """What a trigger is solved from."""
 
     rigs: RigPair
     candidates: Candidates
     sensors: Sensors
-    prediction: Prediction | None
+    prior: Prior | None
     motion: Motion
     settings: Settings
 
@@ -46,10 +46,15 @@ class Terms:
             rigs=pair,
             candidates=candidates,
             sensors=_sensors(pair.levels, sensed),
-            prediction=_prediction(prior, pair, candidates, settings),
+            prior=prior,
             motion=_motion(prior, rigs[0], settings),
             settings=settings,
         )
+
+    @cached_property
+    def prediction(self) -> Prediction | None:
+        """What earlier poses say; only asked for where there are hypotheses to weigh."""
+        return _prediction(self.prior, self.rigs, self.candidates, self.settings)
 
     @property
     def range_limits(self) -> str:

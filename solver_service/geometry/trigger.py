@@ -63,6 +63,7 @@ class NoFix:
 # Poses nearer than this, relative to the range, and turned by less than 0.1 rad (their trace) are one pose.
 _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
+_ALONE: Final = np.ones(1, dtype=bool)
 # Three lights have no gap to check them: of a thousand poses one may be wrong.
 _THREE_PROBABILITY: Final = 0.999
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
@@ -128,8 +129,10 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     if not settings.range_min_m <= range_m <= settings.range_max_m:
         return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {terms.range_limits}")
     ratio = np.exp(readings.log_ratio)
-    same = np.add.reduce((t - t[k]) ** 2, 1) < (_SAME_POSITION * range_m) ** 2
-    same &= R.reshape(-1, 9) @ R[k].ravel() > _SAME_TRACE
+    same = _ALONE
+    if len(readings) > 1:
+        same = np.add.reduce((t - t[k]) ** 2, 1) < (_SAME_POSITION * range_m) ** 2
+        same &= R.reshape(-1, 9) @ R[k].ravel() > _SAME_TRACE
     short = min(readings.lights[k].tolist()) < 0
     chi2 = float(readings.chi2[k])
     # One of four lights may be off by more than its noise; which one, two residuals cannot tell.
