@@ -24,7 +24,7 @@ from tools.monitor.coverage import Coverage, clock_words
 from tools.monitor.health import REASONS, findings, sentence
 from tools.monitor.inbox import QUEUED, Inbox
 from tools.monitor.picture import KEPT_NS, Miss, PairPicture
-from tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of
+from tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
 from tools.monitor.svg import Line, Plot, svg, ticks
 
 HALF = math.sqrt(0.5)
@@ -294,6 +294,13 @@ class TestScene:
             seen = point_m - eye
             assert seen @ ahead / np.linalg.norm(seen) > math.cos(math.radians(40))
         assert eye[2] < target[2]
+
+    def test_a_view_is_left_by_who_swims_out_of_it(self) -> None:
+        eye, target = fit(np.array([3.0, 0.0, 0.0]), 1.6)
+        fov_rad = math.radians(75)
+        assert holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+        assert not holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]))
+        assert not holds(eye, target, fov_rad, np.array([eye + 0.1 * (eye - target)]))
 
     def test_age_is_a_colour(self) -> None:
         colours = age_colours(np.array([0.0, 60.0, 500.0]), 120.0).astype(int)

@@ -197,6 +197,10 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         seen.wait_for("All is well")
         assert seen.colours() > 50
         seen.screenshot("well")
+        seen.page.set_viewport_size({"width": 390, "height": 844})
+        seen.wait_for("All is well")
+        seen.screenshot("well-on-a-phone")
+        seen.page.set_viewport_size({"width": 1280, "height": 800})
 
         processes.kill("b")
         assert seen.wait_for("Node b has left the bus") < 3.0

@@ -15,7 +15,7 @@ from protocol.errors import BuddylineError
 from protocol.messages import NodeInfo
 from tools.monitor import panel
 from tools.monitor.picture import KEPT_NS, PairPicture, Point
-from tools.monitor.scene import Floats, age_colours, ellipsoid, fields_of_view, fit, wxyz
+from tools.monitor.scene import Floats, age_colours, ellipsoid, fields_of_view, fit, holds, wxyz
 
 if TYPE_CHECKING:
     import viser
@@ -35,6 +35,9 @@ DOWN_COLOUR: Final = (90, 160, 255)
 FRUSTUM_M: Final = 0.35
 LIGHT_RADIUS_M: Final = 0.035
 # Trail segments longer than this in time are not drawn: between the poses nothing is known.
+# An eye this far, by its distance, from where the page put it is its owner's; a new place is taken from so far on.
+CHOSEN: Final = 0.02
+WORTH_A_TURN: Final = 0.2
 TRAIL_BREAK_NS: Final = 3 * S_NS // 2
 
 
@@ -183,15 +186,32 @@ class SceneDrawing:
         self._t_m = np.array([3.0, 0.0, 0.0])
         for handle in (self._sight, self._plumb, self._ellipsoid, self._north):
             handle.visible = False
+        self._eyes: dict[int, tuple[Floats, Floats]] = {}
         server.on_client_connect(self.fit)
+        server.on_client_disconnect(self._forget)
 
     def fit(self, client: viser.ClientHandle) -> None:
         """Turn one viewer's eye so that it sees the pair."""
         eye, target = fit(self._t_m, client.camera.aspect)
+        self._eyes[client.client_id] = eye, target
         with client.atomic():
             client.camera.up_direction = (0.0, 0.0, -1.0)
             client.camera.position = eye
             client.camera.look_at = target
+
+    def _forget(self, client: viser.ClientHandle) -> None:
+        self._eyes.pop(client.client_id, None)
+
+    def _follow(self) -> None:
+        """Turn the eyes of those whom the pair has left, and who have not chosen their own view."""
+        for client in list(self._server.get_clients().values()):
+            put = self._eyes.get(client.client_id)
+            if put is None or np.linalg.norm(client.camera.position - put[0]) > CHOSEN * np.linalg.norm(put[0]):
+                continue
+            if not holds(*put, client.camera.fov, np.array((np.zeros(3), self._t_m))):
+                eye, _ = fit(self._t_m, client.camera.aspect)
+                if np.linalg.norm(eye - put[0]) > WORTH_A_TURN * np.linalg.norm(eye):
+                    self.fit(client)
 
     def fit_all(self) -> None:
         """Turn every viewer's eye."""
@@ -230,7 +250,9 @@ class SceneDrawing:
             self._ellipsoid.wxyz = wxyz(R_s_axes)
             self._ellipsoid.scale = tuple(half_m.tolist())
         self._t_m = t_m
-        if not self._fitted:
+        if self._fitted:
+            self._follow()
+        else:
             self._fitted = True
             self.fit_all()
 

@@ -24,6 +24,8 @@ ELLIPSOID_SD: Final = 2.795
 # Below this the shape could not be told from a point, and its axes are those of rounding.
 MIN_HALF_AXIS_M: Final = 1e-4
 MAX_HALF_AXIS_M: Final = 50.0
+# Share of a view's height, from its middle, that is well inside it; the panel covers one side.
+INSIDE: Final = 0.4
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,13 @@ def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
         # A phone held upright: one behind the other, in the upper half; the panel covers the lower.
         return target + distance_m * (0.45 * aside - forward + 0.75 * up), target - 0.45 * distance_m * up
     return target + distance_m * (0.8 * aside - 0.35 * forward + 0.5 * up), target
+
+
+def holds(eye: Floats, target: Floats, fov_rad: float, points: Floats) -> bool:
+    """Return whether an eye that looks at target has all points (n, 3) well inside a view of this height."""
+    towards, ahead = points - eye, target - eye
+    cosine = (towards @ ahead) / (np.linalg.norm(towards, axis=1) * np.linalg.norm(ahead) + 1e-9)
+    return bool((cosine > np.cos(INSIDE * fov_rad)).all())
 
 
 def age_colours(ages_s: Floats, whole_s: float) -> NDArray[np.uint8]:
