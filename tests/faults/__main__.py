@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import signal
 import statistics
 import sys
 
@@ -46,6 +47,8 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
+    # So that whoever ends this early ends what it has started, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     reports = []
     if not args.json:
         print(HEADER)

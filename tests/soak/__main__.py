@@ -9,6 +9,7 @@ and at the end. Exit status 1 where anything was lost or doubled, or grew beyond
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -61,6 +62,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="default: 60")
     parser.add_argument("--every", type=float, default=60.0, metavar="S", help="between two lines; default: 60")
     args = parser.parse_args()
+    # So that whoever ends this early ends what it has started, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory() as directory:
         result = soak(Path(directory), 60 * args.minutes, args.every, show)
     report(result)
