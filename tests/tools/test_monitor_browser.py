@@ -198,6 +198,7 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         assert seen.colours() > 50
         seen.screenshot("well")
         seen.page.set_viewport_size({"width": 390, "height": 844})
+        seen.page.wait_for_timeout(3000)
         seen.wait_for("All is well")
         seen.screenshot("well-on-a-phone")
         seen.page.set_viewport_size({"width": 1280, "height": 800})

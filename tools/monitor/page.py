@@ -186,14 +186,14 @@ class SceneDrawing:
         self._t_m = np.array([3.0, 0.0, 0.0])
         for handle in (self._sight, self._plumb, self._ellipsoid, self._north):
             handle.visible = False
-        self._eyes: dict[int, tuple[Floats, Floats]] = {}
+        self._eyes: dict[int, tuple[Floats, Floats, bool]] = {}  # eye, target, upright, as the page put them
         server.on_client_connect(self.fit)
         server.on_client_disconnect(self._forget)
 
     def fit(self, client: viser.ClientHandle) -> None:
         """Turn one viewer's eye so that it sees the pair."""
         eye, target = fit(self._t_m, client.camera.aspect)
-        self._eyes[client.client_id] = eye, target
+        self._eyes[client.client_id] = eye, target, client.camera.aspect < 1.0
         with client.atomic():
             client.camera.up_direction = (0.0, 0.0, -1.0)
             client.camera.position = eye
@@ -206,11 +206,16 @@ class SceneDrawing:
         """Turn the eyes of those whom the pair has left, and who have not chosen their own view."""
         for client in list(self._server.get_clients().values()):
             put = self._eyes.get(client.client_id)
-            if put is None or np.linalg.norm(client.camera.position - put[0]) > CHOSEN * np.linalg.norm(put[0]):
+            if put is None:
                 continue
-            if not holds(*put, client.camera.fov, np.array((np.zeros(3), self._t_m))):
-                eye, _ = fit(self._t_m, client.camera.aspect)
-                if np.linalg.norm(eye - put[0]) > WORTH_A_TURN * np.linalg.norm(eye):
+            eye, target, upright = put
+            if np.linalg.norm(client.camera.position - eye) > CHOSEN * np.linalg.norm(eye):
+                continue
+            if upright != (client.camera.aspect < 1.0):
+                self.fit(client)
+            elif not holds(eye, target, client.camera.fov, np.array((np.zeros(3), self._t_m))):
+                better, _ = fit(self._t_m, client.camera.aspect)
+                if np.linalg.norm(better - eye) > WORTH_A_TURN * np.linalg.norm(better):
                     self.fit(client)
 
     def fit_all(self) -> None:

@@ -96,7 +96,7 @@ def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
     up = np.array([0.0, 0.0, -1.0])
     if aspect < 1.0:
         # A phone held upright: one behind the other, in the upper half; the panel covers the lower.
-        return target + distance_m * (0.45 * aside - forward + 0.75 * up), target - 0.45 * distance_m * up
+        return target + distance_m * (0.45 * aside - forward + 0.75 * up), target - 0.6 * distance_m * up
     return target + distance_m * (0.8 * aside - 0.35 * forward + 0.5 * up), target
 
 
