@@ -107,7 +107,10 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
             start(f"node {node}", "connected", "--config", str(config), module="tests.soak.node")
         _measure(result, processes, viewer, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("node a", "node b")}
-        time.sleep(3.0)  # the solver takes a pause of 2.5 s for the end
+        # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
+        time.sleep(4.0)
+        statuses["solver"] = processes["solver"].end()
+        time.sleep(1.0)
         statuses |= {name: processes[name].end() for name in processes if name not in statuses and name != "hub"}
         result.failures += [f"{name}: exit status {status}" for name, status in statuses.items() if status]
         for name, process in processes.items():
