@@ -126,9 +126,9 @@ class ProposalFinder:
             # As one row of a picture, which OpenCV compares many times faster than numpy.
             contrast_row, highest, marks = self._contrast[None], self._highest[None], self._marks[None]
             cv2.compare(contrast_row, highest, cv2.CMP_EQ, dst=marks)
-            enough = highest
-            cv2.threshold(contrast_row, max(math.ceil(contrast_min), 1) - 1, 255, cv2.THRESH_BINARY, dst=enough)
-            cv2.bitwise_and(marks, enough, dst=marks)
+            # The highest values have served: in their place, whether the contrast is enough.
+            cv2.threshold(contrast_row, max(math.ceil(contrast_min), 1) - 1, 255, cv2.THRESH_BINARY, dst=highest)
+            cv2.bitwise_and(marks, highest, dst=marks)
 
         # Empty places are passed over a machine word at a time.
         places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()

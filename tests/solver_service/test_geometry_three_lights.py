@@ -59,6 +59,21 @@ def test_three_lights_and_perfect_sensors_give_the_pose(missing, rigs):
     assert solved >= 4
 
 
+def test_what_the_last_poses_speak_for_must_be_likelier_than_what_sensors_tell():
+    rng = np.random.default_rng(7)
+    led, alone = [], []
+    for _ in range(30):
+        scene = random_scene(rng, (1.5, 3.0))
+        views = without(scene, int(rng.integers(4)), rng, 0.1)
+        for prior, found in ((followed(scene, rng), led), (None, alone)):
+            fix = solve(scene, views, scene.sensed(), prior=prior)
+            if isinstance(fix, Fix):
+                found.append(fix.probability)
+    assert min(len(led), len(alone)) >= 10
+    assert min(led) >= 0.999
+    assert 0.98 <= min(alone) < 0.999
+
+
 def test_the_error_is_within_the_covariance_which_is_larger_than_that_of_four():
     rng = np.random.default_rng(4)
     squares, larger = [], []

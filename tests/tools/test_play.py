@@ -1,11 +1,13 @@
 """Playback: what is sent, when, and how a dive goes round and round."""
 
+import math
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 
-from protocol.clock import ManualClock
+from protocol.clock import S_NS, ManualClock
 from protocol.codec import decode
 from protocol.divelog import DiveLogWriter
 from protocol.errors import BuddylineError
@@ -13,8 +15,9 @@ from protocol.local_bus import LocalNetwork
 from protocol.messages import Candidates, NodeInfo, Rejected
 from protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
+from tools import play
 from tools.dives import Dive
-from tools.play import SOLVER_SILENT_S, Player, _selected, _span
+from tools.play import Player, _selected, _span
 
 
 @pytest.fixture(scope="module")
@@ -129,10 +132,21 @@ def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
     assert max(solver.ahead_ns) < 1_700_000_000
 
 
-def test_fast_playback_without_a_solver_waits_for_nobody(log):
-    began_s = time.monotonic()
-    assert Played(log, speed=0.0).sent > 0
-    assert time.monotonic() - began_s < SOLVER_SILENT_S
+def test_fast_playback_without_a_solver_waits_for_nobody(log, monkeypatch):
+    monkeypatch.setattr(play, "SOLVER_SILENT_S", math.inf)
+    network, stop = LocalNetwork(), threading.Event()
+    with Dive([log]) as dive, network.connect() as bus:
+        player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), stop)
+        player.declare(dive.keys)
+        records = list(dive.records(CANDIDATES.name))
+        # Far beyond what a solver would have resolved.
+        late = [replace(record, log_time_ns=record.log_time_ns + k * S_NS) for k, record in enumerate(records)]
+        playing = threading.Thread(target=lambda: [player.send(record) for record in late])
+        playing.start()
+        playing.join(20)
+        stop.set()
+        playing.join()
+    assert player.sent == len(records)
 
 
 @pytest.mark.parametrize(("start_s", "end_s"), [(-1.0, None), (99.0, None), (1.0, 0.5)])

@@ -34,10 +34,10 @@ NORTH_COLOUR: Final = (230, 80, 80)
 DOWN_COLOUR: Final = (90, 160, 255)
 FRUSTUM_M: Final = 0.35
 LIGHT_RADIUS_M: Final = 0.035
-# Trail segments longer than this in time are not drawn: between the poses nothing is known.
 # An eye this far, by its distance, from where the page put it is its owner's; a new place is taken from so far on.
 CHOSEN: Final = 0.02
 WORTH_A_TURN: Final = 0.2
+# Trail segments longer than this in time are not drawn: between the poses nothing is known.
 TRAIL_BREAK_NS: Final = 3 * S_NS // 2
 
 
