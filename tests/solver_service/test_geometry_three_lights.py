@@ -24,9 +24,9 @@ def solve(scene, views, sensed, settings=SETTINGS, prior=None):
     return solve_trigger(*views, scene.rig_a, scene.rig_b, *sensed, settings, prior)
 
 
-def followed(scene, rng):
-    """What a pair that was seen just before is foretold to be."""
-    sigma = np.repeat((0.1, 0.05), 3)
+def followed(scene, rng, sigma=(0.1, 0.05)):
+    """What a pair that was seen just before is foretold to be; sigma: m, rad."""
+    sigma = np.repeat(sigma, 3)
     off = sigma * rng.standard_normal(6)
     R = rotation_exp(off[3:]) @ scene.R
     return Prior(scene.t + off[:3], quaternion_of(R), np.diag(sigma**2))
@@ -62,10 +62,10 @@ def test_three_lights_and_perfect_sensors_give_the_pose(missing, rigs):
 def test_what_the_last_poses_speak_for_must_be_likelier_than_what_sensors_tell():
     rng = np.random.default_rng(7)
     led, alone = [], []
-    for _ in range(30):
-        scene = random_scene(rng, (1.5, 3.0))
+    for _ in range(60):
+        scene = random_scene(rng, (1.5, 6.0))
         views = without(scene, int(rng.integers(4)), rng, 0.1)
-        for prior, found in ((followed(scene, rng), led), (None, alone)):
+        for prior, found in ((followed(scene, rng, (0.4, 0.2)), led), (None, alone)):
             fix = solve(scene, views, scene.sensed(), prior=prior)
             if isinstance(fix, Fix):
                 found.append(fix.probability)
