@@ -23,17 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.detect.lights import Lights
-from node.detect.rings import (
-    RAY_HARMONICS,
-    RAYS,
-    Floats,
-    geometric_radii,
-    luminance,
-    sample_rings,
-    weakest_channel,
-)
+from node.detect.rings import RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 
 _RINGS = 16
+_SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)
 _CLIPPED = 249.0
 _WIDTH_OF_MODEL_PX = 820
 _ROBUST_SD = 3.0
@@ -69,45 +62,34 @@ MODEL: Mapping[str, float] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Centres:
-    """Sources of N lights: centre_px (N, 2), covariance_px2 (N, 2, 2), lean (N, 2): the glow's, towards the beam."""
+    """Sources of N lights: centre_px (N, 2), sigma_px (N,) per axis, lean (N, 2): the glow's, towards the beam."""
 
     centre_px: Floats
-    covariance_px2: Floats
+    sigma_px: Floats
     lean: Floats
 
 
 def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str, float] = MODEL) -> Centres:
     """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture."""
-    start_px, radius_px, ground, weakest = lights.centre_px, lights.core_px, lights.ground, lights.weakest
-    prior_sd = model["core_share"] * radius_px + 0.5
-    radius = geometric_radii(
-        np.maximum(model["inner"] * radius_px, 0.7),
-        np.maximum(model["outer"] * radius_px, model["outer_min_px"]),
-        _RINGS,
-    )
-    log_step = np.log(radius[:, -1] / radius[:, 0]) / (_RINGS - 1)
-    growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), ground, model)
-    prior = np.zeros((len(radius), 4, 4))
-    prior[:, (0, 1), (0, 1)] = 1.0 / prior_sd[:, None] ** 2
-    prior[:, (2, 3), (2, 3)] = 1.0 / model["lean_sd"] ** 2
-    guess = lights.guess_px
-    equations = _Equations(image, guess, radius, log_step, ground, weakest, growth, model)
-    x, covariance = equations.solve(prior, start_px - guess)
-    found = guess + x[:, :2]
+    start_px, radius_px, guess_px = lights.centre_px, lights.core_px, lights.guess_px
+    prior_px2 = (model["core_share"] * radius_px + 0.5) ** 2
+    growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), lights.ground, model)
+    equations = _Equations(image, lights, growth, model)
+    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px)
     # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
-    moved = found - start_px
-    holds = equations.solvable & (np.hypot(moved[:, 0], moved[:, 1]) <= radius_px + 3.0)
-    moved *= (holds * (1.0 - lights.scattered))[:, None]
-    own_px2 = (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2 + np.where(
-        holds, _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2, prior_sd**2
-    )
-    covariance = covariance * holds[:, None, None] + own_px2[:, None, None] * np.eye(2)
-    share = _MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped
-    moved_px = share[:, None] * moved
-    covariance += moved_px[:, :, None] * moved_px[:, None, :]
-    return Centres(start_px + moved, covariance, x[:, 2:] * holds[:, None])
+    moved = guess_px + step_px - start_px
+    square = moved * moved
+    moved_px2 = square[:, 0] + square[:, 1]
+    holds = equations.solvable & (moved_px2 <= (radius_px + 3.0) ** 2)
+    share = holds * (1.0 - lights.scattered)
+    own_px2 = _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
+    variance_px2 = np.where(holds, own_px2, prior_px2)
+    variance_px2 += (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2
+    in_doubt = share * (_MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped)
+    variance_px2 += 0.5 * in_doubt * in_doubt * moved_px2
+    return Centres(start_px + share[:, None] * moved, np.sqrt(variance_px2), lean * holds[:, None])
 
 
 def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
@@ -123,113 +105,143 @@ def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Fl
     return np.asarray(growth, np.float32)
 
 
-def _one_channel(pixels: Floats, weakest: NDArray[np.bool_]) -> Floats:
-    """Give (N, M, K) levels from (N, M, K, C): the weakest channel where asked for, else the luminance."""
+def _one_channel(pixels: NDArray[np.uint8], weakest: NDArray[np.bool_]) -> Floats:
+    """Give (N, M, K) levels: the weakest channel where asked for, else the luminance."""
     level = luminance(pixels)
-    if pixels.shape[3] > 1 and weakest.any():
+    if pixels.ndim > 3 and weakest.any():
         level[weakest] = weakest_channel(pixels[weakest])
     return level
 
 
 class _Equations:
-    """The linear equations of N lights, from levels on rings around their present centres."""
+    """The linear equations of N lights, from levels on rings around where their sources may be.
 
-    def __init__(
-        self,
-        image: NDArray[np.uint8],
-        centre_px: Floats,
-        radius: Floats,
-        log_step: Floats,
-        ground: Floats,
-        weakest: NDArray[np.bool_],
-        growth: Floats,
-        model: Mapping[str, float],
-    ) -> None:
+    M: the rings between the innermost and the outermost, which only serve to tell how the profile falls.
+    """
+
+    def __init__(self, image: NDArray[np.uint8], lights: Lights, growth: Floats, model: Mapping[str, float]) -> None:
         self._model = model
-        rings = sample_rings(image, centre_px, radius)
-        level = _one_channel(rings.pixels, weakest)
-        above = level - ground[:, None, None]
-        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"])
-        if rings.inside is not None:
-            usable &= rings.inside
+        core_px = lights.core_px
+        radius = geometric_radii(
+            np.maximum(model["inner"] * core_px, 0.7),
+            np.maximum(model["outer"] * core_px, model["outer_min_px"]),
+            _SHARES,
+        )
+        log_step = np.log(radius[:, -1:] / radius[:, :1]) / np.float32(_RINGS - 1)
+        rings = sample_rings(image, lights.guess_px, radius)
+        level = _one_channel(rings.pixels, lights.weakest)
+        above = level - lights.ground[:, None, None]
+        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"]) & rings.inside
         np.maximum(above, 1.0, out=above)
-        self._y = np.log(above)
-        np.divide(model["noise"], above, out=above)
-        # Sums over rays as products with ones: many times faster than sums along the last axis.
-        ones = RAY_HARMONICS[:, 0]
+        y = np.log(above)
         used = usable.astype(np.float32)
-        self._weight = used / (above * above + model["model_noise"] ** 2)
         paired = used[:, 2:] * used[:, :-2]
-        count = paired @ ones
-        difference = ((self._y[:, 2:] - self._y[:, :-2]) * paired) @ ones
-        seen = np.zeros(radius.shape, bool)
-        seen[:, 1:-1] = (count >= 0.4 * RAYS) & (used[:, 1:-1] @ ones >= 0.5 * RAYS)
-        falling = np.zeros(radius.shape, np.float32)
-        falling[:, 1:-1] = difference / np.maximum(count, 1) / (-2.0 * log_step[:, None])
-        falling[~seen] = 0.0
-        self._weight *= seen[:, :, None]
-        self._seen = seen
-        self._shift = falling / radius
-        self._log_step = log_step
-        plain = np.where(seen, np.clip(falling, 0.0, model["steep_max"]), 1.0)
+        # Sums over rays as products with ones: many times faster than sums along the last axis.
+        count = paired @ _ONES
+        difference = ((y[:, 2:] - y[:, :-2]) * paired) @ _ONES
+        used, above, self._y = used[:, 1:-1], above[:, 1:-1], y[:, 1:-1]
+        self._seen = (count >= 0.4 * RAYS.count) & (used @ _ONES >= 0.5 * RAYS.count)
+        seen = self._seen.astype(np.float32)
+        falling = difference / (np.maximum(count, 1.0) * (-2.0 * log_step)) * seen
+        self._shift = falling / radius[:, 1:-1]
+        plain = np.where(self._seen, np.minimum(np.maximum(falling, 0.0), model["steep_max"]), 1.0)
         self._growth = growth[:, None] + model["steepness"] * plain
-        self.solvable = seen.sum(axis=1) >= 4
+        self._log_step = log_step
+        self.solvable = np.add.reduce(seen, axis=1) >= 4.0
+        noise = model["noise"] / above
+        # Each sample's weight, and that times y.
+        self._weighted = np.empty((*seen.shape, 2, RAYS.count), np.float32)
+        weight = self._weighted[:, :, 0]
+        np.divide(used * seen[:, :, None], noise * noise + model["model_noise"] ** 2, out=weight)
+        np.multiply(weight, self._y, out=self._weighted[:, :, 1])
 
-    def solve(self, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
-        """Solve for the step to the source and the lean, (N, 4), and the step's covariance (N, 2, 2).
+    def solve(self, prior_px2: Floats, prior_px: Floats) -> tuple[Floats, Floats, Floats]:
+        """Solve for the step to the source (N, 2), the lean (N, 2) and the step's variance (N,) per axis.
 
-        prior: (N, 4, 4) information on both, about prior_px (N, 2) for the step and none for the lean. What the model
-        does not explain, something in front or another light, has less weight the second time. The covariance
-        contains the growth's own uncertainty.
+        The prior on the step has the mean prior_px (N, 2), that on the lean none. What the model does not explain,
+        something in front or another light, has less weight the second time. The variance contains the growth's own
+        uncertainty.
         """
-        sd = self._model["growth_sd"]
-        share = self._glow_share(np.array([0.0, -sd, sd], np.float32))
-        x, _ = self._least_squares(share[:1], prior, prior_px)
-        mean = (self._weight * self._y) @ RAY_HARMONICS[:, 0]
-        mean /= np.maximum(self._weight @ RAY_HARMONICS[:, 0], 1e-6)
-        expected = np.empty((*mean.shape, 3), np.float32)
-        expected[..., 0] = mean
-        expected[..., 1:] = self._shift[..., None] * x[0, :, None, :2] + share[0][..., None] * x[0, :, None, 2:]
-        residual = self._y - expected @ _FIRST_HARMONICS
-        self._weight /= 1.0 + self._weight * residual**2 * (1.0 / _ROBUST_SD**2)
-        x, covariance = self._least_squares(share, prior, prior_px)
-        apart = _GROWTH_SCALE * 0.5 * (x[2, :, :2] - x[1, :, :2])
-        return x[0], _NOISE_SCALE**2 * covariance[0] + apart[:, :, None] * apart[:, None, :]
-
-    def _glow_share(self, more_growth: Floats) -> Floats:
-        """Integrate d ln w / d ln rho along the rings, for S growths; w is 1 at the outermost ring seen, (S, N, M)."""
-        growth = np.maximum(self._growth + more_growth[:, None, None], -0.3)
-        log_share = np.zeros_like(growth)
-        steps = (growth[..., 1:] + growth[..., :-1]) * (0.5 * self._log_step[:, None])
-        np.cumsum(steps, axis=-1, out=log_share[..., 1:])
-        last = np.where(self._seen, log_share, -1e9).max(axis=-1, keepdims=True)
-        return np.asarray(np.exp(np.minimum(log_share - last, 0.0)), np.float32)
-
-    def _least_squares(self, share: Floats, prior: Floats, prior_px: Floats) -> tuple[Floats, Floats]:
-        """Solve for (s, k), (S, N, 4), for S shares, each ring's mean eliminated; and the covariances of s."""
-        sums = self._weight @ RAY_HARMONICS
-        first = (self._weight * self._y) @ RAY_HARMONICS[:, :3]
-        means = sums[..., 1:3] / np.maximum(sums[..., :1], 1e-6)
-        spread = sums[..., 3:]
-        spread[..., :2] -= sums[..., 1:2] * means
-        spread[..., 2] -= sums[..., 2] * means[..., 1]
-        level = first[..., 1:] - first[..., :1] * means
+        prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
+        information = 1.0 / prior_px2
+        prior[:, 0, 0] = prior[:, 1, 1] = information
+        prior[:, 2, 2] = prior[:, 3, 3] = 1.0 / self._model["lean_sd"] ** 2
+        prior[:, :2, 4] = information[:, None] * prior_px
+        share = self._glow_share()
         basis = np.empty((*share.shape[:2], 2, share.shape[2]), np.float32)
         basis[:, :, 0] = self._shift
         basis[:, :, 1] = share
-        products = np.empty((*share.shape[:2], 3, share.shape[2]), np.float32)
-        products[:, :, :2] = basis * self._shift[:, None]
-        products[:, :, 2] = share * share
+        x, mean = self._least_squares(basis[:1], prior)
+        expected = np.empty((*mean.shape, 3), np.float32)
+        expected[..., 0] = mean
+        expected[..., 1:] = basis[0].swapaxes(1, 2) @ x[0, ..., 0].reshape(-1, 2, 2)
+        residual = self._y - (expected.reshape(-1, 3) @ _PLANE).reshape(self._y.shape)
+        robust = self._weighted[:, :, 0] * residual
+        robust *= residual
+        robust *= 1.0 / _ROBUST_SD**2
+        robust += 1.0
+        self._weighted /= robust[:, :, None]
+        x, _ = self._least_squares(basis, prior)
+        apart = x[2, :, :2, 0] - x[1, :, :2, 0]
+        variance = _NOISE_SCALE**2 * (x[0, :, 0, 1] + x[0, :, 1, 2])
+        variance += (0.5 * _GROWTH_SCALE) ** 2 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
+        return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
+
+    def _glow_share(self) -> Floats:
+        """Integrate d ln w / d ln rho along the rings; w is 1 at the outermost ring seen: (3, N, M).
+
+        For the growth as expected, and for less and more of it.
+        """
+        sd = self._model["growth_sd"]
+        growth = np.maximum(self._growth + np.array([[[0.0]], [[-sd]], [[sd]]], np.float32), -0.3)
+        log_share = (growth.reshape(-1, growth.shape[2]) @ _TRAPEZOIDS).reshape(growth.shape)
+        log_share *= self._log_step
+        last = np.where(self._seen, log_share, np.float32(-1e9)).max(axis=-1, keepdims=True)
+        log_share -= last
+        share: Floats = np.exp(np.minimum(log_share, 0.0))
+        return share
+
+    def _least_squares(self, basis: Floats, prior: Floats) -> tuple[Floats, Floats]:
+        """Solve for (s, k), each ring's mean eliminated, for S shares of the glow.
+
+        basis: (S, N, 2, M), what s and k are multiplied by. prior: (N, 4, 7), see _PRIOR. Returns (S, N, 4, 3), the
+        solution and the first two columns of its covariance; and the rings' means (N, M).
+        """
+        n, m = self._seen.shape
+        sums = (self._weighted.reshape(n * m, 2 * RAYS.count) @ _SUMS).reshape(n, m, 10)
+        means = sums[..., 1:4] / np.maximum(sums[..., :1], 1e-6)
+        spread = sums[..., 4:].reshape(n, m, 3, 2) - sums[..., 1:4, None] * means[..., None, :2]
+        rows = np.empty((*basis.shape[:2], 5, m), np.float32)
+        rows[:, :, 3:] = basis
+        np.multiply(basis, self._shift[:, None], out=rows[:, :, :2])
+        np.square(basis[:, :, 1], out=rows[:, :, 2])
         # Neighbouring samples are correlated: the information is less than their number says.
-        less = 1.0 / self._model["inflation"]
-        g = (basis @ level).reshape(*share.shape[:2], 4) * less
-        g[..., :2] += prior[:, :2, 0].sum(axis=1)[:, None] * prior_px
-        a = (products @ spread).reshape(*share.shape[:2], 9)[..., _BLOCKS] * less + prior
-        covariance = np.linalg.inv(a)
-        x = (covariance @ g[..., None])[..., 0]
-        return x.astype(np.float32), covariance[..., :2, :2]
+        products = (rows @ spread.reshape(n, m, 6)).reshape(*basis.shape[:2], 30) * (1.0 / self._model["inflation"])
+        system = np.repeat(prior[None], len(basis), axis=0)
+        system[..., :5] += products.take(_SYSTEM, axis=-1)
+        return np.linalg.solve(system[..., :4], system[..., 4:]), means[..., 2]
 
 
-_FIRST_HARMONICS = np.ascontiguousarray(RAY_HARMONICS[:, :3].T)
-_BLOCKS = np.array([[0, 1, 3, 4], [1, 2, 4, 5], [3, 4, 6, 7], [4, 5, 7, 8]])
-"""Where the 4x4 normal matrix of (s_u, s_v, k_u, k_v) finds its entries in (ss, sw, ww) x (cc, cs, ss)."""
+_ONES = np.ones(RAYS.count, np.float32)
+_PLANE = np.stack([_ONES, *RAYS.uv.T])
+_RAYS_TWICE = np.zeros((2, RAYS.count, 10), np.float32)
+_RAYS_TWICE[0, :, :3] = _PLANE.T
+_RAYS_TWICE[0, :, 4:8] = (RAYS.uv[:, :, None] * RAYS.uv[:, None]).reshape(-1, 4)
+_RAYS_TWICE[1, :, 3] = 1.0
+_RAYS_TWICE[1, :, 8:] = RAYS.uv
+_SUMS = _RAYS_TWICE.reshape(-1, 10)
+"""What is summed up over a ring's rays: 1, c, s, y, then (c, s, y) times (c, s); c and s: the ray's direction."""
+
+_TRAPEZOIDS = np.triu(np.ones((_RINGS - 2, _RINGS - 2), np.float32))
+_TRAPEZOIDS[0] = 0.0
+_TRAPEZOIDS = 0.5 * (_TRAPEZOIDS + np.triu(np.ones_like(_TRAPEZOIDS), 1))
+"""Integrates along the rings, of step 1, from the first on."""
+
+_SYSTEM = np.array([[0, 1, 6, 7, 22], [2, 3, 8, 9, 23], [6, 7, 12, 13, 28], [8, 9, 14, 15, 29]])
+"""Where the normal equations of (s_u, s_v, k_u, k_v), the right side last, find their entries in (ss, sw, ww, s, w)
+times (cc, cs, sc, ss, yc, ys)."""
+
+_PRIOR = np.zeros((4, 7))
+_PRIOR[0, 5] = _PRIOR[1, 6] = 1.0
+"""Of the normal equations: 4x4 on the left, then the right side, then two columns of the identity, for the covariance.
+"""

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from node.detect.proposals import Proposals
+from node.detect.proposals import CLEAR, Proposals
 from node.detect.rings import (
+    FEW_RAYS,
+    RAYS,
     Floats,
-    Shapes,
+    elongation,
     find_shapes,
     geometric_radii,
     luminance,
@@ -30,18 +31,19 @@ VEIL: Final = 40.0
 """Level of the weakest channel from which on the water counts as veiled."""
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 _GUESS, _GUESS_MOST = 0.5, 0.4
+_SETTLE_RADII: Final = np.geomspace(0.4, 7.0, 10, dtype=np.float32)
+_SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class Lights:
+class Lights(NamedTuple):
     """N bright regions.
 
     centre_px (N, 2), core_px (N,): the rim, in the channel that locates. guess_px: (N, 2) about where the source is.
     ground: (N,) what the water itself shows in that channel. weakest: (N,) whether it is the weakest one, else the
     luminance. core_elongation: (N,) in it, near the top. unclipped: (N,) 0-1. scattered: (N,) 0-1, see _scattered;
     the centre of those is where their glow begins. peak, height: (N,) luminance. edge_px: (N, K) outline at half
-    height around edge_at_px (N, 2), of area_px, elongation and open_share (of rays that find no edge). contrast,
-    clutter: (N,) as proposed.
+    height around edge_at_px (N, 2), of area_px, elongation and open_share (of rays that find no edge). outstanding:
+    (N,) as proposed.
     """
 
     centre_px: Floats
@@ -59,20 +61,19 @@ class Lights:
     area_px: Floats
     elongation: Floats
     open_share: Floats
-    contrast: Floats
-    clutter: Floats
+    outstanding: Floats
 
     def at(self, index: NDArray[np.intp]) -> Lights:
         """Give some of them."""
-        return Lights(*(getattr(self, field.name)[index] for field in fields(self)))
+        return Lights._make(values[index] for values in self)
 
 
 def measure_lights(
     image: NDArray[np.uint8], base: NDArray[np.uint8], base_step_px: float, proposals: Proposals
 ) -> Lights:
     """Measure what was proposed in a BGR (H, W, 3) or grey (H, W) picture; base: its grey, base_step_px a pixel."""
-    centre, radius_px, proposals = _settle(base, base_step_px, proposals)
-    radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), 16)
+    centre, radius_px, outstanding = _settle(base, base_step_px, proposals)
+    radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), _SHARES)
     rings = sample_rings(image, centre, radius)
     colour = image.ndim == 3
     level = np.empty((1 + colour, *rings.pixels.shape[:3]), np.float32)
@@ -85,74 +86,86 @@ def measure_lights(
     if colour:
         np.minimum(ground[1], water, out=ground[1])
     height = peak - ground
-    shapes = find_shapes(level, rings.inside, radius, ground[:, None] + _LEVELS[:, None] * height[:, None])
-    elongation = shapes.elongation()
-    # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
-    weakest = shapes.radius_px[-1, :2].mean(axis=0) >= _WEAKEST_FROM_PX if colour else np.zeros(len(radius), bool)
-    own = weakest.astype(np.intp), np.arange(len(radius))
-    rim_px, core_px = (values[own] for values in _rims(shapes))
-    unclipped = np.clip((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0, 1.0)
-    scattered = _scattered(shapes, unclipped, water)
-    rim_px += scattered[:, None] * (_where_glow_begins(shapes) - rim_px)
-    centroid_px = shapes.centre_px.swapaxes(1, 2)[own]
-    guess_px = rim_px + _at_most(_GUESS * (centroid_px[:, 0] - centroid_px[:, _HALF]), _GUESS_MOST * core_px)
+    shapes = find_shapes(level, rings, ground[:, None] + _LEVELS[:, None] * height[:, None])
+    circle = own_circle = shapes.circle_px[0]
+    own_edge, own_ground, weakest = shapes.edge_px[0, _CORE], ground[0], np.zeros(len(radius), bool)
+    if colour:
+        # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
+        weakest = shapes.circle_px[1, 0, :, 2] + shapes.circle_px[1, 1, :, 2] >= 2.0 * _WEAKEST_FROM_PX
+        own_circle = np.where(weakest[:, None], shapes.circle_px[1], circle)
+        own_edge = np.where(weakest[:, None], shapes.edge_px[1, _CORE], own_edge)
+        own_ground = np.where(weakest, ground[1], own_ground)
+    rim_px, core_px = _rims(own_circle)
+    unclipped = np.minimum(np.maximum((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0), 1.0)
+    scattered = _scattered(circle, unclipped, water)
+    rim_px += scattered[:, None] * (_where_glow_begins(circle) - rim_px)
+    step_px = _at_most(_GUESS * (own_circle[0, :, :2] - own_circle[_HALF, :, :2]), _GUESS_MOST * core_px)
+    edge = shapes.edge_px[0, _HALF]
+    radius_px = circle[_HALF, :, 2]
+    core_elongation, half_elongation = elongation(
+        np.concatenate([own_edge, edge]), np.concatenate([own_circle[_CORE], circle[_HALF]])
+    ).reshape(2, -1)
     return Lights(
         centre + rim_px,
         core_px,
-        centre + guess_px,
-        ground[own],
+        centre + (rim_px + step_px),
+        own_ground,
         weakest,
-        elongation.swapaxes(1, 2)[own][:, _CORE],
+        core_elongation,
         unclipped,
         scattered,
         peak[0],
         height[0],
-        shapes.edge_px[0, _HALF],
+        edge,
         centre,
-        np.pi * shapes.radius_px[0, _HALF] ** 2,
-        elongation[0, _HALF],
-        shapes.open_share[0, _HALF],
-        proposals.contrast,
-        proposals.clutter,
+        np.pi * (radius_px * radius_px),
+        half_elongation,
+        shapes.is_open[0, _HALF] @ RAYS.mean,
+        outstanding,
     )
 
 
-def distinct(centre_px: Floats, radius_px: Floats) -> NDArray[np.intp]:
-    """Leave out what lies inside an earlier one; give the indices of the rest. centre_px: (N, 2); radius_px: (N,)."""
-    u, v = centre_px.T
-    apart = np.hypot(u[:, None] - u, v[:, None] - v)
-    reach_px = np.maximum(0.7 * radius_px, 2.0)
-    same = apart < np.maximum(reach_px[:, None], reach_px)
-    # Each row as the bits of one number.
-    rows = (same @ (np.uint64(1) << np.arange(len(same), dtype=np.uint64))).tolist()
-    kept: list[int] = []
-    taken = 0
-    for i, row in enumerate(rows):
-        if not row & taken:
-            kept.append(i)
-            taken |= 1 << i
-    return np.array(kept, np.intp)
+def distinct(centre_px: Floats, radius_px: Floats, at_most: int) -> list[int]:
+    """Leave out what lies inside an earlier one; give the indices of the first of the rest.
+
+    centre_px: (N, 2); radius_px: (N,).
+    """
+    kept: list[tuple[float, float, float]] = []
+    indices: list[int] = []
+    reach2_px2 = np.maximum(0.7 * radius_px, 2.0) ** 2
+    for i, (u, v, reach2) in enumerate(zip(*centre_px.T.tolist(), reach2_px2.tolist(), strict=True)):
+        for other_u, other_v, other_reach2 in kept:
+            apart2 = (u - other_u) * (u - other_u) + (v - other_v) * (v - other_v)
+            if apart2 < reach2 or apart2 < other_reach2:
+                break
+        else:
+            kept.append((u, v, reach2))
+            indices.append(i)
+            if len(indices) == at_most:
+                break
+    return indices
 
 
-def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) -> tuple[Floats, Floats, Proposals]:
+def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) -> tuple[Floats, Floats, Floats]:
     """Move each proposal to the middle of its bright region, and leave out those that end up in one.
 
-    Returns centres (N, 2) and radii (N,) in px of the whole picture, and the proposals they were.
+    Returns centres (N, 2) and radii (N,) in px of the whole picture, and how far they stand out.
     """
     scale = np.float32(base_step_px)
-    step = proposals.step_px / scale
     at = (proposals.centre_px + 0.5) / scale - 0.5
-    radius = geometric_radii(0.4 * step, 7.0 * step, 10)
-    rings = sample_rings(base, at, radius)
-    level = rings.pixels[None, ..., 0]
+    radius = (proposals.step_px / scale)[:, None] * _SETTLE_RADII
+    rings = sample_rings(base, at, radius, FEW_RAYS)
+    level = rings.pixels.astype(np.float32)[None]
     peak = np.minimum(level[:, :, :5].max(axis=(2, 3)), _CLIPPED)
     ground = _low(level[:, :, -3:], 0.2)
-    shapes = find_shapes(level, rings.inside, radius, (ground + 0.8 * (peak - ground))[:, None])
-    centre = (at + shapes.centre_px[0, 0] + 0.5) * scale - 0.5
-    radius_px = shapes.radius_px[0, 0] * scale
-    kept = distinct(centre, radius_px)[:_MAX_MEASURED]
-    kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.clear[kept])))]
-    return centre[kept], radius_px[kept], proposals.at(kept)
+    shapes = find_shapes(level, rings, (ground + 0.8 * (peak - ground))[:, None], FEW_RAYS)
+    circle = shapes.circle_px[0, 0]
+    centre = (at + circle[:, :2] + 0.5) * scale - 0.5
+    radius_px = circle[:, 2] * scale
+    kept = distinct(centre, radius_px, _MAX_MEASURED)
+    clear = int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR))
+    kept = kept[: max(_ALWAYS_MEASURED, clear)]
+    return centre[kept], radius_px[kept], proposals.outstanding[kept]
 
 
 def _low(level: Floats, share: float) -> Floats:
@@ -162,39 +175,34 @@ def _low(level: Floats, share: float) -> Floats:
     return np.partition(flat, k, axis=2)[:, :, k]
 
 
-def _rims(shapes: Shapes) -> tuple[Floats, Floats]:
-    """Give each light's rim, where its profile falls the fastest: centres (C, N, 2), radii (C, N).
+def _rims(circle_px: Floats) -> tuple[Floats, Floats]:
+    """Give each light's rim, where its profile falls the fastest: centres (N, 2), radii (N,), from (S, N, 3).
 
     It is the lamp's own face where that shows, and the edge of what is clipped where the glow is all there is.
     """
-    radius, centre = shapes.radius_px, shapes.centre_px
-    fall = 1.0 / np.maximum(radius[:, 1:] - radius[:, :-1], 0.15)
-    k = fall.argmax(axis=1)
-    channel, place = np.arange(k.shape[0])[:, None], np.arange(k.shape[1])
-    return (
-        0.5 * (centre[channel, k, place] + centre[channel, k + 1, place]),
-        0.5 * (radius[channel, k, place] + radius[channel, k + 1, place]),
-    )
+    k = np.maximum(circle_px[1:, :, 2] - circle_px[:-1, :, 2], 0.15).argmin(axis=0)
+    rim = (0.5 * (circle_px[1:] + circle_px[:-1]))[k, np.arange(len(k))]
+    return rim[:, :2], rim[:, 2]
 
 
-def _scattered(shapes: Shapes, unclipped: Floats, water: Floats) -> Floats:
+def _scattered(circle_px: Floats, unclipped: Floats, water: float) -> Floats:
     """Tell lights in veiled water that show only what the water scatters, (N,) 0-1: not clipped, and with a halo.
 
-    A core's own profile falls as steeply below half its height as above it; a glow flattens out.
+    A core's own profile falls as steeply below half its height as above it; a glow flattens out. circle_px: (S, N, 3).
     """
-    flattening = shapes.radius_px[0, _HALF + 1] / shapes.radius_px[0, _HALF]
-    halo = np.clip((flattening - 1.35) / 0.2, 0.0, 1.0)
-    return np.asarray(halo * unclipped * np.minimum(water / VEIL, 1.0), np.float32)
+    flattening = circle_px[_HALF + 1, :, 2] / circle_px[_HALF, :, 2]
+    halo = np.minimum(np.maximum((flattening - 1.35) / 0.2, 0.0), 1.0)
+    return np.asarray(halo * unclipped * min(water / VEIL, 1.0), np.float32)
 
 
-def _where_glow_begins(shapes: Shapes) -> Floats:
+def _where_glow_begins(circle_px: Floats) -> Floats:
     """Give where a glow without a core comes from, (N, 2): against the way in which its fainter parts lie.
 
     A beam that passes the camera by shines where it has spread; its source lies behind the brightest part.
+    circle_px: (S, N, 3).
     """
-    top, low = shapes.centre_px[0, 0], shapes.centre_px[0, -1]
-    back = _at_most(_GLOW_BACK * (top - low), _GLOW_BACK_MOST * shapes.radius_px[0, _HALF])
-    return np.asarray(top + back, np.float32)
+    top, low = circle_px[0, :, :2], circle_px[-1, :, :2]
+    return top + _at_most(_GLOW_BACK * (top - low), _GLOW_BACK_MOST * circle_px[_HALF, :, 2])
 
 
 def _at_most(step_px: Floats, length_px: Floats) -> Floats:
@@ -203,9 +211,10 @@ def _at_most(step_px: Floats, length_px: Floats) -> Floats:
     return np.asarray(step_px * np.minimum(length_px / own_px, 1.0)[:, None], np.float32)
 
 
-def _water_level(image: NDArray[np.uint8]) -> Floats:
+def _water_level(image: NDArray[np.uint8]) -> float:
     """Give what a fifth of a picture lies below, in the weakest channel."""
-    some = np.ascontiguousarray(image[::16, ::16])
+    # Few rows and more of each: pixels of one row come from memory together.
+    some = image[::32, ::16]
     weak = (some if image.ndim == 2 else weakest_channel(some)).ravel()
     k = len(weak) // 5
-    return np.asarray(np.partition(weak, k)[k], np.float32)
+    return float(np.partition(weak, k)[k])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -17,33 +18,24 @@ _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
-_CLEAR = 5.0
+CLEAR: Final = 5.0
+"""How outstanding a place is that clearly stands out of its neighbourhood."""
 _ALWAYS, _AT_MOST = 16, 64
 _MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Proposals:
     """Places to look at, the most outstanding first; arrays of length N.
 
     centre_px: (N, 2) in the whole picture. step_px: pixels of the picture per pixel of the octave it was found in.
-    contrast: centre minus surround, grey levels. clutter: mean contrast of the neighbourhood.
+    outstanding: centre minus surround over what noise and the neighbourhood (its mean contrast) explain.
     """
 
     centre_px: NDArray[np.float32]
     step_px: NDArray[np.float32]
-    contrast: NDArray[np.float32]
-    clutter: NDArray[np.float32]
-
-    @property
-    def clear(self) -> NDArray[np.bool_]:
-        """Tell which of them clearly stand out of their neighbourhood, (N,): the first ones."""
-        return np.asarray(self.contrast >= _CLEAR * (_NOISE + self.clutter))
-
-    def at(self, index: NDArray[np.intp]) -> Proposals:
-        """Give some of them."""
-        return Proposals(self.centre_px[index], self.step_px[index], self.contrast[index], self.clutter[index])
+    outstanding: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +77,14 @@ class ProposalFinder:
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
+        self._grey_level = np.zeros((0, 0), np.uint8)
         self._marks = np.zeros(0, np.uint8)
         self._contrast = np.zeros(0, np.uint8)
         self._highest = np.zeros(0, np.uint8)
         self._clutter = np.zeros(0, np.uint8)
-        self._table = np.zeros((0, 5), np.int64)
+        self._cell_of = np.zeros(0, np.int32)
+        self._starts = self._widths = np.zeros(0, np.int64)
+        self._steps_px = np.zeros(0, np.float32)
         self._base_step_px = 1.0
 
     def load(self, image: NDArray[np.uint8]) -> None:
@@ -110,7 +105,7 @@ class ProposalFinder:
         steps = np.sort(cv2.absdiff(some[:, 1:], some[:, :-1]), axis=None, kind="stable")
         # What is not noise (edges, texture) stands in the upper half; below it, noise is as good as normal.
         lower = steps[: len(steps) // 2 + 1]
-        return int(np.add.reduce(lower, dtype=np.int64)) / len(lower) / _MEAN_OF_LOWER_HALF
+        return float(cv2.mean(lower)[0]) / _MEAN_OF_LOWER_HALF
 
     def find(self, contrast_min: float, clutter_gain: float) -> Proposals:
         """Find places in the picture that was loaded: the most outstanding 16, and up to 64 that clearly stand out.
@@ -133,23 +128,19 @@ class ProposalFinder:
         # Empty places are passed over a machine word at a time.
         places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()
         places = places[self._marks[places] != 0]
-        which = np.searchsorted(self._table[:, 0], places, side="right") - 1
-        start, width, cell_start, last_cell_row, cell_columns = self._table[which].T
-        rows, columns = np.divmod(places - start, width)
-        cells = np.minimum(rows // _CLUTTER_CELL, last_cell_row) * cell_columns
-        cells += np.minimum(columns // _CLUTTER_CELL, cell_columns - 1) + cell_start
         contrast = self._contrast[places].astype(np.float32)
-        clutter = self._clutter[cells].astype(np.float32)
+        clutter = self._clutter[self._cell_of[places]].astype(np.float32)
         outstanding = contrast / (_NOISE + clutter)
         outstanding[contrast < contrast_min + clutter_gain * clutter] = 0.0
-        clear = int(np.count_nonzero(outstanding >= _CLEAR))
+        clear = int(np.count_nonzero(outstanding >= CLEAR))
         order = np.argsort(-outstanding, kind="stable")[: min(max(clear, _ALWAYS), _AT_MOST)]
         order = order[outstanding[order] > 0.0]
-        step = np.float32(self._base_step_px) * np.exp2(which[order], dtype=np.float32)
+        places = places[order]
+        which = np.searchsorted(self._starts, places, side="right") - 1
+        step = self._steps_px[which]
         centre_px = np.empty((len(order), 2), np.float32)
-        centre_px[:, 0] = columns[order]
-        centre_px[:, 1] = rows[order]
-        return Proposals((centre_px + 0.5) * step[:, None] - 0.5, step, contrast[order], clutter[order])
+        centre_px[:, 1], centre_px[:, 0] = np.divmod(places - self._starts[which], self._widths[which])
+        return Proposals((centre_px + 0.5) * step[:, None] - 0.5, step, outstanding[order])
 
     @property
     def base(self) -> tuple[NDArray[np.uint8], float]:
@@ -160,6 +151,7 @@ class ProposalFinder:
         self._shape = shape
         self._halves = []
         height, width = shape[:2]
+        self._grey_level = np.empty((height, width) if len(shape) == 3 else (0, 0), np.uint8)
         self._base_step_px = 1.0
         while width > _BASE_WIDTH_PX and height >= 2 * _SMALLEST_PX:
             height, width = height // 2, width // 2
@@ -177,10 +169,14 @@ class ProposalFinder:
         self._contrast = np.zeros(whole_words, np.uint8)
         self._highest = np.zeros(whole_words, np.uint8)
         self._clutter = np.zeros(int(cell_starts[-1]), np.uint8)
-        self._table = np.array(
-            [(s, w, cs, c[0] - 1, c[1]) for s, (_, w), cs, c in zip(starts, sizes, cell_starts, cells, strict=False)],
-            np.int64,
-        ).reshape(-1, 5)
+        self._cell_of = np.zeros(whole_words, np.int32)
+        for start, (h, w), cell_start, (rows, columns) in zip(starts, sizes, cell_starts, cells, strict=False):
+            row = np.minimum(np.arange(h) // _CLUTTER_CELL, rows - 1) * columns + cell_start
+            column = np.minimum(np.arange(w) // _CLUTTER_CELL, columns - 1)
+            self._cell_of[start : start + h * w] = (row[:, None] + column).ravel()
+        self._starts = starts[:-1]
+        self._widths = np.array([w for _, w in sizes], np.int64)
+        self._steps_px = np.float32(self._base_step_px) * np.exp2(np.arange(len(sizes)), dtype=np.float32)
         self._octaves = [
             _Octave(
                 # The last of the halves is the pyramid's base.
@@ -202,18 +198,21 @@ class ProposalFinder:
         halves = self._halves
         if len(halves) > 1:
             height, width = halves[1].shape
-            level = halve(_grey(level[: 4 * height : 2, : 4 * width]))
+            level = halve(self._grey(level[: 4 * height : 2, : 4 * width]))
             level = np.asarray(cv2.resize(level, (width, height), dst=halves[1]), np.uint8)
             halves = halves[2:]
-        level = _grey(level)
+        level = self._grey(level)
         for half in halves:
             level = halve(level, half)
         if not self._halves:
             base[...] = level
 
-
-def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+    def _grey(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Give a picture's luminance; a grey one is it."""
+        if image.ndim == 2:
+            return image
+        height, width = image.shape[:2]
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=self._grey_level[:height, :width]), np.uint8)
 
 
 def halve(image: NDArray[np.uint8], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ Rings grow geometrically, so that a light is seen alike at every size. N places,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
@@ -14,121 +14,134 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 
-RAYS = 24
-_ANGLES = np.arange(RAYS) * (2.0 * np.pi / RAYS)
-RAY_COS = np.cos(_ANGLES).astype(np.float32)
-RAY_SIN = np.sin(_ANGLES).astype(np.float32)
-RAY_HARMONICS = np.stack([np.ones(RAYS), RAY_COS, RAY_SIN, RAY_COS**2, RAY_COS * RAY_SIN, RAY_SIN**2], axis=1).astype(
-    np.float32
-)
-"""(K, 6): 1, c, s, cc, cs, ss of each ray's direction."""
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
-_RAYS = np.stack([RAY_COS, RAY_SIN])[:, None, None]
-_CENTROID = RAY_HARMONICS[:, 1:3] / np.float32(1.5 * RAYS)
-_MEAN = np.full(RAYS, 1.0 / RAYS, np.float32)
+
+class Rays:
+    """K directions around a place, and what sums over them.
+
+    uv: (K, 2). at_all: (2, 2K) repeats a place's coordinates. mean: (K,), centroid: (K, 2) and second: (K, 3), by
+    which powers of the distances to an outline give its area over pi, first and second moments.
+    """
+
+    def __init__(self, count: int) -> None:
+        angles = np.arange(count) * (2.0 * np.pi / count)
+        self.count = count
+        self.uv = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
+        self.at_all = np.tile(np.eye(2, dtype=np.float32), count)
+        self.mean = np.full(count, 1.0 / count, np.float32)
+        self.centroid = self.uv / np.float32(1.5 * count)
+        doubled = np.stack([np.ones(count), np.cos(2.0 * angles), np.sin(2.0 * angles)], axis=1)
+        self.second = (doubled / (2.0 * count)).astype(np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+RAYS: Final = Rays(24)
+FEW_RAYS: Final = Rays(12)
+"""Enough for about where a region is."""
+
+
+@dataclass(slots=True, eq=False)
 class Rings:
-    """Samples around N places. radius_px: (N, M). pixels: (N, M, K, C) grey levels, C 1 or 3.
+    """Samples around N places. radius_px: (N, M). pixels: (N, M, K) grey or (N, M, K, 3) blue green red.
 
-    inside: (N, M, K), which lie in the picture; None where all do.
+    inside: (N, M, K), which lie in the picture.
     """
 
     radius_px: Floats
-    pixels: Floats
-    inside: NDArray[np.bool_] | None
+    pixels: NDArray[np.uint8]
+    inside: NDArray[np.bool_]
 
 
-def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats) -> Rings:
+def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats, rays: Rays = RAYS) -> Rings:
     """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), growing, both in px."""
     n, m = radius_px.shape
-    u, v = uv = radius_px[:, :, None] * _RAYS
-    uv += centre_px.T[:, :, None, None]
-    pixels = cv2.remap(
+    uv = radius_px[:, :, None] * rays.uv.ravel()
+    uv += (centre_px @ rays.at_all)[:, None]
+    pixels = cv2.remap(  # type: ignore[call-overload]
         image,
-        u.reshape(n * m, RAYS),
-        v.reshape(n * m, RAYS),
+        uv.reshape(n * m, rays.count, 2),
+        None,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    height, width = image.shape[:2]
-    inside = None
-    if uv.min() < 0.0 or u.max() > width - 1 or v.max() > height - 1:
-        inside = (u > -0.5) & (v > -0.5) & (u < width - 0.5) & (v < height - 0.5)
-    return Rings(radius_px, np.asarray(pixels, np.float32).reshape(n, m, RAYS, -1), inside)
+    half = np.array(image.shape[1::-1], np.float32) @ rays.at_all * np.float32(0.5)
+    uv -= half - np.float32(0.5)
+    in_range = np.abs(uv, out=uv) < half
+    inside = in_range[:, :, ::2] & in_range[:, :, 1::2]
+    return Rings(radius_px, np.asarray(pixels, np.uint8).reshape(n, m, rays.count, *image.shape[2:]), inside)
 
 
-def geometric_radii(first_px: Floats, last_px: Floats, count: int) -> Floats:
-    """Give (N, count) float32 radii that grow by a constant factor from first_px (N,) to last_px (N,)."""
-    share = np.arange(count, dtype=np.float32) / np.float32(count - 1)
+def geometric_radii(first_px: Floats, last_px: Floats, share: Floats) -> Floats:
+    """Give (N, M) float32 radii that grow by a constant factor from first_px (N,) to last_px (N,), at shares (M,)."""
     return np.asarray(first_px[:, None] * (last_px / first_px)[:, None] ** share, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Shapes:
     """Outlines and moments of star-shaped regions around N places, in C channels at S levels.
 
-    edge_px: (C, S, N, K) distance to the outline along each ray; open_share: (C, S, N) share of rays without one.
-    centre_px: (C, S, N, 2) centroid relative to the place. radius_px: (C, S, N) of the circle of equal area.
+    edge_px: (C, S, N, K) distance to the outline along each ray; is_open: (C, S, N, K), rays without one.
+    circle_px: (C, S, N, 3), the centroid relative to the place and the radius of the circle of equal area.
     """
 
     edge_px: Floats
-    open_share: Floats
-    centre_px: Floats
-    radius_px: Floats
-
-    def elongation(self) -> Floats:
-        """Measure the long over the short axis, (C, S, N)."""
-        square = self.edge_px * self.edge_px
-        u, v = self.centre_px[..., 0], self.centre_px[..., 1]
-        second = (square * square) @ RAY_HARMONICS[:, 3:] / (2.0 * RAYS * (self.radius_px * self.radius_px)[..., None])
-        uu, uv, vv = second[..., 0] - u * u, second[..., 1] - u * v, second[..., 2] - v * v
-        mean = 0.5 * (uu + vv)
-        spread = np.hypot(0.5 * (uu - vv), uv)
-        ratio: Floats = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
-        return ratio
+    is_open: NDArray[np.bool_]
+    circle_px: Floats
 
 
-def find_shapes(level: Floats, inside: NDArray[np.bool_] | None, radius_px: Floats, threshold: Floats) -> Shapes:
+def elongation(edge_px: Floats, circle_px: Floats, rays: Rays = RAYS) -> Floats:
+    """Measure the long over the short axis of outlines: (N,) from (N, K) and (N, 3) as in Shapes."""
+    square = edge_px * edge_px
+    second = (square * square) @ rays.second
+    u, v, radius = circle_px.T
+    second /= (radius * radius)[:, None]
+    uu, vv = u * u, v * v
+    mean = second[:, 0] - (uu + vv)
+    spread = np.hypot(second[:, 1] - (uu - vv), second[:, 2] - 2.0 * u * v)
+    ratio: Floats = np.sqrt((mean + spread) / np.maximum(mean - spread, 1e-3 * mean + 1e-9))
+    return ratio
+
+
+def find_shapes(level: Floats, rings: Rings, threshold: Floats, rays: Rays = RAYS) -> Shapes:
     """Follow each ray outward to where it first falls below a threshold, or leaves the picture.
 
-    level: (C, N, M, K) grey levels on rings of radius_px (N, M); inside: (N, M, K), None: all; threshold:
-    (C, S, N).
+    level: (C, N, M, K) grey levels on the rings; threshold: (C, S, N).
     """
-    channels, places, rings = level.shape[:3]
+    channels, places, many = level.shape[:3]
+    radius_px = rings.radius_px
     # Rings last: what follows runs along them.
     outward = np.ascontiguousarray(level.swapaxes(2, 3))
-    below = outward[:, None] < threshold[..., None, None]
-    if inside is not None:
-        below |= ~inside.swapaxes(1, 2)
+    threshold = threshold[..., None]
+    below = outward[:, None] < threshold[..., None]
+    below |= ~rings.inside.swapaxes(1, 2)
+    is_open = ~below[..., -1]
+    below[..., -1] = True
     first = below.argmax(axis=4)
-    is_open = (first == 0) & ~below[..., 0]
-    first[is_open] = rings - 1
+    is_open &= first == many - 1
     before = np.maximum(first - 1, 0)
-    start = np.arange(0, outward.size, rings).reshape(channels, 1, places, RAYS)
+    start = np.arange(0, outward.size, many).reshape(channels, 1, places, rays.count)
     inner, outer = outward.take(start + before), outward.take(start + first)
-    share = (inner - threshold[..., None]) / np.maximum(inner - outer, 1e-3)
+    share = (inner - threshold) / np.maximum(inner - outer, 1e-3)
     np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-    start = np.arange(0, radius_px.size, rings)[:, None]
-    near, far = radius_px.take(start + before), radius_px.take(start + first)
-    edge = near + share * (far - near)
-    edge[is_open] = far[is_open]
-    edge[first == 0] *= 0.5
-    square = edge * edge
-    area = np.maximum(square @ _MEAN, 1e-6)
-    centre = (square * edge) @ _CENTROID / area[..., None]
-    return Shapes(edge, is_open @ _MEAN, centre, np.sqrt(area))
+    start = np.arange(0, radius_px.size, many)[:, None]
+    near = radius_px.take(start + before)
+    edge = near + share * (radius_px.take(start + first) - near)
+    np.multiply(edge, 0.5, out=edge, where=first == 0)
+    rows = edge.reshape(-1, rays.count)
+    square = rows * rows
+    area = np.maximum(square @ rays.mean, 1e-6)
+    circle = np.empty((len(rows), 3), np.float32)
+    np.divide((square * rows) @ rays.centroid, area[:, None], out=circle[:, :2])
+    np.sqrt(area, out=circle[:, 2])
+    return Shapes(edge, is_open, circle.reshape(*first.shape[:3], 3))
 
 
-def luminance(pixels: Floats) -> Floats:
-    """Give (...,) levels from (..., C) pixels, blue green red or grey."""
-    luma: Floats = pixels[..., 0] if pixels.shape[-1] == 1 else pixels @ LUMA_BGR
-    return luma
+def luminance(pixels: NDArray[np.uint8]) -> Floats:
+    """Give (N, M, K) levels from (N, M, K) grey or (N, M, K, 3) blue green red."""
+    level: Floats = pixels.astype(np.float32)
+    return level if pixels.ndim == 3 else level @ LUMA_BGR
 
 
-def weakest_channel(pixels: Floats | NDArray[np.uint8]) -> Floats:
+def weakest_channel(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Give (...,) the lowest of three channels: a core is white, and the water colours the glow."""
-    weakest: Floats = np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])
-    return weakest
+    return np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])

@@ -17,7 +17,7 @@ from node.detect.centre import Centres, locate_sources
 from node.detect.detection import Detection, check_image
 from node.detect.lights import Lights, distinct, measure_lights
 from node.detect.proposals import ProposalFinder
-from node.detect.rings import RAY_COS, RAY_SIN, Floats
+from node.detect.rings import RAYS, Floats
 from protocol.messages import Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
@@ -63,8 +63,9 @@ class SourceDetector:
         lights = measure_lights(image, *self._finder.base, proposals)
         score = _score(lights)
         order = np.argsort(-score, kind="stable")
-        order = order[distinct(lights.centre_px[order], lights.core_px[order])]
-        chosen = order[: max(min(many, int(np.count_nonzero(score[order] >= least))) for many, least in _KEPT)]
+        order = order[distinct(lights.centre_px[order], lights.core_px[order], _KEPT[-1][0])]
+        ranked = score[order].tolist()
+        chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in _KEPT)]
         likely = lights.at(chosen)
         return _detections(likely, locate_sources(image, likely), score[chosen], image.shape)
 
@@ -72,13 +73,13 @@ class SourceDetector:
         """Give the contrast that counts as one: above this picture's noise and that of those before it."""
         noise = self._finder.noise()
         self._noise = noise if self._noise is None else _MEMORY * self._noise + (1.0 - _MEMORY) * noise
-        return float(np.clip(_CONTRAST_TO_NOISE * self._noise, *_CONTRAST_MIN))
+        return min(max(_CONTRAST_TO_NOISE * self._noise, _CONTRAST_MIN[0]), _CONTRAST_MIN[1])
 
 
 def _score(lights: Lights) -> Floats:
     """Give each light's probability of being a lamp, (N,)."""
     features = np.empty((len(lights.peak), len(_SCORE_WEIGHTS)), np.float32)
-    features[:, 0] = np.log(lights.contrast / (4.0 + lights.clutter))
+    features[:, 0] = np.log(lights.outstanding)
     features[:, 1] = np.log(np.maximum(lights.height, 1.0) / 50.0)
     features[:, 2] = lights.elongation - 1.0
     features[:, 3] = lights.open_share
@@ -88,34 +89,30 @@ def _score(lights: Lights) -> Floats:
 
 def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:
     """Put the findings into words and figures; what lies outside the picture is dropped."""
-    centre = found.centre_px.astype(np.float64)
-    edge = lights.edge_px
-    outline = np.empty((*edge.shape, 2))
-    outline[..., 0] = edge * RAY_COS + lights.edge_at_px[:, :1]
-    outline[..., 1] = edge * RAY_SIN + lights.edge_at_px[:, 1:]
-    ahead = ((outline - centre[:, None]) @ found.lean[:, :, None])[:, :, 0]
-    far = outline[np.arange(len(outline)), ahead.argmax(axis=1)]
-    variance = found.covariance_px2
-    table = np.stack(
-        [
-            np.sqrt(0.5 * (variance[:, 0, 0] + variance[:, 1, 1])),
-            np.hypot(found.lean[:, 0], found.lean[:, 1]),
-            lights.area_px,
-            lights.peak,
-            lights.elongation,
-            score,
-            lights.contrast / (4.0 + lights.clutter),
-            lights.height,
-            lights.core_px,
-        ],
-        axis=1,
-    ).tolist()
+    outline = lights.edge_px.astype(np.float64)[..., None] * RAYS.uv
+    outline += lights.edge_at_px[:, None]
+    ahead = (outline @ found.lean[:, :, None])[:, :, 0]
+    axis = np.empty((len(outline), 2, 2))
+    axis[:, 0] = found.centre_px
+    axis[:, 1] = outline[np.arange(len(outline)), ahead.argmax(axis=1)]
+    table = zip(
+        axis[:, 0].tolist(),
+        found.sigma_px.tolist(),
+        np.hypot(found.lean[:, 0], found.lean[:, 1]).tolist(),
+        lights.area_px.tolist(),
+        lights.peak.tolist(),
+        lights.elongation.tolist(),
+        score.tolist(),
+        lights.outstanding.tolist(),
+        lights.height.tolist(),
+        lights.core_px.tolist(),
+        strict=True,
+    )
     detections = []
-    for i, (u, v) in enumerate(centre.tolist()):
+    for i, ((u, v), sigma, lean, area, peak, elongation, likely, stands_out, height, core) in enumerate(table):
         if not (-0.5 <= u <= shape[1] - 0.5 and -0.5 <= v <= shape[0] - 0.5):
             continue
-        sigma, lean, area, peak, elongation, likely, stands_out, height, core = table[i]
         blob = Blob(u_px=u, v_px=v, sigma_px=sigma, area_px=area, peak=peak, elongation=elongation, score=likely)
         why = f"stands out {stands_out:.1f}x, +{height:.0f} levels, core {core:.1f} px, lean {lean:.1f}"
-        detections.append(Detection(blob, outline[i], np.array([centre[i], far[i]]), why))
+        detections.append(Detection(blob, outline[i], axis[i], why))
     return detections
