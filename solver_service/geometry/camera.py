@@ -12,6 +12,8 @@ from solver_service.geometry.rotation import Floats
 
 _MAX_STEPS = 30
 _TOLERANCE = 1e-13
+# Bearing and tangents at the optical axis, at a focal length of one.
+_AHEAD = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +38,15 @@ class Camera:
         For a direction q near the bearing b, tangent @ q / (b @ q) is how far q's image stands off the
         pixel, in px, to first order. Both are NaN where the model does not reach the pixel.
         """
+        frames = self.frames(pixels)
+        return frames[:, 0], frames[:, 1:]
+
+    def frames(self, pixels: Floats) -> Floats:
+        """Give (N, 3, 3) of distorted pixels (N, 2): each one's bearing, then its two tangents, as `rays` has them."""
         distorted = (pixels - self._centre_px) / self._focal_px
         if self.model == "fisheye":
-            return self._fisheye_rays(distorted[:, 0], distorted[:, 1])
-        return self._pinhole_rays(distorted)
+            return self._fisheye_frames(distorted[:, 0], distorted[:, 1])
+        return self._pinhole_frames(distorted)
 
     def same_as(self, other: Camera) -> bool:
         """Whether both have the same lens; their pictures' sizes may differ."""
@@ -89,10 +96,12 @@ class Camera:
             angle = float(np.nansum(self.width_px * self.height_px / (columns * rows) / px2_per_sr))
         return angle if 0.0 < angle < 13.0 else 1.0
 
-    def _pinhole_rays(self, distorted: Floats) -> tuple[Floats, Floats]:
-        x, y = xd, yd = distorted[:, 0], distorted[:, 1]
-        tangents = np.zeros((len(x), 2, 3))
+    def _pinhole_frames(self, distorted: Floats) -> Floats:
+        frames = np.empty((len(distorted), 3, 3))
+        frames[:] = _AHEAD
+        bearings, tangents = frames[:, 0], frames[:, 1:]
         if self._coefficients:
+            x, y = xd, yd = distorted[:, 0], distorted[:, 1]
             k1, k2, p1, p2, k3 = self._coefficients
             for _ in range(_MAX_STEPS):
                 r2 = x * x + y * y
@@ -112,21 +121,19 @@ class Camera:
                     break
             # Past the fold of the distortion a solution is none: no scene point images there.
             x = np.where((step < 1e-9) & (det > 0.0) & (a00 + a11 > 0.0), x, np.nan)
+            bearings[:, 0], bearings[:, 1] = x, y
             tangents[:, 0, 0], tangents[:, 0, 1] = a00, a01
             tangents[:, 1, 0], tangents[:, 1, 1] = a01, a11
             tangents[:, 0, 2], tangents[:, 1, 2] = -(a00 * x + a01 * y), -(a01 * x + a11 * y)
         else:
-            tangents[:, 0, 0] = tangents[:, 1, 1] = 1.0
+            bearings[:, :2] = distorted
             np.negative(distorted, out=tangents[:, :, 2])
-        norm = np.sqrt(x * x + y * y + 1.0)
-        bearings = np.empty((len(x), 3))
-        bearings[:, 0], bearings[:, 1], bearings[:, 2] = x, y, 1.0
-        bearings /= norm[:, None]
-        tangents *= norm[:, None, None]
-        tangents *= self._focal_px[:, None]
-        return bearings, tangents
+        norm = np.sqrt(np.add.reduce(bearings * bearings, 1))[:, None]
+        bearings /= norm
+        tangents *= (norm * self._focal_px)[:, :, None]
+        return frames
 
-    def _fisheye_rays(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
+    def _fisheye_frames(self, xd: Floats, yd: Floats) -> Floats:
         k1, k2, k3, k4 = self._coefficients or (0.0, 0.0, 0.0, 0.0)
         rd = np.sqrt(xd * xd + yd * yd)
         theta, slope, step = rd, np.ones_like(rd), np.zeros_like(rd)
@@ -146,11 +153,11 @@ class Camera:
         cos_phi, sin_phi = np.where(centre, 1.0, xd / safe), yd / safe
         sin_theta, cos_theta = np.sin(theta), np.cos(theta)
         across = np.where(centre, 1.0, rd / np.where(centre, 1.0, sin_theta))
-        bearings = np.stack((sin_theta * cos_phi, sin_theta * sin_phi, cos_theta), axis=-1)
         outward = np.stack((cos_theta * cos_phi, cos_theta * sin_phi, -sin_theta), axis=-1)
         around = np.stack((-sin_phi, cos_phi, np.zeros_like(rd)), axis=-1)
-        tangents = np.empty((*rd.shape, 2, 3))
+        frames = np.empty((len(rd), 3, 3))
+        frames[:, 0] = np.stack((sin_theta * cos_phi, sin_theta * sin_phi, cos_theta), axis=-1)
         along, across = slope[:, None] * outward, across[:, None] * around
-        tangents[:, 0] = self.fx_px * (cos_phi[:, None] * along - sin_phi[:, None] * across)
-        tangents[:, 1] = self.fy_px * (sin_phi[:, None] * along + cos_phi[:, None] * across)
-        return bearings, tangents
+        frames[:, 1] = self.fx_px * (cos_phi[:, None] * along - sin_phi[:, None] * across)
+        frames[:, 2] = self.fy_px * (sin_phi[:, None] * along + cos_phi[:, None] * across)
+        return frames

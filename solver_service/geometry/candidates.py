@@ -25,22 +25,31 @@ _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 class Candidates:
     """The usable candidates, A's first. counts: (A's, B's), their sum N.
 
-    bearings: (3, N), each in its own rig's level frame. tangents: (N, 2, 3), px per rad over sigma_px, likewise.
-    variance: (N,) of the bearing, rad^2 per axis. index: (N,) into the view. shares: (2, N) position over the
-    picture's width and height. sigma_px: (N,). dt_s: (N,) after the instant that the pose is for. log_score: (N,)
-    weak evidence for a light, None where no candidate has a score. log_area: (N,).
+    frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, in its own rig's level frame. table: (6, N)
+    bearing, position over the picture's width and height, and variance of the bearing, rad^2 per axis. index: (N,)
+    into the view. sigma_px: (N,). dt_s: (N,) after the instant that the pose is for. log_score: (N,) weak evidence
+    for a light, None where no candidate has a score. log_area: (N,).
     """
 
     counts: tuple[int, int]
-    bearings: Floats
-    tangents: Floats
-    variance: Floats
+    frames: Floats
+    table: Floats
     index: NDArray[np.intp]
-    shares: Floats
     sigma_px: Floats
     dt_s: Floats
     log_score: Floats | None
     log_area: Floats
+
+    @property
+    def bearings(self) -> Floats:
+        """(3, N), each in its own rig's level frame."""
+        return self.table[:3]
+
+    @property
+    def variance(self) -> Floats:
+        """(N,) of the bearing, rad^2 per axis."""
+        variance: Floats = self.table[5]
+        return variance
 
 
 def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
@@ -53,49 +62,48 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     pixels_a, pixels_b = view_a.pixels.reshape(-1, 2)[:_MAX_CANDIDATES], view_b.pixels.reshape(-1, 2)[:_MAX_CANDIDATES]
     in_a, in_b = len(pixels_a), len(pixels_b)
     pixels = np.concatenate((pixels_a, pixels_b))
-    index, node = _places(in_a, in_b)
+    index, turns, size_px = _places(rigs, in_a, in_b)
     if rigs.one_camera:
-        bearings, in_camera = rig_a.camera.rays(pixels)
+        in_camera = rig_a.camera.frames(pixels)
     else:
-        rays = rig_a.camera.rays(pixels_a), rig_b.camera.rays(pixels_b)
-        bearings, in_camera = (np.concatenate(parts) for parts in zip(*rays, strict=True))
-    turns = rigs.turns.take(node, 0)
-    tangents = in_camera @ turns
-    table = np.empty((9, in_a + in_b))
-    table[:3] = (bearings[:, None] @ turns)[:, 0].T
-    np.divide(pixels.T, rigs.size_px.take(node, 1), out=table[3:5])
+        in_camera = np.concatenate((rig_a.camera.frames(pixels_a), rig_b.camera.frames(pixels_b)))
+    frames = in_camera @ turns
+    table = np.empty((10, in_a + in_b))
     offset_s = 0.5e-9 * (view_a.stamp_ns - view_b.stamp_ns)
-    for view, columns, shift_s in ((view_a, table[5:, :in_a], offset_s), (view_b, table[5:, in_a:], -offset_s)):
+    for view, columns, shift_s in ((view_a, table[6:, :in_a], offset_s), (view_b, table[6:, in_a:], -offset_s)):
         n = columns.shape[1]
         np.add(view.dt_s[:n], shift_s, out=columns[0])
         columns[1], columns[2], columns[3] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
-    if not math.isfinite(np.add.reduce(table[:7], None)):
-        usable = np.isfinite(table[:7].sum(0))
-        in_a = int(usable[:in_a].sum())
-        table, tangents, index = table[:, usable], tangents[usable], index[usable]
-    sigma_px = np.maximum(table[6], _MIN_SIGMA_PX)
+    sigma_px = np.maximum(table[7], _MIN_SIGMA_PX)
+    tangents = frames[:, 1:]
     tangents /= sigma_px[:, None, None]
     gram = tangents @ tangents.swapaxes(1, 2)
+    table[:3] = frames[:, 0].T
+    np.divide(pixels.T, size_px, out=table[3:5])
+    table[5] = 1.0 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2)
+    if not math.isfinite(np.add.reduce(table[:8], None)):
+        usable = np.isfinite(table[:8].sum(0))
+        in_a = int(usable[:in_a].sum())
+        table, frames, index, sigma_px = table[:, usable], frames[usable], index[usable], sigma_px[usable]
     return Candidates(
         counts=(in_a, table.shape[1] - in_a),
-        bearings=table[:3],
-        tangents=tangents,
-        variance=1.0 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2),
+        frames=frames,
+        table=table[:6],
         index=index,
-        shares=table[3:5],
         sigma_px=sigma_px,
-        dt_s=table[5],
-        log_score=_log_score(table[7], in_a),
-        log_area=np.log(np.fmax(table[8], 1.0)),
+        dt_s=table[6],
+        log_score=_log_score(table[8], in_a),
+        log_area=np.log(np.fmax(table[9], 1.0)),
     )
 
 
 @lru_cache(maxsize=64)
-def _places(in_a: int, in_b: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Give the place in its view, and the node, of each of A's candidates and then of B's."""
+def _places(rigs: RigPair, in_a: int, in_b: int) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Give the place in its view of each of A's candidates and then of B's, with its rig's turn and picture size."""
     index, node = np.concatenate((np.arange(in_a), np.arange(in_b))), np.repeat((0, 1), (in_a, in_b))
-    index.flags.writeable = node.flags.writeable = False
-    return index, node
+    turns, size_px = rigs.turns[node], rigs.size_px[:, node]
+    index.flags.writeable = turns.flags.writeable = size_px.flags.writeable = False
+    return index, turns, size_px
 
 
 def _log_score(score: Floats, in_a: int) -> Floats | None:

@@ -33,6 +33,8 @@ _DEPTH_BROKEN: Final = 0.02
 _MOUNT_SIGMA_RAD: Final = math.radians(1.0)
 _HEADING_SIGMA_RAD: Final = math.radians(3.0)
 _DEFAULT_SIGMA_RAD: Final = (math.radians(2.0), math.radians(2.0), math.radians(10.0))
+# No turn at all, and a quarter about down, in NED.
+_ABOUT_DOWN: Final = np.array((np.eye(3), skew(np.array([0.0, 0.0, 1.0]))))
 _UPRIGHT_DOWN: Final = np.array([0.0, 1.0, 0.0])
 _DEPTH_SIGMA_M: Final = 0.02
 # A diver who is not known to lie otherwise is upright to about this (1 sd).
@@ -60,20 +62,23 @@ AGREES: Final = 20.0
 class Sensors:
     """What attitude and depth of both nodes say, in the terms that a pose can be tried against.
 
-    down_a, down_b: (3,) in each camera's frame. tilt_variance: of both together, rad^2. R_a_b: (3, 3) by the
-    attitudes, None where one is missing. heading_variance: of its heading. depth_m: of B's port below A's, None
-    where unknown. attitude_a: whether A's is known; fall_variance: of the tilt of A's down, or else of B's.
+    down_a, down_b: (3,) in each camera's frame. tilt_variance: of both together, rad^2. both: whether both attitudes
+    are known. heading_variance: of both headings' difference. depth_m: of B's port below A's, None where unknown.
+    attitude_a: whether A's is known; fall_variance: of the tilt of A's down, or else of B's. turns: (3, 9), times a
+    pose's R_a_b (9,): the cosine between both downs and, where both attitudes are known, the trace of the turn between
+    R_a_b and them, and twice its sine about A's down.
     """
 
     down_a: Floats
     down_b: Floats
     tilt_variance: float
-    R_a_b: Floats | None
+    both: bool
     heading_variance: float
     depth_m: float | None
     depth_variance: float
     attitude_a: bool
     fall_variance: float
+    turns: Floats
 
 
 @dataclass(eq=False, slots=True)
@@ -150,28 +155,33 @@ def combine(
         # Roll turns about the body's x axis, pitch about the horizontal across it, yaw about the vertical.
         steep2 = float(R_ned_body[2, 0]) ** 2
         sigma = _DEFAULT_SIGMA_RAD if sigma_rad is None else sigma_rad.tolist()
-        roll2, pitch2, yaw2 = (x * x for x in sigma)
+        roll2, pitch2, yaw2 = sigma[0] ** 2, sigma[1] ** 2, sigma[2] ** 2
         tilts.append(0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2)
         heading += yaw2 + roll2 * steep2 + _HEADING_SIGMA_RAD**2
     both = len(R_ned_camera) == 2
+    turns = np.zeros((3, 3, 3))
+    np.multiply(down[0][:, None], down[1], out=turns[0])
+    if both:
+        np.matmul(R_ned_camera[0].T, _ABOUT_DOWN @ R_ned_camera[1], out=turns[1:])
     return Sensors(
         down_a=down[0],
         down_b=down[1],
         tilt_variance=sum(tilts),
-        R_a_b=R_ned_camera[0].T @ R_ned_camera[1] if both else None,
+        both=both,
         heading_variance=heading,
         depth_m=depth_m if R_ned_camera else None,
         depth_variance=depth_variance + _DEPTH_SIGMA_M**2,
         attitude_a=attitudes[0] is not None,
         fall_variance=tilts[0] if attitudes[0] is not None else tilts[1],
+        turns=turns.reshape(3, 9),
     )
 
 
 def log_gaps(chi2: Floats, gaps: int) -> Floats:
     """Give the log density of the gaps over their sds and (2 pi)^(1/2): Gaussian, with a share of gross errors."""
-    usual = (1.0 - GROSS_PROBABILITY) * np.exp(-0.5 * chi2)
-    gross = (GROSS_PROBABILITY * GROSS_SCALE**-gaps) * np.exp((-0.5 / GROSS_SCALE**2) * chi2)
-    density: Floats = np.log(usual + gross)
+    usual = math.log(1.0 - GROSS_PROBABILITY) - 0.5 * chi2
+    gross = math.log(GROSS_PROBABILITY * GROSS_SCALE**-gaps) - (0.5 / GROSS_SCALE**2) * chi2
+    density: Floats = np.logaddexp(usual, gross)
     return density
 
 
@@ -208,15 +218,15 @@ def weigh(
 
     variance: (K,) of the gaps of ln range and of twist.
     """
-    down_b = sensors.down_b @ R_a_b
+    level, cosine, sine = sensors.turns @ R_a_b.reshape(9, -1)
     if "attitude" in checks:
         # The picture's own noise turns B about the line of sight by half the twist gap's.
         spread2 = sensors.tilt_variance + 0.125 * variance
-        off = down_b - sensors.down_a[:, None]
-        tilt_chi2 = dot(off, off) / spread2
+        tilt_chi2 = (2.0 - 2.0 * level) / spread2
         density = (PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * tilt_chi2) / spread2
         log_ratio = np.log(density + PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi))
-        log_ratio += weigh_heading(R_a_b, sensors, 0.25 * variance)
+        if sensors.both:
+            log_ratio += weigh_heading(sine, cosine, sensors.heading_variance + 0.25 * variance)
     else:
         # The reading is upright; of half a turn nothing is known.
         tilt_chi2 = np.zeros(len(variance))
@@ -227,7 +237,7 @@ def weigh(
         if rigs.ported:
             level_a, level_b = rigs.levels
             below = below - level_a.depth_port_m[:, None] + level_b.depth_port_m @ R_a_b
-        fall = sensors.down_a @ below if sensors.attitude_a else dot(down_b, below)
+        fall = sensors.down_a @ below if sensors.attitude_a else dot(sensors.down_b @ R_a_b, below)
         square = fall * fall
         spread2 = sensors.depth_variance + sensors.fall_variance * (dot(below, below) - square)
         spread2 += 0.25 * variance * square
@@ -240,12 +250,11 @@ def weigh(
     return Support(log_ratio + log_prior, log_prior, tilt_chi2, depth_chi2)
 
 
-def weigh_heading(R_a_b: Floats, sensors: Sensors, variance: Floats) -> Floats:
-    """Weigh the turn about the vertical between poses and attitudes, loosely; variance: (K,) of the poses' own."""
-    if sensors.R_a_b is None:
-        return np.zeros(R_a_b.shape[2])
-    predicted, down, variance = sensors.R_a_b, sensors.down_a, sensors.heading_variance + variance
-    sine, cosine = np.array((skew(down) @ predicted, predicted)).reshape(2, 9) @ R_a_b.reshape(9, -1)
+def weigh_heading(sine: Floats, cosine: Floats, variance: Floats) -> Floats:
+    """Weigh the turn about the vertical between poses and attitudes, loosely.
+
+    sine, cosine: (K,) as `Sensors.turns` gives them; variance: (K,) of both headings' difference.
+    """
     turn = 2.0 * np.arctan2(sine, 1.0 + cosine)
     density = (HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
     log_ratio: Floats = np.log(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -70,13 +71,16 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     range2 = dot(t, t)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
     log_ratio = np.where(inside, base + log_gaps(chi2, gaps), -np.inf)
-    best = (-log_ratio).argsort(kind="stable")[:_REFINED]
-    if log_ratio[best[0]] == -np.inf:
+    likeliest = float(np.maximum.reduce(log_ratio))
+    if likeliest == -np.inf:
         what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
         return FourLights(None, why=("out_of_range", what))
-    best = best[log_ratio[best] > log_ratio[best[0]] - _NEGLIGIBLE]
+    best = (log_ratio > likeliest - _NEGLIGIBLE).nonzero()[0]
+    if len(best) > _REFINED:
+        best = best[(-log_ratio[best]).argsort(kind="stable")[:_REFINED]]
     lights = found.lights.take(best, 1).T
     ratio = np.exp(log_ratio)
+    ratio[best] = 0.0
     refined = refine(
         t.take(best, 1).T,
         solved.R_a_b.take(best, 2).transpose(2, 0, 1),
@@ -102,30 +106,37 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
             log_prior=support.log_prior[best],
             lone_odds=np.zeros(len(best)),
         ),
-        others=float(np.add.reduce(ratio) - np.add.reduce(ratio[best])),
+        others=float(np.add.reduce(ratio)),
     )
 
 
 def _sightings(candidates: Candidates, lights: NDArray[np.intp]) -> Sightings:
-    bearings = candidates.bearings.T.take(lights, 0)
-    return Sightings(bearings, candidates.tangents.take(lights, 0), candidates.dt_s[lights])
+    return Sightings(candidates.frames.take(lights, 0), candidates.dt_s[lights])
 
 
 def _clutter(terms: Terms, lights: NDArray[np.intp]) -> Floats:
     """Give how many candidates chance puts into the variance of the positions of K times four lights (K, 4)."""
-    in_a, in_b = terms.candidates.counts
-    per_px2 = np.array((in_a, in_a, in_b, in_b)) / terms.rigs.area_px2
-    clutter: Floats = terms.candidates.sigma_px[lights] ** 2 @ per_px2
+    clutter: Floats = terms.candidates.sigma_px[lights] ** 2 @ _density_px2(terms.rigs, *terms.candidates.counts)
     return clutter
+
+
+@lru_cache(maxsize=64)
+def _density_px2(rigs: RigPair, in_a: int, in_b: int) -> Floats:
+    """Give the candidates per px^2 of the picture that each of the four lights is seen in."""
+    density: Floats = np.array((in_a, in_a, in_b, in_b)) / rigs.area_px2
+    density.flags.writeable = False
+    return density
 
 
 def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:
     """Give what relative motion between the exposures may add to ln range and twist of A's pairs, rad^2."""
-    dt_s, split, motion = terms.candidates.dt_s, terms.candidates.counts[0], terms.motion
-    mean_a_s, mean_b_s = np.add.reduce(dt_s[:split]) / split, np.add.reduce(dt_s[split:]) / (len(dt_s) - split)
-    square_s2 = float(mean_a_s - mean_b_s) ** 2 + motion.skew_sigma_s**2
-    rates2 = (motion.covariance.diagonal() + motion.rates**2).tolist()
-    speed2, turn2 = sum(rates2[:3]) / 3.0, sum(rates2[3:]) / 3.0
+    in_a, motion = terms.candidates.counts[0], terms.motion
+    dt_s = terms.candidates.dt_s.tolist()
+    apart_s = sum(dt_s[:in_a]) / in_a - sum(dt_s[in_a:]) / (len(dt_s) - in_a)
+    square_s2 = apart_s * apart_s + motion.skew_sigma_s**2
+    if square_s2 == 0.0:
+        return np.zeros(pairs.split)
+    speed2, turn2 = motion.mean_squares
     per_range = pairs.chord[: pairs.split] / float(terms.rigs.length_m[1])
     variance: Floats = square_s2 * (speed2 * per_range * per_range + turn2)
     return variance

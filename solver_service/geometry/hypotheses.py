@@ -61,8 +61,8 @@ class Pairs:
     ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and unit chord, first to second, level frame.
     key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's own bar to the direction first -> second.
     variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2). log_weight: how rarely chance puts two candidates
-    so near each other. tan2_beta: of the widest. down: (2, P) gravity across the line of sight, along one's own bar
-    and across it.
+    so near each other. tan2_beta: of the widest. fall_rad, level: gravity across the line of sight, its direction from
+    one's own bar and its length.
     """
 
     split: int
@@ -75,7 +75,8 @@ class Pairs:
     chord: Floats
     log_weight: Floats
     tan2_beta: float
-    down: Floats
+    fall_rad: Floats
+    level: Floats
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -123,9 +124,7 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
     """Give the pairs whose angle fits the other node's bar within the range limits; down: in each level frame."""
     ends, node = _combinations(*candidates.counts)
     shortest2, longest2, own_m2 = _bounds(rigs, candidates.counts, settings.range_min_m, settings.range_max_m)
-    table = np.empty((6, len(candidates.index)))
-    table[:3], table[3:5], table[5] = candidates.bearings, candidates.shares, candidates.variance
-    one, two = table.take(ends[0], 1), table.take(ends[1], 1)
+    one, two = candidates.table.take(ends, 1).swapaxes(0, 1)
     w, total = two - one, two + one
     # Of the cross product of the two, what turns about the bar.
     about = one[1] * two[2] - one[2] * two[1]
@@ -145,9 +144,8 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
     room = 1.0 - np.abs(w[3:5])
     falls = np.array(down).T.take(node, 1)
     # Gravity along the bar and along its perpendicular, both as seen across the line of sight.
-    across = np.empty((2, len(chord)))
-    across[0] = falls[0] - sin_beta * dot(falls, total[:3])
-    across[1] = falls[1] * total[2] - falls[2] * total[1]
+    along = falls[0] - sin_beta * dot(falls, total[:3])
+    across = falls[1] * total[2] - falls[2] * total[1]
     return Pairs(
         split=int(node.searchsorted(1)),
         ends=ends,
@@ -159,7 +157,8 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
         chord=chord,
         log_weight=-np.log(chord2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
         tan2_beta=1.0 / float(np.minimum.reduce(cos_beta2, initial=1.0)) - 1.0,
-        down=across / np.sqrt(cos_beta2),
+        fall_rad=np.arctan2(across, along),
+        level=np.sqrt((along * along + across * across) / cos_beta2),
     )
 
 
@@ -187,35 +186,37 @@ def join(
     chord2 = (max(1.0, length_a_m / length_b_m) * chord) ** 2
     slack_range = (_KEY_TERM + _KEY_SLOPE * pairs.tan2_beta) * chord2 + slack
     slack_twist = _TWIST_TERM * chord2 + slack
-    if by_range:
-        # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
-        least2 = np.exp(2.0 * key_a) / length_b_m**2
-        worst = variance + np.maximum.reduce(variance_b * pairs.chord[split:] ** 2) / least2
-    else:
-        worst = variance + np.maximum.reduce(variance_b)
-    reach = np.minimum(gate_sigma * np.sqrt(worst) + slack_twist, _NEARLY_HALF_PI)
     if by_range and by_twist and split * in_b <= _FEW:
         off = np.abs(key_a[:, None] - key_b)
-        ia, ib = (off < gate_sigma * np.sqrt(variance[:, None] + variance_b) + slack_range[:, None]).nonzero()
+        near = off < gate_sigma * np.sqrt(variance[:, None] + variance_b) + slack_range[:, None]
+        ia, ib = np.divmod(near.ravel().nonzero()[0], in_b)
         ib += split
-    elif by_twist:
-        # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
-        twist_rad = pairs.twist_rad % np.pi
-        ia, ib = _near(twist_rad[:split], reach, twist_rad[split:], period=np.pi)
-        ib += split
+    else:
         if by_range:
+            # B's pair looks no shorter than this where it matches A's: cos(beta_B) is at most one.
+            least2 = np.exp(2.0 * key_a) / length_b_m**2
+            worst = variance + np.maximum.reduce(variance_b * pairs.chord[split:] ** 2) / least2
+        else:
+            worst = variance + np.maximum.reduce(variance_b)
+        reach = gate_sigma * np.sqrt(worst)
+        if by_twist:
+            # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
+            twist_rad = pairs.twist_rad % np.pi
+            reach = np.minimum(reach + slack_twist, _NEARLY_HALF_PI)
+            ia, ib = _near(twist_rad[:split], reach, twist_rad[split:], period=np.pi)
+        else:
+            ia, ib = _near(key_a, reach + slack_range if by_range else np.full(split, np.inf), key_b)
+        ib += split
+        if by_range and by_twist:
             off = np.abs(pairs.key[ia] - pairs.key[ib])
             keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_range[ia]
             ia, ib = ia[keep], ib[keep]
-    else:
-        ia, ib = _near(key_a, gate_sigma * np.sqrt(worst) + slack_range if by_range else np.full(split, np.inf), key_b)
-        ib += split
     off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - np.pi)
     swap = off_half_turn < 0.5 * np.pi
     if by_twist:
         off = np.minimum(off_half_turn, np.pi - off_half_turn)
         gate = gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_twist[ia]
-        keep = off < np.minimum(gate, reach[ia])
+        keep = off < np.minimum(gate, _NEARLY_HALF_PI)
         ia, ib, swap = ia[keep], ib[keep], swap[keep]
     return ia, ib, swap
 
@@ -250,9 +251,8 @@ def search(
         return "twist_gap" if len(ia) else "range_gap"
     # With first -> second as left -> right in A, and B read to agree with it, B's gravity turned into A's frame;
     # across the line of sight the two count the other way round.
-    cosine, sine = np.cos(pairs.twist_rad[ia]), np.sin(pairs.twist_rad[ia])
-    da, db = pairs.down.take(ia, 1), pairs.down.take(ib, 1)
-    upright = da[0] * (cosine * db[0] + sine * db[1]) + da[1] * (sine * db[0] - cosine * db[1])
+    apart = pairs.twist_rad[ia] - pairs.fall_rad[ia] - pairs.fall_rad[ib]
+    upright = pairs.level[ia] * pairs.level[ib] * np.cos(apart)
     flip = upright < 0.0
     undecided = (np.abs(upright) < _UNDECIDED).nonzero()[0]
     if len(undecided):
@@ -260,11 +260,14 @@ def search(
         ia, ib, swap = ia[both], ib[both], swap[both]
         flip = np.concatenate((flip, ~flip[undecided]))
     # Of A's pair, then of B's: whether its second is the left light.
-    left = np.array((flip, swap != flip), dtype=np.intp)
+    turned = np.array((flip, swap != flip), dtype=np.intp)
     both = np.array((ia, ib))
+    first, second = pairs.ends.take(both, 1)
+    exchange = turned * (second - first)
     lights = np.empty((4, len(ia)), dtype=np.intp)
-    lights[::2], lights[1::2] = pairs.ends[left, both], pairs.ends[1 - left, both]
-    w = pairs.w.take(both, 1) * (1.0 - 2.0 * left)
+    np.add(first, exchange, out=lights[::2])
+    np.subtract(second, exchange, out=lights[1::2])
+    w = pairs.w.take(both, 1) * (1 - 2 * turned)
     ends = candidates.bearings.take(lights, 1).reshape(3, 2, 2, -1).transpose(2, 1, 0, 3)
     log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
     log_weight += _alike(candidates.log_area[lights])

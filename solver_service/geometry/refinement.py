@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Final
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +28,15 @@ _SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
 class Sightings:
     """Four lights as K hypotheses read them: B's left and right in A's image, A's left and right in B's.
 
-    bearings: (K, 4, 3). tangents: (K, 4, 2, 3), pixels per radian over sigma_px, so that residuals have unit
+    frames: (K, 4, 3, 3) bearing, then both tangents in pixels per radian over sigma_px, so that residuals have unit
     noise. dt_s: (K, 4) time of each sighting after the instant that the pose is for.
     """
 
-    bearings: Floats
-    tangents: Floats
+    frames: Floats
     dt_s: Floats
 
 
-@dataclass(eq=False, slots=True)
+@dataclass(eq=False)
 class Motion:
     """How the pose moves: d/dt of t_a_b (m/s), then of the small rotation w (rad/s), in A's camera frame.
 
@@ -45,6 +46,12 @@ class Motion:
     rates: Floats
     covariance: Floats
     skew_sigma_s: float = 0.0
+
+    @cached_property
+    def mean_squares(self) -> tuple[float, float]:
+        """Of one component of the velocity, (m/s)^2, and of the turn, (rad/s)^2, as far as both are known."""
+        squares = (self.covariance.diagonal() + self.rates**2).tolist()
+        return sum(squares[:3]) / 3.0, sum(squares[3:]) / 3.0
 
 
 @dataclass(eq=False, slots=True)
@@ -78,33 +85,41 @@ def refine(
     weight = None
     steps = 0
     while True:
-        r, J, depth = residuals(t, R, seen, lights, shifts)
+        J, depth = linearize(t, R, seen, lights, shifts)
         if steps == 0 and (timed or motion.skew_sigma_s > 0.0):
-            weight = weight_of(J, seen.dt_s, motion)
+            weight = weight_of(J[:, :, :6], seen.dt_s, motion)
         Jt = J.swapaxes(1, 2)
-        JtW = Jt if weight is None else Jt @ weight
-        H = JtW @ J
-        # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-        unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
-        scale = unit[:, :, None] * unit[:, None, :]
-        inverse = np.linalg.inv(H * scale + DAMPING)
-        covariance = inverse * scale
-        column = r[:, :, None]
-        g = JtW @ column
-        rw = column if weight is None else weight @ column
-        chi2 = (r[:, None] @ rw)[:, 0, 0]
+        normal = (Jt if weight is None else Jt @ weight) @ J
+        covariance, inverse, move, chi2 = solve_normal(normal)
         if steps == _MAX_STEPS:
+            chi2 = normal[:, 6, 6]
             break
-        move = (covariance @ g)[:, :, 0]
-        chi2 = chi2 - (move[:, None] @ g)[:, 0, 0]
         t, R = moved(t, R, move)
         steps += 1
         if not is_larger(move, t, _SMALL):
             break
-    determined = np.maximum.reduce(inverse.diagonal(0, 1, 2), 1) < _UNDETERMINED
-    finite = np.isfinite(np.add.reduce(covariance, (1, 2)) + chi2 + np.add.reduce(t, 1))
-    sound = determined & (np.minimum.reduce(depth, 1) > 0.0) & finite
+    sound = np.maximum.reduce(inverse.diagonal(0, 1, 2), 1) < _UNDETERMINED
+    sound &= np.minimum.reduce(depth, 1) > 0.0
+    # A step that is not finite makes this one not finite either.
+    sound &= np.isfinite(chi2)
     return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
+
+
+def solve_normal(normal: Floats) -> tuple[Floats, NDArray[np.floating[Any]], Floats, Floats]:
+    """Solve normal equations (K, 7, 7) of derivatives by the pose and, in the last row and column, residuals.
+
+    Returns covariances (K, 6, 6), the same over what each coordinate alone would have, the steps (K, 6) and what
+    chi^2 is after them (K,).
+    """
+    H, g = normal[:, :6, :6], normal[:, :6, 6:]
+    # Positions and rotations have their own units: scaled to a unit diagonal before solving.
+    unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
+    scale = unit[:, :, None] * unit[:, None]
+    inverse = np.linalg.inv(H * scale + DAMPING)
+    covariance = inverse * scale
+    move = covariance @ g
+    chi2 = normal[:, 6, 6] - (move.swapaxes(1, 2) @ g)[:, 0, 0]
+    return covariance, inverse, move[:, :, 0], chi2
 
 
 def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
@@ -114,10 +129,10 @@ def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
 
 def is_larger(move: Floats, t: Floats, limit: float) -> bool:
     """Whether any of the steps (K, 6) that led to t (K, 3) is larger than this, relative to the range and in rad."""
-    range_m = np.sqrt(np.add.reduce(t * t, 1))
-    size = np.abs(move)
-    size[:, :3] /= range_m[:, None]
-    return bool(np.fmax.reduce(size, None, initial=0.0) > limit)
+    for step, place_m in zip(move.tolist(), t.tolist(), strict=True):
+        if max(map(abs, step[3:])) > limit or max(map(abs, step[:3])) > limit * math.hypot(*place_m):
+            return True
+    return False
 
 
 def shifts_of(dt_s: Floats, rates: Floats) -> tuple[Floats, Floats] | None:
@@ -128,16 +143,15 @@ def shifts_of(dt_s: Floats, rates: Floats) -> tuple[Floats, Floats] | None:
     return shift[:, :, :3], rotation_near(shift[:, :, 3:])
 
 
-def residuals(
+def linearize(
     t: Floats, R: Floats, seen: Sightings, lights: tuple[Floats, Floats], shifts: tuple[Floats, Floats] | None
-) -> tuple[Floats, Floats, Floats]:
-    """Give residuals (K, 8), their derivatives (K, 8, 6) by the pose, and the distances along the bearings (K, 4).
+) -> tuple[Floats, Floats]:
+    """Give the derivatives of the residuals by the pose, the residuals as a seventh column (K, 8, 7), and distances.
 
-    shifts: of the pose at each sighting, as by `shifts_of`.
+    shifts: of the pose at each sighting, as by `shifts_of`. The distances (K, 4) are those along the bearings.
     """
     K = len(t)
     Rt = R.swapaxes(1, 2)
-    q = np.empty((K, 4, 3))
     # The lights about the point that the pose turns them about, in A's axes: B's about B, A's seen from B.
     y = np.empty((K, 4, 3))
     np.matmul(lights[1], Rt, out=y[:, :2])
@@ -146,20 +160,25 @@ def residuals(
         shift, turn = shifts
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
         y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
+    # All in A's axes. What B sees is taken backwards, from the light to B: then t moves all four alike.
+    q = np.empty((K, 4, 3))
     np.add(y[:, :2], t[:, None], out=q[:, :2])
-    np.matmul(y[:, 2:], R, out=q[:, 2:])
+    np.negative(y[:, 2:], out=q[:, 2:])
     if shifts is not None:
         q[:, :2] += shift[:, :2]
-    depth = np.add.reduce(seen.bearings * q, 2)
-    G = seen.tangents / depth[:, :, None, None]
-    r = G @ q[..., None]
-    D = G - r * (seen.bearings / depth[:, :, None])[:, :, None]
-    D[:, 2:] = D[:, 2:] @ -Rt[:, None]
-    J = np.empty((K, 4, 2, 6))
-    J[..., :3] = D
+    frames = seen.frames.copy()
+    np.matmul(seen.frames[:, 2:], -Rt[:, None], out=frames[:, 2:])
+    along = frames @ q[..., None]
+    depth = along[:, :, :1]
+    J = np.empty((K, 4, 2, 7))
+    D, r = J[..., :3], J[..., 6:]
+    np.divide(along[:, :, 1:], depth, out=r)
+    np.multiply(r, frames[:, :, :1], out=D)
+    np.subtract(frames[:, :, 1:], D, out=D)
+    D /= depth
     # A turn w moves y by w x y = -[y]x w = [y]x^T w; for A's lights both signs are already turned.
-    np.matmul(D, skew(y).swapaxes(2, 3), out=J[..., 3:])
-    return r.reshape(K, 8), J.reshape(K, 8, 6), depth
+    np.matmul(D, skew(y).swapaxes(2, 3), out=J[..., 3:6])
+    return J.reshape(K, 8, 7), depth[:, :, 0, 0]
 
 
 def weight_of(J: Floats, dt_s: Floats, motion: Motion) -> Floats:

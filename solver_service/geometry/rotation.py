@@ -56,9 +56,10 @@ def quaternion_of(R: Floats) -> Floats:
         (c + g, f + h, 1.0 - a - e + i, d - b),
         (h - f, c - g, d - b, 1.0 + a + e + i),
     )
-    row = max(range(4), key=lambda k: rows[k][k])
-    norm = math.sqrt(sum(x * x for x in rows[row]))
-    return np.array([x / norm for x in rows[row]])
+    squares = rows[0][0], rows[1][1], rows[2][2], rows[3][3]
+    x, y, z, w = rows[squares.index(max(squares))]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return np.array((x / norm, y / norm, z / norm, w / norm))
 
 
 def rotation_exp(w_rad: Floats) -> Floats:

@@ -74,7 +74,7 @@ def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
     attitudes: list[Floats | None] = []
     for one in sensed:
         q = _finite(one.q_ned_body_xyzw, (4,))
-        attitudes.append(q if q is not None and q @ q > 0.25 else None)
+        attitudes.append(q if q is not None and math.hypot(*q.tolist()) > 0.5 else None)
     sigmas = [_finite(one.sigma_rad, (3,)) for one in sensed]
     depth_a_m, depth_b_m = sensed[0].depth_m, sensed[1].depth_m
     depth_m, variance = None, 0.0

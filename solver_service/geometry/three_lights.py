@@ -28,7 +28,15 @@ from solver_service.geometry.evidence import (
 )
 from solver_service.geometry.hypotheses import Pairs
 from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import DAMPING, Sightings, is_larger, moved, residuals, shifts_of, weight_of
+from solver_service.geometry.refinement import (
+    Sightings,
+    is_larger,
+    linearize,
+    moved,
+    shifts_of,
+    solve_normal,
+    weight_of,
+)
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats, skew
 from solver_service.geometry.terms import Terms
@@ -68,7 +76,7 @@ class _Guesses:
 def read_three_lights(terms: Terms, pairs: Pairs) -> Readings | None:
     """Give the best readings of three lights; None where there are none, or the sensors do not support any."""
     sensors, checks = terms.sensors, terms.settings.checks
-    supported = sensors.R_a_b is not None and sensors.depth_m is not None and checks >= {"attitude", "depth"}
+    supported = sensors.both and sensors.depth_m is not None and checks >= {"attitude", "depth"}
     in_a, in_b = terms.candidates.counts
     if not supported or 2 * (pairs.counts[0] * in_b + pairs.counts[1] * in_a) > _MAX_COMBINATIONS:
         return None
@@ -195,32 +203,24 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
     candidates, sensors, levels = terms.candidates, terms.sensors, terms.rigs.levels
     absent = lights < 0
     # The missing light has no weight; its bearing only keeps the arithmetic finite.
-    bearings = candidates.bearings.T.take(lights, 0)
+    frames = candidates.frames.take(lights, 0)
     q = np.concatenate(
         (levels[1].lights_m @ R.swapaxes(1, 2) + t[:, None], (levels[0].lights_m - t[:, None]) @ R), axis=1
     )
-    bearings[absent] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
-    present = ~absent
-    tangents = candidates.tangents.take(lights, 0) * present[:, :, None, None]
-    seen = Sightings(bearings, tangents, candidates.dt_s[lights] * present)
+    frames[absent] = 0.0
+    frames[absent, 0] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
+    seen = Sightings(frames, candidates.dt_s[lights] * ~absent)
     shifts = shifts_of(seen.dt_s, terms.motion.rates)
     bodies = levels[0].lights_m, levels[1].lights_m
     across = _basis(sensors.down_a)
     weight = np.eye(8)
     for step in range(_STEPS):
-        r, J, along = residuals(t, R, seen, bodies, shifts)
-        r_s, J_s, sigma = _sensor_rows(sensors, across, levels, t, R)
+        J, along = linearize(t, R, seen, bodies, shifts)
+        J_s, sigma = _sensor_rows(sensors, across, levels, t, R)
         if step == 0:
-            weight = weight_of(J, seen.dt_s, terms.motion)
-        JtW, JtW_s = J.swapaxes(1, 2) @ weight, J_s.swapaxes(1, 2)
-        H = JtW @ J + JtW_s @ J_s
-        unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
-        scale = unit[:, :, None] * unit[:, None, :]
-        covariance = np.linalg.inv(H * scale + DAMPING) * scale
-        column = r[:, :, None]
-        g = JtW @ column + JtW_s @ r_s[:, :, None]
-        move = (covariance @ g)[:, :, 0]
-        chi2 = (r[:, None] @ (weight @ column) - move[:, None] @ g)[:, 0, 0] + np.add.reduce(r_s * r_s, 1)
+            weight = weight_of(J[:, :, :6], seen.dt_s, terms.motion)
+        normal = J.swapaxes(1, 2) @ weight @ J + J_s.swapaxes(1, 2) @ J_s
+        covariance, _, move, chi2 = solve_normal(normal)
         t, R = moved(t, R, move)
         if not is_larger(move, t, _SMALL):
             break
@@ -253,8 +253,11 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
 
 def _sensor_rows(
     sensors: Sensors, across: Floats, levels: tuple[Rig, Rig], t: Floats, R: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Give whitened residuals (K, 3) of tilt and depth, their derivatives (K, 3, 6), and the product of their sds."""
+) -> tuple[Floats, Floats]:
+    """Give the derivatives of tilt and depth by the pose, whitened, the residuals as a seventh column (K, 3, 7).
+
+    And the product of their sds.
+    """
     down_a = sensors.down_a
     down_b = R @ sensors.down_b
     port_b = R @ levels[1].depth_port_m
@@ -265,15 +268,15 @@ def _sensor_rows(
     level2 = np.add.reduce(below * below, 1) - fall * fall
     sigma_m = np.sqrt(sensors.depth_variance + (0.25 * sensors.tilt_variance) * level2)
     sigma_rad = math.sqrt(sensors.tilt_variance)
-    r, J = np.empty((len(t), 3)), np.zeros((len(t), 3, 6))
+    J = np.zeros((len(t), 3, 7))
     across = across / sigma_rad
-    np.matmul(down_b, across.T, out=r[:, :2])
-    np.matmul(-across, skew(down_b), out=J[:, :2, 3:])
+    np.matmul(down_b, across.T, out=J[:, :2, 6])
+    np.matmul(-across, skew(down_b), out=J[:, :2, 3:6])
     down /= sigma_m[:, None]
-    r[:, 2] = (fall - (sensors.depth_m or 0.0)) / sigma_m
+    J[:, 2, 6] = (fall - (sensors.depth_m or 0.0)) / sigma_m
     J[:, 2, :3] = down
-    J[:, 2, 3:] = -(down[:, None] @ skew(port_b))[:, 0]
-    return r, J, sigma_rad**2 * sigma_m
+    J[:, 2, 3:6] = -(down[:, None] @ skew(port_b))[:, 0]
+    return J, sigma_rad**2 * sigma_m
 
 
 def _basis(down: Floats) -> Floats:
@@ -308,7 +311,8 @@ def _log_ratio(
     total = prior + fit - chance + math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS)
     R_last, u = R.transpose(1, 2, 0), (t / range_m[:, None]).T
     turn_variance = np.add.reduce(u * (covariance[:, 3:, 3:] @ u.T[:, :, None])[:, :, 0].T)
-    heading = weigh_heading(R_last, terms.sensors, turn_variance)
+    _, cosine, sine = terms.sensors.turns @ R.reshape(-1, 9).T
+    heading = weigh_heading(sine, cosine, terms.sensors.heading_variance + turn_variance)
     total += heading
     log_prior = np.zeros(len(t))
     if terms.prediction is not None:

@@ -127,14 +127,17 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     if readings.log_ratio[k] == -np.inf:
         return NoFix("degenerate", "the directions do not determine a pose")
     t, R = readings.t_a_b_m, readings.R_a_b
-    range_m = math.sqrt(float(t[k] @ t[k]))
+    range_m = math.hypot(*t[k].tolist())
     if not settings.range_min_m <= range_m <= settings.range_max_m:
         return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {terms.range_limits}")
-    ratio = np.exp(readings.log_ratio)
     same = _ALONE
+    ratio = agreeing = math.exp(readings.log_ratio[k])
     if len(readings) > 1:
         same = np.add.reduce((t - t[k]) ** 2, 1) < (_SAME_POSITION * range_m) ** 2
         same &= R.reshape(-1, 9) @ R[k].ravel() > _SAME_TRACE
+        ratios = np.exp(readings.log_ratio)
+        agreeing = float(np.add.reduce(ratios[same]))
+        others += float(np.add.reduce(ratios[~same]))
     short = min(readings.lights[k].tolist()) < 0
     chi2 = float(readings.chi2[k])
     # One of four lights may be off by more than its noise; which one, two residuals cannot tell.
@@ -143,11 +146,10 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     if short and sigma_m > _SURE_POSITION * range_m:
         return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
     # A false candidate in a light's place is off by as much as the covariance has been widened for.
-    intruder = float(ratio[k] * readings.lone_odds[k])
+    intruder = ratio * float(readings.lone_odds[k])
     if not short and sigma_m > _SURE_POSITION * range_m:
-        intruder = float(ratio[k]) * intruder_odds(chi2, float(readings.clutter[k]))
-    total = CHANCE_ODDS + float(np.add.reduce(ratio)) + others + intruder
-    probability = float(np.add.reduce(ratio[same])) / total
+        intruder = ratio * intruder_odds(chi2, float(readings.clutter[k]))
+    probability = agreeing / (CHANCE_ODDS + agreeing + others + intruder)
     required = settings.min_probability
     if short:
         required = max(required, _LED_PROBABILITY if readings.log_prior[k] > 0.0 else _THREE_PROBABILITY)
@@ -174,7 +176,7 @@ def _checks(terms: Terms, readings: Readings, k: int) -> tuple[str, ...]:
     checks: list[str] = []
     if min(readings.lights[k].tolist()) >= 0:
         checks += [name for name in ("range", "twist") if name in settings.checks]
-    if sensors.R_a_b is None or "attitude" not in settings.checks:
+    if not sensors.both or "attitude" not in settings.checks:
         checks.append("upright_assumed")
     elif readings.tilt_chi2[k] <= AGREES:
         checks.append("attitude")
@@ -189,6 +191,7 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
     lights, found = readings.lights[k], readings.lights[k].tolist()
     range_a_m, range_b_m = readings.range_m[k].tolist()
     twist_gap_rad = float(readings.twist_gap_rad[k])
+    in_a, in_b = terms.candidates.counts
     t = rig_a.R_level_camera.T @ readings.t_a_b_m[k]
     R = rig_a.R_level_camera.T @ readings.R_a_b[k] @ rig_b.R_level_camera
     if method != "refined":
@@ -199,7 +202,8 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
         range_a_m, range_b_m = solved.range_m[:, 0].tolist()
         twist_gap_rad = float(solved.twist_gap_rad[0])
     covariance = rig_a.both_level_camera.T @ covariance @ rig_a.both_level_camera
-    index = [int(terms.candidates.index[light]) if light >= 0 else -1 for light in found]
+    places = terms.candidates.index.tolist()
+    index = [places[light] if light >= 0 else -1 for light in found]
     return Fix(
         t_a_b_m=t,
         q_a_b_xyzw=quaternion_of(R),
@@ -209,7 +213,7 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
         range_gap_m=range_a_m - range_b_m,
         twist_gap_rad=twist_gap_rad,
         chi2=float(readings.chi2[k]),
-        hypotheses=math.prod(n * (n - 1) for n in terms.candidates.counts),
+        hypotheses=in_a * (in_a - 1) * in_b * (in_b - 1),
         pair_a=(index[0], index[1]),
         pair_b=(index[2], index[3]),
         method=method if min(found) >= 0 else "three_lights",
@@ -221,7 +225,7 @@ def _fix(terms: Terms, readings: Readings, k: int, covariance: Floats, probabili
 def _spread(readings: Readings, k: int, same: NDArray[np.bool_]) -> Floats:
     """Give the covariance of pose k, which may as well be one of its near neighbours; same: (K,) whether one is."""
     covariance: Floats = readings.covariance[k]
-    if np.count_nonzero(same) < 2:
+    if len(readings) == 1 or np.count_nonzero(same) < 2:
         return covariance
     # What the last poses said of near neighbours was read from pictures like this one: it does not count again.
     weights = np.where(same, np.exp(readings.log_ratio - readings.log_prior), 0.0)

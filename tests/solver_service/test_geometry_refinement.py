@@ -24,10 +24,10 @@ def sightings(scenes, rng=None, sigma_px=1.0, dt_s=None):
     if rng is not None:
         pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     a, b = scenes[0].rig_a.camera, scenes[0].rig_b.camera
-    rays = [a.rays(pixels[:, :2].reshape(-1, 2)), b.rays(pixels[:, 2:].reshape(-1, 2))]
-    bearings = np.concatenate([r[0].reshape(-1, 2, 3) for r in rays], axis=1)
-    tangents = np.concatenate([r[1].reshape(-1, 2, 2, 3) for r in rays], axis=1) / sigma_px
-    return Sightings(bearings, tangents, np.zeros((len(scenes), 4)) if dt_s is None else dt_s)
+    of_each = a.frames(pixels[:, :2].reshape(-1, 2)), b.frames(pixels[:, 2:].reshape(-1, 2))
+    frames = np.concatenate([of_one.reshape(-1, 2, 3, 3) for of_one in of_each], axis=1)
+    frames[:, :, 1:] /= sigma_px
+    return Sightings(frames, np.zeros((len(scenes), 4)) if dt_s is None else dt_s)
 
 
 def errors(refined, scenes):
@@ -128,11 +128,11 @@ def test_a_pose_that_the_lights_do_not_determine_is_not_sound():
     """Both lights of B in one pixel: nothing tells its range."""
     scene = random_scene(np.random.default_rng(8), 5.0)
     seen = sightings([scene])
-    bearings, tangents = seen.bearings.copy(), seen.tangents.copy()
-    bearings[:, 1:], tangents[:, 1:] = bearings[:, :1], tangents[:, :1]
+    frames = seen.frames.copy()
+    frames[:, 1:] = frames[:, :1]
     with np.errstate(all="ignore"):
         t, R = scene.t[None] * 1e9, scene.R[None]
-        refined = refine(t, R, Sightings(bearings, tangents, seen.dt_s), IDEAL, IDEAL, STILL)
+        refined = refine(t, R, Sightings(frames, seen.dt_s), IDEAL, IDEAL, STILL)
     assert not refined.sound.any()
 
 
