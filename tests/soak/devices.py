@@ -1,6 +1,6 @@
 """A camera that shows rendered pictures again and again, and sensors to go with them: the rest of the node is real.
 
-To render each picture takes longer than all that is looked at here.
+To render each picture, and to simulate each sample, takes longer than all that is looked at here.
 """
 
 from __future__ import annotations
@@ -55,10 +55,15 @@ def open_camera(config: NodeConfig, clock: Clock) -> RepeatingCamera:
 
 def open_sensors(config: NodeConfig, clock: Clock) -> list[SimulatedSensor]:
     world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    start_ns = config.simulation.start_ns
 
     def sensor(name: str, rate_hz: int, sample: Callable[[str, int], Message]) -> SimulatedSensor:
+        step_ns = S_NS // rate_hz
+        taken = [sample(config.node, start_ns + i * step_ns) for i in range(STRETCH_NS // step_ns + 1)]
+
         def at(stamp_ns: int) -> Message:
-            return replace(sample(config.node, instant_shown(config, stamp_ns)), stamp_ns=stamp_ns)
+            shown_ns = instant_shown(config, stamp_ns) - start_ns
+            return replace(taken[round(shown_ns / step_ns)], stamp_ns=stamp_ns)
 
         return SimulatedSensor(name, rate_hz, at, clock)
 
