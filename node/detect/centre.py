@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from node.detect.lights import Lights
-from node.detect.rings import RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
+from node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 
 _RINGS = 16
 _SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)
@@ -131,16 +131,17 @@ class _Equations:
         rings = sample_rings(image, lights.guess_px, radius)
         level = _one_channel(rings.pixels, lights.weakest)
         above = level - lights.ground[:, None, None]
-        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"]) & rings.inside
+        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        if rings.inside is not None:
+            usable &= rings.inside
         np.maximum(above, 1.0, out=above)
         y = np.log(above)
         used = usable.astype(np.float32)
         paired = used[:, 2:] * used[:, :-2]
-        # Sums over rays as products with ones: many times faster than sums along the last axis.
         count = paired @ _ONES
         difference = ((y[:, 2:] - y[:, :-2]) * paired) @ _ONES
         used, above, self._y = used[:, 1:-1], above[:, 1:-1], y[:, 1:-1]
-        self._seen = (count >= 0.4 * RAYS.count) & (used @ _ONES >= 0.5 * RAYS.count)
+        self._seen = (count >= 0.4 * RAYS) & (used @ _ONES >= 0.5 * RAYS)
         seen = self._seen.astype(np.float32)
         falling = difference / (np.maximum(count, 1.0) * (-2.0 * log_step)) * seen
         self._shift = falling / radius[:, 1:-1]
@@ -150,7 +151,7 @@ class _Equations:
         self.solvable = np.add.reduce(seen, axis=1) >= 4.0
         noise = model["noise"] / above
         # Each sample's weight, and that times y.
-        self._weighted = np.empty((*seen.shape, 2, RAYS.count), np.float32)
+        self._weighted = np.empty((*seen.shape, 2, RAYS), np.float32)
         weight = self._weighted[:, :, 0]
         np.divide(used * seen[:, :, None], noise * noise + model["model_noise"] ** 2, out=weight)
         np.multiply(weight, self._y, out=self._weighted[:, :, 1])
@@ -208,7 +209,7 @@ class _Equations:
         solution and the first two columns of its covariance; and the rings' means (N, M).
         """
         n, m = self._seen.shape
-        sums = (self._weighted.reshape(n * m, 2 * RAYS.count) @ _SUMS).reshape(n, m, 10)
+        sums = (self._weighted.reshape(n * m, 2 * RAYS) @ _SUMS).reshape(n, m, 10)
         means = sums[..., 1:4] / np.maximum(sums[..., :1], 1e-6)
         spread = sums[..., 4:].reshape(n, m, 3, 2) - sums[..., 1:4, None] * means[..., None, :2]
         rows = np.empty((*basis.shape[:2], 5, m), np.float32)
@@ -222,13 +223,13 @@ class _Equations:
         return np.linalg.solve(system[..., :4], system[..., 4:]), means[..., 2]
 
 
-_ONES = np.ones(RAYS.count, np.float32)
-_PLANE = np.stack([_ONES, *RAYS.uv.T])
-_RAYS_TWICE = np.zeros((2, RAYS.count, 10), np.float32)
+_ONES = np.ones(RAYS, np.float32)
+_PLANE = np.stack([_ONES, *RAY_UV.T])
+_RAYS_TWICE = np.zeros((2, RAYS, 10), np.float32)
 _RAYS_TWICE[0, :, :3] = _PLANE.T
-_RAYS_TWICE[0, :, 4:8] = (RAYS.uv[:, :, None] * RAYS.uv[:, None]).reshape(-1, 4)
+_RAYS_TWICE[0, :, 4:8] = (RAY_UV[:, :, None] * RAY_UV[:, None]).reshape(-1, 4)
 _RAYS_TWICE[1, :, 3] = 1.0
-_RAYS_TWICE[1, :, 8:] = RAYS.uv
+_RAYS_TWICE[1, :, 8:] = RAY_UV
 _SUMS = _RAYS_TWICE.reshape(-1, 10)
 """What is summed up over a ring's rays: 1, c, s, y, then (c, s, y) times (c, s); c and s: the ray's direction."""
 

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from node.detect.proposals import CLEAR, Proposals
 from node.detect.rings import (
-    FEW_RAYS,
-    RAYS,
+    MEAN,
     Floats,
     elongation,
     find_shapes,
@@ -31,7 +30,6 @@ VEIL: Final = 40.0
 """Level of the weakest channel from which on the water counts as veiled."""
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 _GUESS, _GUESS_MOST = 0.5, 0.4
-_SETTLE_RADII: Final = np.geomspace(0.4, 7.0, 10, dtype=np.float32)
 _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
 
 
@@ -68,11 +66,11 @@ class Lights(NamedTuple):
         return Lights._make(values[index] for values in self)
 
 
-def measure_lights(
-    image: NDArray[np.uint8], base: NDArray[np.uint8], base_step_px: float, proposals: Proposals
-) -> Lights:
-    """Measure what was proposed in a BGR (H, W, 3) or grey (H, W) picture; base: its grey, base_step_px a pixel."""
-    centre, radius_px, outstanding = _settle(base, base_step_px, proposals)
+def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
+    """Measure what was proposed in a BGR (H, W, 3) or grey (H, W) picture."""
+    kept = distinct(proposals.centre_px, proposals.radius_px, _MAX_MEASURED)
+    kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR)))]
+    centre, radius_px, outstanding = proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept]
     radius = geometric_radii(np.maximum(0.3 * radius_px, 0.5), np.maximum(5.0 * radius_px, 12.0), _SHARES)
     rings = sample_rings(image, centre, radius)
     colour = image.ndim == 3
@@ -98,7 +96,8 @@ def measure_lights(
     rim_px, core_px = _rims(own_circle)
     unclipped = np.minimum(np.maximum((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0), 1.0)
     scattered = _scattered(circle, unclipped, water)
-    rim_px += scattered[:, None] * (_where_glow_begins(circle) - rim_px)
+    if scattered.any():
+        rim_px += scattered[:, None] * (_where_glow_begins(circle) - rim_px)
     step_px = _at_most(_GUESS * (own_circle[0, :, :2] - own_circle[_HALF, :, :2]), _GUESS_MOST * core_px)
     edge = shapes.edge_px[0, _HALF]
     radius_px = circle[_HALF, :, 2]
@@ -120,7 +119,7 @@ def measure_lights(
         centre,
         np.pi * (radius_px * radius_px),
         half_elongation,
-        shapes.is_open[0, _HALF] @ RAYS.mean,
+        shapes.is_open[0, _HALF] @ MEAN,
         outstanding,
     )
 
@@ -144,28 +143,6 @@ def distinct(centre_px: Floats, radius_px: Floats, at_most: int) -> list[int]:
             if len(indices) == at_most:
                 break
     return indices
-
-
-def _settle(base: NDArray[np.uint8], base_step_px: float, proposals: Proposals) -> tuple[Floats, Floats, Floats]:
-    """Move each proposal to the middle of its bright region, and leave out those that end up in one.
-
-    Returns centres (N, 2) and radii (N,) in px of the whole picture, and how far they stand out.
-    """
-    scale = np.float32(base_step_px)
-    at = (proposals.centre_px + 0.5) / scale - 0.5
-    radius = (proposals.step_px / scale)[:, None] * _SETTLE_RADII
-    rings = sample_rings(base, at, radius, FEW_RAYS)
-    level = rings.pixels.astype(np.float32)[None]
-    peak = np.minimum(level[:, :, :5].max(axis=(2, 3)), _CLIPPED)
-    ground = _low(level[:, :, -3:], 0.2)
-    shapes = find_shapes(level, rings, (ground + 0.8 * (peak - ground))[:, None], FEW_RAYS)
-    circle = shapes.circle_px[0, 0]
-    centre = (at + circle[:, :2] + 0.5) * scale - 0.5
-    radius_px = circle[:, 2] * scale
-    kept = distinct(centre, radius_px, _MAX_MEASURED)
-    clear = int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR))
-    kept = kept[: max(_ALWAYS_MEASURED, clear)]
-    return centre[kept], radius_px[kept], proposals.outstanding[kept]
 
 
 def _low(level: Floats, share: float) -> Floats:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 _OCTAVES = 5
 _BASE_WIDTH_PX = 512
-_SMALLEST_PX = 5
 _CLUTTER_CELL = 4
 _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
@@ -24,27 +23,37 @@ _ALWAYS, _AT_MOST = 16, 64
 _MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
+_WINDOW = 5
+"""Side of the window around a place, in px of its octave: no other light stands higher in it."""
+_BRIGHT = 0.5
+"""Of a place's contrast: what lies no more than this below it is of its light."""
+_CLIPPED = 249.0
+_ACROSS = np.arange(_WINDOW)
+_ROW, _COLUMN = np.divmod(np.arange(_WINDOW**2), _WINDOW)
+_MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.float32)
+
 
 @dataclass(slots=True, eq=False)
 class Proposals:
     """Places to look at, the most outstanding first; arrays of length N.
 
-    centre_px: (N, 2) in the whole picture. step_px: pixels of the picture per pixel of the octave it was found in.
+    centre_px: (N, 2) in the whole picture, and radius_px of what is bright around them.
     outstanding: centre minus surround over what noise and the neighbourhood (its mean contrast) explain.
     """
 
     centre_px: NDArray[np.float32]
-    step_px: NDArray[np.float32]
+    radius_px: NDArray[np.float32]
     outstanding: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class _Octave:
-    """Working memory of one octave. All but level are parts of arrays that hold all octaves, end to end."""
+    """Working memory of one octave; all but quarter are parts of arrays that hold all octaves, end to end."""
 
     level: NDArray[np.uint8]
     contrast: NDArray[np.uint8]
     highest: NDArray[np.uint8]
+    quarter: NDArray[np.uint8]
     clutter: NDArray[np.uint8]
 
     def measure(self, below: NDArray[np.uint8] | None) -> None:
@@ -59,10 +68,8 @@ class _Octave:
             cv2.pyrUp(cv2.blur(below, (5, 5)), dst=surround, dstsize=self.level.shape[::-1])
         cv2.GaussianBlur(self.level, (3, 3), 0, dst=self.contrast)
         cv2.subtract(self.contrast, surround, dst=self.contrast)
-        rows, columns = self.clutter.shape
-        whole = self.contrast[: _CLUTTER_CELL * rows, : _CLUTTER_CELL * columns]
-        cells = halve(halve(whole))
-        cv2.blur(cells, (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
+        halve(self.contrast, self.quarter)
+        cv2.blur(halve(self.quarter, self.clutter), (_CLUTTER_CELLS, _CLUTTER_CELLS), dst=self.clutter)
         cv2.dilate(self.contrast, _NEIGHBOURS, dst=self.highest)
 
 
@@ -77,13 +84,14 @@ class ProposalFinder:
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
-        self._grey_level = np.zeros((0, 0), np.uint8)
         self._marks = np.zeros(0, np.uint8)
         self._contrast = np.zeros(0, np.uint8)
         self._highest = np.zeros(0, np.uint8)
         self._clutter = np.zeros(0, np.uint8)
         self._cell_of = np.zeros(0, np.int32)
-        self._starts = self._widths = np.zeros(0, np.int64)
+        self._starts = np.zeros(0, np.int64)
+        self._sizes = np.zeros((0, 2), np.int64)
+        self._level = np.zeros(0, np.uint8)
         self._steps_px = np.zeros(0, np.float32)
         self._base_step_px = 1.0
 
@@ -137,34 +145,34 @@ class ProposalFinder:
         order = order[outstanding[order] > 0.0]
         places = places[order]
         which = np.searchsorted(self._starts, places, side="right") - 1
-        step = self._steps_px[which]
-        centre_px = np.empty((len(order), 2), np.float32)
-        centre_px[:, 1], centre_px[:, 0] = np.divmod(places - self._starts[which], self._widths[which])
-        return Proposals((centre_px + 0.5) * step[:, None] - 0.5, step, outstanding[order])
-
-    @property
-    def base(self) -> tuple[NDArray[np.uint8], float]:
-        """The last picture's grey at the pyramid's base, and its step in px; only where proposals were found."""
-        return self._octaves[0].level, self._base_step_px
+        start, step = self._starts[which], self._steps_px[which]
+        size = self._sizes[which]
+        at = np.array(np.divmod(places - start, size[:, 1])).T
+        corner = np.minimum(np.maximum(at - _WINDOW // 2, 0), size - _WINDOW)
+        across = _ACROSS + (corner[:, 0] * size[:, 1] + corner[:, 1] + start)[:, None]
+        level = self._level.take((across[:, None] + (_ACROSS * size[:, 1:])[:, :, None]).reshape(-1, _WINDOW**2))
+        middle, radius = _settle(level.astype(np.float32), self._level[places].astype(np.float32), contrast[order])
+        centre_px = (corner[:, ::-1] + middle + 0.5) * step[:, None] - 0.5
+        return Proposals(centre_px.astype(np.float32), radius * step, outstanding[order])
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
         self._shape = shape
         self._halves = []
         height, width = shape[:2]
-        self._grey_level = np.empty((height, width) if len(shape) == 3 else (0, 0), np.uint8)
         self._base_step_px = 1.0
-        while width > _BASE_WIDTH_PX and height >= 2 * _SMALLEST_PX:
+        while width > _BASE_WIDTH_PX and height >= 2 * _WINDOW:
             height, width = height // 2, width // 2
             self._base_step_px *= 2.0
             self._halves.append(np.empty((height, width), np.uint8))
         sizes: list[tuple[int, int]] = []
-        while min(height, width) >= _SMALLEST_PX and len(sizes) < _OCTAVES:
+        while min(height, width) >= _WINDOW and len(sizes) < _OCTAVES:
             sizes.append((height, width))
             height, width = height // 2, width // 2
-        cells = [(max(h // _CLUTTER_CELL, 1), max(w // _CLUTTER_CELL, 1)) for h, w in sizes]
+        cells = [(h // _CLUTTER_CELL, w // _CLUTTER_CELL) for h, w in sizes]
         starts = np.cumsum([0, *(h * w for h, w in sizes)])
         cell_starts = np.cumsum([0, *(h * w for h, w in cells)])
         whole_words = -(-int(starts[-1]) // _WORD) * _WORD
+        self._level = np.zeros(whole_words, np.uint8)
         self._marks = np.zeros(whole_words, np.uint8)
         self._contrast = np.zeros(whole_words, np.uint8)
         self._highest = np.zeros(whole_words, np.uint8)
@@ -175,18 +183,21 @@ class ProposalFinder:
             column = np.minimum(np.arange(w) // _CLUTTER_CELL, columns - 1)
             self._cell_of[start : start + h * w] = (row[:, None] + column).ravel()
         self._starts = starts[:-1]
-        self._widths = np.array([w for _, w in sizes], np.int64)
+        self._sizes = np.array(sizes, np.int64).reshape(-1, 2)
         self._steps_px = np.float32(self._base_step_px) * np.exp2(np.arange(len(sizes)), dtype=np.float32)
         self._octaves = [
             _Octave(
-                # The last of the halves is the pyramid's base.
-                self._halves[-1] if self._halves and start == 0 else np.empty(size, np.uint8),
+                self._level[start : start + size[0] * size[1]].reshape(size),
                 self._contrast[start : start + size[0] * size[1]].reshape(size),
                 self._highest[start : start + size[0] * size[1]].reshape(size),
+                np.empty((2 * cell[0], 2 * cell[1]), np.uint8),
                 self._clutter[cell_start : cell_start + cell[0] * cell[1]].reshape(cell),
             )
             for start, size, cell_start, cell in zip(starts, sizes, cell_starts, cells, strict=False)
         ]
+        if self._halves and self._octaves:
+            # The last of the halves is the pyramid's base.
+            self._halves[-1] = self._octaves[0].level
 
     def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
         """Halve down to the pyramid's base.
@@ -198,25 +209,36 @@ class ProposalFinder:
         halves = self._halves
         if len(halves) > 1:
             height, width = halves[1].shape
-            level = halve(self._grey(level[: 4 * height : 2, : 4 * width]))
+            level = halve(_grey(level[: 4 * height : 2, : 4 * width]), halves[0][:height, : 2 * width])
             level = np.asarray(cv2.resize(level, (width, height), dst=halves[1]), np.uint8)
             halves = halves[2:]
-        level = self._grey(level)
+        level = _grey(level)
         for half in halves:
             level = halve(level, half)
         if not self._halves:
             base[...] = level
 
-    def _grey(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Give a picture's luminance; a grey one is it."""
-        if image.ndim == 2:
-            return image
-        height, width = image.shape[:2]
-        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=self._grey_level[:height, :width]), np.uint8)
+
+def _settle(
+    level: NDArray[np.float32], peak: NDArray[np.float32], contrast: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Give the middle (N, 2) of what is bright in windows around N places, from the corner, and its radius (N,).
+
+    level: (N, window), row by row; peak, contrast: (N,), the places' own. In px of the octave.
+    """
+    peak = np.minimum(peak, _CLIPPED)
+    bright = np.minimum(level, peak[:, None]) - (peak - _BRIGHT * contrast)[:, None]
+    area = (bright >= 0.0) @ _MOMENTS[:, 0]
+    moments = np.maximum(bright, 1e-3) @ _MOMENTS
+    return moments[:, 1:] / moments[:, :1], np.sqrt(area / np.pi)
 
 
-def halve(image: NDArray[np.uint8], into: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """Average 2x2 pixels; an odd last row or column is left out, which keeps to OpenCV's fast path."""
-    height, width = max(image.shape[0] // 2, 1), max(image.shape[1] // 2, 1)
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def halve(image: NDArray[np.uint8], into: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Average 2x2 pixels; what is left over at the right and below is left out: that keeps to OpenCV's fast path."""
+    height, width = into.shape
     even = image[: 2 * height, : 2 * width]
     return np.asarray(cv2.resize(even, (width, height), dst=into, interpolation=cv2.INTER_AREA), np.uint8)

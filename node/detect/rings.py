@@ -13,62 +13,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
-
 LUMA_BGR = np.array([0.114, 0.587, 0.299], np.float32)
 
+RAYS = 24
+_ANGLES = np.arange(RAYS) * (2.0 * np.pi / RAYS)
+RAY_UV = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1).astype(np.float32)
+"""(K, 2): each ray's direction."""
 
-class Rays:
-    """K directions around a place, and what sums over them.
-
-    uv: (K, 2). at_all: (2, 2K) repeats a place's coordinates. mean: (K,), centroid: (K, 2) and second: (K, 3), by
-    which powers of the distances to an outline give its area over pi, first and second moments.
-    """
-
-    def __init__(self, count: int) -> None:
-        angles = np.arange(count) * (2.0 * np.pi / count)
-        self.count = count
-        self.uv = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
-        self.at_all = np.tile(np.eye(2, dtype=np.float32), count)
-        self.mean = np.full(count, 1.0 / count, np.float32)
-        self.centroid = self.uv / np.float32(1.5 * count)
-        doubled = np.stack([np.ones(count), np.cos(2.0 * angles), np.sin(2.0 * angles)], axis=1)
-        self.second = (doubled / (2.0 * count)).astype(np.float32)
-
-
-RAYS: Final = Rays(24)
-FEW_RAYS: Final = Rays(12)
-"""Enough for about where a region is."""
+_AT_ALL_RAYS = np.tile(np.eye(2, dtype=np.float32), RAYS)
+_DOUBLED = np.stack([np.ones(RAYS), np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)], axis=1)
+_SECOND = (_DOUBLED / (2.0 * RAYS)).astype(np.float32)
+_CENTROID = RAY_UV / np.float32(1.5 * RAYS)
+MEAN: Final = np.full(RAYS, 1.0 / RAYS, np.float32)
+"""Sums over rays are products with this or the like: many times faster than sums along the last axis."""
 
 
 @dataclass(slots=True, eq=False)
 class Rings:
     """Samples around N places. radius_px: (N, M). pixels: (N, M, K) grey or (N, M, K, 3) blue green red.
 
-    inside: (N, M, K), which lie in the picture.
+    inside: (N, M, K), which lie in the picture; None where all do.
     """
 
     radius_px: Floats
     pixels: NDArray[np.uint8]
-    inside: NDArray[np.bool_]
+    inside: NDArray[np.bool_] | None
 
 
-def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats, rays: Rays = RAYS) -> Rings:
+def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats) -> Rings:
     """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), growing, both in px."""
     n, m = radius_px.shape
-    uv = radius_px[:, :, None] * rays.uv.ravel()
-    uv += (centre_px @ rays.at_all)[:, None]
+    uv = radius_px[:, :, None] * RAY_UV.ravel()
+    uv += (centre_px @ _AT_ALL_RAYS)[:, None]
     pixels = cv2.remap(  # type: ignore[call-overload]
         image,
-        uv.reshape(n * m, rays.count, 2),
+        uv.reshape(n * m, RAYS, 2),
         None,
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    half = np.array(image.shape[1::-1], np.float32) @ rays.at_all * np.float32(0.5)
-    uv -= half - np.float32(0.5)
-    in_range = np.abs(uv, out=uv) < half
-    inside = in_range[:, :, ::2] & in_range[:, :, 1::2]
-    return Rings(radius_px, np.asarray(pixels, np.uint8).reshape(n, m, rays.count, *image.shape[2:]), inside)
+    far = np.array(image.shape[1::-1], np.float32) - np.float32(0.5)
+    inside = None
+    if (np.minimum(centre_px + np.float32(0.5), far - centre_px) <= radius_px[:, -1:]).any():
+        u, v = uv[:, :, ::2], uv[:, :, 1::2]
+        inside = (u > -0.5) & (v > -0.5) & (u < far[0]) & (v < far[1])
+    return Rings(radius_px, np.asarray(pixels, np.uint8).reshape(n, m, RAYS, *image.shape[2:]), inside)
 
 
 def geometric_radii(first_px: Floats, last_px: Floats, share: Floats) -> Floats:
@@ -89,10 +78,10 @@ class Shapes:
     circle_px: Floats
 
 
-def elongation(edge_px: Floats, circle_px: Floats, rays: Rays = RAYS) -> Floats:
+def elongation(edge_px: Floats, circle_px: Floats) -> Floats:
     """Measure the long over the short axis of outlines: (N,) from (N, K) and (N, 3) as in Shapes."""
     square = edge_px * edge_px
-    second = (square * square) @ rays.second
+    second = (square * square) @ _SECOND
     u, v, radius = circle_px.T
     second /= (radius * radius)[:, None]
     uu, vv = u * u, v * v
@@ -102,7 +91,7 @@ def elongation(edge_px: Floats, circle_px: Floats, rays: Rays = RAYS) -> Floats:
     return ratio
 
 
-def find_shapes(level: Floats, rings: Rings, threshold: Floats, rays: Rays = RAYS) -> Shapes:
+def find_shapes(level: Floats, rings: Rings, threshold: Floats) -> Shapes:
     """Follow each ray outward to where it first falls below a threshold, or leaves the picture.
 
     level: (C, N, M, K) grey levels on the rings; threshold: (C, S, N).
@@ -113,13 +102,14 @@ def find_shapes(level: Floats, rings: Rings, threshold: Floats, rays: Rays = RAY
     outward = np.ascontiguousarray(level.swapaxes(2, 3))
     threshold = threshold[..., None]
     below = outward[:, None] < threshold[..., None]
-    below |= ~rings.inside.swapaxes(1, 2)
+    if rings.inside is not None:
+        below |= ~rings.inside.swapaxes(1, 2)
     is_open = ~below[..., -1]
     below[..., -1] = True
     first = below.argmax(axis=4)
     is_open &= first == many - 1
     before = np.maximum(first - 1, 0)
-    start = np.arange(0, outward.size, many).reshape(channels, 1, places, rays.count)
+    start = np.arange(0, outward.size, many).reshape(channels, 1, places, RAYS)
     inner, outer = outward.take(start + before), outward.take(start + first)
     share = (inner - threshold) / np.maximum(inner - outer, 1e-3)
     np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
@@ -127,11 +117,11 @@ def find_shapes(level: Floats, rings: Rings, threshold: Floats, rays: Rays = RAY
     near = radius_px.take(start + before)
     edge = near + share * (radius_px.take(start + first) - near)
     np.multiply(edge, 0.5, out=edge, where=first == 0)
-    rows = edge.reshape(-1, rays.count)
+    rows = edge.reshape(-1, RAYS)
     square = rows * rows
-    area = np.maximum(square @ rays.mean, 1e-6)
+    area = np.maximum(square @ MEAN, 1e-6)
     circle = np.empty((len(rows), 3), np.float32)
-    np.divide((square * rows) @ rays.centroid, area[:, None], out=circle[:, :2])
+    np.divide((square * rows) @ _CENTROID, area[:, None], out=circle[:, :2])
     np.sqrt(area, out=circle[:, 2])
     return Shapes(edge, is_open, circle.reshape(*first.shape[:3], 3))
 

@@ -17,7 +17,7 @@ from node.detect.centre import Centres, locate_sources
 from node.detect.detection import Detection, check_image
 from node.detect.lights import Lights, distinct, measure_lights
 from node.detect.proposals import ProposalFinder
-from node.detect.rings import RAYS, Floats
+from node.detect.rings import RAY_UV, Floats
 from protocol.messages import Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
@@ -58,9 +58,9 @@ class SourceDetector:
         if contrast_min is None:
             contrast_min = self._adapt()
         proposals = self._finder.find(contrast_min, self._values.get("clutter_gain", _CLUTTER_GAIN))
-        if len(proposals.step_px) == 0:
+        if len(proposals.radius_px) == 0:
             return []
-        lights = measure_lights(image, *self._finder.base, proposals)
+        lights = measure_lights(image, proposals)
         score = _score(lights)
         order = np.argsort(-score, kind="stable")
         order = order[distinct(lights.centre_px[order], lights.core_px[order], _KEPT[-1][0])]
@@ -89,7 +89,7 @@ def _score(lights: Lights) -> Floats:
 
 def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:
     """Put the findings into words and figures; what lies outside the picture is dropped."""
-    outline = lights.edge_px.astype(np.float64)[..., None] * RAYS.uv
+    outline = lights.edge_px.astype(np.float64)[..., None] * RAY_UV
     outline += lights.edge_at_px[:, None]
     ahead = (outline @ found.lean[:, :, None])[:, :, 0]
     axis = np.empty((len(outline), 2, 2))
