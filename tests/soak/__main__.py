@@ -3,7 +3,9 @@
 python -m tests.soak --minutes 60
 
 Prints a line a minute, then what was published, received, lost and doubled, and memory and open files after a minute
-and at the end. Exit status 1 where anything was lost or doubled, or grew beyond the bounds in tests/soak/system.py.
+and at the end. Beside the latencies stands the pace of the machine itself: the time that the same piece of work takes
+in a process that has nothing to do with Buddyline. Exit status 1 where anything was lost or doubled, or grew beyond
+the bounds in tests/soak/system.py.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ def show(minute: Minute) -> None:
     loads = " ".join(f"{name} {load.rss_mb:.1f}/{load.fds}" for name, load in minute.loads.items())
     print(
         f"{minute.at_s / 60:5.1f} min: Hz {rates}; ms median {minute.median_ms:.1f} p99 {minute.p99_ms:.1f}; "
-        f"missed {minute.missed}; MB/files {loads}; load average {minute.load_average:.1f}",
+        f"missed {minute.missed}; MB/files {loads}; load average {minute.load_average:.1f}, "
+        f"pace ms {minute.pace_ms[0]:.2f} p99 {minute.pace_ms[1]:.2f}",
         flush=True,
     )
 

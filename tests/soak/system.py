@@ -52,7 +52,7 @@ environment = "basin"
 
 @dataclass
 class Minute:
-    """A line of the report. rates_hz: by topic, of all nodes."""
+    """A line of the report. rates_hz: by topic, of all nodes. pace_ms: what tests/soak/pace.py took, median and p99."""
 
     at_s: float
     rates_hz: dict[str, float]
@@ -61,6 +61,7 @@ class Minute:
     missed: int
     loads: dict[str, Load]
     load_average: float  # of the machine, over the last minute
+    pace_ms: tuple[float, float]
 
 
 @dataclass
@@ -105,7 +106,8 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
             config = directory / f"{node}.toml"
             config.write_text(NODE.format(node=node, endpoint=endpoint, rate_hz=RATE_HZ, directory=directory))
             start(f"node {node}", "connected", "--config", str(config), module="tests.soak.node")
-        _measure(result, processes, viewer, seconds, every_s, show)
+        pace = stack.enter_context(Process(module="tests.soak.pace"))
+        _measure(result, processes, viewer, pace, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("node a", "node b")}
         # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
         time.sleep(4.0)
@@ -130,16 +132,19 @@ def _measure(
     result: Result,
     processes: dict[str, Process],
     viewer: Viewer,
+    pace: Process,
     seconds: float,
     every_s: float,
     show: Callable[[Minute], None],
 ) -> None:
     time.sleep(START_S)
     viewer.latencies_ms()
-    began_s, before, viewer_before = time.monotonic(), 0.0, viewer.counts()
+    began_s, before, viewer_before, paces = time.monotonic(), 0.0, viewer.counts(), len(pace.lines)
     while before < seconds:
         time.sleep(max(began_s + min(before + every_s, seconds) - time.monotonic(), 0.0))
         at_s, counts, latencies_ms = time.monotonic() - began_s, viewer.counts(), viewer.latencies_ms()
+        paces_ms = sorted(float(line) for line in pace.lines[paces:])
+        paces += len(paces_ms)
         rates: Counter[str] = Counter()
         for key, count in (counts - viewer_before).items():
             rates[key.rpartition("/")[2]] += count
@@ -147,11 +152,12 @@ def _measure(
             Minute(
                 at_s=at_s,
                 rates_hz={name: count / (at_s - before) for name, count in rates.items()},
-                median_ms=latencies_ms[len(latencies_ms) // 2] if latencies_ms else -1.0,
-                p99_ms=latencies_ms[len(latencies_ms) * 99 // 100] if latencies_ms else -1.0,
+                median_ms=share_of(latencies_ms, 0.5),
+                p99_ms=share_of(latencies_ms, 0.99),
                 missed=viewer.missed,
                 loads={name: load_of(process.pid) for name, process in processes.items()},
                 load_average=os.getloadavg()[0],
+                pace_ms=(share_of(paces_ms, 0.5), share_of(paces_ms, 0.99)),
             )
         )
         show(result.minutes[-1])
@@ -211,5 +217,10 @@ def _judge_loads(result: Result) -> None:
             result.failures.append(f"p99 of the latency went from {early:.1f} to {late:.1f} ms")
 
 
+def share_of(values: list[float], share: float) -> float:
+    """Return what this share of sorted values lies below; -1 where there are none."""
+    return values[int(len(values) * share)] if values else -1.0
+
+
 def median(values: list[float]) -> float:
-    return sorted(values)[len(values) // 2]
+    return share_of(sorted(values), 0.5)
