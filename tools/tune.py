@@ -177,7 +177,7 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
     else:
         named = [(str(file), None, pixels) for file, pixels in _readable(_spread(_files(inputs), limit))]
     if not named:
-        raise BuddylineError(f"{', '.join(inputs)}: hold no pictures" + (" with truth" if known else ""))
+        raise BuddylineError("no pictures " + ("with truth " if known else "") + f"in {', '.join(inputs)}")
     if known:
         return [Picture(name, pixels, lights) for name, lights, pixels in named if lights is not None], "truth"
     detector = make_detector()
