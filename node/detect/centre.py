@@ -168,30 +168,28 @@ class _Equations:
         prior[:, 0, 0] = prior[:, 1, 1] = information
         prior[:, 2, 2] = prior[:, 3, 3] = 1.0 / self._model["lean_sd"] ** 2
         prior[:, :2, 4] = information[:, None] * prior_px
-        share = self._glow_share()
-        basis = np.empty((*share.shape[:2], 2, share.shape[2]), np.float32)
-        basis[:, :, 0] = self._shift
-        basis[:, :, 1] = share
-        x, mean = self._least_squares(basis[:1], prior)
+        rows = self._rows()
+        x, mean = self._least_squares(rows[:1], prior)
         expected = np.empty((*mean.shape, 3), np.float32)
         expected[..., 0] = mean
-        expected[..., 1:] = basis[0].swapaxes(1, 2) @ x[0, ..., 0].reshape(-1, 2, 2)
+        expected[..., 1:] = rows[0, :, 3:].swapaxes(1, 2) @ x[0, ..., 0].reshape(-1, 2, 2)
         residual = self._y - (expected.reshape(-1, 3) @ _PLANE).reshape(self._y.shape)
         robust = self._weighted[:, :, 0] * residual
         robust *= residual
         robust *= 1.0 / _ROBUST_SD**2
         robust += 1.0
         self._weighted /= robust[:, :, None]
-        x, _ = self._least_squares(basis, prior)
+        x, _ = self._least_squares(rows, prior)
         apart = x[2, :, :2, 0] - x[1, :, :2, 0]
         variance = _NOISE_SCALE**2 * (x[0, :, 0, 1] + x[0, :, 1, 2])
         variance += (0.5 * _GROWTH_SCALE) ** 2 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
         return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
 
-    def _glow_share(self) -> Floats:
-        """Integrate d ln w / d ln rho along the rings; w is 1 at the outermost ring seen: (3, N, M).
+    def _rows(self) -> Floats:
+        """Give what the rings' sums are multiplied by: (3, N, 5, M), ss, sw, ww, s, w.
 
-        For the growth as expected, and for less and more of it.
+        s: the profile's shift. w: the glow's share, d ln w / d ln rho integrated along the rings, 1 at the outermost
+        ring seen; for the growth as expected, and for less and more of it.
         """
         sd = self._model["growth_sd"]
         growth = np.maximum(self._growth + np.array([[[0.0]], [[-sd]], [[sd]]], np.float32), -0.3)
@@ -199,26 +197,27 @@ class _Equations:
         log_share *= self._log_step
         last = np.where(self._seen, log_share, np.float32(-1e9)).max(axis=-1, keepdims=True)
         log_share -= last
-        share: Floats = np.exp(np.minimum(log_share, 0.0))
-        return share
+        np.minimum(log_share, 0.0, out=log_share)
+        rows = np.empty((*growth.shape[:2], 5, growth.shape[2]), np.float32)
+        rows[:, :, 3] = self._shift
+        np.exp(log_share, out=rows[:, :, 4])
+        np.multiply(rows[:, :, 3:], self._shift[:, None], out=rows[:, :, :2])
+        np.square(rows[:, :, 4], out=rows[:, :, 2])
+        return rows
 
-    def _least_squares(self, basis: Floats, prior: Floats) -> tuple[Floats, Floats]:
+    def _least_squares(self, rows: Floats, prior: Floats) -> tuple[Floats, Floats]:
         """Solve for (s, k), each ring's mean eliminated, for S shares of the glow.
 
-        basis: (S, N, 2, M), what s and k are multiplied by. prior: (N, 4, 7), see _PRIOR. Returns (S, N, 4, 3), the
+        rows: (S, N, 5, M), see _rows. prior: (N, 4, 7), see _PRIOR. Returns (S, N, 4, 3), the
         solution and the first two columns of its covariance; and the rings' means (N, M).
         """
         n, m = self._seen.shape
         sums = (self._weighted.reshape(n * m, 2 * RAYS) @ _SUMS).reshape(n, m, 10)
         means = sums[..., 1:4] / np.maximum(sums[..., :1], 1e-6)
         spread = sums[..., 4:].reshape(n, m, 3, 2) - sums[..., 1:4, None] * means[..., None, :2]
-        rows = np.empty((*basis.shape[:2], 5, m), np.float32)
-        rows[:, :, 3:] = basis
-        np.multiply(basis, self._shift[:, None], out=rows[:, :, :2])
-        np.square(basis[:, :, 1], out=rows[:, :, 2])
         # Neighbouring samples are correlated: the information is less than their number says.
-        products = (rows @ spread.reshape(n, m, 6)).reshape(*basis.shape[:2], 30) * (1.0 / self._model["inflation"])
-        system = np.repeat(prior[None], len(basis), axis=0)
+        products = (rows @ spread.reshape(n, m, 6)).reshape(len(rows), n, 30) * (1.0 / self._model["inflation"])
+        system = np.repeat(prior[None], len(rows), axis=0)
         system[..., :5] += products.take(_SYSTEM, axis=-1)
         return np.linalg.solve(system[..., :4], system[..., 4:]), means[..., 2]
 
