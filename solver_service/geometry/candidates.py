@@ -25,8 +25,9 @@ _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 class Candidates:
     """The usable candidates, A's first. counts: (A's, B's), their sum N.
 
-    frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, in its own rig's level frame. table: (6, N)
-    bearing, position over the picture's width and height, and variance of the bearing, rad^2 per axis. index: (N,)
+    frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, in its own rig's level frame. table: (7, N)
+    bearing, position over the picture's width and height, variance of the bearing, rad^2 per axis, and square of the
+    radius that a disc of its area would have, rad^2. index: (N,)
     into the view. sigma_px: (N,). dt_s: (N,) after the instant that the pose is for. log_score: (N,) weak evidence
     for a light, None where no candidate has a score. log_area: (N,).
     """
@@ -68,32 +69,34 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     else:
         in_camera = np.concatenate((rig_a.camera.frames(pixels_a), rig_b.camera.frames(pixels_b)))
     frames = in_camera @ turns
-    table = np.empty((10, in_a + in_b))
+    table = np.empty((11, in_a + in_b))
     offset_s = 0.5e-9 * (view_a.stamp_ns - view_b.stamp_ns)
-    for view, columns, shift_s in ((view_a, table[6:, :in_a], offset_s), (view_b, table[6:, in_a:], -offset_s)):
+    for view, columns, shift_s in ((view_a, table[7:, :in_a], offset_s), (view_b, table[7:, in_a:], -offset_s)):
         n = columns.shape[1]
         np.add(view.dt_s[:n], shift_s, out=columns[0])
         columns[1], columns[2], columns[3] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
-    sigma_px = np.maximum(table[7], _MIN_SIGMA_PX)
+    sigma_px = np.maximum(table[8], _MIN_SIGMA_PX)
     tangents = frames[:, 1:]
     tangents /= sigma_px[:, None, None]
     gram = tangents @ tangents.swapaxes(1, 2)
     table[:3] = frames[:, 0].T
     np.divide(pixels.T, size_px, out=table[3:5])
     table[5] = 1.0 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2)
-    if not math.isfinite(np.add.reduce(table[:8], None)):
-        usable = np.isfinite(table[:8].sum(0))
+    np.fmax(table[10], 1.0, out=table[10])
+    table[6] = table[5] * table[10] / (math.pi * sigma_px * sigma_px)
+    if not math.isfinite(np.add.reduce(table[:9], None)):
+        usable = np.isfinite(table[:9].sum(0))
         in_a = int(usable[:in_a].sum())
         table, frames, index, sigma_px = table[:, usable], frames[usable], index[usable], sigma_px[usable]
     return Candidates(
         counts=(in_a, table.shape[1] - in_a),
         frames=frames,
-        table=table[:6],
+        table=table[:7],
         index=index,
         sigma_px=sigma_px,
-        dt_s=table[6],
-        log_score=_log_score(table[8], in_a),
-        log_area=np.log(np.fmax(table[9], 1.0)),
+        dt_s=table[7],
+        log_score=_log_score(table[9], in_a),
+        log_area=np.log(table[10]),
     )
 
 

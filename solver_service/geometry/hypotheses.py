@@ -136,6 +136,8 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
         ends, node, own_m2 = ends.take(kept, 1), node[kept], own_m2[kept]
         w, total, about = w.take(kept, 1), total.take(kept, 1), about[kept]
         chord2, variance = chord2[kept], variance[kept]
+    # One glow may give several candidates: within it, that two are near each other is no rarity.
+    crowded2 = np.maximum(chord2, total[6])
     chord = np.sqrt(chord2)
     norm = np.sqrt(4.0 - chord2)
     total /= norm
@@ -155,7 +157,7 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
         twist_rad=np.arctan2(-2.0 * about / norm, w[0]),
         variance=variance,
         chord=chord,
-        log_weight=-np.log(chord2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
+        log_weight=-np.log(crowded2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
         tan2_beta=1.0 / float(np.minimum.reduce(cos_beta2, initial=1.0)) - 1.0,
         fall_rad=np.arctan2(across, along),
         level=np.sqrt((along * along + across * across) / cos_beta2),

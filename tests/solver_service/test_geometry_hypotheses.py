@@ -1,5 +1,7 @@
 """The search: it leaves out nothing that passes both gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,3 +46,21 @@ def test_every_combination_within_both_gates_is_found(rigs, count, triggers):
         passing += len(expected)
         assert expected <= found
     assert passing > 20
+
+
+def test_two_candidates_within_one_glow_are_no_rarity():
+    """Near each other they would speak for lights far away, and louder the nearer they are."""
+
+    def log_weights(area_px):
+        pixels = np.array([[800.0, 600.0], [820.0, 600.0], [1100.0, 600.0]])
+        seen = replace(view(pixels, 1.0), area_px=np.full(3, area_px))
+        terms = Terms.of((seen, seen), (IDEAL, IDEAL), (Sensed(), Sensed()), Settings(), None)
+        pairs = find_pairs(terms.candidates, terms.rigs, (terms.sensors.down_a, terms.sensors.down_b), terms.settings)
+        weights = dict(zip(zip(*pairs.ends.tolist(), strict=True), pairs.log_weight.tolist(), strict=True))
+        return weights[0, 1], weights[0, 2]
+
+    (near, far), (crowded, untouched) = log_weights(40.0), log_weights(8000.0)
+    assert untouched == far
+    assert crowded < near
+    # As if they stood a glow's radius apart, times the root of two.
+    assert crowded == pytest.approx(near + np.log(20.0**2 / (2.0 * 8000.0 / np.pi)), abs=0.02)
