@@ -24,7 +24,10 @@ from protocol.messages import (
     RelativePose,
 )
 from solver_service.alignment import ClockAlignment
+from solver_service.geometry.evidence import heading_offset
+from solver_service.geometry.rotation import matrix_of
 from solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
+from solver_service.headings import HeadingOffset
 from solver_service.prior import PosePrior
 from solver_service.results import relative_pose, sensed_of, view_of
 from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
@@ -70,6 +73,7 @@ class SolverCore:
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
         self._prior = PosePrior()
+        self._headings = HeadingOffset()
         self._clock_offset_ns = clock_offset_ns
         self._alignment = alignment
 
@@ -124,6 +128,7 @@ class SolverCore:
             self._resolved = OrderedDict.fromkeys(self._far)
             self._newest_resolved = -1
             self._prior.lose()
+            self._headings.lose()
             if frame.trigger in self._resolved:
                 stream.frames.pop(frame.trigger, None)
                 self.late += 1
@@ -230,10 +235,16 @@ class SolverCore:
             sensed_b,
             self.settings,
             self._prior.at(stamp_ns),
+            self._headings.at(stamp_ns),
         )
         if not isinstance(outcome, Fix):
             return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
         self._prior.update(stamp_ns, outcome)
+        attitudes = sensed_a.q_ned_body_xyzw, sensed_b.q_ned_body_xyzw
+        if attitudes[0] is not None and attitudes[1] is not None and outcome.method != "three_lights":
+            R_a_b, covariance = matrix_of(outcome.q_a_b_xyzw), outcome.covariance[3:, 3:]
+            told = heading_offset(R_a_b, covariance, (rig_a, rig_b), (attitudes[0], attitudes[1]))
+            self._headings.update(stamp_ns, *told)
         if self._alignment is not None:
             known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
             sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from solver_service.geometry.closed_form import dot
-from solver_service.geometry.observation import Settings
+from solver_service.geometry.observation import Heading, Settings
 from solver_service.geometry.rig import Rig, RigPair
 from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
 
@@ -138,18 +138,16 @@ def combine(
     sigmas_rad: tuple[Floats | None, Floats | None],
     depth_m: float | None,
     depth_variance: float,
+    learned: Heading | None,
 ) -> Sensors:
-    """Put both nodes' attitudes (body to NED) and the difference of their depths together."""
+    """Put both nodes' attitudes (body to NED) and the difference of their depths together; learned: of the headings."""
     down, tilts, heading, R_ned_camera = [], [], 0.0, []
     for rig, q_ned_body, sigma_rad in zip(rigs, attitudes, sigmas_rad, strict=True):
         if q_ned_body is None:
             down.append(_UPRIGHT_DOWN)
             tilts.append(_UPRIGHT_SIGMA_RAD**2)
             continue
-        R_ned_body = matrix_of(q_ned_body)
-        if rig.declination_rad:
-            # What a heading has been corrected by is taken back: both then count from magnetic north.
-            R_ned_body = rotation_exp(np.array([0.0, 0.0, -rig.declination_rad])) @ R_ned_body
+        R_ned_body = _from_magnetic_north(rig, q_ned_body)
         R_ned_camera.append(R_ned_body @ rig.R_body_camera)
         down.append(R_ned_camera[-1][2])
         # Roll turns about the body's x axis, pitch about the horizontal across it, yaw about the vertical.
@@ -162,7 +160,11 @@ def combine(
     turns = np.zeros((3, 3, 3))
     np.multiply(down[0][:, None], down[1], out=turns[0])
     if both:
-        np.matmul(R_ned_camera[0].T, _ABOUT_DOWN @ R_ned_camera[1], out=turns[1:])
+        about_down = _ABOUT_DOWN
+        if learned is not None:
+            about_down = _ABOUT_DOWN @ rotation_exp(np.array([0.0, 0.0, learned.offset_rad]))
+            heading = learned.variance
+        np.matmul(R_ned_camera[0].T, about_down @ R_ned_camera[1], out=turns[1:])
     return Sensors(
         down_a=down[0],
         down_b=down[1],
@@ -175,6 +177,27 @@ def combine(
         fall_variance=tilts[0] if attitudes[0] is not None else tilts[1],
         turns=turns.reshape(3, 9),
     )
+
+
+def _from_magnetic_north(rig: Rig, q_ned_body: Floats) -> Floats:
+    """Turn an attitude into its matrix, and take back what its heading has been corrected by: both count alike."""
+    R_ned_body = matrix_of(q_ned_body)
+    if rig.declination_rad:
+        R_ned_body = rotation_exp(np.array([0.0, 0.0, -rig.declination_rad])) @ R_ned_body
+    return R_ned_body
+
+
+def heading_offset(
+    R_a_b: Floats, rotation_covariance: Floats, rigs: tuple[Rig, Rig], attitudes: tuple[Floats, Floats]
+) -> tuple[float, float]:
+    """Give what is to be added to B's heading for both to agree with a pose, rad, and the pose's own variance of it.
+
+    R_a_b: (3, 3) between the cameras' frames; rotation_covariance: (3, 3), in A's. attitudes: body to NED.
+    """
+    of_a, of_b = (_from_magnetic_north(*each) @ each[0].R_body_camera for each in zip(rigs, attitudes, strict=True))
+    turn = of_a @ R_a_b @ of_b.T
+    offset_rad = math.atan2(float(turn[1, 0] - turn[0, 1]), float(turn[0, 0] + turn[1, 1]))
+    return offset_rad, float(of_a[2] @ rotation_covariance @ of_a[2])
 
 
 def log_gaps(chi2: Floats, gaps: int) -> Floats:

@@ -64,6 +64,17 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class Heading:
+    """What is to be added to B's heading for both to agree, as earlier poses have it, and its variance, rad^2.
+
+    The variance is that of the present headings' difference, their own noise included.
+    """
+
+    offset_rad: float
+    variance: float
+
+
+@dataclass(frozen=True)
 class Settings:
     """How triggers are solved.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from solver_service.geometry.candidates import Candidates, find_candidates
 from solver_service.geometry.evidence import Prediction, Sensors, combine
-from solver_service.geometry.observation import Prior, Sensed, Settings, View
+from solver_service.geometry.observation import Heading, Prior, Sensed, Settings, View
 from solver_service.geometry.refinement import Motion
 from solver_service.geometry.rig import Rig, RigPair, pair_of
 from solver_service.geometry.rotation import Floats, matrix_of
@@ -38,6 +38,7 @@ class Terms:
         sensed: tuple[Sensed, Sensed],
         settings: Settings,
         prior: Prior | None,
+        heading: Heading | None = None,
     ) -> Terms:
         """Bring everything into the level frames; what is not finite is as good as not there."""
         pair = pair_of(*rigs)
@@ -45,7 +46,7 @@ class Terms:
         return Terms(
             rigs=pair,
             candidates=candidates,
-            sensors=_sensors(pair.levels, sensed),
+            sensors=_sensors(pair.levels, sensed, heading),
             prior=prior,
             motion=_motion(prior, rigs[0], settings),
             settings=settings,
@@ -70,7 +71,7 @@ def _finite(value: Floats | None, shape: tuple[int, ...]) -> Floats | None:
     return array if array.shape == shape and math.isfinite(sum(array.ravel().tolist())) else None
 
 
-def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
+def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed], heading: Heading | None) -> Sensors:
     attitudes: list[Floats | None] = []
     for one in sensed:
         q = _finite(one.q_ned_body_xyzw, (4,))
@@ -83,7 +84,7 @@ def _sensors(levels: tuple[Rig, Rig], sensed: tuple[Sensed, Sensed]) -> Sensors:
         for one in sensed:
             sigma_m = one.depth_sigma_m
             variance += sigma_m**2 if sigma_m is not None and math.isfinite(sigma_m) else 0.0
-    return combine(levels, (attitudes[0], attitudes[1]), (sigmas[0], sigmas[1]), depth_m, variance)
+    return combine(levels, (attitudes[0], attitudes[1]), (sigmas[0], sigmas[1]), depth_m, variance, heading)
 
 
 def _prediction(prior: Prior | None, pair: RigPair, candidates: Candidates, settings: Settings) -> Prediction | None:

@@ -17,7 +17,7 @@ from solver_service.geometry.closed_form import closed_form
 from solver_service.geometry.evidence import AGREES, CHANCE_ODDS, intruder_odds
 from solver_service.geometry.four_lights import read_four_lights
 from solver_service.geometry.hypotheses import find_pairs
-from solver_service.geometry.observation import Prior, Reason, Sensed, Settings, View
+from solver_service.geometry.observation import Heading, Prior, Reason, Sensed, Settings, View
 from solver_service.geometry.readings import Readings
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats, quaternion_of, rotation_log
@@ -89,13 +89,17 @@ def solve_trigger(
     sensed_b: Sensed,
     settings: Settings,
     prior: Prior | None = None,
+    heading: Heading | None = None,
 ) -> Fix | NoFix:
-    """Find the four lights among both nodes' candidates, and T_a_b from them, or say why there is none."""
+    """Find the four lights among both nodes' candidates, and T_a_b from them, or say why there is none.
+
+    prior, heading: what earlier poses tell of this one, and of the headings.
+    """
     for name, rig in (("A", rig_a), ("B", rig_b)):
         if not rig.usable:
             return NoFix("degenerate", f"the lights of {name} are less than 1 mm apart")
     with np.errstate(all="ignore"):
-        terms = Terms.of((view_a, view_b), (rig_a, rig_b), (sensed_a, sensed_b), settings, prior)
+        terms = Terms.of((view_a, view_b), (rig_a, rig_b), (sensed_a, sensed_b), settings, prior, heading)
         return _solve(terms)
 
 

@@ -1,0 +1,112 @@
+"""How far the headings disagree: learned from poses, lost with time, moved by no single wrong one."""
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+from protocol.messages import Attitude, Candidates, RelativePose
+from solver_service.core import SolverCore
+from solver_service.geometry.evidence import heading_offset
+from solver_service.geometry.rotation import matrix_of, quaternion_of
+from solver_service.geometry.trigger import Settings
+from solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
+from tests.solver_service.scenes import IDEAL, random_scene, rotation
+
+STEP_NS = 100_000_000
+POSE_VARIANCE = math.radians(0.3) ** 2
+
+
+def fed(offsets_rad, headings=None, start=0):
+    headings = headings or HeadingOffset()
+    for k, offset_rad in enumerate(offsets_rad, start):
+        headings.update(k * STEP_NS, offset_rad, POSE_VARIANCE)
+    return headings
+
+
+def test_a_drifting_bias_is_followed_and_the_variance_is_true():
+    rng = np.random.default_rng(1)
+    squares = []
+    for sigma_deg in (1.5, 3.0, 6.0):
+        headings = HeadingOffset()
+        for k in range(1500):
+            # Two thirds of a turn to start with: the angle comes round.
+            bias_rad = 4.2 + math.radians(8.0) * math.sin(0.02 * k)
+            told_rad = math.remainder(bias_rad + math.radians(sigma_deg) * rng.normal(), 2.0 * math.pi)
+            heading = headings.at(k * STEP_NS)
+            if k > 100:
+                off_rad = math.remainder(told_rad - heading.offset_rad, 2.0 * math.pi)
+                squares.append(off_rad * off_rad / heading.variance)
+            headings.update(k * STEP_NS, told_rad, POSE_VARIANCE)
+        assert heading.variance < 2.0 * math.radians(sigma_deg) ** 2
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_few_poses_and_an_old_one_tell_nothing():
+    assert fed([0.3] * (ENOUGH - 1)).at(ENOUGH * STEP_NS) is None
+    headings = fed([0.3] * ENOUGH)
+    assert headings.at(ENOUGH * STEP_NS).offset_rad == pytest.approx(0.3, abs=0.01)
+    assert headings.at(-1) is None
+    assert headings.at((ENOUGH - 1) * STEP_NS + LIFETIME_NS + 1) is None
+
+
+def test_one_wrong_pose_moves_nothing_and_steel_is_followed():
+    headings = fed([0.1] * 50)
+    fed([1.5], headings, 50)
+    assert headings.at(51 * STEP_NS).offset_rad == pytest.approx(0.1, abs=0.01)
+    fed([0.1] * 20, headings, 51)
+    fed([1.5] * 10, headings, 71)
+    assert headings.at(81 * STEP_NS).offset_rad == pytest.approx(1.5, abs=0.1)
+
+
+def test_what_a_pose_tells_is_the_error_of_the_heading():
+    rng = np.random.default_rng(2)
+    for error_rad in (0.0, 0.4, -2.8):
+        scene = random_scene(rng, 5.0)
+        q_a, q_b = (one.q_ned_body_xyzw for one in scene.sensed())
+        turned = quaternion_of(rotation((0, 0, 1), error_rad) @ matrix_of(q_b))
+        offset_rad, variance = heading_offset(scene.R, 1e-4 * np.eye(3), (IDEAL, IDEAL), (q_a, turned))
+        assert offset_rad == pytest.approx(-error_rad, abs=1e-9)
+        assert variance == pytest.approx(1e-4)
+
+
+def test_with_a_compass_far_off_three_lights_still_give_poses(dive):
+    messages, world = dive
+    seen = {result.trigger: result for result in solved(messages) if isinstance(result, RelativePose)}
+    short = set(sorted(seen)[20::3])
+
+    def without_a_light(message):
+        if not isinstance(message, Candidates) or message.node != "b" or message.trigger not in short:
+            return message
+        lost = seen[message.trigger].blobs_b[0]
+        return msgspec.structs.replace(message, blobs=[b for i, b in enumerate(message.blobs) if i != lost])
+
+    lacking = [without_a_light(message) for message in messages]
+    true, off = three_lights(lacking, world), three_lights([turned(message) for message in lacking], world)
+    assert true > 5
+    assert off > 0.7 * true
+
+
+def turned(message):
+    """B's compass is 80 degrees off."""
+    if not isinstance(message, Attitude) or message.node != "b":
+        return message
+    R = rotation((0, 0, 1), math.radians(80.0)) @ matrix_of(np.array(message.q_ned_body_xyzw))
+    return msgspec.structs.replace(message, q_ned_body_xyzw=tuple(quaternion_of(R).tolist()))
+
+
+def solved(messages):
+    core = SolverCore("a", "b", Settings())
+    return [result for message in messages for result in core.handle(message)] + core.flush()
+
+
+def three_lights(messages, world):
+    """Count the poses of three lights, all of them right."""
+    count = 0
+    for pose in solved(messages):
+        if isinstance(pose, RelativePose) and pose.method == "three_lights":
+            truth = world.truth(pose.stamp_ns, pose.trigger)
+            assert np.linalg.norm(np.subtract(pose.t_a_b_m, truth.t_a_b_m)) < 0.1 * pose.range_m
+            count += 1
+    return count
