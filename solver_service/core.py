@@ -25,6 +25,7 @@ from protocol.messages import (
 )
 from solver_service.alignment import ClockAlignment
 from solver_service.geometry.evidence import heading_offset
+from solver_service.geometry.observation import Heading
 from solver_service.geometry.rotation import matrix_of
 from solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
 from solver_service.headings import HeadingOffset
@@ -86,6 +87,12 @@ class SolverCore:
     def newest_ns(self) -> tuple[int | None, int | None]:
         """Stamps of the newest frames of a and b."""
         return self._a.newest_ns, self._b.newest_ns
+
+    @property
+    def heading(self) -> Heading | None:
+        """How far the headings disagree by the poses up to the newest frame, None where they have not told."""
+        newest_ns = max((ns for ns in self.newest_ns if ns is not None), default=0)
+        return self._headings.at(newest_ns)
 
     @property
     def pending(self) -> int:

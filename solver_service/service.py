@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import statistics
 import threading
 import time
@@ -38,6 +39,8 @@ LIVE_WITHIN_NS: Final = 60 * S_NS
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 TOLERATED_OFFSET_S: Final = 0.005
 ALIGN_EVERY_S: Final = 10.0
+# Of two calibrated compasses away from steel: several times what they say of themselves.
+TOLERATED_HEADING_RAD: Final = math.radians(20.0)
 BUFFERED_BEFORE_PAIR: Final = 4096
 SOLVED_FROM: Final = (INFO, ATTITUDE, DEPTH, CANDIDATES)
 
@@ -220,6 +223,13 @@ class SolverService(Service):
         offset = self._offset
         if offset is not None and abs(offset.offset_s) > max(TOLERATED_OFFSET_S, 4 * offset.sigma_s):
             problems.append(f"clock of {core.node_b} is {offset.offset_s * 1e3:+.1f} ms from that of {core.node_a}")
+        heading = core.heading
+        if heading is not None and abs(heading.offset_rad) > TOLERATED_HEADING_RAD:
+            apart_deg = math.degrees(abs(heading.offset_rad))
+            nodes = f"{core.node_a} and {core.node_b}"
+            problems.append(
+                f"compasses of {nodes} disagree by {apart_deg:.0f} deg: is one near steel, or not calibrated?"
+            )
         latencies_s = sorted(self._latencies_s)
         self._latencies_s.clear()
         received_a, received_b = core.received

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from protocol.messages import Attitude, Candidates, RelativePose
+from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
 from solver_service.geometry.evidence import heading_offset
 from solver_service.geometry.rotation import matrix_of, quaternion_of
 from solver_service.geometry.trigger import Settings
 from solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
+from solver_service.service import SolverService
 from tests.solver_service.scenes import IDEAL, random_scene, rotation
 
 STEP_NS = 100_000_000
@@ -86,6 +88,19 @@ def test_with_a_compass_far_off_three_lights_still_give_poses(dive):
     true, off = three_lights(lacking, world), three_lights([turned(message) for message in lacking], world)
     assert true > 5
     assert off > 0.7 * true
+
+
+def test_the_solver_says_that_compasses_disagree(dive):
+    messages, _ = dive
+    service = SolverService(SolverConfig(), "defaults")
+    problems = []
+    for said in (messages, [turned(message) for message in messages]):
+        core = SolverCore("a", "b", Settings())
+        for message in said:
+            core.handle(message)
+        problems.append(service.status(core).problem)
+    assert "compasses" not in problems[0]
+    assert "compasses of a and b disagree by 8" in problems[1]
 
 
 def turned(message):
