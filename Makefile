@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint pytest install clean
+.PHONY: demo test coverage install clean
 
 demo: .venv/.run
 	$(BIN)/buddyline demo $(ARGS)
@@ -12,6 +12,10 @@ test: .venv/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/pytest
+
+# Traced, everything takes half as long again: too slow for the viewer of the soak on a slow machine.
+coverage: .venv/.test
 	$(BIN)/pytest --cov --cov-report=term:skip-covered
 
 install: .venv/.run
