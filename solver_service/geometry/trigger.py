@@ -65,9 +65,9 @@ _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
 _ALONE: Final = np.ones(1, dtype=bool)
 # Three lights have no gap to check them: they must be likelier than four, and likelier still where the last poses
-# speak for them, which know nothing of how a diver turns aside.
+# speak for them, which know nothing of how a diver turns aside, or against them, as for another diver's lamps.
 _THREE_PROBABILITY: Final = 0.98
-_LED_PROBABILITY: Final = 0.999
+_FOLLOWED_PROBABILITY: Final = 0.999
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
 _GROSS_CHI2: Final = 11.3
 # A position that is known to this share of the range (1 sd) is no wrong one.
@@ -156,7 +156,7 @@ def _decide(terms: Terms, readings: Readings, others: float) -> Fix | NoFix:
     probability = agreeing / (CHANCE_ODDS + agreeing + others + intruder)
     required = settings.min_probability
     if short:
-        required = max(required, _LED_PROBABILITY if readings.log_prior[k] > 0.0 else _THREE_PROBABILITY)
+        required = max(required, _FOLLOWED_PROBABILITY if readings.log_prior[k] != 0.0 else _THREE_PROBABILITY)
     if probability >= required:
         covariance = widened * _spread(readings, k, same)
         return _fix(terms, readings, k, covariance, probability)

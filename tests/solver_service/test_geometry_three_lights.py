@@ -59,18 +59,21 @@ def test_three_lights_and_perfect_sensors_give_the_pose(missing, rigs):
     assert solved >= 4
 
 
-def test_what_the_last_poses_speak_for_must_be_likelier_than_what_sensors_tell():
+def test_beside_last_poses_three_lights_must_be_likelier_than_what_sensors_tell_alone():
     rng = np.random.default_rng(7)
-    led, alone = [], []
+    led, against, alone = [], [], []
     for _ in range(60):
         scene = random_scene(rng, (1.5, 6.0))
         views = without(scene, int(rng.integers(4)), rng, 0.1)
-        for prior, found in ((followed(scene, rng, (0.4, 0.2)), led), (None, alone)):
-            fix = solve(scene, views, scene.sensed(), prior=prior)
+        prior = followed(scene, rng, (0.4, 0.2))
+        elsewhere = replace(prior, t_a_b_m=1.3 * scene.t)
+        for given, found in ((prior, led), (elsewhere, against), (None, alone)):
+            fix = solve(scene, views, scene.sensed(), prior=given)
             if isinstance(fix, Fix):
                 found.append(fix.probability)
-    assert min(len(led), len(alone)) >= 10
+    assert min(len(led), len(against), len(alone)) >= 10
     assert min(led) >= 0.999
+    assert min(against) >= 0.999
     assert 0.98 <= min(alone) < 0.999
 
 
