@@ -33,8 +33,8 @@ _DEPTH_BROKEN: Final = 0.02
 _MOUNT_SIGMA_RAD: Final = math.radians(1.0)
 _HEADING_SIGMA_RAD: Final = math.radians(3.0)
 _DEFAULT_SIGMA_RAD: Final = (math.radians(2.0), math.radians(2.0), math.radians(10.0))
-# No turn at all, and a quarter about down, in NED.
-_ABOUT_DOWN: Final = np.array((np.eye(3), skew(np.array([0.0, 0.0, 1.0]))))
+# Down alone, no turn at all, and a quarter about down, in NED.
+_ABOUT_DOWN: Final = np.array((np.diag([0.0, 0.0, 1.0]), np.eye(3), skew(np.array([0.0, 0.0, 1.0]))))
 _UPRIGHT_DOWN: Final = np.array([0.0, 1.0, 0.0])
 _DEPTH_SIGMA_M: Final = 0.02
 # A diver who is not known to lie otherwise is upright to about this (1 sd).
@@ -157,14 +157,15 @@ def combine(
         tilts.append(0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2)
         heading += yaw2 + roll2 * steep2 + _HEADING_SIGMA_RAD**2
     both = len(R_ned_camera) == 2
-    turns = np.zeros((3, 3, 3))
-    np.multiply(down[0][:, None], down[1], out=turns[0])
     if both:
         about_down = _ABOUT_DOWN
         if learned is not None:
             about_down = _ABOUT_DOWN @ rotation_exp(np.array([0.0, 0.0, learned.offset_rad]))
             heading = learned.variance
-        np.matmul(R_ned_camera[0].T, about_down @ R_ned_camera[1], out=turns[1:])
+        turns = R_ned_camera[0].T @ (about_down @ R_ned_camera[1])
+    else:
+        turns = np.zeros((3, 3, 3))
+        turns[0] = down[0][:, None] * down[1]
     return Sensors(
         down_a=down[0],
         down_b=down[1],

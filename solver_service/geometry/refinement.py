@@ -98,11 +98,10 @@ def refine(
         steps += 1
         if not is_larger(move, t, _SMALL):
             break
-    sound = np.maximum.reduce(inverse.diagonal(0, 1, 2), 1) < _UNDETERMINED
-    sound &= np.minimum.reduce(depth, 1) > 0.0
-    # A step that is not finite makes this one not finite either.
-    sound &= np.isfinite(chi2)
-    return Refined(t, R, covariance, np.maximum(chi2, 0.0), sound)
+    each = zip(inverse.diagonal(0, 1, 2).tolist(), depth.tolist(), chi2.tolist(), strict=True)
+    # A step that is not finite makes chi^2 not finite either.
+    sound = [max(openness) < _UNDETERMINED and min(far) > 0.0 and math.isfinite(off) for openness, far, off in each]
+    return Refined(t, R, covariance, np.maximum(chi2, 0.0), np.array(sound))
 
 
 def solve_normal(normal: Floats) -> tuple[Floats, NDArray[np.floating[Any]], Floats, Floats]:

@@ -16,7 +16,6 @@ for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _CROSS[_i, _k, _j] = 1.0
     _CROSS[_i, _j, _k] = -1.0
 _CROSS_FLAT: Final[Floats] = _CROSS.reshape(3, 9)
-_HALF_CROSS_FLAT: Final[Floats] = 0.5 * _CROSS_FLAT
 _EYE: Final[Floats] = np.eye(3)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
@@ -31,15 +30,15 @@ def matrix_of(q_xyzw: Floats) -> Floats:
     """Turn one quaternion (4,), of any length but zero, into its matrix (3, 3)."""
     x, y, z, w = np.asarray(q_xyzw, dtype=np.float64).tolist()
     s = 2.0 / (x * x + y * y + z * z + w * w)
-    return _rodrigues(x, y, z, s * w, s)
+    return np.array(_rodrigues(x, y, z, s * w, s))
 
 
-def _rodrigues(x: float, y: float, z: float, first: float, second: float) -> Floats:
-    """Give 1 + first K + second K^2, K the matrix of the cross product (x, y, z) x."""
+def _rodrigues(x: float, y: float, z: float, first: float, second: float) -> tuple[tuple[float, float, float], ...]:
+    """Give the rows of 1 + first K + second K^2, K the matrix of the cross product (x, y, z) x."""
     a, b, c = first * x, first * y, first * z
     xy, xz, yz = second * x * y, second * x * z, second * y * z
     xx, yy, zz = second * x * x, second * y * y, second * z * z
-    return np.array(((1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)))
+    return (1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)
 
 
 def quaternion_of(R: Floats) -> Floats:
@@ -69,7 +68,7 @@ def rotation_exp(w_rad: Floats) -> Floats:
         x, y, z = w_rad.tolist()
         angle = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
         sinc = math.sin(angle) / angle
-        return _rodrigues(x, y, z, sinc * math.cos(angle), 0.5 * sinc * sinc)
+        return np.array(_rodrigues(x, y, z, sinc * math.cos(angle), 0.5 * sinc * sinc))
     half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)
     sine = np.sin(half) / half
     first, second = sine * np.cos(half), 0.5 * sine * sine
@@ -80,10 +79,11 @@ def rotation_exp(w_rad: Floats) -> Floats:
 
 def rotation_near(w_rad: Floats) -> Floats:
     """Turn small rotation vectors (..., 3) into matrices (..., 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
-    K = (w_rad @ _HALF_CROSS_FLAT).reshape(*w_rad.shape, 3)
-    scale = 8.0 / (4.0 + np.add.reduce(w_rad * w_rad, -1))
-    R: Floats = _EYE + scale[..., None, None] * (K + K @ K)
-    return R
+    rows = []
+    for x, y, z in w_rad.reshape(-1, 3).tolist():
+        scale = 2.0 / (4.0 + x * x + y * y + z * z)
+        rows.append(_rodrigues(x, y, z, 2.0 * scale, scale))
+    return np.array(rows).reshape(*w_rad.shape, 3)
 
 
 def rotation_log(R: Floats) -> Floats:
