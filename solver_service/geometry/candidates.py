@@ -27,9 +27,9 @@ class Candidates:
 
     frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, in its own rig's level frame. table: (7, N)
     bearing, position over the picture's width and height, variance of the bearing, rad^2 per axis, and square of the
-    radius that a disc of its area would have, rad^2. index: (N,)
-    into the view. sigma_px: (N,). dt_s: (N,) after the instant that the pose is for. log_score: (N,) weak evidence
-    for a light, None where no candidate has a score. log_area: (N,).
+    radius that a disc of its area would have, rad^2. index: (N,) into the view. sigma_px: (N,). dt_s: (N,) after the
+    instant that the pose is for. log_score: (N,) weak evidence for a light, None where no candidate has a score.
+    log_area: (N,).
     """
 
     counts: tuple[int, int]
