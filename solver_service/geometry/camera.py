@@ -38,11 +38,14 @@ class Camera:
         For a direction q near the bearing b, tangent @ q / (b @ q) is how far q's image stands off the
         pixel, in px, to first order. Both are NaN where the model does not reach the pixel.
         """
-        frames = self.frames(pixels)
+        frames, _ = self.frames(pixels)
         return frames[:, 0], frames[:, 1:]
 
-    def frames(self, pixels: Floats) -> Floats:
-        """Give (N, 3, 3) of distorted pixels (N, 2): each one's bearing, then its two tangents, as `rays` has them."""
+    def frames(self, pixels: Floats) -> tuple[Floats, Floats]:
+        """Give each distorted pixel's (N, 2) bearing and two tangents, as `rays` has them, (N, 3, 3), and px^2 per sr.
+
+        The second (N,) is the area in the picture over the solid angle there, NaN where the model does not reach.
+        """
         distorted = (pixels - self._centre_px) / self._focal_px
         if self.model == "fisheye":
             return self._fisheye_frames(distorted[:, 0], distorted[:, 1])
@@ -90,13 +93,11 @@ class Camera:
         v = (np.arange(rows) + 0.5) * self.height_px / rows - 0.5
         grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         with np.errstate(all="ignore"):
-            _, tangents = self.rays(grid)
-            gram = tangents @ tangents.transpose(0, 2, 1)
-            px2_per_sr = np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2)
+            _, px2_per_sr = self.frames(grid)
             angle = float(np.nansum(self.width_px * self.height_px / (columns * rows) / px2_per_sr))
         return angle if 0.0 < angle < 13.0 else 1.0
 
-    def _pinhole_frames(self, distorted: Floats) -> Floats:
+    def _pinhole_frames(self, distorted: Floats) -> tuple[Floats, Floats]:
         frames = np.empty((len(distorted), 3, 3))
         frames[:] = _AHEAD
         bearings, tangents = frames[:, 0], frames[:, 1:]
@@ -125,15 +126,20 @@ class Camera:
             tangents[:, 0, 0], tangents[:, 0, 1] = a00, a01
             tangents[:, 1, 0], tangents[:, 1, 1] = a01, a11
             tangents[:, 0, 2], tangents[:, 1, 2] = -(a00 * x + a01 * y), -(a01 * x + a11 * y)
+            area = det * (self.fx_px * self.fy_px)
         else:
             bearings[:, :2] = distorted
             np.negative(distorted, out=tangents[:, :, 2])
-        norm = np.sqrt(np.add.reduce(bearings * bearings, 1))[:, None]
+            area = self.fx_px * self.fy_px
+        norm2 = np.add.reduce(bearings * bearings, 1)
+        norm = np.sqrt(norm2)
+        area = norm2 * norm * area
+        norm = norm[:, None]
         bearings /= norm
         tangents *= (norm * self._focal_px)[:, :, None]
-        return frames
+        return frames, area
 
-    def _fisheye_frames(self, xd: Floats, yd: Floats) -> Floats:
+    def _fisheye_frames(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
         k1, k2, k3, k4 = self._coefficients or (0.0, 0.0, 0.0, 0.0)
         rd = np.sqrt(xd * xd + yd * yd)
         theta, slope, step = rd, np.ones_like(rd), np.zeros_like(rd)
@@ -157,7 +163,7 @@ class Camera:
         around = np.stack((-sin_phi, cos_phi, np.zeros_like(rd)), axis=-1)
         frames = np.empty((len(rd), 3, 3))
         frames[:, 0] = np.stack((sin_theta * cos_phi, sin_theta * sin_phi, cos_theta), axis=-1)
-        along, across = slope[:, None] * outward, across[:, None] * around
-        frames[:, 1] = self.fx_px * (cos_phi[:, None] * along - sin_phi[:, None] * across)
-        frames[:, 2] = self.fy_px * (sin_phi[:, None] * along + cos_phi[:, None] * across)
-        return frames
+        along, sideways = slope[:, None] * outward, across[:, None] * around
+        frames[:, 1] = self.fx_px * (cos_phi[:, None] * along - sin_phi[:, None] * sideways)
+        frames[:, 2] = self.fy_px * (sin_phi[:, None] * along + cos_phi[:, None] * sideways)
+        return frames, (self.fx_px * self.fy_px) * slope * across

@@ -65,9 +65,10 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     pixels = np.concatenate((pixels_a, pixels_b))
     index, turns, size_px = _places(rigs, in_a, in_b)
     if rigs.one_camera:
-        in_camera = rig_a.camera.frames(pixels)
+        in_camera, px2_per_sr = rig_a.camera.frames(pixels)
     else:
-        in_camera = np.concatenate((rig_a.camera.frames(pixels_a), rig_b.camera.frames(pixels_b)))
+        of_each = zip(rig_a.camera.frames(pixels_a), rig_b.camera.frames(pixels_b), strict=True)
+        in_camera, px2_per_sr = map(np.concatenate, of_each)
     frames = in_camera @ turns
     table = np.empty((11, in_a + in_b))
     offset_s = 0.5e-9 * (view_a.stamp_ns - view_b.stamp_ns)
@@ -76,14 +77,12 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
         np.add(view.dt_s[:n], shift_s, out=columns[0])
         columns[1], columns[2], columns[3] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
     sigma_px = np.maximum(table[8], _MIN_SIGMA_PX)
-    tangents = frames[:, 1:]
-    tangents /= sigma_px[:, None, None]
-    gram = tangents @ tangents.swapaxes(1, 2)
+    frames[:, 1:] /= sigma_px[:, None, None]
     table[:3] = frames[:, 0].T
     np.divide(pixels.T, size_px, out=table[3:5])
-    table[5] = 1.0 / np.sqrt(gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2)
+    np.divide(sigma_px * sigma_px, px2_per_sr, out=table[5])
     np.fmax(table[10], 1.0, out=table[10])
-    table[6] = table[5] * table[10] / (math.pi * sigma_px * sigma_px)
+    np.divide(table[10], math.pi * px2_per_sr, out=table[6])
     if not math.isfinite(np.add.reduce(table[:9], None)):
         usable = np.isfinite(table[:9].sum(0))
         in_a = int(usable[:in_a].sum())

@@ -261,15 +261,11 @@ def search(
         both = np.concatenate((np.arange(len(ia)), undecided))
         ia, ib, swap = ia[both], ib[both], swap[both]
         flip = np.concatenate((flip, ~flip[undecided]))
-    # Of A's pair, then of B's: whether its second is the left light.
-    turned = np.array((flip, swap != flip), dtype=np.intp)
     both = np.array((ia, ib))
-    first, second = pairs.ends.take(both, 1)
-    exchange = turned * (second - first)
-    lights = np.empty((4, len(ia)), dtype=np.intp)
-    np.add(first, exchange, out=lights[::2])
-    np.subtract(second, exchange, out=lights[1::2])
-    w = pairs.w.take(both, 1) * (1 - 2 * turned)
+    # A's pair, then B's, behind all others where its second is the left light.
+    as_read = both + np.array((flip, swap != flip)) * len(pairs.key)
+    lights = np.concatenate((pairs.ends, pairs.ends[::-1]), 1).take(as_read, 1).swapaxes(0, 1).reshape(4, -1)
+    w = np.concatenate((pairs.w, -pairs.w), 1).take(as_read, 1)
     ends = candidates.bearings.take(lights, 1).reshape(3, 2, 2, -1).transpose(2, 1, 0, 3)
     log_weight = pairs.log_weight[ia] + pairs.log_weight[ib]
     log_weight += _alike(candidates.log_area[lights])

@@ -14,12 +14,17 @@ from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats, rotation_near, skew
 
 _MAX_STEPS: Final = 12
-# A step this small, relative to the range and in rad, leaves less than its square.
+# A step this small, relative to the range and in rad, leaves less than its square; ten times this leaves a hundredth of
+# the noise, where chi^2 shows that there is any.
 _SMALL: Final = 5e-4
+_SMALL_IN_NOISE: Final = 5e-3
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
 DAMPING: Final = 1e-13 * np.eye(6)
 _EYE: Final = np.eye(8)
+# y @ _TURNED, reshaped to (3, 7), is what a turn w of y moves it by, w x y, before w, and y itself in the last column.
+_UNTURNED: Final = np.eye(3)
+_TURNED: Final = np.concatenate((np.zeros((3, 3, 3)), -skew(_UNTURNED), _UNTURNED[:, :, None]), 2).reshape(3, 21)
 # Which sightings a later clock of B moves, and where to.
 _SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
 
@@ -96,7 +101,7 @@ def refine(
             break
         t, R = moved(t, R, move)
         steps += 1
-        if not is_larger(move, t, _SMALL):
+        if not is_large(move, t, chi2):
             break
     each = zip(inverse.diagonal(0, 1, 2).tolist(), depth.tolist(), chi2.tolist(), strict=True)
     # A step that is not finite makes chi^2 not finite either.
@@ -126,9 +131,10 @@ def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
     return t - move[:, :3], rotation_near(-move[:, 3:]) @ R
 
 
-def is_larger(move: Floats, t: Floats, limit: float) -> bool:
-    """Whether any of the steps (K, 6) that led to t (K, 3) is larger than this, relative to the range and in rad."""
-    for step, place_m in zip(move.tolist(), t.tolist(), strict=True):
+def is_large(move: Floats, t: Floats, chi2: Floats) -> bool:
+    """Whether any of the steps (K, 6) that led to t (K, 3) and chi2 (K,) leaves more than what does not matter."""
+    for step, place_m, off in zip(move.tolist(), t.tolist(), chi2.tolist(), strict=True):
+        limit = min(max(_SMALL, _SMALL_IN_NOISE * math.sqrt(max(off, 0.0))), _SMALL_IN_NOISE)
         if max(map(abs, step[3:])) > limit or max(map(abs, step[:3])) > limit * math.hypot(*place_m):
             return True
     return False
@@ -159,24 +165,25 @@ def linearize(
         shift, turn = shifts
         y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
         y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
-    # All in A's axes. What B sees is taken backwards, from the light to B: then t moves all four alike.
-    q = np.empty((K, 4, 3))
-    np.add(y[:, :2], t[:, None], out=q[:, :2])
-    np.negative(y[:, 2:], out=q[:, 2:])
+    # From the camera to the light, q, behind its derivatives. All in A's axes; what B sees is taken backwards, from the
+    # light to B: then t moves all four alike, and so does a turn w, by w x y.
+    arms = (y @ _TURNED).reshape(K, 4, 3, 7)
+    arms[..., :3] = _UNTURNED
+    q = arms[..., 6]
+    q[:, :2] += t[:, None]
+    np.negative(q[:, 2:], out=q[:, 2:])
     if shifts is not None:
         q[:, :2] += shift[:, :2]
     frames = seen.frames.copy()
     np.matmul(seen.frames[:, 2:], -Rt[:, None], out=frames[:, 2:])
-    along = frames @ q[..., None]
-    depth = along[:, :, :1]
-    J = np.empty((K, 4, 2, 7))
-    D, r = J[..., :3], J[..., 6:]
-    np.divide(along[:, :, 1:], depth, out=r)
-    np.multiply(r, frames[:, :, :1], out=D)
-    np.subtract(frames[:, :, 1:], D, out=D)
-    D /= depth
-    # A turn w moves y by w x y = -[y]x w = [y]x^T w; for A's lights both signs are already turned.
-    np.matmul(D, skew(y).swapaxes(2, 3), out=J[..., 3:6])
+    # How q and its derivatives extend along the bearing and along both tangents.
+    extent = frames @ arms
+    along, across = extent[:, :, :1], extent[:, :, 1:]
+    depth = along[..., 6:]
+    r = across[..., 6:] / depth
+    J = across - r * along
+    J /= depth
+    J[..., 6:] = r
     return J.reshape(K, 8, 7), depth[:, :, 0, 0]
 
 

@@ -30,7 +30,7 @@ from solver_service.geometry.hypotheses import Pairs
 from solver_service.geometry.readings import Readings
 from solver_service.geometry.refinement import (
     Sightings,
-    is_larger,
+    is_large,
     linearize,
     moved,
     shifts_of,
@@ -53,8 +53,6 @@ _UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 _KEPT: Final = 64
 _REFINED: Final = 6
 _STEPS: Final = 4
-# A step this small, relative to the range and in rad, leaves less than its square.
-_SMALL: Final = 1e-3
 # How far a bar may rise more than its attitude says, and the middle stand off the bisector: shares of alpha.
 _BAR_RISE: Final = 0.15
 _SPLIT_SHARE: Final = 0.1
@@ -222,7 +220,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         normal = J.swapaxes(1, 2) @ weight @ J + J_s.swapaxes(1, 2) @ J_s
         covariance, _, move, chi2 = solve_normal(normal)
         t, R = moved(t, R, move)
-        if not is_larger(move, t, _SMALL):
+        if not is_large(move, t, chi2):
             break
     range2 = np.add.reduce(t * t, 1)
     settings = terms.settings

@@ -50,6 +50,12 @@ def test_tangents_are_the_derivative_of_the_projection(camera):
         np.testing.assert_allclose(predicted, project(camera, q) - pixels, atol=2e-5)
 
 
+def test_the_area_per_solid_angle_is_that_which_the_tangents_span(camera):
+    frames, px2_per_sr = camera.frames(grid(camera))
+    # Bearing and tangents are the edges of a block as high as one.
+    np.testing.assert_allclose(px2_per_sr, np.linalg.det(frames), rtol=1e-12)
+
+
 def test_a_fisheye_sees_behind_itself():
     camera = CAMERAS["fisheye_plain"]
     bearing = camera.bearings(np.array([[camera.cx_px + camera.fx_px * 2.0, camera.cy_px]]))[0]

@@ -25,7 +25,7 @@ def sightings(scenes, rng=None, sigma_px=1.0, dt_s=None):
         pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     a, b = scenes[0].rig_a.camera, scenes[0].rig_b.camera
     of_each = a.frames(pixels[:, :2].reshape(-1, 2)), b.frames(pixels[:, 2:].reshape(-1, 2))
-    frames = np.concatenate([of_one.reshape(-1, 2, 3, 3) for of_one in of_each], axis=1)
+    frames = np.concatenate([of_one.reshape(-1, 2, 3, 3) for of_one, _ in of_each], axis=1)
     frames[:, :, 1:] /= sigma_px
     return Sightings(frames, np.zeros((len(scenes), 4)) if dt_s is None else dt_s)
 
