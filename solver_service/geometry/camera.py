@@ -126,18 +126,16 @@ class Camera:
             tangents[:, 0, 0], tangents[:, 0, 1] = a00, a01
             tangents[:, 1, 0], tangents[:, 1, 1] = a01, a11
             tangents[:, 0, 2], tangents[:, 1, 2] = -(a00 * x + a01 * y), -(a01 * x + a11 * y)
-            area = det * (self.fx_px * self.fy_px)
+            area: Floats | float = det * (self.fx_px * self.fy_px)
         else:
             bearings[:, :2] = distorted
             np.negative(distorted, out=tangents[:, :, 2])
             area = self.fx_px * self.fy_px
         norm2 = np.add.reduce(bearings * bearings, 1)
         norm = np.sqrt(norm2)
-        area = norm2 * norm * area
-        norm = norm[:, None]
-        bearings /= norm
-        tangents *= (norm * self._focal_px)[:, :, None]
-        return frames, area
+        bearings /= norm[:, None]
+        tangents *= (norm[:, None] * self._focal_px)[:, :, None]
+        return frames, norm2 * norm * area
 
     def _fisheye_frames(self, xd: Floats, yd: Floats) -> tuple[Floats, Floats]:
         k1, k2, k3, k4 = self._coefficients or (0.0, 0.0, 0.0, 0.0)

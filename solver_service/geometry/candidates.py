@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from solver_service.geometry.observation import View
 from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
+from solver_service.geometry.scalars import ONE, PI, scalar
 
 # A message holds no more.
 _MAX_CANDIDATES: Final = 64
-_MIN_SIGMA_PX: Final = 0.05
+_MIN_SIGMA_PX: Final = scalar(0.05)
 # Scores beyond say no more; half the log odds are then at most 1.5.
 _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 
@@ -81,8 +82,8 @@ def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
     table[:3] = frames[:, 0].T
     np.divide(pixels.T, size_px, out=table[3:5])
     np.divide(sigma_px * sigma_px, px2_per_sr, out=table[5])
-    np.fmax(table[10], 1.0, out=table[10])
-    np.divide(table[10], math.pi * px2_per_sr, out=table[6])
+    np.fmax(table[10], ONE, out=table[10])
+    np.divide(table[10], PI * px2_per_sr, out=table[6])
     if not math.isfinite(np.add.reduce(table[:9], None)):
         usable = np.isfinite(table[:9].sum(0))
         in_a = int(usable[:in_a].sum())

@@ -17,12 +17,12 @@ import numpy as np
 
 from solver_service.geometry.rig import Rig, RigPair, pair_of
 from solver_service.geometry.rotation import Floats
+from solver_service.geometry.scalars import FOUR, HALF, ONE, QUARTER, TURN, TWO
 
 Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"]
 
 # A round of the split shrinks its error by about alpha^2 / 4, a round of the offset by its ratio to the range.
 _ROUNDS: Final = 9
-_TURN: Final = 2.0 * np.pi
 # Left and right of a middle.
 _ENDS: Final[Floats] = np.array((-1.0, 1.0)).reshape(2, 1, 1, 1)
 
@@ -60,7 +60,7 @@ class Spans:
         total, difference = left + right, right - left
         chord2 = dot(difference, difference)
         chord = np.sqrt(chord2)
-        return Spans(ends, total / np.sqrt(4.0 - chord2)[:, None], difference / chord[:, None], chord)
+        return Spans(ends, total / np.sqrt(FOUR - chord2)[:, None], difference / chord[:, None], chord)
 
 
 @dataclass(eq=False, slots=True)
@@ -82,7 +82,7 @@ class ClosedForm:
 
 def wrap(angle_rad: Floats) -> Floats:
     """Bring angles into [-pi, pi]."""
-    wrapped: Floats = angle_rad - _TURN * np.rint(angle_rad / _TURN)
+    wrapped: Floats = angle_rad - TURN * np.rint(angle_rad / TURN)
     return wrapped
 
 
@@ -94,12 +94,12 @@ def dot(a: Floats, b: Floats) -> Floats:
 
 def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m: Floats) -> Floats:
     """Eq. 1: the distance of the bar's middle from the camera that sees the bar of length_m under alpha."""
-    return _eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.sqrt(1.0 - sin_beta * sin_beta), length_m)
+    return _eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.sqrt(ONE - sin_beta * sin_beta), length_m)
 
 
 def _eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, cos_beta: Floats, length_m: Floats) -> Floats:
     shortened = cos_alpha * sin_beta
-    range_m: Floats = length_m / (2.0 * sin_alpha) * (cos_alpha * cos_beta + np.sqrt(1.0 - shortened * shortened))
+    range_m: Floats = length_m / (TWO * sin_alpha) * (cos_alpha * cos_beta + np.sqrt(ONE - shortened * shortened))
     return range_m
 
 
@@ -153,7 +153,7 @@ def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset
 def _angles(chord: Floats) -> tuple[Floats, Floats]:
     """Give cos and sin of alpha."""
     chord2 = chord * chord
-    return 1.0 - 0.5 * chord2, chord * np.sqrt(1.0 - 0.25 * chord2)
+    return ONE - HALF * chord2, chord * np.sqrt(ONE - QUARTER * chord2)
 
 
 def _split(spans: Spans, cos_alpha: Floats, rounds: int) -> tuple[Floats, Floats]:
@@ -169,7 +169,7 @@ def _split(spans: Spans, cos_alpha: Floats, rounds: int) -> tuple[Floats, Floats
 def _off_bisector(sin_beta: Floats, cos_alpha: Floats) -> tuple[Floats, Floats]:
     """Give cos and sin of how far the bars' middles stand off the bisectors; sin_beta: as either node sees them."""
     other = sin_beta[::-1]
-    half = 0.5 * (np.arcsin(other) - np.arcsin(other * cos_alpha))
+    half = HALF * (np.arcsin(other) - np.arcsin(other * cos_alpha))
     return np.cos(half), np.sin(half)
 
 
@@ -178,7 +178,7 @@ def _pose(
 ) -> ClosedForm:
     """Put a pose together from lines of sight u and the bars across them; slant: what Eq. 1 takes for sin beta."""
     ux, uy, uz = u.swapaxes(0, 1)
-    cos_beta = np.sqrt(1.0 - ux * ux)
+    cos_beta = np.sqrt(ONE - ux * ux)
     cos_alpha, sin_alpha = angles[0][::-1], angles[1][::-1]
     if slant is None:
         range_m = _eq1_range_m(cos_alpha, sin_alpha, ux, cos_beta, bars.length_m)
@@ -187,7 +187,7 @@ def _pose(
     twist = np.arctan2(uz * span[:, 1] - uy * span[:, 2], span[:, 0])
     twist_gap = wrap(twist[0] - twist[1])
     # The paper uses one of the two twists only.
-    mean = twist[0] - 0.5 * twist_gap if mean_twist else twist[0]
+    mean = twist[0] - HALF * twist_gap if mean_twist else twist[0]
     # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
     side = np.zeros(u.shape)
     np.divide(uz, cos_beta, out=side[:, 1])
@@ -199,7 +199,7 @@ def _pose(
     z = side[0] * cosine - own[0] * sine
     # B's frame about the same line of sight: -u_B, its bar across it, and their cross product.
     R = y[:, None] * own[1] - u[0][:, None] * u[1] - z[:, None] * side[1]
-    t = u[0] * (0.5 * (range_m[0] + range_m[1]))
+    t = u[0] * (HALF * (range_m[0] + range_m[1]))
     if not bars.centred:
         t = t + bars.middle_m[0] - bars.middle_m[1, :, 0] @ R
     return ClosedForm(u, range_m, twist, twist_gap, R, t)
@@ -209,12 +209,12 @@ def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, F
     """Move the bearings (2, 2, 3, K) from the cameras to the middles of their own bars, by the distances so far."""
     cos_alpha, sin_alpha = angles
     sin_beta = u[:, 0]
-    cos_beta = np.sqrt(1.0 - sin_beta * sin_beta)
+    cos_beta = np.sqrt(ONE - sin_beta * sin_beta)
     of_a_m, of_b_m = _eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, cos_beta, bars.length_m)
-    range_m = 0.5 * (of_a_m + of_b_m)
+    range_m = HALF * (of_a_m + of_b_m)
     sin_beta, cos_beta = sin_beta[::-1, None], cos_beta[::-1, None]
     middle = bars.middle_m + range_m * u
-    arm = 0.5 * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
+    arm = HALF * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
     light = middle + _ENDS * arm
     ray = ends * np.sqrt(dot(light, light))[:, :, None] - bars.middle_m
     moved: Floats = ray / np.sqrt(dot(ray, ray))[:, :, None]

@@ -21,6 +21,7 @@ from solver_service.geometry.closed_form import dot
 from solver_service.geometry.observation import Heading, Settings
 from solver_service.geometry.rig import Rig, RigPair
 from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
+from solver_service.geometry.scalars import EIGHTH, HALF, ONE, QUARTER, TURN, TWO, scalar
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
@@ -52,6 +53,19 @@ DEPTH_SPREAD_M: Final = 6.0
 # A prediction from earlier poses is wrong this often, and where it is right it is believed this much at most (log).
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
+# Densities over what chance gives: of a sensor that works, where it is right, and of one that is broken.
+_TILT_PEAK: Final = scalar(PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi))
+_TILT_FLOOR: Final = scalar(PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi))
+_HEADING_PEAK: Final = scalar(HEADING_SPREAD * (1.0 - _HEADING_BROKEN))
+_HEADING_FLOOR: Final = scalar(HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi))
+_DEPTH_PEAK: Final = scalar(DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN))
+_DEPTH_FLOOR: Final = scalar(_DEPTH_BROKEN)
+# Of no, one and both gaps: log densities without and with a gross error, where they are right.
+_LOG_USUAL: Final = scalar(math.log(1.0 - GROSS_PROBABILITY))
+_LOG_GROSS: Final = tuple(scalar(math.log(GROSS_PROBABILITY * GROSS_SCALE**-gaps)) for gaps in range(3))
+_GROSS_SLOPE: Final = scalar(0.5 / GROSS_SCALE**2)
+_MINUS_HALF: Final = scalar(-0.5)
+_MINUS_TWO: Final = scalar(-2.0)
 # The matrices whose products with a rotation, summed, are the vector part sin(angle) axis, and the trace.
 _TURNS: Final = np.concatenate((0.5 * skew(np.eye(3)), np.eye(3)[None]))
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
@@ -203,9 +217,7 @@ def heading_offset(
 
 def log_gaps(chi2: Floats, gaps: int) -> Floats:
     """Give the log density of the gaps over their sds and (2 pi)^(1/2): Gaussian, with a share of gross errors."""
-    usual = math.log(1.0 - GROSS_PROBABILITY) - 0.5 * chi2
-    gross = math.log(GROSS_PROBABILITY * GROSS_SCALE**-gaps) - (0.5 / GROSS_SCALE**2) * chi2
-    density: Floats = np.logaddexp(usual, gross)
+    density: Floats = np.logaddexp(_LOG_USUAL - HALF * chi2, _LOG_GROSS[gaps] - _GROSS_SLOPE * chi2)
     return density
 
 
@@ -245,12 +257,11 @@ def weigh(
     level, cosine, sine = sensors.turns @ R_a_b.reshape(9, -1)
     if "attitude" in checks:
         # The picture's own noise turns B about the line of sight by half the twist gap's.
-        spread2 = sensors.tilt_variance + 0.125 * variance
-        tilt_chi2 = (2.0 - 2.0 * level) / spread2
-        density = (PITCH_SPREAD * (1.0 - _TILT_BROKEN) / (2.0 * math.pi)) * np.exp(-0.5 * tilt_chi2) / spread2
-        log_ratio = np.log(density + PITCH_SPREAD * _TILT_BROKEN / (4.0 * math.pi))
+        spread2 = sensors.tilt_variance + EIGHTH * variance
+        tilt_chi2 = (TWO - TWO * level) / spread2
+        log_ratio = np.log(_TILT_PEAK * np.exp(_MINUS_HALF * tilt_chi2) / spread2 + _TILT_FLOOR)
         if sensors.both:
-            log_ratio += weigh_heading(sine, cosine, sensors.heading_variance + 0.25 * variance)
+            log_ratio += weigh_heading(sine, cosine, sensors.heading_variance + QUARTER * variance)
     else:
         # The reading is upright; of half a turn nothing is known.
         tilt_chi2 = np.zeros(len(variance))
@@ -264,10 +275,10 @@ def weigh(
         fall = sensors.down_a @ below if sensors.attitude_a else dot(sensors.down_b @ R_a_b, below)
         square = fall * fall
         spread2 = sensors.depth_variance + sensors.fall_variance * (dot(below, below) - square)
-        spread2 += 0.25 * variance * square
+        spread2 += QUARTER * variance * square
         depth_chi2 = (fall - sensors.depth_m) ** 2 / spread2
-        density = (DEPTH_SPREAD_M * (1.0 - _DEPTH_BROKEN)) * np.exp(-0.5 * depth_chi2)
-        log_ratio += np.log(density / np.sqrt(2.0 * math.pi * spread2) + _DEPTH_BROKEN)
+        density = _DEPTH_PEAK * np.exp(_MINUS_HALF * depth_chi2) / np.sqrt(TURN * spread2)
+        log_ratio += np.log(density + _DEPTH_FLOOR)
     log_prior = np.zeros(len(variance))
     if prediction is not None:
         log_prior = weigh_prediction(R_a_b, t_a_b_m, prediction)
@@ -279,11 +290,9 @@ def weigh_heading(sine: Floats, cosine: Floats, variance: Floats) -> Floats:
 
     sine, cosine: (K,) as `Sensors.turns` gives them; variance: (K,) of both headings' difference.
     """
-    turn = 2.0 * np.arctan2(sine, 1.0 + cosine)
-    density = (HEADING_SPREAD * (1.0 - _HEADING_BROKEN)) * np.exp(-0.5 * turn * turn / variance)
-    log_ratio: Floats = np.log(
-        density / np.sqrt(2.0 * math.pi * variance) + HEADING_SPREAD * _HEADING_BROKEN / (2.0 * math.pi)
-    )
+    half_turn = np.arctan2(sine, ONE + cosine)
+    density = _HEADING_PEAK * np.exp(_MINUS_TWO * half_turn * half_turn / variance) / np.sqrt(TURN * variance)
+    log_ratio: Floats = np.log(density + _HEADING_FLOOR)
     return log_ratio
 
 

@@ -19,6 +19,7 @@ from solver_service.geometry.readings import Readings
 from solver_service.geometry.refinement import Sightings, refine
 from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
+from solver_service.geometry.scalars import TURN
 from solver_service.geometry.terms import Terms
 
 # So many of the best are refined; what lies further below the best (log ratio) does not matter.
@@ -61,7 +62,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
     gaps = len(settings.checks & {"range", "twist"})
     base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
-    base -= (0.5 * gaps) * np.log((2.0 * math.pi) * variance)
+    base -= (0.5 * gaps) * np.log(TURN * variance)
     gap2 = np.zeros(len(variance))
     if "range" in settings.checks:
         gap2 = gap2 + np.log(solved.range_m[0] / solved.range_m[1]) ** 2

@@ -21,37 +21,41 @@ from solver_service.geometry.evidence import GROSS_SCALE
 from solver_service.geometry.observation import Settings
 from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
+from solver_service.geometry.scalars import EIGHTH, FOUR, HALF, ONE, PI, ZERO, scalar
 
 # The join's own error, in units of alpha^2: at the optical axis, and per tan^2 of the widest bearing. Found from
 # random poses over fields of view up to 90 degrees; the twist's is smaller.
 _KEY_TERM: Final = 0.03
 _KEY_SLOPE: Final = 0.15
-_TWIST_TERM: Final = 0.03
+_TWIST_TERM: Final = scalar(0.03)
 # The join takes the cameras to stand in the middle of their bars: what that leaves, per offset over range.
 _OFFSET_SLOPE: Final = 1.5
 # A bar seen at a grazing angle looks this much shorter at most.
 _FORESHORTENING: Final = 0.3
 # A pair whose angle is known worse than this (relative variance) says nothing.
-_MAX_RELATIVE_VARIANCE: Final = 0.06
+_MAX_RELATIVE_VARIANCE: Final = scalar(0.06)
 # The largest angle a bar is seen under, over length / range; and the square of the largest chord of all.
 _NEAREST: Final = 1.5
 _MAX_CHORD2: Final = 3.9
 # The least share of a picture over which a pair may be shifted and stay in view.
-_LEAST_IN_VIEW: Final = 0.02
+_LEAST_IN_VIEW: Final = scalar(0.02)
 # How the log ratio of two areas scatters (1 sd): of two lamps of a kind, and of any two candidates; and the most
 # that areas may speak against two lamps.
 _LIKE_LOG_AREA, _ANY_LOG_AREA = 0.8, 1.2
-_LIKE_GAIN: Final = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA)
-_LIKE_SLOPE: Final = 0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2
-_MAX_UNLIKE: Final = 1.0
+_LIKE_GAIN: Final = scalar(math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA))
+_LIKE_SLOPE: Final = scalar(0.5 / _LIKE_LOG_AREA**2 - 0.5 / _ANY_LOG_AREA**2)
+_LEAST_ALIKE: Final = scalar(-1.0)
 # Of so few combinations of pairs all are looked at: sorting costs more.
 _FEW: Final = 2000
 # Of so many combinations of pairs the gates are widened for gross errors; beyond, chance hides the right one.
 _MAX_WIDE: Final = 60_000
 # Gravity across the line of sight (product of both) below which both readings of left and right are weighed.
-_UNDECIDED: Final = 0.3
+_UNDECIDED: Final = scalar(0.3)
 # Twists reach no further than this, so that none is met twice.
-_NEARLY_HALF_PI: Final = 1.57
+_NEARLY_HALF_PI: Final = scalar(1.57)
+_HALF_PI: Final = scalar(0.5 * math.pi)
+_LEAST_COS2: Final = scalar(1e-6)
+_MINUS_TWO: Final = scalar(-2.0)
 
 
 @dataclass(eq=False, slots=True)
@@ -139,11 +143,11 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
     # One glow may give several candidates: within it, that two are near each other is no rarity.
     crowded2 = np.maximum(chord2, total[6])
     chord = np.sqrt(chord2)
-    norm = np.sqrt(4.0 - chord2)
+    norm = np.sqrt(FOUR - chord2)
     total /= norm
     sin_beta = total[0]
-    cos_beta2 = np.maximum(1.0 - sin_beta * sin_beta, 1e-6)
-    room = 1.0 - np.abs(w[3:5])
+    cos_beta2 = np.maximum(ONE - sin_beta * sin_beta, _LEAST_COS2)
+    room = ONE - np.abs(w[3:5])
     falls = np.array(down).T.take(node, 1)
     # Gravity along the bar and along its perpendicular, both as seen across the line of sight.
     along = falls[0] - sin_beta * dot(falls, total[:3])
@@ -153,8 +157,8 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
         ends=ends,
         c=total[:3],
         w=w[:3] / chord,
-        key=0.5 * np.log(chord2 * cos_beta2 * own_m2) + 0.125 * chord2,
-        twist_rad=np.arctan2(-2.0 * about / norm, w[0]),
+        key=HALF * np.log(chord2 * cos_beta2 * own_m2) + EIGHTH * chord2,
+        twist_rad=np.arctan2(_MINUS_TWO * about / norm, w[0]),
         variance=variance,
         chord=chord,
         log_weight=-np.log(crowded2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
@@ -167,7 +171,7 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
 def _alike(log_area: Floats) -> Floats:
     """Give the log likelihood ratio (K,) of the areas (4, K) for lamps of a kind, against any candidates."""
     square = (log_area[::2] - log_area[1::2]) ** 2
-    weight = np.maximum(_LIKE_GAIN - _LIKE_SLOPE * square, -_MAX_UNLIKE)
+    weight = np.maximum(_LIKE_GAIN - _LIKE_SLOPE * square, _LEAST_ALIKE)
     total: Floats = weight[0] + weight[1]
     return total
 
@@ -203,7 +207,7 @@ def join(
         reach = gate_sigma * np.sqrt(worst)
         if by_twist:
             # Both orders swapped leave the difference of the twists as it is, one swapped adds pi.
-            twist_rad = pairs.twist_rad % np.pi
+            twist_rad = pairs.twist_rad % PI
             reach = np.minimum(reach + slack_twist, _NEARLY_HALF_PI)
             ia, ib = _near(twist_rad[:split], reach, twist_rad[split:], period=np.pi)
         else:
@@ -213,10 +217,10 @@ def join(
             off = np.abs(pairs.key[ia] - pairs.key[ib])
             keep = off < gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_range[ia]
             ia, ib = ia[keep], ib[keep]
-    off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - np.pi)
-    swap = off_half_turn < 0.5 * np.pi
+    off_half_turn = np.abs(np.abs(pairs.twist_rad[ia] - pairs.twist_rad[ib]) - PI)
+    swap = off_half_turn < _HALF_PI
     if by_twist:
-        off = np.minimum(off_half_turn, np.pi - off_half_turn)
+        off = np.minimum(off_half_turn, PI - off_half_turn)
         gate = gate_sigma * np.sqrt(variance[ia] + pairs.variance[ib]) + slack_twist[ia]
         keep = off < np.minimum(gate, _NEARLY_HALF_PI)
         ia, ib, swap = ia[keep], ib[keep], swap[keep]
@@ -255,7 +259,7 @@ def search(
     # across the line of sight the two count the other way round.
     apart = pairs.twist_rad[ia] - pairs.fall_rad[ia] - pairs.fall_rad[ib]
     upright = pairs.level[ia] * pairs.level[ib] * np.cos(apart)
-    flip = upright < 0.0
+    flip = upright < ZERO
     undecided = (np.abs(upright) < _UNDECIDED).nonzero()[0]
     if len(undecided):
         both = np.concatenate((np.arange(len(ia)), undecided))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from solver_service.geometry.rig import Rig
 from solver_service.geometry.rotation import Floats, rotation_near, skew
+from solver_service.geometry.scalars import ONE, ZERO
 
 _MAX_STEPS: Final = 12
 # A step this small, relative to the range and in rad, leaves less than its square; ten times this leaves a hundredth of
@@ -106,7 +107,7 @@ def refine(
     each = zip(inverse.diagonal(0, 1, 2).tolist(), depth.tolist(), chi2.tolist(), strict=True)
     # A step that is not finite makes chi^2 not finite either.
     sound = [max(openness) < _UNDETERMINED and min(far) > 0.0 and math.isfinite(off) for openness, far, off in each]
-    return Refined(t, R, covariance, np.maximum(chi2, 0.0), np.array(sound))
+    return Refined(t, R, covariance, np.maximum(chi2, ZERO), np.array(sound))
 
 
 def solve_normal(normal: Floats) -> tuple[Floats, NDArray[np.floating[Any]], Floats, Floats]:
@@ -117,7 +118,7 @@ def solve_normal(normal: Floats) -> tuple[Floats, NDArray[np.floating[Any]], Flo
     """
     H, g = normal[:, :6, :6], normal[:, :6, 6:]
     # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-    unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
+    unit = ONE / np.sqrt(H.diagonal(0, 1, 2))
     scale = unit[:, :, None] * unit[:, None]
     inverse = np.linalg.inv(H * scale + DAMPING)
     covariance = inverse * scale
