@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -232,12 +233,12 @@ def intruder_odds(chi2: float, clutter: float) -> float:
     return MISSING_ODDS * clutter * 2.0 * math.pi * _FORETOLD_VARIANCE / max(usual + gross, 1e-300)
 
 
+@lru_cache(maxsize=64)
 def log_chance(rigs: RigPair, counts: tuple[int, int], settings: Settings) -> float:
     """Give the part of the log ratio that all hypotheses of a trigger share; counts: candidates in each picture."""
     pairings = counts[0] * (counts[0] - 1) * counts[1] * (counts[1] - 1)
-    unseen = 2 - len(settings.checks & {"range", "twist"})
     # A gap that nobody looks at says what chance says: about one turn, or an e-fold of range.
-    spread = math.log(settings.range_max_m / settings.range_min_m) * (2.0 * math.pi) ** unseen
+    spread = math.log(settings.range_max_m / settings.range_min_m) * (2.0 * math.pi) ** (2 - settings.gaps)
     return math.log(rigs.views_sr / (pairings * spread))
 
 

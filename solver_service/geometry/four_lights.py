@@ -60,7 +60,7 @@ def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
     )
     t, variance = solved.t_a_b_m, found.variance
     support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
-    gaps = len(settings.checks & {"range", "twist"})
+    gaps = settings.gaps
     base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
     base -= (0.5 * gaps) * np.log(TURN * variance)
     gap2 = np.zeros(len(variance))

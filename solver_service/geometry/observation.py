@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Literal, TypeAlias
 
 from solver_service.geometry.rotation import Floats
@@ -92,6 +93,11 @@ class Settings:
     speed_mps: float = 0.2
     turn_radps: float = 0.2
     skew_sigma_s: float = 0.0
+
+    @cached_property
+    def gaps(self) -> int:
+        """How many of both gaps may speak."""
+        return len(self.checks & {"range", "twist"})
 
     def __post_init__(self) -> None:
         """Refuse what cannot work."""

@@ -15,10 +15,11 @@ from solver_service.geometry.rotation import Floats, rotation_near, skew
 from solver_service.geometry.scalars import ONE, ZERO
 
 _MAX_STEPS: Final = 12
-# A step this small, relative to the range and in rad, leaves less than its square; ten times this leaves a hundredth of
-# the noise, where chi^2 shows that there is any.
+# A step this small, relative to the range and in rad, leaves less than its square. Where chi^2 shows that there is
+# noise, one this large per sd of it leaves a hundredth of that, up to the largest.
 _SMALL: Final = 5e-4
-_SMALL_IN_NOISE: Final = 5e-3
+_SMALL_PER_SD: Final = 5e-3
+_LARGEST: Final = 1e-2
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
 DAMPING: Final = 1e-13 * np.eye(6)
@@ -135,7 +136,7 @@ def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
 def is_large(move: Floats, t: Floats, chi2: Floats) -> bool:
     """Whether any of the steps (K, 6) that led to t (K, 3) and chi2 (K,) leaves more than what does not matter."""
     for step, place_m, off in zip(move.tolist(), t.tolist(), chi2.tolist(), strict=True):
-        limit = min(max(_SMALL, _SMALL_IN_NOISE * math.sqrt(max(off, 0.0))), _SMALL_IN_NOISE)
+        limit = min(max(_SMALL, _SMALL_PER_SD * math.sqrt(max(off, 0.0))), _LARGEST)
         if max(map(abs, step[3:])) > limit or max(map(abs, step[:3])) > limit * math.hypot(*place_m):
             return True
     return False
