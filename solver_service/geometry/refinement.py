@@ -15,11 +15,10 @@ from solver_service.geometry.rotation import Floats, rotation_near, skew
 from solver_service.geometry.scalars import ONE, ZERO
 
 _MAX_STEPS: Final = 12
-# A step this small, relative to the range and in rad, leaves less than its square. Where chi^2 shows that there is
-# noise, one this large per sd of it leaves a hundredth of that, up to the largest.
+# A step this small, relative to the range and in rad, leaves less than its square.
 _SMALL: Final = 5e-4
-_SMALL_PER_SD: Final = 5e-3
-_LARGEST: Final = 1e-2
+# What a step may leave of the noise, in sd, where chi^2 shows that there is any.
+_LEFT: Final = 0.01
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
 DAMPING: Final = 1e-13 * np.eye(6)
@@ -103,7 +102,7 @@ def refine(
             break
         t, R = moved(t, R, move)
         steps += 1
-        if not is_large(move, t, chi2):
+        if not is_large(move, t, normal[:, 6, 6], chi2):
             break
     each = zip(inverse.diagonal(0, 1, 2).tolist(), depth.tolist(), chi2.tolist(), strict=True)
     # A step that is not finite makes chi^2 not finite either.
@@ -133,11 +132,13 @@ def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
     return t - move[:, :3], rotation_near(-move[:, 3:]) @ R
 
 
-def is_large(move: Floats, t: Floats, chi2: Floats) -> bool:
-    """Whether any of the steps (K, 6) that led to t (K, 3) and chi2 (K,) leaves more than what does not matter."""
-    for step, place_m, off in zip(move.tolist(), t.tolist(), chi2.tolist(), strict=True):
-        limit = min(max(_SMALL, _SMALL_PER_SD * math.sqrt(max(off, 0.0))), _LARGEST)
-        if max(map(abs, step[3:])) > limit or max(map(abs, step[:3])) > limit * math.hypot(*place_m):
+def is_large(move: Floats, t: Floats, before: Floats, chi2: Floats) -> bool:
+    """Whether any of the steps (K, 6) leaves what matters; they led to t (K, 3), and from chi^2 before (K,) to chi2."""
+    each = zip(move.tolist(), t.tolist(), before.tolist(), chi2.tolist(), strict=True)
+    for step, place_m, at_first, at_last in each:
+        size = max(max(map(abs, step[:3])) / (math.hypot(*place_m) or 1.0), *map(abs, step[3:]))
+        # The geometry changes by about this share over the step, and so the step: in sd, the root of what chi^2 loses.
+        if size > _SMALL and size * size * (at_first - at_last) > _LEFT**2 * at_last:
             return True
     return False
 

@@ -220,7 +220,7 @@ def _refined(terms: Terms, lights: NDArray[np.intp], t: Floats, R: Floats) -> Re
         normal = J.swapaxes(1, 2) @ weight @ J + J_s.swapaxes(1, 2) @ J_s
         covariance, _, move, chi2 = solve_normal(normal)
         t, R = moved(t, R, move)
-        if not is_large(move, t, chi2):
+        if not is_large(move, t, normal[:, 6, 6], chi2):
             break
     range2 = np.add.reduce(t * t, 1)
     settings = terms.settings

@@ -65,6 +65,23 @@ def test_covariance_is_true(rigs, range_m, sigma_px):
     assert np.mean(refined.chi2) == pytest.approx(2.0, abs=0.3)
 
 
+@pytest.mark.parametrize("rigs", RIGS.values(), ids=list(RIGS))
+def test_what_the_last_step_leaves_is_little_of_the_noise(rigs):
+    rng = np.random.default_rng(11)
+    scenes = [random_scene(rng, (1.5, 20.0), *rigs) for _ in range(100)]
+    seen = sightings(scenes, rng, 0.5)
+    # One by one: among many, the poorest start decides how often all are linearized.
+    for k, scene in enumerate(scenes):
+        of_one = Sightings(seen.frames[k : k + 1], seen.dt_s[k : k + 1])
+        R = rotation_exp(0.004 * rng.standard_normal((1, 3))) @ scene.R
+        once = refine((1.0 + 0.004 * rng.standard_normal()) * scene.t[None], R, of_one, *rigs, STILL)
+        again = once
+        for _ in range(3):
+            again = refine(again.t_a_b_m, again.R_a_b, of_one, *rigs, STILL)
+        e = np.concatenate((again.t_a_b_m[0] - once.t_a_b_m[0], rotation_log(again.R_a_b[0] @ once.R_a_b[0].T)))
+        assert e @ np.linalg.inv(again.covariance[0]) @ e / 6.0 < 0.02**2
+
+
 def moving(rng, rates, dt_s, count):
     """Scenes, and what is seen of them where each sighting is dt_s (4,) off the instant."""
     scenes = [random_scene(rng, (2.0, 6.0)) for _ in range(count)]
