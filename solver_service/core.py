@@ -35,8 +35,10 @@ from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStrea
 
 # How long, in the dive's own time, a frame waits for the other node's frame that may still come.
 MATCH_WINDOW_NS: Final = 1 * S_NS
-# Where the other node is silent altogether.
+# Where the other node is silent altogether. After an outage the frames of one node come all at once, and before the
+# other's: a live frame waits for so long by the receiver's own clock, too.
 SILENCE_WINDOW_NS: Final = 2 * S_NS
+PATIENCE_S: Final = 1.5
 MAX_PENDING: Final = 512
 MAX_RESOLVED_MEMORY: Final = 8192
 
@@ -73,6 +75,7 @@ class SolverCore:
         self._resolved: OrderedDict[int, None] = OrderedDict()
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
+        self._now_s: float | None = None
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._clock_offset_ns = clock_offset_ns
@@ -99,8 +102,12 @@ class SolverCore:
         """Triggers that wait for something."""
         return len(self._pending())
 
-    def handle(self, message: Message) -> list[RelativePose | Rejected]:
-        """Take one message of a node; return what is resolved by it, in the order of the triggers."""
+    def handle(self, message: Message, now_s: float | None = None) -> list[RelativePose | Rejected]:
+        """Take one message of a node; return what is resolved by it, in the order of the triggers.
+
+        now_s: when it has come, by a clock that is never set; None where messages are read from a log.
+        """
+        self._now_s = now_s
         stream = {self.node_a: self._a, self.node_b: self._b}.get(getattr(message, "node", ""))
         if stream is None:
             self.foreign += 1
@@ -126,7 +133,7 @@ class SolverCore:
 
     def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
         other = self._b if stream is self._a else self._a
-        arrival = stream.add_frame(frame, other.newest_ns)
+        arrival = stream.add_frame(frame, other.newest_ns, self._now_s)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
@@ -137,7 +144,7 @@ class SolverCore:
             self._prior.lose()
             self._headings.lose()
             if frame.trigger in self._resolved:
-                stream.frames.pop(frame.trigger, None)
+                stream.drop(frame.trigger)
                 self.late += 1
             return []
         if arrival is Arrival.FAR:
@@ -147,14 +154,14 @@ class SolverCore:
             self._far.append(frame.trigger)
             return [] if frame.trigger in self._resolved else [self._reject(frame, "late", detail)]
         if frame.trigger in self._resolved:
-            stream.frames.pop(frame.trigger, None)
+            stream.drop(frame.trigger)
             self.late += 1
             return []
         if arrival is Arrival.CONFLICT:
             self._conflicts.add(frame.trigger)
             return []
         if frame.trigger < self._newest_resolved:
-            stream.frames.pop(frame.trigger, None)
+            stream.drop(frame.trigger)
             self.late += 1
             return [self._reject(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
         return []
@@ -211,8 +218,11 @@ class SolverCore:
         own = self._a if other is self._b else self._b
         other_ns = other.newest_ns if other.newest_ns is not None else 0
         own_ns = own.newest_ns if own.newest_ns is not None else 0
+        arrived_s = own.arrived_s.get(frame.trigger)
+        patient = self._now_s is None or arrived_s is None or self._now_s - arrived_s > PATIENCE_S
+        silent = own_ns - frame.stamp_ns > SILENCE_WINDOW_NS and patient
         # A node whose clock is far from this frame says nothing about what of it may still come.
-        return MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS or own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
+        return silent or MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS
 
     def _solve(
         self,
@@ -273,8 +283,8 @@ class SolverCore:
         )
 
     def _finish(self, trigger: int, *, newest: bool = True) -> None:
-        self._a.frames.pop(trigger, None)
-        self._b.frames.pop(trigger, None)
+        self._a.drop(trigger)
+        self._b.drop(trigger)
         self._conflicts.discard(trigger)
         self._resolved[trigger] = None
         if len(self._resolved) > MAX_RESOLVED_MEMORY:

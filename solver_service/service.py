@@ -159,14 +159,14 @@ class SolverService(Service):
 
     def _handle(self, message: Message, node: str) -> list[RelativePose | Rejected]:
         if self._core is not None:
-            return self._core.handle(message)
+            return self._core.handle(message, time.monotonic())
         self._before_pair.append(message)
         if isinstance(message, NodeInfo | Candidates) and node not in self._seen:
             self._seen.append(node)
         if len(self._seen) < 2:
             return []
         core = self._pair(*sorted(self._seen[:2]))
-        results = [result for waiting in self._before_pair for result in core.handle(waiting)]
+        results = [result for waiting in self._before_pair for result in core.handle(waiting, time.monotonic())]
         self._before_pair.clear()
         return results
 

@@ -37,6 +37,7 @@ class NodeStream:
     def __init__(self, node: str) -> None:
         self.node = node
         self.frames: dict[int, Candidates] = {}
+        self.arrived_s: dict[int, float] = {}
         self.attitude: SampleStream[Attitude] = SampleStream(lag_ns=0)
         self.depth: SampleStream[Depth] = SampleStream(lag_ns=DEPTH_LAG_NS)
         self.received = 0
@@ -61,8 +62,11 @@ class NodeStream:
         at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
         return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
-    def add_frame(self, frame: Candidates, other_newest_ns: int | None) -> Arrival:
-        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap."""
+    def add_frame(self, frame: Candidates, other_newest_ns: int | None, now_s: float | None = None) -> Arrival:
+        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap.
+
+        now_s: when it has come, where that is known.
+        """
         self.received += 1
         verdict = self._place_in_time(frame.stamp_ns, other_newest_ns)
         if verdict is Arrival.FAR:
@@ -77,7 +81,14 @@ class NodeStream:
         if len(self._sequence) > MAX_SEQUENCE_MEMORY:
             self._sequence.popitem(last=False)
         self.frames[frame.trigger] = frame
+        if now_s is not None:
+            self.arrived_s[frame.trigger] = now_s
         return verdict
+
+    def drop(self, trigger: int) -> None:
+        """Forget the frame of a trigger, if it is here."""
+        self.frames.pop(trigger, None)
+        self.arrived_s.pop(trigger, None)
 
     def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
@@ -97,6 +108,7 @@ class NodeStream:
             return Arrival.FAR
         self._far.clear()
         self.frames.clear()
+        self.arrived_s.clear()
         self._sequence.clear()
         self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns

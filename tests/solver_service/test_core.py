@@ -142,6 +142,37 @@ def test_one_node_alone_expires_and_memory_is_bounded(dive):
     assert {r.reason for r in results} == {"unmatched"}
 
 
+def test_after_an_outage_one_nodes_frames_wait_for_the_others():
+    """Five seconds of a arrive at once, then those of b: nothing is given up, and the poses are the same."""
+    messages, _ = dive_messages(seconds=11.0)
+    expected, _ = solve(messages)
+    cut_ns, back_ns = START_NS + 3_000_000_000, START_NS + 8_000_000_000
+
+    def arrives_s(message):
+        seconds = (message.stamp_ns - START_NS) / 1e9
+        if not cut_ns <= message.stamp_ns < back_ns:
+            return seconds + (0.6 if message.stamp_ns >= back_ns else 0.0)
+        return 8.0 + 1e-4 * seconds + (0.5 if message.node == "b" else 0.0)
+
+    core = SolverCore("a", "b", Settings())
+    results = []
+    for message in sorted(messages, key=arrives_s):
+        results += core.handle(message, arrives_s(message))
+    assert results + core.flush() == expected
+
+
+def test_a_live_frame_waits_two_seconds_for_a_silent_node(dive):
+    messages, _ = dive
+    core = SolverCore("a", "b", Settings())
+    core.handle(next(m for m in messages if m.node == "b" and isinstance(m, NodeInfo)))
+    for message in messages:
+        if message.node == "a":
+            given_up = core.handle(message, (message.stamp_ns - START_NS) / 1e9 + 0.05)
+            waited_s = [(message.stamp_ns - result.stamp_ns) / 1e9 for result in given_up]
+            assert all(2.0 < s < 2.0 + 2 * PERIOD_NS / 1e9 for s in waited_s)
+    assert core.counts["unmatched"] > 20
+
+
 def test_without_calibration_every_trigger_says_so(dive):
     messages, _ = dive
     results, _ = solve([m for m in messages if not (isinstance(m, NodeInfo) and m.node == "b")])
