@@ -127,7 +127,9 @@ class Observer:
             triggers=len(triggers),
             without_outcome=sum(1 for trigger in triggers if trigger not in outcomes),
             outcomes_doubled=sum(count - 1 for count in outcomes.values()),
-            reasons=Counter(o.reason if isinstance(o, Rejected) else "pose" for o, _ in self.outcomes),
+            reasons=Counter(
+                o.reason if isinstance(o, Rejected) else "pose" for o, _ in self.outcomes if o.trigger in triggers
+            ),
         )
 
 
