@@ -75,7 +75,7 @@ class SolverCore:
         self._resolved: OrderedDict[int, None] = OrderedDict()
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
-        self._now_s: float | None = None
+        self._now_s = 0.0
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._clock_offset_ns = clock_offset_ns
@@ -105,9 +105,10 @@ class SolverCore:
     def handle(self, message: Message, now_s: float | None = None) -> list[RelativePose | Rejected]:
         """Take one message of a node; return what is resolved by it, in the order of the triggers.
 
-        now_s: when it has come, by a clock that is never set; None where messages are read from a log.
+        now_s: when it has come, by a clock that is never set, if it is of a live dive and not of a stored one.
         """
-        self._now_s = now_s
+        if now_s is not None:
+            self._now_s = now_s
         stream = {self.node_a: self._a, self.node_b: self._b}.get(getattr(message, "node", ""))
         if stream is None:
             self.foreign += 1
@@ -121,7 +122,7 @@ class SolverCore:
         elif isinstance(message, Depth):
             stream.depth.add(message)
         elif isinstance(message, Candidates):
-            early = self._take_frame(stream, message)
+            early = self._take_frame(stream, message, now_s)
             return early + self._resolve()
         else:
             return []
@@ -131,9 +132,9 @@ class SolverCore:
         """Resolve all that is pending with what there is: the dive has ended or has paused."""
         return self._resolve(everything=True)
 
-    def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
+    def _take_frame(self, stream: NodeStream, frame: Candidates, now_s: float | None) -> list[RelativePose | Rejected]:
         other = self._b if stream is self._a else self._a
-        arrival = stream.add_frame(frame, other.newest_ns, self._now_s)
+        arrival = stream.add_frame(frame, other.newest_ns, now_s)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
@@ -219,8 +220,8 @@ class SolverCore:
         other_ns = other.newest_ns if other.newest_ns is not None else 0
         own_ns = own.newest_ns if own.newest_ns is not None else 0
         arrived_s = own.arrived_s.get(frame.trigger)
-        patient = self._now_s is None or arrived_s is None or self._now_s - arrived_s > PATIENCE_S
-        silent = own_ns - frame.stamp_ns > SILENCE_WINDOW_NS and patient
+        waited = arrived_s is None or self._now_s - arrived_s > PATIENCE_S
+        silent = own_ns - frame.stamp_ns > SILENCE_WINDOW_NS and waited
         # A node whose clock is far from this frame says nothing about what of it may still come.
         return silent or MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS
 

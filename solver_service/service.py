@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 # A dive that pauses this long is taken as ended: what waits is resolved with what there is.
 PAUSE_S: Final = 2.5
-# Poses of live dives have latencies; those of stored ones do not.
+# Poses of live dives have latencies, and their frames may be late; those of stored ones do not.
 LIVE_WITHIN_NS: Final = 60 * S_NS
 # The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
@@ -159,16 +159,21 @@ class SolverService(Service):
 
     def _handle(self, message: Message, node: str) -> list[RelativePose | Rejected]:
         if self._core is not None:
-            return self._core.handle(message, time.monotonic())
+            return self._core.handle(message, self._now_s(message))
         self._before_pair.append(message)
         if isinstance(message, NodeInfo | Candidates) and node not in self._seen:
             self._seen.append(node)
         if len(self._seen) < 2:
             return []
         core = self._pair(*sorted(self._seen[:2]))
-        results = [result for waiting in self._before_pair for result in core.handle(waiting, time.monotonic())]
+        results = [result for waiting in self._before_pair for result in core.handle(waiting, self._now_s(waiting))]
         self._before_pair.clear()
         return results
+
+    def _now_s(self, message: Message) -> float | None:
+        """Give the time for a message of a live dive: those of a stored one may come faster than they were made."""
+        age_ns = self.clock.now_ns() - getattr(message, "stamp_ns", 0)
+        return time.monotonic() if abs(age_ns) < LIVE_WITHIN_NS else None
 
     def _pair(self, node_a: str, node_b: str) -> SolverCore:
         self._core = SolverCore(node_a, node_b, self._settings, alignment=self._alignment)

@@ -65,7 +65,7 @@ class NodeStream:
     def add_frame(self, frame: Candidates, other_newest_ns: int | None, now_s: float | None = None) -> Arrival:
         """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap.
 
-        now_s: when it has come, where that is known.
+        now_s: when it has come, if live.
         """
         self.received += 1
         verdict = self._place_in_time(frame.stamp_ns, other_newest_ns)

@@ -1,0 +1,23 @@
+"""The live service's own part: what it tells the core of the time."""
+
+import pytest
+
+from protocol.bus import Received
+from protocol.clock import S_NS, ManualClock
+from protocol.codec import encode
+from protocol.messages import Candidates, NodeInfo
+from protocol.topics import key_of
+from solver_service.config import SolverConfig
+from solver_service.service import SolverService
+from tests.fuzz.targets import Capture
+from tests.solver_service.conftest import START_NS
+
+
+@pytest.mark.parametrize(("age_s", "given_up"), [(6, False), (86_400, True)], ids=["live", "stored"])
+def test_frames_of_a_live_dive_that_come_all_at_once_wait_for_the_other_node(dive, age_s, given_up):
+    service = SolverService(SolverConfig(nodes=["a", "b"]), clock=ManualClock(START_NS + age_s * S_NS))
+    service.attach(Capture())
+    for message in dive[0]:
+        if message.node == "a" and isinstance(message, NodeInfo | Candidates):
+            service.receive(Received(key_of(message), encode(message), 0, ""))
+    assert (service._core.counts["unmatched"] > 0) is given_up
