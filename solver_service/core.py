@@ -35,9 +35,10 @@ from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStrea
 
 # How long, in the dive's own time, a frame waits for the other node's frame that may still come.
 MATCH_WINDOW_NS: Final = 1 * S_NS
-# Where the other node is silent altogether. After an outage the frames of one node come all at once, and before the
-# other's: a live frame waits for so long by the receiver's own clock, too.
+# Where the other node is silent altogether.
 SILENCE_WINDOW_NS: Final = 2 * S_NS
+# After an outage what was held up comes all at once, one node's before the other's, frames before attitudes: for so
+# long, by the receiver's own clock, nothing counts as silent.
 PATIENCE_S: Final = 1.5
 MAX_PENDING: Final = 512
 MAX_RESOLVED_MEMORY: Final = 8192
@@ -122,7 +123,9 @@ class SolverCore:
         elif isinstance(message, Depth):
             stream.depth.add(message)
         elif isinstance(message, Candidates):
-            early = self._take_frame(stream, message, now_s)
+            if now_s is not None:
+                stream.saw_frame_come(message.stamp_ns, now_s)
+            early = self._take_frame(stream, message)
             return early + self._resolve()
         else:
             return []
@@ -132,9 +135,9 @@ class SolverCore:
         """Resolve all that is pending with what there is: the dive has ended or has paused."""
         return self._resolve(everything=True)
 
-    def _take_frame(self, stream: NodeStream, frame: Candidates, now_s: float | None) -> list[RelativePose | Rejected]:
+    def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
         other = self._b if stream is self._a else self._a
-        arrival = stream.add_frame(frame, other.newest_ns, now_s)
+        arrival = stream.add_frame(frame, other.newest_ns)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
@@ -145,7 +148,7 @@ class SolverCore:
             self._prior.lose()
             self._headings.lose()
             if frame.trigger in self._resolved:
-                stream.drop(frame.trigger)
+                stream.frames.pop(frame.trigger, None)
                 self.late += 1
             return []
         if arrival is Arrival.FAR:
@@ -155,14 +158,14 @@ class SolverCore:
             self._far.append(frame.trigger)
             return [] if frame.trigger in self._resolved else [self._reject(frame, "late", detail)]
         if frame.trigger in self._resolved:
-            stream.drop(frame.trigger)
+            stream.frames.pop(frame.trigger, None)
             self.late += 1
             return []
         if arrival is Arrival.CONFLICT:
             self._conflicts.add(frame.trigger)
             return []
         if frame.trigger < self._newest_resolved:
-            stream.drop(frame.trigger)
+            stream.frames.pop(frame.trigger, None)
             self.late += 1
             return [self._reject(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
         return []
@@ -209,7 +212,8 @@ class SolverCore:
                 return None
             missing = " and ".join(n for n, known in ((self.node_a, known_a), (self.node_b, known_b)) if known is None)
             return self._reject(frame_a, "no_info", f"no NodeInfo of {missing}")
-        covered = self._a.sensors_cover(frame_a.stamp_ns) and self._b.sensors_cover(frame_b.stamp_ns)
+        held_up = self._held_up()
+        covered = self._a.sensors_cover(frame_a.stamp_ns, held_up) and self._b.sensors_cover(frame_b.stamp_ns, held_up)
         if not covered and not at_once:
             return None
         return self._solve(frame_a, frame_b, known_a, known_b)
@@ -219,11 +223,13 @@ class SolverCore:
         own = self._a if other is self._b else self._b
         other_ns = other.newest_ns if other.newest_ns is not None else 0
         own_ns = own.newest_ns if own.newest_ns is not None else 0
-        arrived_s = own.arrived_s.get(frame.trigger)
-        waited = arrived_s is None or self._now_s - arrived_s > PATIENCE_S
-        silent = own_ns - frame.stamp_ns > SILENCE_WINDOW_NS and waited
+        silent = own_ns - frame.stamp_ns > SILENCE_WINDOW_NS and not self._held_up()
         # A node whose clock is far from this frame says nothing about what of it may still come.
         return silent or MATCH_WINDOW_NS < other_ns - frame.stamp_ns <= FAR_NS
+
+    def _held_up(self) -> bool:
+        """Whether what has been held up may still be coming."""
+        return self._now_s - max(self._a.held_up_s, self._b.held_up_s) <= PATIENCE_S
 
     def _solve(
         self,
@@ -284,8 +290,8 @@ class SolverCore:
         )
 
     def _finish(self, trigger: int, *, newest: bool = True) -> None:
-        self._a.drop(trigger)
-        self._b.drop(trigger)
+        self._a.frames.pop(trigger, None)
+        self._b.frames.pop(trigger, None)
         self._conflicts.discard(trigger)
         self._resolved[trigger] = None
         if len(self._resolved) > MAX_RESOLVED_MEMORY:

@@ -67,14 +67,15 @@ class SampleStream(Generic[S]):
         self._samples.clear()
         self._recent_back.clear()
 
-    def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int) -> bool:
+    def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int, held_up: bool) -> bool:
         """Whether what matters for a frame at stamp_ns is here, or is not going to come.
 
         first_frame_ns, newest_frame_ns: the node's frames so far; a sensor that stays behind them for three
-        seconds of the dive is not waited for any longer.
+        seconds of the dive is not waited for any longer. held_up: unless what it has sent may have been.
         """
         newest_ns = self._stamps[-1] if self._stamps else first_frame_ns
-        return newest_ns >= stamp_ns - self._lag_ns or newest_frame_ns - newest_ns > SENSOR_WAIT_NS
+        stopped = newest_frame_ns - newest_ns > SENSOR_WAIT_NS and not (held_up and self._stamps)
+        return stopped or newest_ns >= stamp_ns - self._lag_ns
 
     def around(self, stamp_ns: int) -> tuple[S | None, S | None]:
         """Return the samples at or before, and after, stamp_ns."""

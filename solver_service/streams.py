@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections import OrderedDict
 from enum import Enum
 from typing import Final
@@ -17,6 +18,8 @@ from solver_service.sensors import DEPTH_LAG_NS, SampleStream
 FAR_NS: Final = 5 * S_NS
 # ... until so many in a row agree that the clock has been set.
 FRAMES_TO_BELIEVE: Final = 5
+# A frame that comes so much later after the last one than it was made has been held up.
+HELD_UP_S: Final = 1.0
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
 
@@ -32,17 +35,18 @@ class Arrival(Enum):
 
 
 class NodeStream:
-    """One node's side of the match; bounded."""
+    """One node's side of the match; bounded. held_up_s: when a frame has come last that had been held up."""
 
     def __init__(self, node: str) -> None:
         self.node = node
         self.frames: dict[int, Candidates] = {}
-        self.arrived_s: dict[int, float] = {}
         self.attitude: SampleStream[Attitude] = SampleStream(lag_ns=0)
         self.depth: SampleStream[Depth] = SampleStream(lag_ns=DEPTH_LAG_NS)
         self.received = 0
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
+        self.held_up_s = -math.inf
+        self._came: tuple[int, float] | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
         self._newest_trigger = -1
@@ -62,11 +66,8 @@ class NodeStream:
         at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
         return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
-    def add_frame(self, frame: Candidates, other_newest_ns: int | None, now_s: float | None = None) -> Arrival:
-        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap.
-
-        now_s: when it has come, if live.
-        """
+    def add_frame(self, frame: Candidates, other_newest_ns: int | None) -> Arrival:
+        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap."""
         self.received += 1
         verdict = self._place_in_time(frame.stamp_ns, other_newest_ns)
         if verdict is Arrival.FAR:
@@ -81,14 +82,15 @@ class NodeStream:
         if len(self._sequence) > MAX_SEQUENCE_MEMORY:
             self._sequence.popitem(last=False)
         self.frames[frame.trigger] = frame
-        if now_s is not None:
-            self.arrived_s[frame.trigger] = now_s
         return verdict
 
-    def drop(self, trigger: int) -> None:
-        """Forget the frame of a trigger, if it is here."""
-        self.frames.pop(trigger, None)
-        self.arrived_s.pop(trigger, None)
+    def saw_frame_come(self, stamp_ns: int, now_s: float) -> None:
+        """Compare when a frame was made and when it has come with the one before."""
+        if self._came is not None:
+            before_ns, before_s = self._came
+            if now_s - before_s - (stamp_ns - before_ns) / S_NS > HELD_UP_S:
+                self.held_up_s = now_s
+        self._came = stamp_ns, now_s
 
     def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
@@ -108,7 +110,6 @@ class NodeStream:
             return Arrival.FAR
         self._far.clear()
         self.frames.clear()
-        self.arrived_s.clear()
         self._sequence.clear()
         self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns
@@ -130,13 +131,15 @@ class NodeStream:
         boot_1, seq_1, _ = self._sequence[after]
         return boot_0 == boot_1 and seq_1 == seq_0 + 1
 
-    def sensors_cover(self, stamp_ns: int) -> bool:
-        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come."""
+    def sensors_cover(self, stamp_ns: int, held_up: bool) -> bool:
+        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come.
+
+        held_up: whether they may have been, so that it says nothing that they are not here.
+        """
         if self.first_ns is None or self.newest_ns is None:
             return True
-        return self.attitude.covers(stamp_ns, self.first_ns, self.newest_ns) and self.depth.covers(
-            stamp_ns, self.first_ns, self.newest_ns
-        )
+        first_ns, newest_ns = self.first_ns, self.newest_ns
+        return all(sensor.covers(stamp_ns, first_ns, newest_ns, held_up) for sensor in (self.attitude, self.depth))
 
 
 def _since(calibration: tuple[NodeInfo, Rig]) -> int:

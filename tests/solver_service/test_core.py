@@ -142,8 +142,9 @@ def test_one_node_alone_expires_and_memory_is_bounded(dive):
     assert {r.reason for r in results} == {"unmatched"}
 
 
-def test_after_an_outage_one_nodes_frames_wait_for_the_others():
-    """Five seconds of a arrive at once, then those of b: nothing is given up, and the poses are the same."""
+@pytest.mark.parametrize("last", ["b", "attitudes"])
+def test_after_an_outage_what_comes_last_is_waited_for(last):
+    """Five seconds of frames arrive at once, without the other node's or their attitudes: the poses are the same."""
     messages, _ = dive_messages(seconds=11.0)
     expected, _ = solve(messages)
     cut_ns, back_ns = START_NS + 3_000_000_000, START_NS + 8_000_000_000
@@ -152,7 +153,8 @@ def test_after_an_outage_one_nodes_frames_wait_for_the_others():
         seconds = (message.stamp_ns - START_NS) / 1e9
         if not cut_ns <= message.stamp_ns < back_ns:
             return seconds + (0.6 if message.stamp_ns >= back_ns else 0.0)
-        return 8.0 + 1e-4 * seconds + (0.5 if message.node == "b" else 0.0)
+        late = message.node == "b" if last == "b" else isinstance(message, Attitude | Depth)
+        return 8.0 + 1e-4 * seconds + (0.5 if late else 0.0)
 
     core = SolverCore("a", "b", Settings())
     results = []
