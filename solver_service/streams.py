@@ -85,12 +85,12 @@ class NodeStream:
         return verdict
 
     def saw_frame_come(self, stamp_ns: int, now_s: float) -> None:
-        """Compare when a frame was made and when it has come with the one before."""
-        if self._came is not None:
-            before_ns, before_s = self._came
+        """Compare when a frame was made and when it has come with the newest before; an old one again says nothing."""
+        before_ns, before_s = self._came or (stamp_ns - 1, now_s)
+        if stamp_ns > before_ns:
             if now_s - before_s - (stamp_ns - before_ns) / S_NS > HELD_UP_S:
                 self.held_up_s = now_s
-        self._came = stamp_ns, now_s
+            self._came = stamp_ns, now_s
 
     def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
@@ -111,6 +111,7 @@ class NodeStream:
         self._far.clear()
         self.frames.clear()
         self._sequence.clear()
+        self._came = None
         self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns
         return Arrival.CLOCK_SET

@@ -163,6 +163,21 @@ def test_after_an_outage_what_comes_last_is_waited_for(last):
     assert results + core.flush() == expected
 
 
+def test_old_frames_again_and_again_hold_nothing_up(dive):
+    """With a sensor that has stopped, too."""
+    messages = [m for m in dive[0] if not (isinstance(m, Depth) and m.stamp_ns > START_NS + 1_000_000_000)]
+    first = next(m for m in messages if isinstance(m, Candidates))
+    core = SolverCore("a", "b", Settings())
+    for message in messages:
+        now_s = (message.stamp_ns - START_NS) / 1e9
+        core.handle(message, now_s)
+        if isinstance(message, Candidates):
+            core.handle(first, now_s)
+    last_ns = max(m.stamp_ns for m in messages)
+    # One sensor is given up three seconds after its last sample, and then no frame waits.
+    assert core._newest_resolved * PERIOD_NS > last_ns - 500_000_000
+
+
 def test_a_live_frame_waits_two_seconds_for_a_silent_node(dive):
     messages, _ = dive
     core = SolverCore("a", "b", Settings())
