@@ -38,8 +38,8 @@ MATCH_WINDOW_NS: Final = 1 * S_NS
 # Where the other node is silent altogether.
 SILENCE_WINDOW_NS: Final = 2 * S_NS
 # After an outage what was held up comes all at once, one node's before the other's, frames before attitudes: for so
-# long, by the receiver's own clock, nothing counts as silent.
-PATIENCE_S: Final = 1.5
+# long after its first frame, by when things come, nothing counts as silent.
+PATIENCE_NS: Final = 3 * S_NS // 2
 MAX_PENDING: Final = 512
 MAX_RESOLVED_MEMORY: Final = 8192
 
@@ -76,7 +76,7 @@ class SolverCore:
         self._resolved: OrderedDict[int, None] = OrderedDict()
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
-        self._now_s = 0.0
+        self._came_ns: int | None = None
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._clock_offset_ns = clock_offset_ns
@@ -103,13 +103,12 @@ class SolverCore:
         """Triggers that wait for something."""
         return len(self._pending())
 
-    def handle(self, message: Message, now_s: float | None = None) -> list[RelativePose | Rejected]:
+    def handle(self, message: Message, came_ns: int | None = None) -> list[RelativePose | Rejected]:
         """Take one message of a node; return what is resolved by it, in the order of the triggers.
 
-        now_s: when it has come, by a clock that is never set, if it is of a live dive and not of a stored one.
+        came_ns: when it has come, by the receiver's clock; None where it was read from a log.
         """
-        if now_s is not None:
-            self._now_s = now_s
+        self._came_ns = came_ns
         stream = {self.node_a: self._a, self.node_b: self._b}.get(getattr(message, "node", ""))
         if stream is None:
             self.foreign += 1
@@ -123,8 +122,6 @@ class SolverCore:
         elif isinstance(message, Depth):
             stream.depth.add(message)
         elif isinstance(message, Candidates):
-            if now_s is not None:
-                stream.saw_frame_come(message.stamp_ns, now_s)
             early = self._take_frame(stream, message)
             return early + self._resolve()
         else:
@@ -138,6 +135,8 @@ class SolverCore:
     def _take_frame(self, stream: NodeStream, frame: Candidates) -> list[RelativePose | Rejected]:
         other = self._b if stream is self._a else self._a
         arrival = stream.add_frame(frame, other.newest_ns)
+        if self._came_ns is not None and arrival is not Arrival.FAR:
+            stream.saw_frame_come(frame.stamp_ns, self._came_ns)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
@@ -229,7 +228,8 @@ class SolverCore:
 
     def _held_up(self) -> bool:
         """Whether what has been held up may still be coming."""
-        return self._now_s - max(self._a.held_up_s, self._b.held_up_s) <= PATIENCE_S
+        came_ns = self._came_ns
+        return came_ns is not None and any(0 <= came_ns - s.held_up_ns <= PATIENCE_NS for s in (self._a, self._b))
 
     def _solve(
         self,

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from protocol.clock import MS_NS, S_NS
 from protocol.messages import Attitude, Depth
 
+# Samples further back than this come of a clock that has been set.
 HORIZON_NS: Final = 20 * S_NS
+# After an outage a node's samples wait for the other node's frames: as far as the nodes' caches reach.
+KEPT_NS: Final = 60 * S_NS
 MAX_SAMPLES: Final = 8192
 SENSOR_WAIT_NS: Final = 3 * S_NS
 
@@ -57,8 +60,8 @@ class SampleStream(Generic[S]):
             return
         self._stamps.insert(at, sample.stamp_ns)
         self._samples.insert(at, sample)
-        if len(self._stamps) > MAX_SAMPLES or self._stamps[0] < self._stamps[-1] - 2 * HORIZON_NS:
-            keep = max(bisect.bisect_left(self._stamps, self._stamps[-1] - HORIZON_NS), len(self._stamps) - MAX_SAMPLES)
+        if len(self._stamps) > MAX_SAMPLES or self._stamps[0] < self._stamps[-1] - 2 * KEPT_NS:
+            keep = max(bisect.bisect_left(self._stamps, self._stamps[-1] - KEPT_NS), len(self._stamps) - MAX_SAMPLES)
             del self._stamps[:keep], self._samples[:keep]
 
     def clear(self) -> None:
@@ -71,7 +74,8 @@ class SampleStream(Generic[S]):
         """Whether what matters for a frame at stamp_ns is here, or is not going to come.
 
         first_frame_ns, newest_frame_ns: the node's frames so far; a sensor that stays behind them for three
-        seconds of the dive is not waited for any longer. held_up: unless what it has sent may have been.
+        seconds of the dive is not waited for any longer. held_up: whether its samples may still be on their way; then
+        one that has sent any is.
         """
         newest_ns = self._stamps[-1] if self._stamps else first_frame_ns
         stopped = newest_frame_ns - newest_ns > SENSOR_WAIT_NS and not (held_up and self._stamps)

@@ -25,6 +25,7 @@ from solver_service.answered import Answered
 from solver_service.config import SolverConfig
 from solver_service.core import SolverCore
 from solver_service.health import NodeHealth
+from solver_service.streams import LIVE_WITHIN_NS
 
 if TYPE_CHECKING:
     from protocol.bus import Bus, Publisher, Received
@@ -33,8 +34,6 @@ log = logging.getLogger(__name__)
 
 # A dive that pauses this long is taken as ended: what waits is resolved with what there is.
 PAUSE_S: Final = 2.5
-# Poses of live dives have latencies, and their frames may be late; those of stored ones do not.
-LIVE_WITHIN_NS: Final = 60 * S_NS
 # The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 TOLERATED_OFFSET_S: Final = 0.005
@@ -133,19 +132,19 @@ class SolverService(Service):
                 if new:
                     # So are all after it, whatever becomes of the clock.
                     self._joined_ns = 0
-                self._take_frame(message, new=new)
+                self._take_frame(message, received.receive_ns, new=new)
                 return
-            self._publish(self._handle(message, node))
+            self._publish(self._handle(message, node, received.receive_ns))
             if self._health is not None and isinstance(message, NodeInfo):
                 self._health.saw_period(node, message.trigger_period_ns)
 
-    def _take_frame(self, frame: Candidates, *, new: bool) -> None:
+    def _take_frame(self, frame: Candidates, came_ns: int, *, new: bool) -> None:
         """Handle a frame; new: it came after this solver had joined, and not out of a cache."""
         if self._health is not None:
             self._health.saw_frame(frame.node, frame.stamp_ns, time.monotonic())
         if not new and self._answered.is_over(frame.stamp_ns, self.clock.now_ns()):
             return
-        self._publish(self._handle(frame, frame.node))
+        self._publish(self._handle(frame, frame.node, came_ns))
         if new:
             self._publish(self._answered.saw_new_frame(frame.trigger))
 
@@ -157,23 +156,18 @@ class SolverService(Service):
                 self._health.saw_process(name, alive)
         self._report()
 
-    def _handle(self, message: Message, node: str) -> list[RelativePose | Rejected]:
+    def _handle(self, message: Message, node: str, came_ns: int) -> list[RelativePose | Rejected]:
         if self._core is not None:
-            return self._core.handle(message, self._now_s(message))
+            return self._core.handle(message, came_ns)
         self._before_pair.append(message)
         if isinstance(message, NodeInfo | Candidates) and node not in self._seen:
             self._seen.append(node)
         if len(self._seen) < 2:
             return []
         core = self._pair(*sorted(self._seen[:2]))
-        results = [result for waiting in self._before_pair for result in core.handle(waiting, self._now_s(waiting))]
+        results = [result for waiting in self._before_pair for result in core.handle(waiting, came_ns)]
         self._before_pair.clear()
         return results
-
-    def _now_s(self, message: Message) -> float | None:
-        """Give the time for a message of a live dive: those of a stored one may come faster than they were made."""
-        age_ns = self.clock.now_ns() - getattr(message, "stamp_ns", 0)
-        return time.monotonic() if abs(age_ns) < LIVE_WITHIN_NS else None
 
     def _pair(self, node_a: str, node_b: str) -> SolverCore:
         self._core = SolverCore(node_a, node_b, self._settings, alignment=self._alignment)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import math
 from collections import OrderedDict
 from enum import Enum
 from typing import Final
@@ -18,8 +17,11 @@ from solver_service.sensors import DEPTH_LAG_NS, SampleStream
 FAR_NS: Final = 5 * S_NS
 # ... until so many in a row agree that the clock has been set.
 FRAMES_TO_BELIEVE: Final = 5
-# A frame that comes so much later after the last one than it was made has been held up.
-HELD_UP_S: Final = 1.0
+# A frame of a live dive, which is one of so near the receiver's own time, has been held up where it comes so much later
+# after the last one than it was made; but a link that lets frames through by fits and starts is no outage each time.
+LIVE_WITHIN_NS: Final = 60 * S_NS
+HELD_UP_NS: Final = 1 * S_NS
+HELD_UP_AGAIN_NS: Final = 5 * S_NS
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
 
@@ -35,7 +37,7 @@ class Arrival(Enum):
 
 
 class NodeStream:
-    """One node's side of the match; bounded. held_up_s: when a frame has come last that had been held up."""
+    """One node's side of the match; bounded. held_up_ns: when the first frame after an outage has come."""
 
     def __init__(self, node: str) -> None:
         self.node = node
@@ -45,8 +47,8 @@ class NodeStream:
         self.received = 0
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
-        self.held_up_s = -math.inf
-        self._came: tuple[int, float] | None = None
+        self.held_up_ns = -HELD_UP_AGAIN_NS
+        self._came_ns: tuple[int, int] | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
         self._newest_trigger = -1
@@ -84,13 +86,16 @@ class NodeStream:
         self.frames[frame.trigger] = frame
         return verdict
 
-    def saw_frame_come(self, stamp_ns: int, now_s: float) -> None:
+    def saw_frame_come(self, stamp_ns: int, came_ns: int) -> None:
         """Compare when a frame was made and when it has come with the newest before; an old one again says nothing."""
-        before_ns, before_s = self._came or (stamp_ns - 1, now_s)
-        if stamp_ns > before_ns:
-            if now_s - before_s - (stamp_ns - before_ns) / S_NS > HELD_UP_S:
-                self.held_up_s = now_s
-            self._came = stamp_ns, now_s
+        made_before_ns, came_before_ns = self._came_ns or (stamp_ns - 1, came_ns)
+        if stamp_ns <= made_before_ns:
+            return
+        held_up_ns = came_ns - came_before_ns - (stamp_ns - made_before_ns)
+        again = 0 <= came_ns - self.held_up_ns < HELD_UP_AGAIN_NS
+        if held_up_ns > HELD_UP_NS and abs(came_ns - stamp_ns) < LIVE_WITHIN_NS and not again:
+            self.held_up_ns = came_ns
+        self._came_ns = stamp_ns, came_ns
 
     def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
@@ -111,7 +116,7 @@ class NodeStream:
         self._far.clear()
         self.frames.clear()
         self._sequence.clear()
-        self._came = None
+        self._came_ns = None
         self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns
         return Arrival.CLOCK_SET
@@ -135,7 +140,7 @@ class NodeStream:
     def sensors_cover(self, stamp_ns: int, held_up: bool) -> bool:
         """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come.
 
-        held_up: whether they may have been, so that it says nothing that they are not here.
+        held_up: whether they may still be on their way, so that their absence says nothing.
         """
         if self.first_ns is None or self.newest_ns is None:
             return True

@@ -17,7 +17,7 @@ from solver_service.geometry.scalars import ONE, ZERO
 _MAX_STEPS: Final = 12
 # A step this small, relative to the range and in rad, leaves less than its square.
 _SMALL: Final = 5e-4
-# What a step may leave of the noise, in sd, where chi^2 shows that there is any.
+# What a step may leave of the noise, as chi^2 after it shows that.
 _LEFT: Final = 0.01
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from protocol.clock import MS_NS, S_NS
 from protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
 from solver_service.core import MAX_PENDING, SolverCore
 from solver_service.geometry.trigger import Settings
@@ -142,51 +143,73 @@ def test_one_node_alone_expires_and_memory_is_bounded(dive):
     assert {r.reason for r in results} == {"unmatched"}
 
 
+def held_up(message, last):
+    """When a message comes, ns: after five seconds of outage all at once, and then what comes last."""
+    cut_ns, back_ns = START_NS + 3 * S_NS, START_NS + 8 * S_NS
+    if not cut_ns <= message.stamp_ns < back_ns:
+        return message.stamp_ns + (600 * MS_NS if message.stamp_ns >= back_ns else 0)
+    late = message.node == "b" if last == "b" else isinstance(message, Attitude | Depth)
+    return back_ns + (message.stamp_ns - cut_ns) // 10_000 + (500 * MS_NS if late else 0)
+
+
 @pytest.mark.parametrize("last", ["b", "attitudes"])
 def test_after_an_outage_what_comes_last_is_waited_for(last):
     """Five seconds of frames arrive at once, without the other node's or their attitudes: the poses are the same."""
     messages, _ = dive_messages(seconds=11.0)
     expected, _ = solve(messages)
-    cut_ns, back_ns = START_NS + 3_000_000_000, START_NS + 8_000_000_000
-
-    def arrives_s(message):
-        seconds = (message.stamp_ns - START_NS) / 1e9
-        if not cut_ns <= message.stamp_ns < back_ns:
-            return seconds + (0.6 if message.stamp_ns >= back_ns else 0.0)
-        late = message.node == "b" if last == "b" else isinstance(message, Attitude | Depth)
-        return 8.0 + 1e-4 * seconds + (0.5 if late else 0.0)
-
     core = SolverCore("a", "b", Settings())
     results = []
-    for message in sorted(messages, key=arrives_s):
-        results += core.handle(message, arrives_s(message))
+    for message in sorted(messages, key=lambda message: held_up(message, last)):
+        results += core.handle(message, held_up(message, last))
     assert results + core.flush() == expected
+
+
+def test_of_a_stored_dive_nothing_is_held_up(dive):
+    """A dive may be played faster than it was made, and stand still in between."""
+    frames = [m for m in dive[0] if m.node == "a" and isinstance(m, Candidates)]
+    later_ns = 86_400 * S_NS
+    core = SolverCore("a", "b", Settings())
+    core.handle(frames[0], frames[0].stamp_ns + later_ns)
+    for frame in frames[1:]:
+        core.handle(frame, frames[0].stamp_ns + later_ns + 5 * S_NS)
+    assert core.counts["unmatched"] == len(frames) - 1 - 2 * S_NS // PERIOD_NS
 
 
 def test_old_frames_again_and_again_hold_nothing_up(dive):
     """With a sensor that has stopped, too."""
-    messages = [m for m in dive[0] if not (isinstance(m, Depth) and m.stamp_ns > START_NS + 1_000_000_000)]
+    messages = [m for m in dive[0] if not (isinstance(m, Depth) and m.stamp_ns > START_NS + S_NS)]
     first = next(m for m in messages if isinstance(m, Candidates))
     core = SolverCore("a", "b", Settings())
     for message in messages:
-        now_s = (message.stamp_ns - START_NS) / 1e9
-        core.handle(message, now_s)
+        core.handle(message, message.stamp_ns)
         if isinstance(message, Candidates):
-            core.handle(first, now_s)
-    last_ns = max(m.stamp_ns for m in messages)
+            core.handle(first, message.stamp_ns)
     # One sensor is given up three seconds after its last sample, and then no frame waits.
-    assert core._newest_resolved * PERIOD_NS > last_ns - 500_000_000
+    assert core._newest_resolved * PERIOD_NS > max(m.stamp_ns for m in messages) - 500 * MS_NS
+
+
+def test_a_link_by_fits_and_starts_keeps_nobody_waiting_for_long():
+    """A's frames come 1.3 s late at most, all 1.3 s together; b has gone."""
+    messages, _ = dive_messages(seconds=30.0, sensors=False)
+    core = SolverCore("a", "b", Settings())
+    waited_s = []
+    for message in messages:
+        if message.node == "a" and isinstance(message, Candidates):
+            came_ns = START_NS + -(-(message.stamp_ns - START_NS) // (1300 * MS_NS)) * 1300 * MS_NS
+            waited_s += [(came_ns - result.stamp_ns) / S_NS for result in core.handle(message, came_ns)]
+    assert len(waited_s) > 200
+    assert max(waited_s) < 6.0
 
 
 def test_a_live_frame_waits_two_seconds_for_a_silent_node(dive):
     messages, _ = dive
     core = SolverCore("a", "b", Settings())
-    core.handle(next(m for m in messages if m.node == "b" and isinstance(m, NodeInfo)))
+    core.handle(next(m for m in messages if m.node == "b" and isinstance(m, NodeInfo)), START_NS)
     for message in messages:
         if message.node == "a":
-            given_up = core.handle(message, (message.stamp_ns - START_NS) / 1e9 + 0.05)
-            waited_s = [(message.stamp_ns - result.stamp_ns) / 1e9 for result in given_up]
-            assert all(2.0 < s < 2.0 + 2 * PERIOD_NS / 1e9 for s in waited_s)
+            given_up = core.handle(message, message.stamp_ns + 50 * MS_NS)
+            waited_s = [(message.stamp_ns - result.stamp_ns) / S_NS for result in given_up]
+            assert all(2.0 < s < 2.0 + 2 * PERIOD_NS / S_NS for s in waited_s)
     assert core.counts["unmatched"] > 20
 
 
