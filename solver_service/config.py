@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
@@ -33,8 +34,9 @@ class SolveConfig(Config, frozen=True, kw_only=True):
         unknown = [check for check in self.checks if check not in CHECKS]
         if unknown:
             raise ConfigError(f"{source}: solve.checks = {unknown[0]!r}: known are {', '.join(CHECKS)}")
-        if self.range_min_m >= self.range_max_m:
-            raise ConfigError(f"{source}: solve.range_min_m = {self.range_min_m}: not below range_max_m")
+        if not self.range_min_m < self.range_max_m < math.inf:
+            what = f"solve.range_min_m = {self.range_min_m:g}, range_max_m = {self.range_max_m:g}"
+            raise ConfigError(f"{source}: {what}: not 0 < min < max")
         return Settings(
             method=cast(Method, self.method),
             checks=frozenset(self.checks),

@@ -215,7 +215,14 @@ class SolverCore:
         covered = self._a.sensors_cover(frame_a.stamp_ns, held_up) and self._b.sensors_cover(frame_b.stamp_ns, held_up)
         if not covered and not at_once:
             return None
-        return self._solve(frame_a, frame_b, known_a, known_b)
+        try:
+            return self._solve(frame_a, frame_b, known_a, known_b)
+        except (ArithmeticError, ValueError) as error:
+            # Finite numbers that no camera, sensor or rig gives, 1e300 say, of which the arithmetic can make none.
+            self._prior.lose()
+            self._headings.lose()
+            detail = f"numbers of {self.node_a} or {self.node_b} are beyond all measure ({error})"
+            return self._reject(frame_a, "degenerate", detail)
 
     def _expired(self, frame: Candidates, other: NodeStream) -> bool:
         """Whether the other node's frame for the same trigger can be given up."""

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from protocol.bus import Received
 from protocol.codec import MAX_MESSAGE_BYTES, encode
-from protocol.messages import Candidates, NodeInfo, Rejected, RelativePose
+from protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
 from protocol.topics import key_of
 from solver_service.config import SolverConfig
 from solver_service.service import SolverService
@@ -97,6 +97,34 @@ def test_a_big_sound_message_is_taken_for_what_is_known_of_it():
     solver.take(payload, key)
     assert solver.status().bad_messages == 0
     assert solver.status().received_a == 1
+
+
+def beyond_measure(message, what):
+    if isinstance(message, Candidates) and what in ("sigma_px", "area_px"):
+        return replace(
+            message, blobs=[replace(blob, **{what: 1e-300 if what == "sigma_px" else 1e308}) for blob in message.blobs]
+        )
+    if isinstance(message, Depth) and what in ("depth_m", "sigma_m"):
+        return replace(message, **{what: 1e308})
+    if isinstance(message, Attitude) and what == "sigma_rad":
+        return replace(message, sigma_rad=(1e200, 1e200, 1e200))
+    return message
+
+
+@pytest.mark.parametrize("what", ["sigma_px", "area_px", "depth_m", "sigma_m", "sigma_rad"])
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_numbers_beyond_all_measure_cost_no_more_than_their_own_triggers(what):
+    messages, _ = dive_messages(seconds=5.0, seed=7)
+    solver = Solver()
+    start_ns = messages[0].stamp_ns
+    for message in messages:
+        wild = message.node == "b" and 1.0e9 < message.stamp_ns - start_ns < 1.6e9
+        solver.take(beyond_measure(message, what) if wild else message)
+    results = solver.results()
+    triggers = [m.trigger for m in messages if isinstance(m, Candidates) and m.node == "a"]
+    assert [result.trigger for result in results] == triggers
+    after = [r for r in results if r.stamp_ns - start_ns > 2.6e9]
+    assert sum(isinstance(r, RelativePose) for r in after) > 0.6 * len(after)
 
 
 def test_old_triggers_again_change_nothing_and_are_counted(messages, healthy):
