@@ -218,7 +218,7 @@ class SolverCore:
         try:
             return self._solve(frame_a, frame_b, known_a, known_b)
         except (ArithmeticError, ValueError) as error:
-            # Finite numbers that no camera, sensor or rig gives, 1e300 say, of which the arithmetic can make none.
+            # Finite numbers that no camera, sensor or rig gives, such as 1e300, overflow or leave nothing to solve.
             self._prior.lose()
             self._headings.lose()
             detail = f"numbers of {self.node_a} or {self.node_b} are beyond all measure ({error})"
@@ -280,9 +280,10 @@ class SolverCore:
             known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
             sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px
             self._alignment.add(frame_a.stamp_ns, outcome, (rig_a, rig_b), known_s, sigma_rad)
+        pose = relative_pose(frame_a, frame_b, rig_a, sensed_a, outcome)
         self._finish(frame_a.trigger)
         self.counts["solved"] += 1
-        return relative_pose(frame_a, frame_b, rig_a, sensed_a, outcome)
+        return pose
 
     def _reject(self, frame: Candidates, reason: Reason, detail: str, stamp_ns: int | None = None) -> Rejected:
         self._finish(frame.trigger, newest=reason != "late")

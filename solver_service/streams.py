@@ -48,7 +48,7 @@ class NodeStream:
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
         self.held_up_ns = -HELD_UP_AGAIN_NS
-        self._came_ns: tuple[int, int] | None = None
+        self._newest_came_ns: tuple[int, int] | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
         self._newest_trigger = -1
@@ -88,14 +88,14 @@ class NodeStream:
 
     def saw_frame_come(self, stamp_ns: int, came_ns: int) -> None:
         """Compare when a frame was made and when it has come with the newest before; an old one again says nothing."""
-        made_before_ns, came_before_ns = self._came_ns or (stamp_ns - 1, came_ns)
+        made_before_ns, came_before_ns = self._newest_came_ns or (stamp_ns - 1, came_ns)
         if stamp_ns <= made_before_ns:
             return
         held_up_ns = came_ns - came_before_ns - (stamp_ns - made_before_ns)
         again = 0 <= came_ns - self.held_up_ns < HELD_UP_AGAIN_NS
         if held_up_ns > HELD_UP_NS and abs(came_ns - stamp_ns) < LIVE_WITHIN_NS and not again:
             self.held_up_ns = came_ns
-        self._came_ns = stamp_ns, came_ns
+        self._newest_came_ns = stamp_ns, came_ns
 
     def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
         if self.newest_ns is None:
@@ -116,7 +116,7 @@ class NodeStream:
         self._far.clear()
         self.frames.clear()
         self._sequence.clear()
-        self._came_ns = None
+        self._newest_came_ns = None
         self._newest_trigger = -1
         self.first_ns = self.newest_ns = stamp_ns
         return Arrival.CLOCK_SET

@@ -22,7 +22,7 @@ from solver_service.geometry.closed_form import dot
 from solver_service.geometry.observation import Heading, Settings
 from solver_service.geometry.rig import Rig, RigPair
 from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
-from solver_service.geometry.scalars import EIGHTH, HALF, ONE, QUARTER, TURN, TWO, scalar
+from solver_service.geometry.scalars import EIGHTH, HALF, MINUS_TWO, ONE, QUARTER, TURN, TWO, scalar
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
@@ -66,7 +66,6 @@ _LOG_USUAL: Final = scalar(math.log(1.0 - GROSS_PROBABILITY))
 _LOG_GROSS: Final = tuple(scalar(math.log(GROSS_PROBABILITY * GROSS_SCALE**-gaps)) for gaps in range(3))
 _GROSS_SLOPE: Final = scalar(0.5 / GROSS_SCALE**2)
 _MINUS_HALF: Final = scalar(-0.5)
-_MINUS_TWO: Final = scalar(-2.0)
 # The matrices whose products with a rotation, summed, are the vector part sin(angle) axis, and the trace.
 _TURNS: Final = np.concatenate((0.5 * skew(np.eye(3)), np.eye(3)[None]))
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
@@ -292,7 +291,7 @@ def weigh_heading(sine: Floats, cosine: Floats, variance: Floats) -> Floats:
     sine, cosine: (K,) as `Sensors.turns` gives them; variance: (K,) of both headings' difference.
     """
     half_turn = np.arctan2(sine, ONE + cosine)
-    density = _HEADING_PEAK * np.exp(_MINUS_TWO * half_turn * half_turn / variance) / np.sqrt(TURN * variance)
+    density = _HEADING_PEAK * np.exp(MINUS_TWO * half_turn * half_turn / variance) / np.sqrt(TURN * variance)
     log_ratio: Floats = np.log(density + _HEADING_FLOOR)
     return log_ratio
 

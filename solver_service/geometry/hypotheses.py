@@ -21,7 +21,7 @@ from solver_service.geometry.evidence import GROSS_SCALE
 from solver_service.geometry.observation import Settings
 from solver_service.geometry.rig import RigPair
 from solver_service.geometry.rotation import Floats
-from solver_service.geometry.scalars import EIGHTH, FOUR, HALF, ONE, PI, ZERO, scalar
+from solver_service.geometry.scalars import EIGHTH, FOUR, HALF, MINUS_TWO, ONE, PI, ZERO, scalar
 
 # The join's own error, in units of alpha^2: at the optical axis, and per tan^2 of the widest bearing. Found from
 # random poses over fields of view up to 90 degrees; the twist's is smaller.
@@ -55,7 +55,6 @@ _UNDECIDED: Final = scalar(0.3)
 _NEARLY_HALF_PI: Final = scalar(1.57)
 _HALF_PI: Final = scalar(0.5 * math.pi)
 _LEAST_COS2: Final = scalar(1e-6)
-_MINUS_TWO: Final = scalar(-2.0)
 
 
 @dataclass(eq=False, slots=True)
@@ -158,7 +157,7 @@ def find_pairs(candidates: Candidates, rigs: RigPair, down: tuple[Floats, Floats
         c=total[:3],
         w=w[:3] / chord,
         key=HALF * np.log(chord2 * cos_beta2 * own_m2) + EIGHTH * chord2,
-        twist_rad=np.arctan2(_MINUS_TWO * about / norm, w[0]),
+        twist_rad=np.arctan2(MINUS_TWO * about / norm, w[0]),
         variance=variance,
         chord=chord,
         log_weight=-np.log(crowded2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
