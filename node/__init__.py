@@ -1,5 +1,5 @@
 """One node: capture, detect, publish and record."""
 
-from protocol import __version__
+from buddyline.protocol import __version__
 
 __all__ = ["__version__"]

@@ -1,12 +1,12 @@
-"""Run one node: `python -m node --config a.toml`."""
+"""Run one node: `python -m buddyline.node --config a.toml`."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-from protocol.errors import BuddylineError
-from protocol.service import start_logging
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.service import start_logging
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,9 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the node until it is stopped; return the exit status."""
     import msgspec
-
-    from node.config import load_node_config
-    from node.service import NodeService
+    from buddyline.node.config import load_node_config
+    from buddyline.node.service import NodeService
 
     config = load_node_config(args.config)
     if args.connect:

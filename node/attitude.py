@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
+from buddyline.node.drivers.samples import ImuSample, Vector
+from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration
+from buddyline.node.heading import HeadingFilter, wrap
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from node.drivers.samples import ImuSample, Vector
-from node.geomagnetism import EarthField, MagnetometerCalibration
-from node.heading import HeadingFilter, wrap
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError
 
 SAMPLE_S: Final = 0.01
 # Swell averages out over more than its period, where the bias is known well enough to wait for it.

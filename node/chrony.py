@@ -7,7 +7,7 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any, Final
 
-from protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError
 
 COMMAND: Final = ("chronyc", "-n", "-c", "tracking")
 # A stopped node must not wait longer than its other threads do.

@@ -8,16 +8,16 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from node.chrony import ChronyError, Tracking, read_tracking
-from protocol.clock import Clock
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.messages import MAX_HEARD, ClockBeacon, HeardClock
-from protocol.topics import CLOCK, check_sender
+from buddyline.node.chrony import ChronyError, Tracking, read_tracking
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import MAX_HEARD, ClockBeacon, HeardClock
+from buddyline.protocol.topics import CLOCK, check_sender
 
 if TYPE_CHECKING:
-    from node.outlet import Outlet
-    from protocol.bus import Bus, Received
+    from buddyline.node.outlet import Outlet
+    from buddyline.protocol.bus import Bus, Received
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from node.drivers.readout import boottime_ns, wall_offset_ns
-from protocol.clock import MS_NS, S_NS
+from buddyline.node.drivers.readout import boottime_ns, wall_offset_ns
+from buddyline.protocol.clock import MS_NS, S_NS
 
 log = logging.getLogger(__name__)
 

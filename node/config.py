@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from buddyline.node.geomagnetism import EarthField, earth_field
+from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.messages import ArTag, CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
+from buddyline.protocol.security import Tls
 from msgspec import UNSET, Meta, field
 from msgspec.structs import replace
-
-from node.geomagnetism import EarthField, earth_field
-from protocol.config import Config, ConfigError, load_config
-from protocol.messages import ArTag, CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
-from protocol.security import Tls
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 

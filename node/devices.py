@@ -10,14 +10,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Message, NodeInfo
 from numpy.typing import NDArray
 
-from protocol.clock import Clock
-from protocol.errors import BuddylineError
-from protocol.messages import Message, NodeInfo
-
 if TYPE_CHECKING:
-    from node.config import NodeConfig
+    from buddyline.node.config import NodeConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +83,15 @@ class Source(Protocol):
 
 
 CAMERAS: Final[Mapping[str, str]] = {
-    "simulated": "node.sim.devices:open_camera",
-    "stored": "node.drivers.stored:open_camera",
-    "picamera2": "node.drivers.camera_picamera2:open_camera",
+    "simulated": "buddyline.node.sim.devices:open_camera",
+    "stored": "buddyline.node.drivers.stored:open_camera",
+    "picamera2": "buddyline.node.drivers.camera_picamera2:open_camera",
 }
 
 SENSORS: Final[Mapping[str, str]] = {
-    "simulated": "node.sim.devices:open_sensors",
-    "stored": "node.drivers.stored:open_sensors",
-    "i2c": "node.drivers.devices:open_sensors",
+    "simulated": "buddyline.node.sim.devices:open_sensors",
+    "stored": "buddyline.node.drivers.stored:open_sensors",
+    "i2c": "buddyline.node.drivers.devices:open_sensors",
 }
 
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]

@@ -15,9 +15,8 @@ import math
 from typing import Final
 
 import numpy as np
+from buddyline.node.geomagnetism import EarthField
 from numpy.typing import NDArray
-
-from node.geomagnetism import EarthField
 
 Vector = NDArray[np.float64]
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from buddyline.node.config import NodeConfig
+from buddyline.node.devices import Frame
+from buddyline.node.outlet import Outlet
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime
 from numpy.typing import NDArray
-
-from node.config import NodeConfig
-from node.devices import Frame
-from node.outlet import Outlet
-from protocol.clock import S_NS
-from protocol.messages import CompressedImage, FoxgloveTime
 
 
 class Turn:

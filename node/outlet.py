@@ -6,14 +6,14 @@ import threading
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from protocol.clock import Clock
-from protocol.codec import encode
-from protocol.messages import Message
-from protocol.topics import Topic, key_of, topic_of
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.codec import encode
+from buddyline.protocol.messages import Message
+from buddyline.protocol.topics import Topic, key_of, topic_of
 
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Publisher
-    from protocol.recorder import Recorder
+    from buddyline.protocol.bus import Bus, Publisher
+    from buddyline.protocol.recorder import Recorder
 
 
 class Outlet:

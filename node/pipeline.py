@@ -6,11 +6,10 @@ import statistics
 from collections import deque
 
 import msgspec
-
-from node.detect import Detection, Detector
-from node.devices import Frame
-from protocol.clock import trigger_index
-from protocol.messages import MAX_BLOBS, Blob, Candidates
+from buddyline.node.detect import Detection, Detector
+from buddyline.node.devices import Frame
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.messages import MAX_BLOBS, Blob, Candidates
 
 __all__ = ["Pipeline", "blobs_of"]
 

@@ -15,29 +15,28 @@ from typing import TYPE_CHECKING, Final
 import cv2
 import msgspec
 import numpy as np
+from buddyline.node import __version__
+from buddyline.node.clock_sync import ClockSync
+from buddyline.node.clock_watch import ClockWatch
+from buddyline.node.config import NodeConfig
+from buddyline.node.detect import make_detector
+from buddyline.node.devices import Camera, Frame, Source, open_camera, open_sensors
+from buddyline.node.images import Images
+from buddyline.node.outlet import Outlet
+from buddyline.node.pipeline import Pipeline
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.config import ConfigError, config_sha256
+from buddyline.protocol.messages import NodeInfo, NodeStatus
+from buddyline.protocol.pictures import PictureLog
+from buddyline.protocol.recorder import Recorder, RecordError
+from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
+from buddyline.protocol.service import Service
+from buddyline.protocol.statusfile import StatusFile
+from buddyline.protocol.topics import TOPICS
 from msgspec import UNSET
 
-from node import __version__
-from node.clock_sync import ClockSync
-from node.clock_watch import ClockWatch
-from node.config import NodeConfig
-from node.detect import make_detector
-from node.devices import Camera, Frame, Source, open_camera, open_sensors
-from node.images import Images
-from node.outlet import Outlet
-from node.pipeline import Pipeline
-from protocol.clock import S_NS, Clock, SystemClock
-from protocol.config import ConfigError, config_sha256
-from protocol.messages import NodeInfo, NodeStatus
-from protocol.pictures import PictureLog
-from protocol.recorder import Recorder, RecordError
-from protocol.security import RefusedError, SecurityError, check_identity, node_name
-from protocol.service import Service
-from protocol.statusfile import StatusFile
-from protocol.topics import TOPICS
-
 if TYPE_CHECKING:
-    from protocol.bus import Bus
+    from buddyline.protocol.bus import Bus
 
 log = logging.getLogger(__name__)
 
@@ -246,7 +245,7 @@ class NodeService(Service):
 
     def _open_bus(self) -> Bus | None:
         """Connect, again and again where the hub and this node do not accept each other: the log goes on anyway."""
-        from protocol.zenoh_bus import connect
+        from buddyline.protocol.zenoh_bus import connect
 
         while not self.stop.is_set():
             try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Final
 
-from protocol.clock import MS_NS, trigger_index
+from buddyline.protocol.clock import MS_NS, trigger_index
 
 PHASES: Final = 5
 SETTLING_FRAMES: Final = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
-from protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
+from buddyline.protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
 # What `ros2` publishes: domain, topic, type and its hash. Longer than any key of ours behind a namespace is.

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Protocol, Self, TypeAlias
 
-from protocol.clock import Clock
-from protocol.codec import encode, payload_stamp_ns
-from protocol.delivery import FailureLatch, RateCap, ThreadDiedError
-from protocol.messages import Message
-from protocol.topics import Topic, parse_key
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.delivery import FailureLatch, RateCap, ThreadDiedError
+from buddyline.protocol.messages import Message
+from buddyline.protocol.topics import Topic, parse_key
 
 CACHE_S: Final = 60.0
 MAX_TRIGGER_HZ: Final = 30.0

@@ -11,9 +11,8 @@ import math
 from typing import Any, Final, TypeVar
 
 import msgspec
-
-from protocol.errors import MessageError
-from protocol.messages import FoxgloveTime, Message
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import FoxgloveTime, Message
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-
-from protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError
 
 C = TypeVar("C", bound=msgspec.Struct)
 

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
-from protocol.clock import S_NS, Clock
+from buddyline.protocol.clock import S_NS, Clock
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 CLOSE_S: Final = 1.0

@@ -10,20 +10,19 @@ from functools import cache
 from pathlib import Path
 from typing import IO, Final, cast
 
+from buddyline.protocol import topics
+from buddyline.protocol.codec import decode, encode, payload_stamp_ns
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Message
+from buddyline.protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
+from buddyline.protocol.schemas import json_schema
+from buddyline.protocol.spool import Spool
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
-
-from protocol import topics
-from protocol.codec import decode, encode, payload_stamp_ns
-from protocol.errors import BuddylineError
-from protocol.messages import Message
-from protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
-from protocol.schemas import json_schema
-from protocol.spool import Spool
 
 CHUNK_BYTES: Final = 1024 * 1024
 LOG_NOTE: Final = "buddyline.log"

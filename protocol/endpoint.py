@@ -6,11 +6,11 @@ import ipaddress
 import re
 from typing import TYPE_CHECKING, Final
 
-from protocol.codec import MAX_MESSAGE_BYTES
-from protocol.errors import BuddylineError
+from buddyline.protocol.codec import MAX_MESSAGE_BYTES
+from buddyline.protocol.errors import BuddylineError
 
 if TYPE_CHECKING:
-    from protocol.security import Tls
+    from buddyline.protocol.security import Tls
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from protocol.bus import (
+from buddyline.protocol.bus import (
     CACHE_S,
     Bus,
     KeyExprs,
@@ -18,9 +18,9 @@ from protocol.bus import (
     each_of,
     held_order,
 )
-from protocol.clock import Clock, SystemClock
-from protocol.delivery import Delivery, RateCap
-from protocol.topics import Topic
+from buddyline.protocol.clock import Clock, SystemClock
+from buddyline.protocol.delivery import Delivery, RateCap
+from buddyline.protocol.topics import Topic
 
 
 def key_matches(key_expr: str, key: str) -> bool:

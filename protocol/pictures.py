@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
 
 log = logging.getLogger(__name__)
 

@@ -9,10 +9,10 @@ from collections import deque
 from pathlib import Path
 from typing import Final
 
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.pictures import FULL, PictureLog
-from protocol.topics import IMAGE, parse_key
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.pictures import FULL, PictureLog
+from buddyline.protocol.topics import IMAGE, parse_key
 
 log = logging.getLogger(__name__)
 

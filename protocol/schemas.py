@@ -7,9 +7,8 @@ from functools import cache
 from typing import Any
 
 import msgspec
+from buddyline.protocol.messages import Message
 from msgspec import inspect
-
-from protocol.messages import Message
 
 _PLAIN = {
     inspect.IntType: {"type": "integer"},

@@ -12,11 +12,10 @@ import stat
 from pathlib import Path
 from typing import Final
 
+from buddyline.protocol.config import Config
+from buddyline.protocol.endpoint import host_and_port
+from buddyline.protocol.errors import BuddylineError
 from msgspec.structs import replace
-
-from protocol.config import Config
-from protocol.endpoint import host_and_port
-from protocol.errors import BuddylineError
 
 HUB: Final = "hub"
 SOLVER: Final = "solver"

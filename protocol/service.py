@@ -12,12 +12,12 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from protocol.errors import BuddylineError
-from protocol.systemd import Notifier
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.systemd import Notifier
 
 if TYPE_CHECKING:
-    from protocol.messages import Message
-    from protocol.statusfile import StatusFile
+    from buddyline.protocol.messages import Message
+    from buddyline.protocol.statusfile import StatusFile
 
 log = logging.getLogger(__name__)
 

@@ -14,8 +14,7 @@ import time
 from pathlib import Path
 
 import msgspec
-
-from protocol.messages import Message
+from buddyline.protocol.messages import Message
 
 log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal
 
-from protocol import messages
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import NODE_ID_PATTERN, Message
+from buddyline.protocol import messages
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import NODE_ID_PATTERN, Message
 
 Priority = Literal["interactive_high", "data_high", "data", "data_low", "background"]
 

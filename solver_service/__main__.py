@@ -1,12 +1,12 @@
-"""Run the solver: `python -m solver_service`."""
+"""Run the solver: `python -m buddyline.solver_service`."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-from protocol.errors import BuddylineError
-from protocol.service import start_logging
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.service import start_logging
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,9 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the solver until it is stopped; return the exit status."""
     import msgspec
-
-    from solver_service.config import load_solver_config
-    from solver_service.service import SolverService
+    from buddyline.solver_service.config import load_solver_config
+    from buddyline.solver_service.service import SolverService
 
     config = load_solver_config(args.config)
     if args.connect:

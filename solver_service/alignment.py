@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.rotation import matrix_of, rotation_exp
+from buddyline.solver_service.geometry.trigger import Fix, Rig
 from numpy.typing import NDArray
-
-from protocol.clock import S_NS
-from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.rotation import matrix_of, rotation_exp
-from solver_service.geometry.trigger import Fix, Rig
 
 Floats = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from protocol.clock import S_NS
-from protocol.messages import Rejected, RelativePose
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Rejected, RelativePose
 
 Outcome = RelativePose | Rejected
 

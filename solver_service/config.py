@@ -6,13 +6,12 @@ import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
+from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.messages import NodeId
+from buddyline.protocol.security import SOLVER, Tls, check_identity
+from buddyline.solver_service.geometry.observation import Method, Settings
 from msgspec import Meta, field
 from msgspec.structs import replace
-
-from protocol.config import Config, ConfigError, load_config
-from protocol.messages import NodeId
-from protocol.security import SOLVER, Tls, check_identity
-from solver_service.geometry.observation import Method, Settings
 
 CHECKS = ("range", "twist", "attitude", "depth")
 METHODS = get_args(Method)

@@ -10,10 +10,8 @@ from __future__ import annotations
 from collections import Counter, OrderedDict, deque
 from typing import Final
 
-from msgspec.structs import replace
-
-from protocol.clock import S_NS, trigger_index
-from protocol.messages import (
+from buddyline.protocol.clock import S_NS, trigger_index
+from buddyline.protocol.messages import (
     Attitude,
     Candidates,
     Depth,
@@ -23,15 +21,16 @@ from protocol.messages import (
     Rejected,
     RelativePose,
 )
-from solver_service.alignment import ClockAlignment
-from solver_service.geometry.evidence import heading_offset
-from solver_service.geometry.observation import Heading
-from solver_service.geometry.rotation import matrix_of
-from solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
-from solver_service.headings import HeadingOffset
-from solver_service.prior import PosePrior
-from solver_service.results import relative_pose, sensed_of, view_of
-from solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
+from buddyline.solver_service.alignment import ClockAlignment
+from buddyline.solver_service.geometry.evidence import heading_offset
+from buddyline.solver_service.geometry.observation import Heading
+from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
+from buddyline.solver_service.headings import HeadingOffset
+from buddyline.solver_service.prior import PosePrior
+from buddyline.solver_service.results import relative_pose, sensed_of, view_of
+from buddyline.solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
+from msgspec.structs import replace
 
 # How long, in the dive's own time, a frame waits for the other node's frame that may still come.
 MATCH_WINDOW_NS: Final = 1 * S_NS

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from protocol.clock import S_NS
-from solver_service.geometry.observation import Heading
+from buddyline.protocol.clock import S_NS
+from buddyline.solver_service.geometry.observation import Heading
 
 # Without a pose for so long, another bias is as likely as this one.
 LIFETIME_NS: Final = 60 * S_NS

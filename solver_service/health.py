@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from protocol.clock import S_NS
+from buddyline.protocol.clock import S_NS
 
 # Said with the next status, a second later at most: within two seconds together.
 STALE_S: Final = 1.0

@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import Final, TypeAlias
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.trigger import Fix, Prior
 from numpy.typing import NDArray
-
-from protocol.clock import S_NS
-from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
-from solver_service.geometry.trigger import Fix, Prior
 
 LIFETIME_NS: Final = 2 * S_NS
 # How divers and the cameras they hold speed up and turn: spectral densities of white acceleration,

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, RelativePose
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.trigger import Fix, Rig, Sensed, View
+from buddyline.solver_service.sensors import SampleStream, attitude_at, depth_at
 from msgspec import UNSET
-
-from protocol.messages import Attitude, Candidates, Depth, NodeInfo, RelativePose
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rotation import matrix_of
-from solver_service.geometry.trigger import Fix, Rig, Sensed, View
-from solver_service.sensors import SampleStream, attitude_at, depth_at
 
 
 def rig_of(info: NodeInfo) -> Rig:

@@ -8,10 +8,9 @@ from collections import deque
 from typing import Final, Generic, TypeVar
 
 import numpy as np
+from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.messages import Attitude, Depth
 from numpy.typing import NDArray
-
-from protocol.clock import MS_NS, S_NS
-from protocol.messages import Attitude, Depth
 
 # Samples further back than this come of a clock that has been set.
 HORIZON_NS: Final = 20 * S_NS

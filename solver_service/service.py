@@ -10,25 +10,34 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol import __version__
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus
+from buddyline.protocol.service import Service
+from buddyline.protocol.statusfile import StatusFile
+from buddyline.protocol.topics import (
+    ATTITUDE,
+    CANDIDATES,
+    DEPTH,
+    INFO,
+    POSE,
+    REJECTED,
+    SOLVER_STATUS,
+    check_sender,
+    parse_key,
+)
+from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
+from buddyline.solver_service.answered import Answered
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.health import NodeHealth
+from buddyline.solver_service.streams import LIVE_WITHIN_NS
 from msgspec import UNSET
 
-from protocol import __version__
-from protocol.clock import S_NS, Clock, SystemClock
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus
-from protocol.service import Service
-from protocol.statusfile import StatusFile
-from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, SOLVER_STATUS, check_sender, parse_key
-from solver_service.alignment import ClockAlignment, ClockOffset
-from solver_service.answered import Answered
-from solver_service.config import SolverConfig
-from solver_service.core import SolverCore
-from solver_service.health import NodeHealth
-from solver_service.streams import LIVE_WITHIN_NS
-
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Publisher, Received
+    from buddyline.protocol.bus import Bus, Publisher, Received
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +87,7 @@ class SolverService(Service):
         self.spawn("bus", self._connect)
 
     def _connect(self) -> None:
-        from protocol.zenoh_bus import connect
+        from buddyline.protocol.zenoh_bus import connect
 
         bus = connect(
             self.config.connect,

@@ -7,11 +7,11 @@ from collections import OrderedDict
 from enum import Enum
 from typing import Final
 
-from protocol.clock import S_NS
-from protocol.messages import Attitude, Candidates, Depth, NodeInfo
-from solver_service.geometry.rig import Rig
-from solver_service.results import rig_of
-from solver_service.sensors import DEPTH_LAG_NS, SampleStream
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.results import rig_of
+from buddyline.solver_service.sensors import DEPTH_LAG_NS, SampleStream
 
 # A frame further than this from the node's others is not of the same time line ...
 FAR_NS: Final = 5 * S_NS

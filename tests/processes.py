@@ -24,7 +24,7 @@ def free_endpoint() -> str:
 def buddyline(*words: str, timeout: float = 60.0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run one command to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "tools", *map(str, words)],
+        [sys.executable, "-P", "-m", "buddyline", *map(str, words)],
         capture_output=True,
         text=True,
         timeout=timeout,
@@ -41,7 +41,7 @@ class Process:
     """
 
     def __init__(
-        self, *words: str, cwd: Path | None = None, prefix: tuple[str, ...] = (), module: str = "tools"
+        self, *words: str, cwd: Path | None = None, prefix: tuple[str, ...] = (), module: str = "buddyline"
     ) -> None:
         self.lines: list[str] = []
         self._changed = threading.Condition()

@@ -7,12 +7,12 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import Rejected, RelativePose
+from buddyline.tools.dives import Dive
 
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.messages import Rejected, RelativePose
 from tests.processes import Process, buddyline, free_endpoint
 from tests.solver_service.conftest import dive_messages
-from tools.dives import Dive
 
 END_WITHIN_S = 2.0
 

@@ -8,14 +8,14 @@ import logging
 from dataclasses import asdict
 from typing import Final
 
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError, MessageError
-from solver_service.alignment import ClockAlignment, ClockOffset
-from solver_service.config import SolveConfig
-from solver_service.core import SolverCore
-from tools.dives import Dive
-from tools.progress import Progress
-from tools.solve import messages_of, pair_of
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
+from buddyline.solver_service.config import SolveConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.tools.dives import Dive
+from buddyline.tools.progress import Progress
+from buddyline.tools.solve import messages_of, pair_of
 
 log = logging.getLogger(__name__)
 

@@ -10,23 +10,22 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from buddyline.node.drivers.stored import PictureError, decode_picture
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.codec import encode
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Attitude, CompressedImage, NodeInfo, RelativePose
+from buddyline.protocol.topics import ARTAG, check_node_id, parse_key
+from buddyline.tools.dives import Dive
+from buddyline.tools.evaluation.rotation import Floats, multiply, normalized, rotate
+from buddyline.tools.evaluation.truth import Track
+from buddyline.tools.progress import Progress
+from buddyline.tools.solve import COPIED, pair_of
+from buddyline.tools.tags.detection import TagFinder
+from buddyline.tools.tags.layout import Layout, layout_of, load_layout
+from buddyline.tools.tags.pose import TagPose, readings_of, tag_pose
 from msgspec import UNSET
-
-from node.drivers.stored import PictureError, decode_picture
-from protocol.clock import trigger_index
-from protocol.codec import encode
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, CompressedImage, NodeInfo, RelativePose
-from protocol.topics import ARTAG, check_node_id, parse_key
-from tools.dives import Dive
-from tools.evaluation.rotation import Floats, multiply, normalized, rotate
-from tools.evaluation.truth import Track
-from tools.progress import Progress
-from tools.solve import COPIED, pair_of
-from tools.tags.detection import TagFinder
-from tools.tags.layout import Layout, layout_of, load_layout
-from tools.tags.pose import TagPose, readings_of, tag_pose
 
 log = logging.getLogger(__name__)
 

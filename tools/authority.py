@@ -9,12 +9,11 @@ import secrets
 from pathlib import Path
 from typing import Final, Self
 
+from buddyline.protocol.errors import BuddylineError
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-from protocol.errors import BuddylineError
 
 # A node without a clock of its own may be behind by as much when it is switched on.
 BACKDATED: Final = datetime.timedelta(days=7)

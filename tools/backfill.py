@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-
-from protocol.divelog import DiveLogReader, DiveLogWriter, Record
-from protocol.errors import BuddylineError
-from tools.dives import Dive
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, Record
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.dives import Dive
 
 Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns), sorted, and their payloads' CRC-32
 

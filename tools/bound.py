@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-
-from protocol.messages import NodeInfo
-from tools.evaluation.lights import project
-from tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate
+from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.evaluation.lights import project
+from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate
 
 _STEP: Final = 1e-5
 

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-
-from protocol.clock import SystemClock
-from protocol.codec import encode
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, NodeInfo, Vector3
-from tools.client import add_client_arguments, client_config
-from tools.dives import load_info
+from buddyline.protocol.clock import SystemClock
+from buddyline.protocol.codec import encode
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel, NodeInfo, Vector3
+from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.dives import load_info
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +103,7 @@ def _result_arguments(parser: argparse.ArgumentParser, kind: str, pair: bool = F
 
 
 def _board(args: argparse.Namespace) -> None:
-    from tools.calibration.board import Board
+    from buddyline.tools.calibration.board import Board
 
     board = Board(args.columns, args.rows, args.square_mm / 1e3)
     board.write_pdf(Path(args.output))
@@ -112,10 +111,10 @@ def _board(args: argparse.Namespace) -> None:
 
 
 def _camera(args: argparse.Namespace) -> None:
-    from tools.calibration.board import Board
-    from tools.calibration.camera import CornerFinder, calibrate, distinct, draw
-    from tools.calibration.inputs import pictures
-    from tools.calibration.pictures import write_picture
+    from buddyline.tools.calibration.board import Board
+    from buddyline.tools.calibration.camera import CornerFinder, calibrate, distinct, draw
+    from buddyline.tools.calibration.inputs import pictures
+    from buddyline.tools.calibration.pictures import write_picture
 
     if bool(args.info) != bool(args.new_info):
         raise BuddylineError("--info and --new-info go together")
@@ -151,10 +150,10 @@ def _camera(args: argparse.Namespace) -> None:
 
 
 def _lights(args: argparse.Namespace) -> None:
-    from solver_service.results import rig_of
-    from tools.calibration.inputs import stations
-    from tools.calibration.lights import Noise, fit
-    from tools.calibration.pictures import draw_lights, write_picture
+    from buddyline.solver_service.results import rig_of
+    from buddyline.tools.calibration.inputs import stations
+    from buddyline.tools.calibration.lights import Noise, fit
+    from buddyline.tools.calibration.pictures import draw_lights, write_picture
 
     places, infos = stations(args.dives, [tuple(tape) for tape in args.tape])
     rigs = rig_of(infos[0]), rig_of(infos[1])
@@ -179,10 +178,10 @@ def _lights(args: argparse.Namespace) -> None:
 
 
 def _magnetometer(args: argparse.Namespace) -> None:
-    from node.geomagnetism import earth_field
-    from tools.calibration.ellipsoid import fit
-    from tools.calibration.inputs import inertial
-    from tools.calibration.pictures import draw_magnetometer, write_picture
+    from buddyline.node.geomagnetism import earth_field
+    from buddyline.tools.calibration.ellipsoid import fit
+    from buddyline.tools.calibration.inputs import inertial
+    from buddyline.tools.calibration.pictures import draw_magnetometer, write_picture
 
     node, mags_t, accels_mps2 = inertial(args.dives, args.node)
     norm_t = None
@@ -213,7 +212,7 @@ def _magnetometer(args: argparse.Namespace) -> None:
 
 
 def _clock(args: argparse.Namespace) -> int:
-    from tools.calibration.clock_report import as_json, as_text, listen, read, reports
+    from buddyline.tools.calibration.clock_report import as_json, as_text, listen, read, reports
 
     if not 3.0 <= args.seconds <= 3600.0:
         raise BuddylineError(f"--seconds {args.seconds:g}: 3 to 3600")

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
-from protocol import __version__
-from protocol.errors import BuddylineError
+from buddyline.protocol import __version__
+from buddyline.protocol.errors import BuddylineError
 
 SUMMARY: Final = "Two underwater nodes see each other's lights; Buddyline says where they are."
 
@@ -29,55 +29,60 @@ class Command:
 COMMANDS: Final = (
     Command(
         "demo",
-        "tools.demo",
+        "buddyline.tools.demo",
         "run hub, two simulated nodes and solver on this machine, and watch the poses",
         ("buddyline demo", "buddyline demo --environment lake --seconds 30"),
     ),
-    Command("hub", "tools.hub", "run the hub that all others connect to", ("buddyline hub",)),
+    Command("hub", "buddyline.tools.hub", "run the hub that all others connect to", ("buddyline hub",)),
     Command(
         "keys",
-        "tools.keys",
+        "buddyline.tools.keys",
         "make keys and certificates, so that the hub may listen beyond this machine",
         ("buddyline keys init --hub 192.168.2.1", "buddyline keys node a", "buddyline keys solver"),
     ),
     Command(
-        "node", "node.__main__", "run one node: camera, sensors, detector, log", ("buddyline node --config a.toml",)
+        "node",
+        "buddyline.node.__main__",
+        "run one node: camera, sensors, detector, log",
+        ("buddyline node --config a.toml",),
     ),
     Command(
         "install-service",
-        "tools.install_service",
+        "buddyline.tools.install_service",
         "write the systemd unit of node, hub or solver",
         ("sudo .venv/bin/buddyline install-service node --config pi.toml", "buddyline install-service hub --print"),
     ),
     Command(
         "doctor",
-        "tools.doctor.command",
+        "buddyline.tools.doctor.command",
         "check what a diver would forget, and say what to do about it",
         ("buddyline doctor --config a.toml", "buddyline doctor", "buddyline doctor --config a.toml --json"),
     ),
-    Command("solver", "solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)),
+    Command(
+        "solver", "buddyline.solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)
+    ),
     Command(
         "play",
-        "tools.play",
+        "buddyline.tools.play",
         "send stored dives over the bus, as if they happened now",
         ("buddyline play a.mcap b.mcap", "buddyline play dive.mcap --speed 4 --start 10 --end 60"),
     ),
-    Command("record", "tools.record", "record the bus into a dive log", ("buddyline record topside.mcap",)),
+    Command("record", "buddyline.tools.record", "record the bus into a dive log", ("buddyline record topside.mcap",)),
     Command(
         "repair",
-        "tools.repair",
+        "buddyline.tools.repair",
         "make a proper log out of a damaged one, and say what was lost",
         ("buddyline repair cut.mcap -o whole.mcap",),
     ),
     Command(
         "backfill",
-        "tools.backfill",
+        "buddyline.tools.backfill",
         "complete a topside recording out of the nodes' own logs",
         ("buddyline backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
     ),
     Command(
         "detect",
-        "tools.detect",
+        "buddyline.tools.detect",
         "find light candidates in stored pictures or a dive's pictures",
         (
             "buddyline detect photos/ --draw marked/",
@@ -86,91 +91,91 @@ COMMANDS: Final = (
     ),
     Command(
         "tune",
-        "tools.tune",
+        "buddyline.tools.tune",
         "propose a site's detector values, and show the pictures they were judged on",
         ("buddyline tune dive.mcap", "buddyline tune pictures/ --draw judged/"),
     ),
     Command(
         "solve",
-        "tools.solve",
+        "buddyline.tools.solve",
         "solve stored dives offline",
         ("buddyline solve a.mcap b.mcap -o poses.mcap", "buddyline solve dive.mcap -o p.mcap --checks range"),
     ),
     Command(
         "align",
-        "tools.align",
+        "buddyline.tools.align",
         "find the offset between the two nodes' clocks from a dive in which they moved",
         ("buddyline align a.mcap b.mcap",),
     ),
     Command(
         "calibrate",
-        "tools.calibrate",
+        "buddyline.tools.calibrate",
         "calibrate camera, lights, magnetometer or clocks, and say whether the result is good",
         ("buddyline calibrate board -o board.pdf", "buddyline calibrate camera pictures/", "buddyline calibrate clock"),
     ),
     Command(
         "simulate",
-        "tools.simulate",
+        "buddyline.tools.simulate",
         "make a dive with known truth",
         ("buddyline simulate dive.mcap --environment basin --seconds 60", "buddyline simulate dive.mcap --images"),
     ),
     Command(
         "evaluate",
-        "tools.evaluate",
+        "buddyline.tools.evaluate",
         "measure poses and candidates against truth",
         ("buddyline evaluate poses.mcap --truth dive.truth.mcap",),
     ),
     Command(
         "monitor",
-        "tools.monitor.live",
+        "buddyline.tools.monitor.live",
         "watch a running pair in the browser: scene, cameras, plots, health",
         ("buddyline monitor", "buddyline monitor --connect tcp/192.168.2.1:7447 --open"),
     ),
     Command(
         "view",
-        "tools.monitor.view",
+        "buddyline.tools.monitor.view",
         "look at a stored dive in the browser, played from anywhere",
         ("buddyline view poses.mcap", "buddyline view pictures.mcap poses.mcap --start 60"),
     ),
     Command(
         "report",
-        "tools.monitor.report",
+        "buddyline.tools.monitor.report",
         "write a dive's report: one page to keep and to send",
         ("buddyline report poses.mcap -o report.html",),
     ),
     Command(
         "ros2",
-        "tools.ros2",
+        "buddyline.tools.ros2",
         "let ROS 2 (rmw_zenoh) see attitudes, depths, poses and transforms",
         ("buddyline ros2", "buddyline ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
     ),
     Command(
         "artag",
-        "tools.artag",
+        "buddyline.tools.artag",
         "poses from AR tags in a dive's pictures, to compare the lights with",
         ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
     ),
     Command(
         "experiments",
-        "tools.experiments.command",
+        "buddyline.tools.experiments.command",
         "the paper's figures and numbers, again, with ours beside them: one report",
         ("buddyline experiments -o report/ --quick", "buddyline experiments -o report/ --tag-video test_vid.mp4"),
     ),
     Command(
         "plan",
-        "tools.plan",
+        "buddyline.tools.plan",
         "how far a pair will measure well, by camera, lights and visibility",
         ("buddyline plan --baseline 0.88 --visibility 6 --camera a.toml",),
     ),
     Command(
         "mark",
-        "tools.survey.mark",
+        "buddyline.tools.survey.mark",
         "name a station or a point of a running dive",
         ('buddyline mark T4 --node b --note "flake"',),
     ),
     Command(
         "survey",
-        "tools.survey.command",
+        "buddyline.tools.survey.command",
         "legs and stations out of solved dives, adjusted, and files that surveyors use",
         (
             "buddyline survey legs cave.toml --dive solved.mcap a.mcap b.mcap",
@@ -179,7 +184,7 @@ COMMANDS: Final = (
     ),
     Command(
         "export",
-        "tools.export",
+        "buddyline.tools.export",
         "write poses for other programs",
         ("buddyline export poses.mcap --format tum -o poses.tum",),
     ),
@@ -224,7 +229,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(command: Command, words: list[str]) -> int:
-    from protocol.service import start_logging
+    from buddyline.protocol.service import start_logging
 
     module = import_module(command.module)
     parser = argparse.ArgumentParser(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 
+from buddyline.protocol.config import Config, load_config
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
+from buddyline.protocol.security import VIEWER, Tls, check_identity
 from msgspec.structs import replace
-
-from protocol.config import Config, load_config
-from protocol.endpoint import DEFAULT_ENDPOINT
-from protocol.security import VIEWER, Tls, check_identity
 
 
 class ClientConfig(Config, frozen=True, kw_only=True):

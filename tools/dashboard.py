@@ -10,19 +10,18 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
+from buddyline.node.sim.scenario import Environment, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus
+from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, parse_key
+from buddyline.solver_service.geometry.rotation import matrix_of
 from msgspec import UNSET
 
-from node.sim.scenario import Environment, Scenario
-from node.sim.world import World
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus
-from protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, parse_key
-from solver_service.geometry.rotation import matrix_of
-
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Received
+    from buddyline.protocol.bus import Bus, Received
 
 RECENT_S: Final = 5.0
 STALE_S: Final = 1.0

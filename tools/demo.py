@@ -16,10 +16,10 @@ import time
 from pathlib import Path
 from typing import Final
 
-from node.sim.scenario import ENVIRONMENTS
-from protocol.errors import BuddylineError
-from protocol.service import Service
-from tools.dashboard import Dashboard
+from buddyline.node.sim.scenario import ENVIRONMENTS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.service import Service
+from buddyline.tools.dashboard import Dashboard
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ class Processes:
         """Start `buddyline words...`; its messages go to a file of its own."""
         with open(self._log_of(name), "wb") as errors:
             self._children[name] = subprocess.Popen(
-                [sys.executable, "-m", "tools", *words],
+                [sys.executable, "-P", "-m", "buddyline", *words],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
@@ -130,7 +130,7 @@ start_ns = {start_ns}
 
 def run(args: argparse.Namespace) -> int:
     """Run the demo until its time is over, or until stopped."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     service = Service("demo")
     service.handle_signals()

@@ -10,19 +10,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
-
-from node.detect import ENVIRONMENTS, METHODS, Detection, draw, make_detector
-from node.devices import Frame
-from node.drivers.stored import PictureError, decode_picture, picture_files
-from node.pipeline import Pipeline
-from protocol.clock import trigger_index
-from protocol.codec import encode
-from protocol.divelog import DiveLogWriter, Record
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Candidates, CompressedImage, Message, NodeInfo
-from protocol.topics import parse_key
-from tools.dives import Dive
-from tools.progress import Progress
+from buddyline.node.detect import ENVIRONMENTS, METHODS, Detection, draw, make_detector
+from buddyline.node.devices import Frame
+from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
+from buddyline.node.pipeline import Pipeline
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.codec import encode
+from buddyline.protocol.divelog import DiveLogWriter, Record
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo
+from buddyline.protocol.topics import parse_key
+from buddyline.tools.dives import Dive
+from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 

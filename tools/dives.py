@@ -9,14 +9,13 @@ from pathlib import Path
 from types import TracebackType
 
 import msgspec
-
-from protocol.codec import decode
-from protocol.config import ConfigError
-from protocol.divelog import DiveLogReader, Record, read_logs
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import NodeInfo
-from protocol.pictures import with_pictures
-from protocol.topics import INFO, parse_key
+from buddyline.protocol.codec import decode
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.divelog import DiveLogReader, Record, read_logs
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import NodeInfo
+from buddyline.protocol.pictures import with_pictures
+from buddyline.protocol.topics import INFO, parse_key
 
 
 class Dive:

@@ -7,10 +7,10 @@ import json
 import logging
 from pathlib import Path
 
-from protocol.errors import BuddylineError
-from tools.evaluation.logs import load_for_evaluation, parse_pair
-from tools.evaluation.report import as_dict, as_text
-from tools.evaluation.result import evaluate
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.evaluation.logs import load_for_evaluation, parse_pair
+from buddyline.tools.evaluation.report import as_dict, as_text
+from buddyline.tools.evaluation.result import evaluate
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print, and draw where asked for; return 0."""
     if args.plots is not None:
-        from tools.evaluation import plots
+        from buddyline.tools.evaluation import plots
 
         plots.check(args.plots)
     recorded = load_for_evaluation(args.logs, args.truth, args.pair)

@@ -11,12 +11,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Rejected, RelativePose, Truth
+from buddyline.tools.evaluation.logs import load, parse_pair
 from msgspec import UNSET
-
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import Rejected, RelativePose, Truth
-from tools.evaluation.logs import load, parse_pair
 
 FORMATS: Final = ("tum", "csv", "foxglove")
 
@@ -78,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _export_foxglove(args: argparse.Namespace) -> int:
-    from tools.dives import Dive
-    from tools.export_foxglove import export_foxglove
+    from buddyline.tools.dives import Dive
+    from buddyline.tools.export_foxglove import export_foxglove
 
     if args.output is None:
         raise BuddylineError("--format foxglove: give -o FILE.mcap")

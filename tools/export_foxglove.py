@@ -12,13 +12,21 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, Blob, Candidates, CompressedImage, Depth, Message, NodeInfo, RelativePose
-from protocol.topics import parse_key
-from solver_service.geometry.rotation import matrix_of, quaternion_of
-from tools.dives import Dive
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import (
+    Attitude,
+    Blob,
+    Candidates,
+    CompressedImage,
+    Depth,
+    Message,
+    NodeInfo,
+    RelativePose,
+)
+from buddyline.protocol.topics import parse_key
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.tools.dives import Dive
 
 WORLD: Final = "world"
 TRANSFORMS: Final = "/tf"

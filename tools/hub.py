@@ -5,16 +5,15 @@ from __future__ import annotations
 import argparse
 import logging
 
+from buddyline.protocol.config import Config, load_config
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodeId
+from buddyline.protocol.security import HUB, Tls, check_identity
+from buddyline.protocol.service import Service
+from buddyline.protocol.statusfile import StatusFile
 from msgspec import field
 from msgspec.structs import replace
-
-from protocol.config import Config, load_config
-from protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
-from protocol.errors import BuddylineError
-from protocol.messages import NodeId
-from protocol.security import HUB, Tls, check_identity
-from protocol.service import Service
-from protocol.statusfile import StatusFile
 
 log = logging.getLogger(__name__)
 
@@ -67,8 +66,8 @@ def check_exposure(config: HubConfig, *, insecure: bool) -> str | None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the hub until it is stopped."""
-    from protocol.access import access_rules
-    from protocol.zenoh_bus import open_hub
+    from buddyline.protocol.access import access_rules
+    from buddyline.protocol.zenoh_bus import open_hub
 
     config = load_hub_config(args.config)
     if args.listen:

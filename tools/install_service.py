@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError
 
 SERVICES: Final = ("node", "hub", "solver")
 STATE: Final = Path("/var/lib/buddyline")
@@ -145,7 +145,7 @@ def _plan(args: argparse.Namespace) -> Plan:
         return Plan(args.service, config, _user(args))
     if config is None:
         raise BuddylineError("a node needs its configuration: --config FILE.toml")
-    from node.config import load_node_config
+    from buddyline.node.config import load_node_config
 
     node = load_node_config(config)
     groups = ["video"] if node.camera.name == "picamera2" else []
@@ -157,11 +157,11 @@ def _plan(args: argparse.Namespace) -> Plan:
 
 def _check_config(service: str, config: Path) -> None:
     if service == "hub":
-        from tools.hub import load_hub_config
+        from buddyline.tools.hub import load_hub_config
 
         load_hub_config(str(config))
     else:
-        from solver_service.config import load_solver_config
+        from buddyline.solver_service.config import load_solver_config
 
         load_solver_config(config)
 

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from protocol.endpoint import host_and_port
-from protocol.errors import BuddylineError
-from protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
-from protocol.topics import check_node_id
+from buddyline.protocol.endpoint import host_and_port
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
+from buddyline.protocol.topics import check_node_id
 
 if TYPE_CHECKING:
-    from tools.authority import Authority
+    from buddyline.tools.authority import Authority
 
 DIRECTORY: Final = "keys"
 PORT: Final = 7447
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make keys; never over others."""
     try:
-        from tools.authority import Authority
+        from buddyline.tools.authority import Authority
     except ImportError as error:
         raise BuddylineError("keys: the package cryptography is missing; `pip install 'buddyline[keys]'`") from error
     if args.days is not None and args.days < 1:
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Path]:
-    from tools.authority import Authority
+    from buddyline.tools.authority import Authority
 
     host_and_port(f"tls/{host}:{PORT}")
     authority = Authority.create(directory, authority_days)

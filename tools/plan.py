@@ -11,13 +11,12 @@ from typing import Any, Final
 
 import msgspec
 import numpy as np
-
-from node.config import load_node_config
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, NodeInfo
-from tools.bound import pose_bounds
-from tools.dives import load_info
-from tools.evaluation.rotation import Floats, multiply, normalized
+from buddyline.node.config import load_node_config
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel, NodeInfo
+from buddyline.tools.bound import pose_bounds
+from buddyline.tools.dives import load_info
+from buddyline.tools.evaluation.rotation import Floats, multiply, normalized
 
 RANGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
 FIELD_OF_VIEW_RAD: Final = math.radians(48.8)

@@ -10,23 +10,22 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.divelog import Record
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from buddyline.protocol.security import PLAYER
+from buddyline.protocol.service import Service
+from buddyline.protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
+from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.dives import Dive
+from buddyline.tools.progress import Progress
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from protocol.clock import S_NS, Clock, SystemClock
-from protocol.codec import encode, payload_stamp_ns
-from protocol.divelog import Record
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import CompressedImage, FoxgloveTime, Message
-from protocol.security import PLAYER
-from protocol.service import Service
-from protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
-from tools.client import add_client_arguments, client_config
-from tools.dives import Dive
-from tools.progress import Progress
-
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Publisher, Received
+    from buddyline.protocol.bus import Bus, Publisher, Received
 
 log = logging.getLogger(__name__)
 
@@ -183,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
     """Play until the dive's end, or until stopped."""
     if not (math.isfinite(args.speed) and args.speed >= 0):
         raise BuddylineError(f"--speed {args.speed}: 0 or more")
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     config = client_config(args, PLAYER)
     service = Service("play")

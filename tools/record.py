@@ -9,15 +9,15 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.recorder import Recorder
-from protocol.service import Service
-from protocol.topics import EVERYTHING, check_sender, parse_key
-from tools.client import add_client_arguments, client_config
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.recorder import Recorder
+from buddyline.protocol.service import Service
+from buddyline.protocol.topics import EVERYTHING, check_sender, parse_key
+from buddyline.tools.client import add_client_arguments, client_config
 
 if TYPE_CHECKING:
-    from protocol.bus import Received
+    from buddyline.protocol.bus import Received
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class BusRecorder:
 
 def run(args: argparse.Namespace) -> int:
     """Record until stopped."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     config = client_config(args)
     service = Service("record")

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-
-from protocol.clock import S_NS
-from protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 
 SHOWN_GAPS: Final = 20
 

@@ -17,19 +17,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-
-from protocol.clock import S_NS, Clock, SystemClock
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
-from protocol.security import ROS
-from protocol.service import Service
-from protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
-from solver_service.geometry.rotation import matrix_of, quaternion_of
-from tools.client import add_client_arguments, client_config
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
+from buddyline.protocol.security import ROS
+from buddyline.protocol.service import Service
+from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.tools.client import add_client_arguments, client_config
 
 if TYPE_CHECKING:
-    from protocol.bus import Received
+    from buddyline.protocol.bus import Received
 
 log = logging.getLogger(__name__)
 
@@ -249,7 +248,7 @@ def run(args: argparse.Namespace) -> int:
     service.handle_signals()
 
     def follow() -> None:
-        from protocol.zenoh_bus import connect, open_session
+        from buddyline.protocol.zenoh_bus import connect, open_session
 
         def waits(text: str) -> None:
             log.info("ros2: %s", text)

@@ -8,13 +8,12 @@ import sys
 from dataclasses import asdict, fields
 
 import cv2
-
-from node.sim.dive import Plan, messages
-from node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
-from node.sim.world import World
-from protocol.clock import MS_NS, S_NS
-from protocol.divelog import DiveLogWriter
-from tools.progress import Progress
+from buddyline.node.sim.dive import Plan, messages
+from buddyline.node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
 ASPECT = 616 / 820

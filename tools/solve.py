@@ -9,16 +9,16 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from protocol.codec import encode
-from protocol.config import ConfigError
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import CompressedImage, Message, NodeInfo, Rejected, RelativePose
-from protocol.topics import CANDIDATES, check_node_id, parse_key
-from solver_service.config import CHECKS, METHODS, SolveConfig
-from solver_service.core import SolverCore
-from tools.dives import Dive, load_info
-from tools.progress import Progress
+from buddyline.protocol.codec import encode
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.topics import CANDIDATES, check_node_id, parse_key
+from buddyline.solver_service.config import CHECKS, METHODS, SolveConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.tools.dives import Dive, load_info
+from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def messages_of(
     raw = [node for node in pair if node not in dive.nodes("candidates")]
     detector = None
     if raw:
-        from tools.detect import DiveDetector
+        from buddyline.tools.detect import DiveDetector
 
         detector = DiveDetector(args.detector, args.environment, infos)
     topics = (*COPIED, "image") if raw else COPIED

@@ -17,17 +17,16 @@ from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
+from buddyline.node.detect import ENVIRONMENTS, METHODS, draw, make_detector, presets
+from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import CompressedImage, LightTruth
+from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
+from buddyline.tools.dives import Dive
+from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
-
-from node.detect import ENVIRONMENTS, METHODS, draw, make_detector, presets
-from node.drivers.stored import PictureError, decode_picture, picture_files
-from protocol.clock import trigger_index
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import CompressedImage, LightTruth
-from protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
-from tools.dives import Dive
-from tools.progress import Progress
 
 log = logging.getLogger(__name__)
 

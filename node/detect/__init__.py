@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from node.detect import paper, source
-from node.detect.detection import Detection, Detector, ImageError
-from node.detect.drawing import draw
-from protocol.errors import BuddylineError
+from buddyline.node.detect import paper, source
+from buddyline.node.detect.detection import Detection, Detector, ImageError
+from buddyline.node.detect.drawing import draw
+from buddyline.protocol.errors import BuddylineError
 
 METHODS: Final = ("source", "paper")
 ENVIRONMENTS: Final = ("auto", "cavern", "night_reef", "lake", "basin")

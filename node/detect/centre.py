@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.node.detect.lights import Lights
+from buddyline.node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 from numpy.typing import NDArray
-
-from node.detect.lights import Lights
-from node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 
 _RINGS = 16
 _SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)

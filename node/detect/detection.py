@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Blob
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from protocol.messages import Blob
 
 
 @dataclass(frozen=True, slots=True)

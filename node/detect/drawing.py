@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from buddyline.node.detect.detection import Detection, check_image
 from numpy.typing import NDArray
-
-from node.detect.detection import Detection, check_image
 
 _LIKELY = (80, 255, 80)
 _UNLIKELY = (60, 60, 255)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-
-from node.detect.proposals import CLEAR, Proposals
-from node.detect.rings import (
+from buddyline.node.detect.proposals import CLEAR, Proposals
+from buddyline.node.detect.rings import (
     MEAN,
     Floats,
     elongation,
@@ -18,6 +16,7 @@ from node.detect.rings import (
     sample_rings,
     weakest_channel,
 )
+from numpy.typing import NDArray
 
 _ALWAYS_MEASURED, _MAX_MEASURED = 8, 24
 _CORE_RINGS: Final = 7

@@ -12,10 +12,9 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.node.detect.detection import Detection, check_image
+from buddyline.protocol.messages import MAX_BLOBS, Blob
 from numpy.typing import NDArray
-
-from node.detect.detection import Detection, check_image
-from protocol.messages import MAX_BLOBS, Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     {

@@ -11,14 +11,13 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
+from buddyline.node.detect.centre import Centres, locate_sources
+from buddyline.node.detect.detection import Detection, check_image
+from buddyline.node.detect.lights import Lights, distinct, measure_lights
+from buddyline.node.detect.proposals import ProposalFinder
+from buddyline.node.detect.rings import RAY_UV, Floats
+from buddyline.protocol.messages import Blob
 from numpy.typing import NDArray
-
-from node.detect.centre import Centres, locate_sources
-from node.detect.detection import Detection, check_image
-from node.detect.lights import Lights, distinct, measure_lights
-from node.detect.proposals import ProposalFinder
-from node.detect.rings import RAY_UV, Floats
-from protocol.messages import Blob
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     {

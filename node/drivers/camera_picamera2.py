@@ -13,16 +13,15 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
+from buddyline.node.config import CameraConfig, NodeConfig
+from buddyline.node.devices import Frame
+from buddyline.node.drivers.health import Health
+from buddyline.node.drivers.readout import GLOBAL_SHUTTERS, Readout, boottime_ns, line_time_ns, wall_offset_ns
+from buddyline.node.drivers.samples import DeviceError
+from buddyline.node.trigger import FrameChooser, PhaseLock, frames_per_trigger
+from buddyline.protocol.clock import MS_NS, S_NS, Clock
+from buddyline.protocol.messages import NodeInfo
 from numpy.typing import NDArray
-
-from node.config import CameraConfig, NodeConfig
-from node.devices import Frame
-from node.drivers.health import Health
-from node.drivers.readout import GLOBAL_SHUTTERS, Readout, boottime_ns, line_time_ns, wall_offset_ns
-from node.drivers.samples import DeviceError
-from node.trigger import FrameChooser, PhaseLock, frames_per_trigger
-from protocol.clock import MS_NS, S_NS, Clock
-from protocol.messages import NodeInfo
 
 log = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from node.drivers.samples import STANDARD_GRAVITY_MPS2, DepthSample
-from protocol.clock import S_NS
+from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2, DepthSample
+from buddyline.protocol.clock import S_NS
 
 FRESH_KGPM3: Final = 997.0
 STANDARD_AIR_PA: Final = 101_325.0

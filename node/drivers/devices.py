@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from buddyline.node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
+from buddyline.node.config import NodeConfig
+from buddyline.node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
+from buddyline.node.drivers.health import Health
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_imu
+from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
+from buddyline.node.geomagnetism import MagnetometerCalibration
+from buddyline.protocol.clock import MS_NS, S_NS, Clock
+from buddyline.protocol.messages import Attitude, Depth, Imu, Message, Vector3
 from msgspec import UNSET
-
-from node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
-from node.config import NodeConfig
-from node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
-from node.drivers.health import Health
-from node.drivers.i2c import I2cBus
-from node.drivers.registry import NONE, check_names, open_depth, open_imu
-from node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
-from node.geomagnetism import MagnetometerCalibration
-from protocol.clock import MS_NS, S_NS, Clock
-from protocol.messages import Attitude, Depth, Imu, Message, Vector3
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import threading
 from fcntl import ioctl
 from typing import Any, Final, Self
 
-from node.drivers.samples import DeviceError
+from buddyline.node.drivers.samples import DeviceError
 
 # linux/i2c-dev.h: how long the adapter waits for a transfer, in units of 10 ms. Its default, one second,
 # would let one chip that holds the bus down silence the others for that long.

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Final, Protocol, Self
 
 import numpy as np
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.l3gd20h import L3gd20h
+from buddyline.node.drivers.lis3mdl import Lis3mdl
+from buddyline.node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
+from buddyline.node.drivers.lsm303d import Lsm303d
+from buddyline.node.drivers.samples import DeviceError, ImuSample, Vector
+from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from node.drivers.i2c import I2cBus
-from node.drivers.l3gd20h import L3gd20h
-from node.drivers.lis3mdl import Lis3mdl
-from node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
-from node.drivers.lsm303d import Lsm303d
-from node.drivers.samples import DeviceError, ImuSample, Vector
-from protocol.clock import S_NS, Clock
-from protocol.errors import BuddylineError
 
 # Noise moves the last bits of six axes all the time. Readings may repeat while the chip is slower than the
 # loop; ten in a row mean that it has stopped, as after a brown-out.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
-from node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
+from buddyline.node.drivers.st_chip import StChip, decode_vector
 
 AUTO_INCREMENT: Final = 0x80
 OUT_MAG: Final = 0x08

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
-from node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
+from buddyline.node.drivers.st_chip import StChip, decode_vector
 
 OUT_GYRO: Final = 0x22  # the accelerometer follows at 0x28: one burst of twelve bytes
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final, Literal, Self
 
-from node.drivers.i2c import I2cBus
-from node.drivers.samples import DepthSample
-from protocol.clock import MS_NS, Clock
-from protocol.errors import BuddylineError
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.samples import DepthSample
+from buddyline.protocol.clock import MS_NS, Clock
+from buddyline.protocol.errors import BuddylineError
 
 ADDRESS: Final = 0x76
 RESET: Final = 0x1E

@@ -7,28 +7,27 @@ from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.samples import DepthDevice, DeviceError, ImuDevice
+from buddyline.protocol.clock import Clock, SystemClock
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from node.drivers.i2c import I2cBus
-from node.drivers.samples import DepthDevice, DeviceError, ImuDevice
-from protocol.clock import Clock, SystemClock
-from protocol.errors import BuddylineError
 
 AUTO: Final = "auto"
 NONE: Final = "none"
 
 # In the order in which `auto` looks: nine axes before six.
 IMUS: Final[Mapping[str, str]] = {
-    "minimu9_v3": "node.drivers.imu:MinImu9V3",
-    "minimu9_v5": "node.drivers.imu:MinImu9V5",
-    "minimu9_v6": "node.drivers.imu:MinImu9V6",
-    "lsm6ds": "node.drivers.imu:Lsm6dsAlone",
+    "minimu9_v3": "buddyline.node.drivers.imu:MinImu9V3",
+    "minimu9_v5": "buddyline.node.drivers.imu:MinImu9V5",
+    "minimu9_v6": "buddyline.node.drivers.imu:MinImu9V6",
+    "lsm6ds": "buddyline.node.drivers.imu:Lsm6dsAlone",
 }
 
 DEPTHS: Final[Mapping[str, tuple[str, str | None]]] = {
-    AUTO: ("node.drivers.ms5837:Ms5837", None),
-    "ms5837_30ba": ("node.drivers.ms5837:Ms5837", "30ba"),
-    "ms5837_02ba": ("node.drivers.ms5837:Ms5837", "02ba"),
+    AUTO: ("buddyline.node.drivers.ms5837:Ms5837", None),
+    "ms5837_30ba": ("buddyline.node.drivers.ms5837:Ms5837", "30ba"),
+    "ms5837_02ba": ("buddyline.node.drivers.ms5837:Ms5837", "02ba"),
 }
 
 

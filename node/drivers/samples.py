@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
 
 Vector = NDArray[np.float64]
 

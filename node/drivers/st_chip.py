@@ -6,9 +6,8 @@ import struct
 from typing import ClassVar, Self
 
 import numpy as np
-
-from node.drivers.i2c import I2cBus
-from node.drivers.samples import DeviceError, Vector
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.samples import DeviceError, Vector
 
 WHO_AM_I = 0x0F
 

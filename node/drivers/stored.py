@@ -16,17 +16,16 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.node.config import NodeConfig
+from buddyline.node.devices import Frame
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.divelog import DiveLogReader, read_logs
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, NodeInfo
+from buddyline.protocol.pictures import with_pictures
+from buddyline.protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
 from numpy.typing import NDArray
-
-from node.config import NodeConfig
-from node.devices import Frame
-from protocol.clock import Clock
-from protocol.config import ConfigError
-from protocol.divelog import DiveLogReader, read_logs
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, NodeInfo
-from protocol.pictures import with_pictures
-from protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
 
 log = logging.getLogger(__name__)
 

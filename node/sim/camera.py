@@ -10,9 +10,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
+from buddyline.protocol.messages import CameraModel
 from numpy.typing import NDArray
-
-from protocol.messages import CameraModel
 
 Array = NDArray[np.float64]
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
-from node.sim.glow import stands_out
-from node.sim.randomness import generator
-from node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, View
-from protocol.messages import MAX_BLOBS, Blob
+from buddyline.node.sim.glow import stands_out
+from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, View
+from buddyline.protocol.messages import MAX_BLOBS, Blob
 
 
 def visible(scene: Scene, index: int, view: View, lamp: Lamp) -> bool:

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
-from node.config import NodeConfig, SimulationConfig
-from node.devices import Frame
-from node.sim.scenario import ENVIRONMENTS, Environment, Scenario
-from node.sim.world import World
-from protocol.clock import S_NS, Clock
-from protocol.config import ConfigError
-from protocol.messages import Message, NodeInfo
+from buddyline.node.config import NodeConfig, SimulationConfig
+from buddyline.node.devices import Frame
+from buddyline.node.sim.scenario import ENVIRONMENTS, Environment, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.messages import Message, NodeInfo
 
 ATTITUDE_HZ = 50
 IMU_HZ = 100

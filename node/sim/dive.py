@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import cv2
-
-from node.sim.randomness import generator
-from node.sim.world import World
-from protocol import topics
-from protocol.clock import MS_NS, S_NS, trigger_index
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, FoxgloveTime, Message
+from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.world import World
+from buddyline.protocol import topics
+from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 
 BOOT: Final = "simulated"
 ATTITUDE_NS: Final = S_NS // 50

@@ -12,11 +12,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.node.sim.rig import beam
+from buddyline.node.sim.scenario import Water
+from buddyline.node.sim.scene import LAMP_RADIUS_M, Lamp
 from numpy.typing import NDArray
-
-from node.sim.rig import beam
-from node.sim.scenario import Water
-from node.sim.scene import LAMP_RADIUS_M, Lamp
 
 Image = NDArray[np.float32]
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from buddyline.node.sim import tags
+from buddyline.node.sim.glow import GlowRenderer
+from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.scene import Lamp, Passer, Scene, View
+from buddyline.node.sim.scenery import Scenery
+from buddyline.node.sim.snow import Snow
 from numpy.typing import NDArray
-
-from node.sim import tags
-from node.sim.glow import GlowRenderer
-from node.sim.randomness import generator
-from node.sim.scenario import Scenario
-from node.sim.scene import Lamp, Passer, Scene, View
-from node.sim.scenery import Scenery
-from node.sim.snow import Snow
 
 Image = NDArray[np.float32]
 NOISE_MARGIN_PX = 64

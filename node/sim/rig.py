@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-
-from node.sim import rotation
-from node.sim.randomness import generator
-from node.sim.rotation import Vector
-from node.sim.scenario import Scenario
-from protocol.messages import CameraModel
+from buddyline.node.sim import rotation
+from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.rotation import Vector
+from buddyline.node.sim.scenario import Scenario
+from buddyline.protocol.messages import CameraModel
 
 Q_BODY_CAMERA: Final = (0.5, 0.5, 0.5, 0.5)
 R_BODY_CAMERA: Final = rotation.from_quaternion(Q_BODY_CAMERA)

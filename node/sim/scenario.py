@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
-from node.sim.camera import pinhole
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel
-from protocol.topics import check_node_id
+from buddyline.node.sim.camera import pinhole
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel
+from buddyline.protocol.topics import check_node_id
 
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
 Trajectory: TypeAlias = Literal["circles", "rest"]

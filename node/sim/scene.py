@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-
-from node.sim import tags
-from node.sim.camera import project
-from node.sim.randomness import Sway, generator
-from node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, Rig, beam, build
-from node.sim.rotation import Matrix, Vector
-from node.sim.scenario import Scenario
-from node.sim.tags import SeenTag
-from node.sim.trajectory import Motion, Placement
+from buddyline.node.sim import tags
+from buddyline.node.sim.camera import project
+from buddyline.node.sim.randomness import Sway, generator
+from buddyline.node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, Rig, beam, build
+from buddyline.node.sim.rotation import Matrix, Vector
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.tags import SeenTag
+from buddyline.node.sim.trajectory import Motion, Placement
 
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0

@@ -6,14 +6,13 @@ import math
 from typing import Final
 
 import numpy as np
-
-from node.sim import rotation
-from node.sim.randomness import Sway, generator
-from node.sim.rig import R_BODY_CAMERA
-from node.sim.rotation import Vector
-from node.sim.scenario import Scenario
-from node.sim.scene import Scene
-from protocol.messages import Attitude, Depth, Imu
+from buddyline.node.sim import rotation
+from buddyline.node.sim.randomness import Sway, generator
+from buddyline.node.sim.rig import R_BODY_CAMERA
+from buddyline.node.sim.rotation import Vector
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.scene import Scene
+from buddyline.protocol.messages import Attitude, Depth, Imu
 
 GRAVITY_MPS2: Final = 9.80665
 SURFACE_PA: Final = 101325.0

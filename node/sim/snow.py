@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.scene import View
+from buddyline.protocol.messages import CameraModel
 from numpy.typing import NDArray
-
-from node.sim.randomness import generator
-from node.sim.scenario import Scenario
-from node.sim.scene import View
-from protocol.messages import CameraModel
 
 Image = NDArray[np.float32]
 BOX_M = 2.4

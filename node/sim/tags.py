@@ -8,9 +8,8 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.node.sim.rotation import Vector
 from numpy.typing import NDArray
-
-from node.sim.rotation import Vector
 
 Image = NDArray[np.float32]
 

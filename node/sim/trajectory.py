@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-
-from node.sim import rotation
-from node.sim.randomness import Sway, generator
-from node.sim.rotation import Matrix, Vector
-from node.sim.scenario import Scenario
+from buddyline.node.sim import rotation
+from buddyline.node.sim.randomness import Sway, generator
+from buddyline.node.sim.rotation import Matrix, Vector
+from buddyline.node.sim.scenario import Scenario
 
 SPEED_MPS = 0.7
 LOOK_AWAY_PERIOD_S = 20.0

@@ -9,19 +9,16 @@ from __future__ import annotations
 from typing import Literal, TypeAlias
 
 import numpy as np
-from msgspec import UNSET
-from numpy.typing import NDArray
-
-from node.sim import candidates, rotation, tags
-from node.sim.glow import core_px
-from node.sim.picture import Painter
-from node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
-from node.sim.rotation import Matrix, Vector
-from node.sim.scenario import Scenario
-from node.sim.scene import Lamp, Scene
-from node.sim.sensors import Sensors
-from node.sim.tags import Tag
-from protocol.messages import (
+from buddyline.node.sim import candidates, rotation, tags
+from buddyline.node.sim.glow import core_px
+from buddyline.node.sim.picture import Painter
+from buddyline.node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
+from buddyline.node.sim.rotation import Matrix, Vector
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.scene import Lamp, Scene
+from buddyline.node.sim.sensors import Sensors
+from buddyline.node.sim.tags import Tag
+from buddyline.protocol.messages import (
     ArTag,
     Attitude,
     Candidates,
@@ -32,6 +29,8 @@ from protocol.messages import (
     TrueLight,
     Truth,
 )
+from msgspec import UNSET
+from numpy.typing import NDArray
 
 Triple: TypeAlias = tuple[float, float, float]
 

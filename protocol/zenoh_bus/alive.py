@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import zenoh
-
-from protocol.delivery import Delivery, FailureLatch
-from protocol.zenoh_bus.intake import INTAKE, Intake
+from buddyline.protocol.delivery import Delivery, FailureLatch
+from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake
 
 # `**` does not match chunks that begin with @: nobody takes a token for a message.
 ALIVE: Final = "buddyline/@alive"

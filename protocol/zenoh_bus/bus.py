@@ -9,8 +9,7 @@ from typing import Any, Final
 
 import zenoh
 import zenoh.ext
-
-from protocol.bus import (
+from buddyline.protocol.bus import (
     CACHE_S,
     Bus,
     KeyExprs,
@@ -21,15 +20,15 @@ from protocol.bus import (
     check_alive_name,
     each_of,
 )
-from protocol.clock import Clock, SystemClock
-from protocol.delivery import Delivery, RateCap
-from protocol.endpoint import DEFAULT_ENDPOINT, client_settings
-from protocol.security import Tls
-from protocol.topics import Topic
-from protocol.zenoh_bus.alive import ALIVE, ZenohWatch
-from protocol.zenoh_bus.session import BulkLink, config_of, open_client
-from protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
-from protocol.zenoh_bus.watchdog import Watchdog
+from buddyline.protocol.clock import Clock, SystemClock
+from buddyline.protocol.delivery import Delivery, RateCap
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, client_settings
+from buddyline.protocol.security import Tls
+from buddyline.protocol.topics import Topic
+from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
+from buddyline.protocol.zenoh_bus.session import BulkLink, config_of, open_client
+from buddyline.protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
+from buddyline.protocol.zenoh_bus.watchdog import Watchdog
 
 HEARTBEAT_S: Final = 0.25
 

@@ -7,12 +7,11 @@ from types import TracebackType
 from typing import Final, Self
 
 import zenoh
-
-from protocol.endpoint import DEFAULT_ENDPOINT, hub_settings
-from protocol.errors import BuddylineError
-from protocol.security import Tls
-from protocol.topics import TOPICS
-from protocol.zenoh_bus.session import config_of
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, hub_settings
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.security import Tls
+from buddyline.protocol.topics import TOPICS
+from buddyline.protocol.zenoh_bus.session import config_of
 
 # Whoever invents keys, or sends what is no pose, must not fill the hub's memory.
 MAX_RETAINED: Final = 256

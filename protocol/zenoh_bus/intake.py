@@ -8,8 +8,7 @@ from typing import Final, TypeAlias
 
 import zenoh
 import zenoh.ext
-
-from protocol.delivery import CLOSE_S, FailureLatch
+from buddyline.protocol.delivery import CLOSE_S, FailureLatch
 
 INTAKE: Final = 8192
 

@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import zenoh
-
-from protocol.endpoint import client_settings
-from protocol.security import RefusedError, Tls, refusal
+from buddyline.protocol.endpoint import client_settings
+from buddyline.protocol.security import RefusedError, Tls, refusal
 
 RETRY_S: Final = 0.25
 

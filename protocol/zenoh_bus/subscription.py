@@ -8,15 +8,14 @@ from typing import Final
 
 import zenoh
 import zenoh.ext
-
-from protocol.bus import Received, held_order
-from protocol.clock import Clock
-from protocol.delivery import CLOSE_S, Delivery, FailureLatch
-from protocol.sequence import Gap, Source
-from protocol.sequence import Sequence as Numbers
-from protocol.topics import parse_key
-from protocol.zenoh_bus.intake import INTAKE, AnySubscriber, Intake
-from protocol.zenoh_bus.session import RETRY_S
+from buddyline.protocol.bus import Received, held_order
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
+from buddyline.protocol.sequence import Gap, Source
+from buddyline.protocol.sequence import Sequence as Numbers
+from buddyline.protocol.topics import parse_key
+from buddyline.protocol.zenoh_bus.intake import INTAKE, AnySubscriber, Intake
+from buddyline.protocol.zenoh_bus.session import RETRY_S
 
 QUERY_S: Final = 2.0
 MAX_FETCHING: Final = 16

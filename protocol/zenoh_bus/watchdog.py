@@ -7,10 +7,9 @@ import threading
 from typing import Final
 
 import zenoh
-
-from protocol.connection import cut_connection
-from protocol.delivery import CLOSE_S
-from protocol.zenoh_bus.alive import ALIVE
+from buddyline.protocol.connection import cut_connection
+from buddyline.protocol.delivery import CLOSE_S
+from buddyline.protocol.zenoh_bus.alive import ALIVE
 
 # Longer than the lease: a link that fell silent ends by that, and its questions with it. Then once more, for a
 # machine that was too busy.

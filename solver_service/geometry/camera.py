@@ -7,8 +7,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-
-from solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats
 
 _MAX_STEPS = 30
 _TOLERANCE = 1e-13

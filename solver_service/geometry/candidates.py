@@ -8,12 +8,11 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.observation import View
+from buddyline.solver_service.geometry.rig import RigPair
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.scalars import ONE, PI, scalar
 from numpy.typing import NDArray
-
-from solver_service.geometry.observation import View
-from solver_service.geometry.rig import RigPair
-from solver_service.geometry.rotation import Floats
-from solver_service.geometry.scalars import ONE, PI, scalar
 
 # A message holds no more.
 _MAX_CANDIDATES: Final = 64

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-
-from solver_service.geometry.rig import Rig, RigPair, pair_of
-from solver_service.geometry.rotation import Floats
-from solver_service.geometry.scalars import FOUR, HALF, ONE, QUARTER, TURN, TWO
+from buddyline.solver_service.geometry.rig import Rig, RigPair, pair_of
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.scalars import FOUR, HALF, ONE, QUARTER, TURN, TWO
 
 Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"]
 

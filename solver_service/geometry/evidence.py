@@ -17,12 +17,11 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-
-from solver_service.geometry.closed_form import dot
-from solver_service.geometry.observation import Heading, Settings
-from solver_service.geometry.rig import Rig, RigPair
-from solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
-from solver_service.geometry.scalars import EIGHTH, HALF, MINUS_TWO, ONE, QUARTER, TURN, TWO, scalar
+from buddyline.solver_service.geometry.closed_form import dot
+from buddyline.solver_service.geometry.observation import Heading, Settings
+from buddyline.solver_service.geometry.rig import Rig, RigPair
+from buddyline.solver_service.geometry.rotation import Floats, matrix_of, rotation_exp, skew
+from buddyline.solver_service.geometry.scalars import EIGHTH, HALF, MINUS_TWO, ONE, QUARTER, TURN, TWO, scalar
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1

@@ -8,19 +8,18 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.candidates import Candidates
+from buddyline.solver_service.geometry.closed_form import Bars, dot, solve_exact
+from buddyline.solver_service.geometry.evidence import log_chance, log_gaps, weigh
+from buddyline.solver_service.geometry.hypotheses import Pairs, search
+from buddyline.solver_service.geometry.observation import Reason
+from buddyline.solver_service.geometry.readings import Readings
+from buddyline.solver_service.geometry.refinement import Sightings, refine
+from buddyline.solver_service.geometry.rig import RigPair
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.scalars import TURN
+from buddyline.solver_service.geometry.terms import Terms
 from numpy.typing import NDArray
-
-from solver_service.geometry.candidates import Candidates
-from solver_service.geometry.closed_form import Bars, dot, solve_exact
-from solver_service.geometry.evidence import log_chance, log_gaps, weigh
-from solver_service.geometry.hypotheses import Pairs, search
-from solver_service.geometry.observation import Reason
-from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import Sightings, refine
-from solver_service.geometry.rig import RigPair
-from solver_service.geometry.rotation import Floats
-from solver_service.geometry.scalars import TURN
-from solver_service.geometry.terms import Terms
 
 # So many of the best are refined; what lies further below the best (log ratio) does not matter.
 _REFINED: Final = 6

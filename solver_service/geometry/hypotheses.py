@@ -13,15 +13,14 @@ from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
+from buddyline.solver_service.geometry.candidates import Candidates
+from buddyline.solver_service.geometry.closed_form import Spans, dot
+from buddyline.solver_service.geometry.evidence import GROSS_SCALE
+from buddyline.solver_service.geometry.observation import Settings
+from buddyline.solver_service.geometry.rig import RigPair
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.scalars import EIGHTH, FOUR, HALF, MINUS_TWO, ONE, PI, ZERO, scalar
 from numpy.typing import NDArray
-
-from solver_service.geometry.candidates import Candidates
-from solver_service.geometry.closed_form import Spans, dot
-from solver_service.geometry.evidence import GROSS_SCALE
-from solver_service.geometry.observation import Settings
-from solver_service.geometry.rig import RigPair
-from solver_service.geometry.rotation import Floats
-from solver_service.geometry.scalars import EIGHTH, FOUR, HALF, MINUS_TWO, ONE, PI, ZERO, scalar
 
 # The join's own error, in units of alpha^2: at the optical axis, and per tan^2 of the widest bearing. Found from
 # random poses over fields of view up to 90 degrees; the twist's is smaller.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, TypeAlias
 
-from solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats
 
 Method: TypeAlias = Literal["refined", "exact", "paper", "paper_midpoint", "paper_literal"]
 Reason: TypeAlias = Literal[

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
 from numpy.typing import NDArray
-
-from solver_service.geometry.rotation import Floats
 
 
 @dataclass(eq=False, slots=True)

@@ -8,11 +8,10 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, rotation_near, skew
+from buddyline.solver_service.geometry.scalars import ONE, ZERO
 from numpy.typing import NDArray
-
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, rotation_near, skew
-from solver_service.geometry.scalars import ONE, ZERO
 
 _MAX_STEPS: Final = 12
 # A step this small, relative to the range and in rad, leaves less than its square.

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
-
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import Floats
 
 # Camera to body for the nominal mount: x forward is z, y right is x, z down is y.
 NOMINAL_R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -6,8 +6,7 @@ import math
 from typing import Final
 
 import numpy as np
-
-from solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats
 
 
 def scalar(value: float) -> Floats:

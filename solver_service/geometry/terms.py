@@ -8,13 +8,12 @@ from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
-
-from solver_service.geometry.candidates import Candidates, find_candidates
-from solver_service.geometry.evidence import Prediction, Sensors, combine
-from solver_service.geometry.observation import Heading, Prior, Sensed, Settings, View
-from solver_service.geometry.refinement import Motion
-from solver_service.geometry.rig import Rig, RigPair, pair_of
-from solver_service.geometry.rotation import Floats, matrix_of
+from buddyline.solver_service.geometry.candidates import Candidates, find_candidates
+from buddyline.solver_service.geometry.evidence import Prediction, Sensors, combine
+from buddyline.solver_service.geometry.observation import Heading, Prior, Sensed, Settings, View
+from buddyline.solver_service.geometry.refinement import Motion
+from buddyline.solver_service.geometry.rig import Rig, RigPair, pair_of
+from buddyline.solver_service.geometry.rotation import Floats, matrix_of
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-
-from solver_service.geometry.closed_form import dot, eq1_range_m
-from solver_service.geometry.evidence import (
+from buddyline.solver_service.geometry.closed_form import dot, eq1_range_m
+from buddyline.solver_service.geometry.evidence import (
     DEPTH_SPREAD_M,
     GROSS_PROBABILITY,
     GROSS_SCALE,
@@ -26,9 +24,9 @@ from solver_service.geometry.evidence import (
     weigh_heading,
     weigh_prediction,
 )
-from solver_service.geometry.hypotheses import Pairs
-from solver_service.geometry.readings import Readings
-from solver_service.geometry.refinement import (
+from buddyline.solver_service.geometry.hypotheses import Pairs
+from buddyline.solver_service.geometry.readings import Readings
+from buddyline.solver_service.geometry.refinement import (
     Sightings,
     is_large,
     linearize,
@@ -37,9 +35,10 @@ from solver_service.geometry.refinement import (
     solve_normal,
     weight_of,
 )
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, skew
-from solver_service.geometry.terms import Terms
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, skew
+from buddyline.solver_service.geometry.terms import Terms
+from numpy.typing import NDArray
 
 # More combinations than this are not tried: among so many, three lights are never certain.
 _MAX_COMBINATIONS: Final = 4000

@@ -10,19 +10,18 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, intruder_odds
+from buddyline.solver_service.geometry.four_lights import read_four_lights
+from buddyline.solver_service.geometry.hypotheses import find_pairs
+from buddyline.solver_service.geometry.observation import Heading, Prior, Reason, Sensed, Settings, View
+from buddyline.solver_service.geometry.readings import Readings
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, quaternion_of, rotation_log
+from buddyline.solver_service.geometry.terms import Terms
+from buddyline.solver_service.geometry.three_lights import read_three_lights
 from numpy.typing import NDArray
-
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.evidence import AGREES, CHANCE_ODDS, intruder_odds
-from solver_service.geometry.four_lights import read_four_lights
-from solver_service.geometry.hypotheses import find_pairs
-from solver_service.geometry.observation import Heading, Prior, Reason, Sensed, Settings, View
-from solver_service.geometry.readings import Readings
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import Floats, quaternion_of, rotation_log
-from solver_service.geometry.terms import Terms
-from solver_service.geometry.three_lights import read_three_lights
 
 __all__ = ["Camera", "Fix", "NoFix", "Prior", "Reason", "Rig", "Sensed", "Settings", "View", "solve_trigger"]
 

@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from protocol.bus import Bus, Received
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.divelog import DiveLogReader
-from protocol.messages import Candidates, Message, Rejected, RelativePose
-from protocol.topics import CANDIDATES, POSE, REJECTED, parse_key
-from protocol.zenoh_bus import connect
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
+from buddyline.protocol.topics import CANDIDATES, POSE, REJECTED, parse_key
+from buddyline.protocol.zenoh_bus import connect
 
 # What a node exposed in the last moment before it was stopped may not have left it.
 END_NS = S_NS

@@ -13,8 +13,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from protocol.clock import S_NS
-from protocol.divelog import DiveLogReader
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogReader
+
 from tests.faults.observer import Tally
 from tests.faults.system import System
 

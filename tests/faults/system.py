@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from protocol.endpoint import is_loopback
+from buddyline.protocol.endpoint import is_loopback
+
 from tests.faults.observer import Observer, Tally
 from tests.processes import Process, free_endpoint
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from protocol import messages as m
+from buddyline.protocol import messages as m
 
 STAMP_NS = 1_764_000_000_000_000_000
 PERIOD_NS = 100_000_000

@@ -14,23 +14,23 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from buddyline.node.config import NodeConfig
+from buddyline.protocol.bus import Received
+from buddyline.protocol.codec import decode, encode, payload_stamp_ns
+from buddyline.protocol.config import Config, ConfigError, parse_config
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.topics import TOPICS, Topic, key_of
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.service import SolverService
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.hub import HubConfig
+from buddyline.tools.repair import run as repair
 from hypothesis import strategies as st
 
-from node.config import NodeConfig
-from protocol.bus import Received
-from protocol.codec import decode, encode, payload_stamp_ns
-from protocol.config import Config, ConfigError, parse_config
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose
-from protocol.topics import TOPICS, Topic, key_of
-from solver_service.config import SolverConfig
-from solver_service.service import SolverService
 from tests.fuzz.samples import SOUND, STAMP_NS
 from tests.solver_service.conftest import dive_messages
-from tools.client import ClientConfig
-from tools.hub import HubConfig
-from tools.repair import run as repair
 
 NASTY_NUMBERS = [
     0,

@@ -10,10 +10,10 @@ import sys
 
 import numpy as np
 import pytest
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.registry import open_depth, open_imu
+from buddyline.protocol.clock import S_NS, ManualClock
 
-from node.drivers.i2c import I2cBus
-from node.drivers.registry import open_depth, open_imu
-from protocol.clock import S_NS, ManualClock
 from tests.node.drivers import wire
 from tests.node.test_attitude import calm_run, disturbed_run
 

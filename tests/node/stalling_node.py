@@ -7,11 +7,11 @@ import os
 import sys
 from pathlib import Path
 
-from node import service
-from node.devices import CAMERAS, SENSORS
-from node.sim import devices as simulated
-from protocol import recorder
-from protocol import service as threads
+from buddyline.node import service
+from buddyline.node.devices import CAMERAS, SENSORS
+from buddyline.node.sim import devices as simulated
+from buddyline.protocol import recorder
+from buddyline.protocol import service as threads
 
 
 def _hold(name, stop):
@@ -49,7 +49,7 @@ def main():
     SENSORS["stalling"] = "tests.node.stalling_node:open_sensors"
     service.HANGS_S, service.STALE_S, service.REPORT_S, threads.BEAT_S = 0.6, 0.4, 0.2, 0.2
     recorder.SYNC_INTERVAL_S, recorder.RETRY_S = 0.2, 0.1
-    from tools.cli import main as program
+    from buddyline.tools.cli import main as program
 
     return program()
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from buddyline.node.drivers.samples import ImuSample
 from numpy.typing import NDArray
-
-from node.drivers.samples import ImuSample
 
 RATE_HZ = 100
 START_NS = 1_764_000_000_000_000_000

@@ -8,11 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from buddyline.node.attitude import VqfAttitude, ned_of_enu, quaternion_to_matrix
+from buddyline.node.drivers.samples import ImuSample
+from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration
+from buddyline.protocol.errors import BuddylineError
 
-from node.attitude import VqfAttitude, ned_of_enu, quaternion_to_matrix
-from node.drivers.samples import ImuSample
-from node.geomagnetism import EarthField, MagnetometerCalibration
-from protocol.errors import BuddylineError
 from tests.node import swell
 
 pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")

@@ -1,8 +1,7 @@
 """chronyc's reports as chrony 4.3 prints them, and everything else that may stand there under that name."""
 
 import pytest
-
-from node.chrony import ChronyError, decode_tracking, read_tracking
+from buddyline.node.chrony import ChronyError, decode_tracking, read_tracking
 
 FOLLOWS = (
     "7F000001,127.0.0.1,9,1795238696.487130714,0.000000683,0.000000048,0.000000947,"

@@ -4,16 +4,16 @@ import threading
 
 import msgspec
 import pytest
+from buddyline.node.chrony import ChronyError, decode_tracking
+from buddyline.node.clock_sync import HEARD_FOR_S, Beacons, ClockSync
+from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import ManualClock
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import MAX_HEARD, ClockBeacon
+from buddyline.protocol.topics import CLOCK
 
-from node.chrony import ChronyError, decode_tracking
-from node.clock_sync import HEARD_FOR_S, Beacons, ClockSync
-from protocol.bus import Received
-from protocol.clock import ManualClock
-from protocol.codec import decode, encode
-from protocol.errors import MessageError
-from protocol.local_bus import LocalNetwork
-from protocol.messages import MAX_HEARD, ClockBeacon
-from protocol.topics import CLOCK
 from tests.node.test_chrony import FOLLOWS, LOST
 
 NOW_NS = 1_764_000_000_000_000_000

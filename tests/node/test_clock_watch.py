@@ -1,9 +1,8 @@
 """A clock that is set is told from one that drifts or is slewed."""
 
 import pytest
-
-from node.clock_watch import ClockWatch
-from protocol.clock import MS_NS, S_NS
+from buddyline.node.clock_watch import ClockWatch
+from buddyline.protocol.clock import MS_NS, S_NS
 
 LOOK_NS = 200 * MS_NS
 

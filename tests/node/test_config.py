@@ -1,11 +1,10 @@
 """A node's configuration: a calibration of pictures of another size is refused."""
 
 import pytest
+from buddyline.node.config import CalibrationConfig, CameraConfig, NodeConfig
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.messages import CameraModel
 from msgspec.structs import replace
-
-from node.config import CalibrationConfig, CameraConfig, NodeConfig
-from protocol.config import ConfigError
-from protocol.messages import CameraModel
 
 CAMERA = CameraModel(model="pinhole", fx_px=1808.0, fy_px=1808.0, cx_px=830.0, cy_px=600.0, distortion=[0.0] * 5)
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from buddyline.node.detect import ENVIRONMENTS, METHODS, ImageError, draw, make_detector
+from buddyline.protocol.errors import BuddylineError
 
-from node.detect import ENVIRONMENTS, METHODS, ImageError, draw, make_detector
-from protocol.errors import BuddylineError
 from tests.node.rendered import lamp_picture
 
 

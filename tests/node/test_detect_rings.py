@@ -3,9 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-
-from node.detect.lights import distinct
-from node.detect.rings import elongation, find_shapes, geometric_radii, luminance, sample_rings
+from buddyline.node.detect.lights import distinct
+from buddyline.node.detect.rings import elongation, find_shapes, geometric_radii, luminance, sample_rings
 
 SHARES = np.linspace(0.0, 1.0, 120, dtype=np.float32)
 

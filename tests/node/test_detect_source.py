@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from buddyline.node.detect import make_detector
 
-from node.detect import make_detector
 from tests.node.rendered import lamp_picture
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "pictures"

@@ -7,9 +7,8 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-
-from node.geomagnetism import MagnetometerCalibration, earth_field
-from protocol.errors import BuddylineError
+from buddyline.node.geomagnetism import MagnetometerCalibration, earth_field
+from buddyline.protocol.errors import BuddylineError
 
 NOV_2025_NS = 1_764_000_000_000_000_000
 

@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 import pytest
-
-from node.geomagnetism import EarthField
-from node.heading import UNKNOWN_SIGMA_RAD, HeadingFilter, wrap
+from buddyline.node.geomagnetism import EarthField
+from buddyline.node.heading import UNKNOWN_SIGMA_RAD, HeadingFilter, wrap
 
 DT_S = 0.05
 DIP_RAD = math.radians(62)

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-
-from node.detect import Detection, make_detector
-from node.devices import CAMERAS, Frame, load
-from node.pipeline import Pipeline, blobs_of
-from protocol.errors import BuddylineError
-from protocol.messages import MAX_BLOBS, Blob
+from buddyline.node.detect import Detection, make_detector
+from buddyline.node.devices import CAMERAS, Frame, load
+from buddyline.node.pipeline import Pipeline, blobs_of
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import MAX_BLOBS, Blob
 
 PERIOD_NS = 100_000_000
 NOTHING = np.zeros((0, 2))

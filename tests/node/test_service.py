@@ -13,14 +13,14 @@ import time
 from itertools import pairwise
 
 import pytest
+from buddyline.node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, SensorsConfig
+from buddyline.node.images import Turn
+from buddyline.node.service import NodeService
+from buddyline.protocol.clock import MS_NS, S_NS, SystemClock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.messages import NodeStatus
 
-from node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, SensorsConfig
-from node.images import Turn
-from node.service import NodeService
-from protocol.clock import MS_NS, S_NS, SystemClock
-from protocol.codec import decode
-from protocol.divelog import DiveLogReader
-from protocol.messages import NodeStatus
 from tests.disks import small_disk
 from tests.processes import REPOSITORY, Process, free_endpoint
 
@@ -242,7 +242,7 @@ class Silent:
 
 @pytest.mark.parametrize(("problem", "progresses"), [("", False), ("no answer: check the chip's wiring", True)])
 def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, monkeypatch, problem, progresses):
-    monkeypatch.setattr("node.service.FIRST_S", -10.0)
+    monkeypatch.setattr("buddyline.node.service.FIRST_S", -10.0)
     config = NodeConfig(node="a", camera=CameraConfig(name="stored"), record=RecordConfig(directory=str(tmp_path)))
     service = NodeService(config)
     service.sources = [Silent(problem)]

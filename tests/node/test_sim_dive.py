@@ -6,14 +6,13 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-
-from node.sim.dive import Plan, messages
-from node.sim.scenario import Scenario
-from node.sim.world import World
-from protocol.clock import S_NS
-from protocol.codec import encode
-from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth
+from buddyline.node.sim.dive import Plan, messages
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, Truth
 
 START_NS = 1_764_000_000 * S_NS
 

@@ -3,12 +3,11 @@
 import cv2
 import numpy as np
 import pytest
-
-from node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, phase, stands_out
-from node.sim.rig import SPILL
-from node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
-from node.sim.scene import Lamp
-from node.sim.world import World
+from buddyline.node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, phase, stands_out
+from buddyline.node.sim.rig import SPILL
+from buddyline.node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
+from buddyline.node.sim.scene import Lamp
+from buddyline.node.sim.world import World
 
 S_NS = 1_000_000_000
 BEAM_RAD = np.radians(12)

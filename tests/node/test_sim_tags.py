@@ -3,12 +3,11 @@
 import cv2
 import numpy as np
 import pytest
+from buddyline.node.sim import rotation, tags
+from buddyline.node.sim.camera import project
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
 from msgspec import UNSET
-
-from node.sim import rotation, tags
-from node.sim.camera import project
-from node.sim.scenario import Scenario
-from node.sim.world import World
 
 S_NS = 1_000_000_000
 

@@ -5,16 +5,15 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-
-from node.sim import rotation
-from node.sim.camera import pinhole, project
-from node.sim.rig import R_BODY_CAMERA
-from node.sim.scenario import ENVIRONMENTS, Scenario
-from node.sim.sensors import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRAVITY_MPS2
-from node.sim.world import World
-from protocol.codec import decode, encode
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, Candidates
+from buddyline.node.sim import rotation
+from buddyline.node.sim.camera import pinhole, project
+from buddyline.node.sim.rig import R_BODY_CAMERA
+from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
+from buddyline.node.sim.sensors import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRAVITY_MPS2
+from buddyline.node.sim.world import World
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel, Candidates
 
 S_NS = 1_000_000_000
 START_NS = 1_764_000_000 * S_NS

@@ -5,13 +5,12 @@ import threading
 import cv2
 import numpy as np
 import pytest
-
-from node.config import CameraConfig, NodeConfig
-from node.drivers.stored import PictureError, decode_picture, open_camera, open_sensors
-from protocol.clock import ManualClock
-from protocol.config import ConfigError
-from protocol.divelog import DiveLogWriter
-from protocol.messages import Attitude, CompressedImage, Depth, FoxgloveTime
+from buddyline.node.config import CameraConfig, NodeConfig
+from buddyline.node.drivers.stored import PictureError, decode_picture, open_camera, open_sensors
+from buddyline.protocol.clock import ManualClock
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.messages import Attitude, CompressedImage, Depth, FoxgloveTime
 
 GREY = np.arange(48, dtype=np.uint8).reshape(6, 8)
 

@@ -7,9 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from node.trigger import LATENCY_FRAMES, LOCKED_NS, FrameChooser, PhaseLock, frames_per_trigger
-from protocol.clock import MS_NS, S_NS
+from buddyline.node.trigger import LATENCY_FRAMES, LOCKED_NS, FrameChooser, PhaseLock, frames_per_trigger
+from buddyline.protocol.clock import MS_NS, S_NS
 
 START_NS = 1_764_000_000 * S_NS
 PERIOD_NS = 100 * MS_NS

@@ -9,15 +9,14 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-
-from protocol import topics
-from protocol.bus import Bus, Received
-from protocol.clock import ManualClock
-from protocol.codec import decode, payload_stamp_ns
-from protocol.errors import MessageError
-from protocol.local_bus import LocalNetwork, key_matches
-from protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
-from protocol.zenoh_bus import connect, open_hub
+from buddyline.protocol import topics
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.clock import ManualClock
+from buddyline.protocol.codec import decode, payload_stamp_ns
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.local_bus import LocalNetwork, key_matches
+from buddyline.protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
+from buddyline.protocol.zenoh_bus import connect, open_hub
 
 WAIT_S = 10.0
 NOW_NS = 1_700_000_000_000_000_000

@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 
 import pytest
-
-from protocol import delivery, topics
-from protocol.bus import cache_depth
-from protocol.clock import S_NS, ManualClock
-from protocol.delivery import Delivery, FailureLatch, RateCap
+from buddyline.protocol import delivery, topics
+from buddyline.protocol.bus import cache_depth
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.delivery import Delivery, FailureLatch, RateCap
 
 WAIT_S = 10.0
 

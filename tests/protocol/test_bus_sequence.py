@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from buddyline.protocol import sequence
+from buddyline.protocol.sequence import Gap, Sequence
 from hypothesis import given
 from hypothesis import strategies as st
-
-from protocol import sequence
-from protocol.sequence import Gap, Sequence
 
 A, B = ("a", 1), ("b", 1)
 

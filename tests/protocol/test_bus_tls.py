@@ -8,15 +8,15 @@ import threading
 from pathlib import Path
 
 import pytest
+from buddyline.protocol import topics
+from buddyline.protocol.access import access_rules
+from buddyline.protocol.bus import Received
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Mark
+from buddyline.protocol.security import RefusedError, Tls
+from buddyline.protocol.zenoh_bus import ZenohBus, connect, open_hub
 
-from protocol import topics
-from protocol.access import access_rules
-from protocol.bus import Received
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import Mark
-from protocol.security import RefusedError, Tls
-from protocol.zenoh_bus import ZenohBus, connect, open_hub
 from tests.processes import Process, buddyline, free_endpoint
 from tests.tools.identities import copy_of, expired, make_keys, tls
 

@@ -15,20 +15,19 @@ from contextlib import contextmanager
 
 import pytest
 import zenoh
-
-from protocol import topics
-from protocol.bus import Bus, Received
-from protocol.connection import cut_connection
-from protocol.errors import BuddylineError
-from protocol.zenoh_bus import connect, open_hub, watchdog
-from protocol.zenoh_bus import hub as hub_module
-from protocol.zenoh_bus import subscription as subscription_module
+from buddyline.protocol import topics
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.connection import cut_connection
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
+from buddyline.protocol.zenoh_bus import hub as hub_module
+from buddyline.protocol.zenoh_bus import subscription as subscription_module
 
 WAIT_S = 10.0
 
 HUB = """
 import sys
-from protocol.zenoh_bus import open_hub
+from buddyline.protocol.zenoh_bus import open_hub
 with open_hub(sys.argv[1]):
     print("listening", flush=True)
     sys.stdin.readline()
@@ -37,8 +36,8 @@ with open_hub(sys.argv[1]):
 # What a process has open, told by itself: sockets that listen or are not TCP, and how many links to the hub.
 SOCKETS = """
 import json, os, sys, threading
-from protocol import topics
-from protocol.zenoh_bus import connect, open_hub
+from buddyline.protocol import topics
+from buddyline.protocol.zenoh_bus import connect, open_hub
 
 def sockets():
     links = [f"/proc/self/fd/{fd}" for fd in os.listdir("/proc/self/fd")]

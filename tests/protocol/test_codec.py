@@ -5,12 +5,11 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.codec import decode, encode, payload_stamp_ns
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Attitude, Blob, Candidates, CompressedImage, Depth, FoxgloveTime, NodeInfo
 from hypothesis import given
 from hypothesis import strategies as st
-
-from protocol.codec import decode, encode, payload_stamp_ns
-from protocol.errors import MessageError
-from protocol.messages import Attitude, Blob, Candidates, CompressedImage, Depth, FoxgloveTime, NodeInfo
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"null", b"[" * 100_000, b"{" * 50, b"{}", b'{"node":'])

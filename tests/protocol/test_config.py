@@ -1,9 +1,8 @@
 """Configuration: strict, and errors name file, field and value."""
 
 import pytest
-
-from node.config import NodeConfig
-from protocol.config import ConfigError, config_sha256, load_config, parse_config
+from buddyline.node.config import NodeConfig
+from buddyline.protocol.config import ConfigError, config_sha256, load_config, parse_config
 
 
 @pytest.mark.parametrize(

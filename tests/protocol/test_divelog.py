@@ -8,13 +8,12 @@ import sys
 import textwrap
 
 import pytest
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime
+from buddyline.protocol.recorder import Recorder
+from buddyline.protocol.topics import parse_key
 from mcap.reader import make_reader
-
-from protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
-from protocol.errors import BuddylineError
-from protocol.messages import CompressedImage, Depth, FoxgloveTime
-from protocol.recorder import Recorder
-from protocol.topics import parse_key
 
 S_NS = 1_000_000_000
 
@@ -118,7 +117,7 @@ def test_kill_loses_at_most_two_seconds(tmp_path):
     program = textwrap.dedent(
         """
         import sys, time
-        from protocol.recorder import Recorder
+        from buddyline.protocol.recorder import Recorder
         recorder = Recorder(sys.argv[1])
         for i in range(10_000):
             stamp = time.time_ns()
@@ -151,7 +150,7 @@ def test_recorder_writes_everything_and_says_where_it_failed(tmp_path):
 
 
 def test_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
-    monkeypatch.setattr("protocol.recorder.MAX_QUEUED_BYTES", 1000)
+    monkeypatch.setattr("buddyline.protocol.recorder.MAX_QUEUED_BYTES", 1000)
     with Recorder(tmp_path / "a.mcap") as recorder:
         with recorder._ready:  # the writing thread cannot take anything meanwhile
             for i in range(8):

@@ -4,10 +4,9 @@ import json
 import math
 
 import pytest
-
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.messages import Attitude, Candidates, NodeInfo
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Attitude, Candidates, NodeInfo
 
 ATTITUDE = {
     "node": "a",

@@ -7,15 +7,15 @@ import threading
 import time
 
 import pytest
+from buddyline.protocol import recorder as module
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.pictures import PictureLog, with_pictures
+from buddyline.protocol.recorder import Recorder, RecordError
+from buddyline.protocol.spool import Spool
+from buddyline.tools.dives import Dive
 
-from protocol import recorder as module
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.pictures import PictureLog, with_pictures
-from protocol.recorder import Recorder, RecordError
-from protocol.spool import Spool
 from tests.disks import small_disk
-from tools.dives import Dive
 
 MIB = 1024 * 1024
 PICTURE = "buddyline/node/a/image"
@@ -179,14 +179,14 @@ def test_a_disk_that_turns_read_only_is_named_and_its_end_is_an_error(tmp_path, 
     def refuse(fd, data):
         raise OSError(errno.EROFS, "Read-only file system")
 
-    monkeypatch.setattr("protocol.spool.os.write", refuse)
+    monkeypatch.setattr("buddyline.protocol.spool.os.write", refuse)
     sender.depth()
     sender.picture(1000)
     until(lambda: recorder.error is not None)
     assert "Read-only file system" in str(recorder.error)
     with pytest.raises(RecordError, match=r"a-1\.mcap: its end is lost: Read-only"):
         recorder.close()
-    monkeypatch.setattr("protocol.spool.os.write", plain)
+    monkeypatch.setattr("buddyline.protocol.spool.os.write", plain)
     assert stamps(path, DEPTH)[:1] == [1]
 
 
@@ -230,7 +230,7 @@ def test_a_spool_goes_on_in_the_middle_of_a_write(tmp_path, monkeypatch):
         allowed[0] -= done
         return done
 
-    monkeypatch.setattr("protocol.spool.os.write", short)
+    monkeypatch.setattr("buddyline.protocol.spool.os.write", short)
     spool = Spool(tmp_path / "file")
     spool.write(b"hello ")
     for word in (b"wide ", b"world"):

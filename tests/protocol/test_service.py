@@ -6,9 +6,9 @@ import textwrap
 import threading
 
 import pytest
+from buddyline.protocol import service as module
+from buddyline.protocol.service import STUCK_S, Service, StuckError
 
-from protocol import service as module
-from protocol.service import STUCK_S, Service, StuckError
 from tests.processes import REPOSITORY
 
 
@@ -16,7 +16,7 @@ def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
     program = textwrap.dedent(
         """
         import sys, threading
-        from protocol import service as module
+        from buddyline.protocol import service as module
         module.STUCK_S, module.WATCH_S, module.JOIN_TIMEOUT_S = 0.2, 0.05, 0.1
         module.start_logging()
         service = module.Service("node a")
@@ -47,7 +47,7 @@ def test_a_process_that_holds_on_when_stuck_is_ended_anyway():
     program = textwrap.dedent(
         """
         import threading
-        from protocol import service as module
+        from buddyline.protocol import service as module
         module.STUCK_S, module.WATCH_S, module.END_ANYWAY_S = 0.2, 0.05, 0.2
         service = module.Service("node a")
         service.spawn("camera", lambda: (service.going_on(), threading.Event().wait()))

@@ -4,10 +4,9 @@ import json
 import logging
 
 import pytest
-
-from protocol.codec import decode
-from protocol.messages import NodeStatus
-from protocol.statusfile import StatusFile
+from buddyline.protocol.codec import decode
+from buddyline.protocol.messages import NodeStatus
+from buddyline.protocol.statusfile import StatusFile
 
 STATUS = NodeStatus(
     node="a", stamp_ns=5, boot="b", software="s", uptime_s=1.0, rates_hz={}, drops={}, ages_s={}, problem="disk: full"

@@ -4,9 +4,8 @@ import secrets
 import socket
 
 import pytest
-
-from protocol.service import Service
-from protocol.systemd import MAX_TEXT, Notifier
+from buddyline.protocol.service import Service
+from buddyline.protocol.systemd import MAX_TEXT, Notifier
 
 
 @pytest.fixture(params=["path", "abstract"])

@@ -3,11 +3,10 @@
 import json
 
 import pytest
-
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import CompressedImage, FoxgloveTime, Mark, Rejected
-from protocol.schemas import json_schema
-from protocol.topics import CANDIDATES, POSE, TOPICS, check_sender, key_of, parse_key
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Mark, Rejected
+from buddyline.protocol.schemas import json_schema
+from buddyline.protocol.topics import CANDIDATES, POSE, TOPICS, check_sender, key_of, parse_key
 
 
 def test_keys_parse_back():

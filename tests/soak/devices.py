@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from buddyline.node.config import NodeConfig
+from buddyline.node.sim.devices import DEPTH_HZ, IMU_HZ, SimulatedCamera, SimulatedSensor, scenario_of
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.messages import Message
 from msgspec.structs import replace
 from numpy.typing import NDArray
-
-from node.config import NodeConfig
-from node.sim.devices import DEPTH_HZ, IMU_HZ, SimulatedCamera, SimulatedSensor, scenario_of
-from node.sim.world import World
-from protocol.clock import S_NS, Clock
-from protocol.messages import Message
 
 ATTITUDE_HZ = 100
 PICTURES = 30

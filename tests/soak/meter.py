@@ -9,13 +9,13 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from protocol.bus import Received
-from protocol.clock import S_NS
-from protocol.codec import decode, payload_stamp_ns
-from protocol.divelog import DiveLogReader
-from protocol.messages import Candidates, RelativePose
-from protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, NODE_STATUS, POSE, REJECTED, Topic, parse_key
-from protocol.zenoh_bus import connect
+from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode, payload_stamp_ns
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.messages import Candidates, RelativePose
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, NODE_STATUS, POSE, REJECTED, Topic, parse_key
+from buddyline.protocol.zenoh_bus import connect
 
 COUNTED = (CANDIDATES, ATTITUDE, IMU, DEPTH, NODE_STATUS, POSE, REJECTED)
 PAGE = os.sysconf("SC_PAGE_SIZE")

@@ -1,9 +1,9 @@
-"""One node as `python -m node` runs it, with the devices of the soak: `python -m tests.soak.node --config a.toml`."""
+"""One node as `buddyline node` runs it, with the devices of the soak: `python -m tests.soak.node --config a.toml`."""
 
 import sys
 
-from node import devices
-from node.__main__ import main
+from buddyline.node import devices
+from buddyline.node.__main__ import main
 
 if __name__ == "__main__":
     for registry, opens in ((devices.CAMERAS, "open_camera"), (devices.SENSORS, "open_sensors")):

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
-from protocol.clock import S_NS
+from buddyline.protocol.clock import S_NS
+
 from tests.processes import Process, free_endpoint
 from tests.soak.meter import Load, Stream, Streams, Viewer, load_of, stamps_of, streams_of
 

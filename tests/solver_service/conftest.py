@@ -1,10 +1,9 @@
 """A short simulated dive as messages, in the order they were made."""
 
 import pytest
-
-from node.sim.scenario import Scenario
-from node.sim.world import World
-from protocol.clock import trigger_index
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import trigger_index
 
 START_NS = 1_764_000_000_000_000_000
 PERIOD_NS = 100_000_000

@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, Rig
-from solver_service.geometry.trigger import Sensed, View
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, Rig
+from buddyline.solver_service.geometry.trigger import Sensed, View
 
 HD = Camera("pinhole", 1640, 1232, 1800.0, 1800.0, 819.5, 615.5)
 IDEAL = Rig(HD, np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]]))

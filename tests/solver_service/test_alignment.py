@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.solver_service.alignment import ClockAlignment
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import rotation_exp
+from buddyline.solver_service.geometry.trigger import Settings
 
-from solver_service.alignment import ClockAlignment
-from solver_service.core import SolverCore
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import rotation_exp
-from solver_service.geometry.trigger import Settings
 from tests.solver_service.conftest import dive_messages
 from tests.solver_service.test_prior import fix
 

@@ -4,15 +4,15 @@ import time
 from collections import Counter
 
 import pytest
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import Candidates, Rejected
+from buddyline.protocol.topics import key_of, parse_key
+from buddyline.solver_service.answered import Answered
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.service import SolverService
 
-from protocol.clock import S_NS, ManualClock
-from protocol.codec import decode
-from protocol.local_bus import LocalNetwork
-from protocol.messages import Candidates, Rejected
-from protocol.topics import key_of, parse_key
-from solver_service.answered import Answered
-from solver_service.config import SolverConfig
-from solver_service.service import SolverService
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 

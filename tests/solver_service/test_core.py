@@ -6,11 +6,11 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
+from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
+from buddyline.solver_service.core import MAX_PENDING, SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
 
-from protocol.clock import MS_NS, S_NS
-from protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
-from solver_service.core import MAX_PENDING, SolverCore
-from solver_service.geometry.trigger import Settings
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 

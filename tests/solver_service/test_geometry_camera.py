@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.camera import Camera
 
-from solver_service.geometry.camera import Camera
 from tests.solver_service.scenes import HD, project
 
 CAMERAS = {

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.closed_form import closed_form, eq1_range_m
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import matrix_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from solver_service.geometry.closed_form import closed_form, eq1_range_m
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import matrix_of
 from tests.solver_service.scenes import HD, IDEAL, ODD_A, ODD_B, random_scene
 
 # B's L and R in A's image, A's L and R in B's, normalized; t_a_b; q_a_b; mm off with the bisector, and literally.

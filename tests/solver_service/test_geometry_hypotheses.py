@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.hypotheses import find_pairs, join
+from buddyline.solver_service.geometry.observation import Settings
+from buddyline.solver_service.geometry.terms import Terms
+from buddyline.solver_service.geometry.trigger import Sensed
 
-from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.hypotheses import find_pairs, join
-from solver_service.geometry.observation import Settings
-from solver_service.geometry.terms import Terms
-from solver_service.geometry.trigger import Sensed
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, view
 
 GATE = 4.5

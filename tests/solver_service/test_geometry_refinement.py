@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.refinement import Motion, Sightings, refine
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import rotation_exp, rotation_log
 
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.refinement import Motion, Sightings, refine
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import rotation_exp, rotation_log
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, project, random_scene
 
 STILL = Motion(np.zeros(6), np.zeros((6, 6)))

@@ -3,10 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
-
-from solver_service.geometry.rotation import (
+from buddyline.solver_service.geometry.rotation import (
     matrix_of,
     quaternion_of,
     rotation_exp,
@@ -14,6 +11,8 @@ from solver_service.geometry.rotation import (
     rotation_near,
     skew,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 DIRECTIONS = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)
 ANGLES = st.one_of(st.floats(0, math.pi), st.sampled_from([0.0, 1e-12, 1e-8, 1e-4, math.pi - 1e-6, math.pi]))

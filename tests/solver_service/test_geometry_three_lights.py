@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, solve_trigger
 
-from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
-from solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, solve_trigger
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, view
 
 SETTINGS = Settings()

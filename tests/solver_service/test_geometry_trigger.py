@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import matrix_of, rotation_log
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, View, solve_trigger
 
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rig import Rig
-from solver_service.geometry.rotation import matrix_of, rotation_log
-from solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, View, solve_trigger
 from tests.solver_service.scenes import (
     HD,
     IDEAL,

@@ -5,15 +5,15 @@ import math
 import msgspec
 import numpy as np
 import pytest
+from buddyline.protocol.messages import Attitude, Candidates, RelativePose
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.evidence import heading_offset
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
+from buddyline.solver_service.service import SolverService
 
-from protocol.messages import Attitude, Candidates, RelativePose
-from solver_service.config import SolverConfig
-from solver_service.core import SolverCore
-from solver_service.geometry.evidence import heading_offset
-from solver_service.geometry.rotation import matrix_of, quaternion_of
-from solver_service.geometry.trigger import Settings
-from solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
-from solver_service.service import SolverService
 from tests.solver_service.scenes import IDEAL, random_scene, rotation
 
 STEP_NS = 100_000_000

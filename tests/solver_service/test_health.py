@@ -4,14 +4,14 @@ import threading
 import time
 
 import pytest
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import NodeInfo
+from buddyline.protocol.topics import INFO, SOLVER_STATUS
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.health import NodeHealth
+from buddyline.solver_service.service import SolverService
 
-from protocol.codec import decode, encode
-from protocol.local_bus import LocalNetwork
-from protocol.messages import NodeInfo
-from protocol.topics import INFO, SOLVER_STATUS
-from solver_service.config import SolverConfig
-from solver_service.health import NodeHealth
-from solver_service.service import SolverService
 from tests.solver_service.conftest import dive_messages
 
 S_NS = 1_000_000_000

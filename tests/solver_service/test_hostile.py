@@ -3,14 +3,14 @@
 import tracemalloc
 
 import pytest
+from buddyline.protocol.bus import Received
+from buddyline.protocol.codec import MAX_MESSAGE_BYTES, encode
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.topics import key_of
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
 
-from protocol.bus import Received
-from protocol.codec import MAX_MESSAGE_BYTES, encode
-from protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
-from protocol.topics import key_of
-from solver_service.config import SolverConfig
-from solver_service.service import SolverService
 from tests.fuzz.targets import Capture
 from tests.solver_service.conftest import dive_messages
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-
-from solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
-from solver_service.geometry.trigger import Fix
-from solver_service.prior import LIFETIME_NS, PosePrior
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.trigger import Fix
+from buddyline.solver_service.prior import LIFETIME_NS, PosePrior
 
 STEP_NS = 100_000_000
 

@@ -1,12 +1,13 @@
 """The live service's own part: it tells the core when each message has come."""
 
-from protocol.bus import Received
-from protocol.clock import S_NS
-from protocol.codec import encode
-from protocol.messages import Candidates
-from protocol.topics import key_of
-from solver_service.config import SolverConfig
-from solver_service.service import SolverService
+from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode
+from buddyline.protocol.messages import Candidates
+from buddyline.protocol.topics import key_of
+from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.service import SolverService
+
 from tests.fuzz.targets import Capture
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from buddyline.tools.calibration.board import Board
 from numpy.typing import NDArray
-
-from tools.calibration.board import Board
 
 SIZE = (640, 480)
 FOCAL_PX = 520.0

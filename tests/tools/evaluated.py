@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-
-from protocol.divelog import DiveLogWriter
-from protocol.messages import (
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.messages import (
     Blob,
     CameraModel,
     Candidates,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from protocol.security import Tls
-from tools.authority import Authority
-from tools.cli import main
+from buddyline.protocol.security import Tls
+from buddyline.tools.authority import Authority
+from buddyline.tools.cli import main
 
 
 def make_keys(directory: Path, *nodes: str) -> Path:

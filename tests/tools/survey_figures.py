@@ -16,15 +16,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from buddyline.tools.survey import survex
+from buddyline.tools.survey.averages import wrap
+from buddyline.tools.survey.derive import Derived
+from buddyline.tools.survey.lines import bearing_of, line_of
+from buddyline.tools.survey.network import adjust
+from buddyline.tools.survey.readings import of_messages
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 
 from tests.tools import survey_world as world
-from tools.survey import survex
-from tools.survey.averages import wrap
-from tools.survey.derive import Derived
-from tools.survey.lines import bearing_of, line_of
-from tools.survey.network import adjust
-from tools.survey.readings import of_messages
-from tools.survey.settings import AlarmSettings, SurveySettings
 
 HANDS = 5
 # Swimming past the other and on to the next station, at this speed, and then tying off.

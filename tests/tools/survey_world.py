@@ -11,16 +11,15 @@ import subprocess
 from dataclasses import dataclass, field
 
 import numpy as np
+from buddyline.node.sim import rotation
+from buddyline.node.sim.camera import pinhole, project
+from buddyline.node.sim.rig import Q_BODY_CAMERA, R_BODY_CAMERA
+from buddyline.protocol.messages import Attitude, Blob, Candidates, Depth, Imu, Mark, NodeInfo
+from buddyline.solver_service.config import SolveConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.tools.survey.derive import Derived
+from buddyline.tools.survey.project import About, AdjustSettings, Leg, Project
 from msgspec.structs import replace
-
-from node.sim import rotation
-from node.sim.camera import pinhole, project
-from node.sim.rig import Q_BODY_CAMERA, R_BODY_CAMERA
-from protocol.messages import Attitude, Blob, Candidates, Depth, Imu, Mark, NodeInfo
-from solver_service.config import SolveConfig
-from solver_service.core import SolverCore
-from tools.survey.derive import Derived
-from tools.survey.project import About, AdjustSettings, Leg, Project
 
 PERIOD_NS = 500_000_000
 START_NS = 1_777_629_600_000_000_000  # 2026-05-01T10:00:00Z

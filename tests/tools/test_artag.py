@@ -5,20 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from node.sim import rotation, tags
-from node.sim.scenario import Scenario
-from node.sim.world import World
-from protocol.divelog import DiveLogReader
-from protocol.errors import BuddylineError
-from protocol.messages import ArTag, CameraModel, RelativePose
-from tools.cli import main
-from tools.evaluation.lights import project
-from tools.evaluation.rotation import conjugate, multiply, normalized, rotate, rotation_vector
-from tools.experiments import tank
-from tools.tags.detection import TagFinder
-from tools.tags.layout import Layout, layout_of, load_layout
-from tools.tags.pose import CORNER_SIGMA_PX, readings_of, tag_pose
+from buddyline.node.sim import rotation, tags
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import ArTag, CameraModel, RelativePose
+from buddyline.tools.cli import main
+from buddyline.tools.evaluation.lights import project
+from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotate, rotation_vector
+from buddyline.tools.experiments import tank
+from buddyline.tools.tags.detection import TagFinder
+from buddyline.tools.tags.layout import Layout, layout_of, load_layout
+from buddyline.tools.tags.pose import CORNER_SIGMA_PX, readings_of, tag_pose
 
 CAMERA = CameraModel(
     model="pinhole", fx_px=904.0, fy_px=904.0, cx_px=409.5, cy_px=307.5, distortion=[-0.2, 0.05, 0.001, 0.0, 0.0]

@@ -1,13 +1,13 @@
 """`buddyline backfill`: the union of a topside recording and the nodes' logs, each message once, by time."""
 
 import pytest
+from buddyline.protocol.codec import encode
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Mark
+from buddyline.protocol.topics import key_of
+from buddyline.tools.cli import main
 
-from protocol.codec import encode
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.messages import CompressedImage, FoxgloveTime, Mark
-from protocol.topics import key_of
 from tests.solver_service.conftest import dive_messages
-from tools.cli import main
 
 S_NS = 1_000_000_000
 LATENCY_NS = 40_000_000

@@ -3,9 +3,8 @@
 import json
 
 import pytest
-
-from tools.bench import detect, presets
-from tools.bench.__main__ import main
+from buddyline.tools.bench import detect, presets
+from buddyline.tools.bench.__main__ import main
 
 
 @pytest.fixture(autouse=True)

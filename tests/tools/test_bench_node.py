@@ -3,9 +3,8 @@
 import json
 
 import pytest
-
-from tools.bench import node
-from tools.bench.__main__ import main
+from buddyline.tools.bench import node
+from buddyline.tools.bench.__main__ import main
 
 pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
 

@@ -4,10 +4,9 @@ import json
 
 import numpy as np
 import pytest
-
-from tools.bench import accuracy, solve
-from tools.bench.__main__ import main
-from tools.bench.triggers import images, simulate
+from buddyline.tools.bench import accuracy, solve
+from buddyline.tools.bench.__main__ import main
+from buddyline.tools.bench.triggers import images, simulate
 
 
 def test_the_times_of_the_solver_come_with_those_of_eq_1(capsys, monkeypatch):

@@ -9,17 +9,17 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from buddyline.node.config import CalibrationConfig
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.config import parse_config
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel, NodeInfo
+from buddyline.tools import calibrate
+from buddyline.tools.calibration import camera
+from buddyline.tools.calibration.board import Board
+from buddyline.tools.calibration.camera import CornerFinder, PoorCalibration, View, coverage, distinct, draw
 
-from node.config import CalibrationConfig
-from protocol.codec import decode, encode
-from protocol.config import parse_config
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel, NodeInfo
 from tests.tools import boards
-from tools import calibrate
-from tools.calibration import camera
-from tools.calibration.board import Board
-from tools.calibration.camera import CornerFinder, PoorCalibration, View, coverage, distinct, draw
 
 BOARD = Board()
 CORNERS = np.asarray(BOARD.charuco().getChessboardCorners(), float)

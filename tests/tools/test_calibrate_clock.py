@@ -6,19 +6,19 @@ import threading
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import ClockBeacon, HeardClock, NodeStatus
+from buddyline.protocol.topics import CLOCK
+from buddyline.tools.calibration import clock_report
+from buddyline.tools.calibration.clock import Legs, drift_between, estimate, steps, windows
+from buddyline.tools.calibration.clock_report import Heard, as_json, as_text, reports
+from buddyline.tools.cli import main
+from buddyline.tools.client import ClientConfig
 
-from protocol.clock import S_NS
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.local_bus import LocalNetwork
-from protocol.messages import ClockBeacon, HeardClock, NodeStatus
-from protocol.topics import CLOCK
 from tests.processes import free_endpoint
-from tools.calibration import clock_report
-from tools.calibration.clock import Legs, drift_between, estimate, steps, windows
-from tools.calibration.clock_report import Heard, as_json, as_text, reports
-from tools.cli import main
-from tools.client import ClientConfig
 
 START_NS = 1_764_000_000_000_000_000
 

@@ -9,16 +9,15 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-
-from protocol.codec import decode, encode
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import Blob, CameraModel, Candidates, NodeInfo, RelativePose
-from protocol.topics import CANDIDATES, INFO, POSE
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rotation import quaternion_of, rotation_exp
-from tools import calibrate
-from tools.calibration.lights import Noise, PoorLights, Station, fit
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Blob, CameraModel, Candidates, NodeInfo, RelativePose
+from buddyline.protocol.topics import CANDIDATES, INFO, POSE
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import quaternion_of, rotation_exp
+from buddyline.tools import calibrate
+from buddyline.tools.calibration.lights import Noise, PoorLights, Station, fit
 
 FOCAL_PX = 1000.0
 CAMERA = Camera("pinhole", 1640, 1232, FOCAL_PX, FOCAL_PX, 819.5, 615.5, (0.0,) * 5)

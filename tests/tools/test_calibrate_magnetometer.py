@@ -8,17 +8,16 @@ import tomllib
 import cv2
 import numpy as np
 import pytest
-
-from node.config import SensorsConfig
-from node.geomagnetism import MagnetometerCalibration
-from protocol.codec import encode
-from protocol.config import parse_config
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import Imu
-from protocol.topics import IMU
-from tools import calibrate
-from tools.calibration.ellipsoid import CoverageError, coverage, fit
+from buddyline.node.config import SensorsConfig
+from buddyline.node.geomagnetism import MagnetometerCalibration
+from buddyline.protocol.codec import encode
+from buddyline.protocol.config import parse_config
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Imu
+from buddyline.protocol.topics import IMU
+from buddyline.tools import calibrate
+from buddyline.tools.calibration.ellipsoid import CoverageError, coverage, fit
 
 FIELD_T = 48e-6
 DIP_RAD = np.radians(62.0)

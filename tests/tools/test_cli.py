@@ -3,11 +3,11 @@
 import json
 
 import pytest
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.tools.cli import COMMANDS, main
 
-from protocol.divelog import DiveLogWriter
 from tests.processes import buddyline
 from tests.solver_service.conftest import dive_messages
-from tools.cli import COMMANDS, main
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_dive_without_calibration(capsys, tmp_path):
     assert status == 2
     assert "--info a=FILE" in err
     info = next(m for m in messages if hasattr(m, "camera"))
-    from protocol.codec import encode
+    from buddyline.protocol.codec import encode
 
     for node in ("a", "b"):
         import msgspec

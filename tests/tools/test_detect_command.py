@@ -6,14 +6,14 @@ import logging
 import cv2
 import numpy as np
 import pytest
+from buddyline.node.config import load_node_config
+from buddyline.node.detect import make_detector
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, LightTruth, TrueLight
+from buddyline.tools.cli import main
 
-from node.config import load_node_config
-from node.detect import make_detector
-from protocol.divelog import DiveLogWriter
-from protocol.messages import CompressedImage, FoxgloveTime, LightTruth, TrueLight
 from tests.node.rendered import lamp_picture
 from tests.tools.evaluated import info
-from tools.cli import main
 
 AT = (100.0, 70.0)
 PICTURE = lamp_picture([AT], size=(200, 150), core=300.0)

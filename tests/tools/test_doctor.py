@@ -7,21 +7,21 @@ import time
 import msgspec
 import numpy as np
 import pytest
+from buddyline.node.chrony import decode_tracking
+from buddyline.node.config import NodeConfig, load_node_config
+from buddyline.node.detect import Detection
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import Attitude, Blob, Depth, Imu, NodeStatus
+from buddyline.protocol.topics import INFO, NODE_STATUS
+from buddyline.tools.cli import main
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.doctor import bus, checks, command, machine, rig
+from buddyline.tools.doctor.finding import Finding, status_of
 
-from node.chrony import decode_tracking
-from node.config import NodeConfig, load_node_config
-from node.detect import Detection
-from protocol.clock import S_NS, ManualClock
-from protocol.errors import BuddylineError
-from protocol.local_bus import LocalNetwork
-from protocol.messages import Attitude, Blob, Depth, Imu, NodeStatus
-from protocol.topics import INFO, NODE_STATUS
 from tests.node.test_chrony import FOLLOWS, LOST, SERVES
 from tests.processes import REPOSITORY
-from tools.cli import main
-from tools.client import ClientConfig
-from tools.doctor import bus, checks, command, machine, rig
-from tools.doctor.finding import Finding, status_of
 
 EXAMPLES = REPOSITORY / "node" / "examples"
 STAMP_NS = 1_764_000_000_000_000_000

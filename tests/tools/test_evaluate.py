@@ -6,12 +6,18 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.node.sim.camera import project as sim_project
+from buddyline.protocol.messages import Attitude, CameraModel
+from buddyline.tools.evaluation.lights import project
+from buddyline.tools.evaluation.poses import nees
+from buddyline.tools.evaluation.recorded import Recorded
+from buddyline.tools.evaluation.result import Result, evaluate
+from buddyline.tools.evaluation.rotation import interpolate, multiply, normalized, rotate, rotation_vector
+from buddyline.tools.evaluation.truth import inverted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import UNSET
 
-from node.sim.camera import project as sim_project
-from protocol.messages import Attitude, CameraModel
 from tests.tools.evaluated import (
     COVARIANCE,
     FACING,
@@ -29,12 +35,6 @@ from tests.tools.evaluated import (
     rejection,
     truth,
 )
-from tools.evaluation.lights import project
-from tools.evaluation.poses import nees
-from tools.evaluation.recorded import Recorded
-from tools.evaluation.result import Result, evaluate
-from tools.evaluation.rotation import interpolate, multiply, normalized, rotate, rotation_vector
-from tools.evaluation.truth import inverted
 
 angles = st.floats(-1.8, 1.8)
 

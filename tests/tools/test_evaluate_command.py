@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import Candidates, NodeInfo, Truth
+from buddyline.tools.cli import main
+from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
+from buddyline.tools.evaluation.truth import TruthTrack, inverted
 
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.messages import Candidates, NodeInfo, Truth
 from tests.tools.evaluated import FIRST, INFOS, frame, info, light_truth, pose, rejection, truth, write_log
-from tools.cli import main
-from tools.evaluation.lights import Blobs, is_right_pair, true_lights
-from tools.evaluation.truth import TruthTrack, inverted
 
 DIVES = Path(__file__).parents[3] / "shared" / "data" / "dives"
 

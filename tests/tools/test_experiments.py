@@ -5,14 +5,14 @@ import re
 
 import numpy as np
 import pytest
+from buddyline.protocol.messages import RelativePose
+from buddyline.tools.bound import pose_bounds
+from buddyline.tools.cli import main
+from buddyline.tools.evaluation.poses import pose_errors
+from buddyline.tools.evaluation.truth import Track, TruthTrack
+from buddyline.tools.experiments import numbers, page
 
-from protocol.messages import RelativePose
 from tests.tools.evaluated import INFOS, pose, truth
-from tools.bound import pose_bounds
-from tools.cli import main
-from tools.evaluation.poses import pose_errors
-from tools.evaluation.truth import Track, TruthTrack
-from tools.experiments import numbers, page
 
 
 def _errors(offsets_m, range_m=3.0):

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.tools.cli import main
 from msgspec.structs import replace
 
 from tests.tools.evaluated import COVARIANCE, FIRST, PERIOD_NS, pose, rejection, truth, write_log
-from tools.cli import main
 
 STAMP_NS = 1_764_000_000_123_456_789
 

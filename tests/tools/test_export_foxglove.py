@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Message
+from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.tools.cli import main
 
-from protocol.errors import BuddylineError
-from protocol.messages import Message
-from solver_service.geometry.rotation import matrix_of
 from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, write_log
 from tests.tools.watched import PNG, at, attitude, depth, image
-from tools.cli import main
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 decoding = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
@@ -101,8 +101,8 @@ def test_chosen_lights_are_named_and_a_missing_one_is_left_out(exported: dict[st
 
 
 def test_an_output_is_named_and_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from tools.dives import Dive
-    from tools.export_foxglove import export_foxglove
+    from buddyline.tools.dives import Dive
+    from buddyline.tools.export_foxglove import export_foxglove
 
     dive = write_log(tmp_path / "dive.mcap", *INFOS.values(), pose(0))
     assert main(["export", dive, "--format", "foxglove"]) == 2

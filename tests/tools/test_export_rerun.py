@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from buddyline.protocol.messages import Message
+from buddyline.tools.cli import main
 
-from protocol.messages import Message
 from tests.tools.evaluated import INFOS, frame, pose, write_log
 from tests.tools.watched import at, attitude, depth, image
-from tools.cli import main
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

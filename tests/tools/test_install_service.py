@@ -5,9 +5,8 @@ import shutil
 import subprocess
 
 import pytest
-
-from tools import install_service
-from tools.cli import main
+from buddyline.tools import install_service
+from buddyline.tools.cli import main
 
 CONFIG = 'node = "a"\n[camera]\nname = "{camera}"\n[sensors]\nname = "{sensors}"\n[record]\ndirectory = "{directory}"\n'
 

@@ -4,16 +4,16 @@ import argparse
 import stat
 
 import pytest
+from buddyline.node.config import load_node_config
+from buddyline.protocol.endpoint import host_and_port, is_loopback
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.security import Tls, check_identity
+from buddyline.solver_service.config import load_solver_config
+from buddyline.tools.cli import main
+from buddyline.tools.client import ClientConfig, client_config
+from buddyline.tools.hub import HubConfig, check_exposure, load_hub_config
 
-from node.config import load_node_config
-from protocol.endpoint import host_and_port, is_loopback
-from protocol.errors import BuddylineError
-from protocol.security import Tls, check_identity
-from solver_service.config import load_solver_config
 from tests.tools.identities import copy_of, expired, make_keys, tls
-from tools.cli import main
-from tools.client import ClientConfig, client_config
-from tools.hub import HubConfig, check_exposure, load_hub_config
 
 
 @pytest.fixture(scope="module")

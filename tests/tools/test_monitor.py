@@ -8,24 +8,24 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.codec import encode
+from buddyline.protocol.messages import Message
+from buddyline.protocol.topics import POSE, key_of
+from buddyline.tools.monitor import panel
+from buddyline.tools.monitor.coverage import Coverage, clock_words
+from buddyline.tools.monitor.health import REASONS, findings, sentence
+from buddyline.tools.monitor.inbox import QUEUED, Inbox
+from buddyline.tools.monitor.picture import KEPT_NS, Miss, PairPicture
+from buddyline.tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
+from buddyline.tools.monitor.svg import Line, Plot, svg, ticks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from protocol.bus import Received
-from protocol.clock import S_NS, ManualClock
-from protocol.codec import encode
-from protocol.messages import Message
-from protocol.topics import POSE, key_of
 from tests.tools.evaluated import FACING, INFOS, OFFSET_PX, frame, pose, rejection
 from tests.tools.watched import at, attitude, feed, image, solver_status, status, watched
-from tools.monitor import panel
-from tools.monitor.coverage import Coverage, clock_words
-from tools.monitor.health import REASONS, findings, sentence
-from tools.monitor.inbox import QUEUED, Inbox
-from tools.monitor.picture import KEPT_NS, Miss, PairPicture
-from tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
-from tools.monitor.svg import Line, Plot, svg, ticks
 
 HALF = math.sqrt(0.5)
 

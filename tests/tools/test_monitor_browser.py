@@ -129,7 +129,11 @@ class Processes:
     def start(self, name: str, *words: str) -> None:
         with open(self._directory / f"{name}.log", "ab") as log:
             self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "tools", *words], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+                [sys.executable, "-P", "-m", "buddyline", *words],
+                cwd=ROOT,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
             )
 
     def kill(self, name: str) -> None:
@@ -257,7 +261,7 @@ def test_a_stored_dive_is_played_and_scrubbed(chromium: Any, processes: Processe
 
 @pytest.mark.parametrize("size", list(SIZES))
 def test_a_report_is_read_without_a_network(chromium: Any, tmp_path: Path, size: str) -> None:
-    from tools.cli import main
+    from buddyline.tools.cli import main
 
     output = tmp_path / "report.html"
     assert main(["report", dive_log(tmp_path), "-o", str(output)]) == 0

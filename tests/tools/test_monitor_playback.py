@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Message
+from buddyline.tools.dives import Dive
+from buddyline.tools.monitor.coverage import Coverage
+from buddyline.tools.monitor.playback import LEAD_NS, Playback, survey
+from buddyline.tools.monitor.report import report_html
+from buddyline.tools.monitor.summary import summarize
 from mcap.reader import make_reader
 
-from protocol.clock import S_NS
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.messages import Message
 from tests.tools.evaluated import INFOS, frame, info, pose, rejection, truth, write_log
 from tests.tools.watched import at, image, tick, watched
-from tools.dives import Dive
-from tools.monitor.coverage import Coverage
-from tools.monitor.playback import LEAD_NS, Playback, survey
-from tools.monitor.report import report_html
-from tools.monitor.summary import summarize
 
 TICKS = 600
 

@@ -5,16 +5,15 @@ import math
 
 import numpy as np
 import pytest
-
-from node.detect import make_detector
-from node.sim.scenario import WATERS, Scenario
-from node.sim.world import World
-from tools import plan
-from tools.bound import pose_bounds
-from tools.cli import main
-from tools.evaluation.logs import load
-from tools.evaluation.result import evaluate
-from tools.plan import described, expected, light_reach_m, with_baseline
+from buddyline.node.detect import make_detector
+from buddyline.node.sim.scenario import WATERS, Scenario
+from buddyline.node.sim.world import World
+from buddyline.tools import plan
+from buddyline.tools.bound import pose_bounds
+from buddyline.tools.cli import main
+from buddyline.tools.evaluation.logs import load
+from buddyline.tools.evaluation.result import evaluate
+from buddyline.tools.plan import described, expected, light_reach_m, with_baseline
 
 FACING = np.array([[0.0, 1.0, 0.0, 0.0]])
 

@@ -6,18 +6,18 @@ import time
 from dataclasses import replace
 
 import pytest
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.codec import decode
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import Candidates, NodeInfo, Rejected
+from buddyline.protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
+from buddyline.tools import play
+from buddyline.tools.dives import Dive
+from buddyline.tools.play import Player, _selected, _span
 
-from protocol.clock import S_NS, ManualClock
-from protocol.codec import decode
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.local_bus import LocalNetwork
-from protocol.messages import Candidates, NodeInfo, Rejected
-from protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
-from tools import play
-from tools.dives import Dive
-from tools.play import Player, _selected, _span
 
 
 @pytest.fixture(scope="module")

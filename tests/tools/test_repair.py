@@ -4,12 +4,11 @@ import random
 
 import numpy as np
 import pytest
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import Depth
+from buddyline.tools.cli import main
+from buddyline.tools.repair import missing
 from mcap.reader import make_reader
-
-from protocol.divelog import DiveLogReader, DiveLogWriter
-from protocol.messages import Depth
-from tools.cli import main
-from tools.repair import missing
 
 S_NS = 1_000_000_000
 COUNT, EVERY = 100, 10

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.messages import Message
+from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
 
-from protocol.clock import S_NS, ManualClock
-from protocol.messages import Message
-from solver_service.geometry.rotation import matrix_of
 from tests.processes import free_endpoint
 from tests.tools.evaluated import INFOS, pose
 from tests.tools.watched import at, attitude, depth
-from tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 
@@ -112,7 +112,7 @@ def test_an_attachment_is_33_bytes() -> None:
 
 
 def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any) -> None:
-    from protocol.zenoh_bus import open_hub, open_session
+    from buddyline.protocol.zenoh_bus import open_hub, open_session
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -162,8 +162,9 @@ def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any
 
 def test_a_secured_hub_lets_the_bridge_publish_for_ros_and_nobody_else(store: Any, tmp_path: Path) -> None:
     pytest.importorskip("cryptography", reason="cryptography is not installed")
-    from protocol.access import access_rules
-    from protocol.zenoh_bus import open_hub, open_session
+    from buddyline.protocol.access import access_rules
+    from buddyline.protocol.zenoh_bus import open_hub, open_session
+
     from tests.tools.identities import make_keys, tls
 
     keys = make_keys(tmp_path, "a")

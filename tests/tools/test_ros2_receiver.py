@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 
-from protocol.clock import S_NS
-from protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 from tests.tools.evaluated import INFOS, pose
 from tests.tools.watched import at, attitude, depth
 
@@ -63,7 +63,7 @@ def receiver(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    from protocol.zenoh_bus import open_hub
+    from buddyline.protocol.zenoh_bus import open_hub
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -89,7 +89,7 @@ def test_attitude_depth_pose_and_transforms_arrive_as_they_are(
             text=True,
         ) as listener,
         subprocess.Popen(
-            [sys.executable, "-m", "tools", "ros2", "--connect", endpoint, "--domain", str(DOMAIN)],
+            [sys.executable, "-P", "-m", "buddyline", "ros2", "--connect", endpoint, "--domain", str(DOMAIN)],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             stdout=log,
@@ -108,7 +108,7 @@ def test_attitude_depth_pose_and_transforms_arrive_as_they_are(
 
 def heard_while_publishing(listener: subprocess.Popen[str], endpoint: str) -> dict[str, list[Any]]:
     """Publish a pair that stays where it is until the listener has heard of everything; return it by topic."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     heard: dict[str, list[Any]] = defaultdict(list)
 

@@ -1,10 +1,9 @@
 """`buddyline simulate`: dive logs with truth."""
 
 import pytest
-
-from protocol.divelog import DiveLogReader
-from protocol.messages import Candidates, CompressedImage, NodeInfo, Truth
-from tools.cli import main
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.messages import Candidates, CompressedImage, NodeInfo, Truth
+from buddyline.tools.cli import main
 
 
 def _simulated(path, *words):

@@ -8,13 +8,13 @@ import subprocess
 
 import numpy as np
 import pytest
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey import compass, drawing, report, survex, tables, therion
+from buddyline.tools.survey.network import adjust
+from buddyline.tools.survey.project import Edit, FixedPoint, Place
 from msgspec.structs import replace
 
-from protocol.errors import BuddylineError
 from tests.tools import survey_world as world
-from tools.survey import compass, drawing, report, survex, tables, therion
-from tools.survey.network import adjust
-from tools.survey.project import Edit, FixedPoint, Place
 
 CAVERN = pytest.mark.skipif(shutil.which("cavern") is None, reason="survex is not installed")
 THERION = pytest.mark.skipif(shutil.which("therion") is None, reason="therion is not installed")

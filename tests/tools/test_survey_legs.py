@@ -4,22 +4,22 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.messages import Imu, Mark, Rejected, RelativePose
+from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
+from buddyline.tools.survey.chain import Stop, stand
+from buddyline.tools.survey.derive import Derived, ranges
+from buddyline.tools.survey.live import LiveAlarms
+from buddyline.tools.survey.network import adjust
+from buddyline.tools.survey.project import Leg
+from buddyline.tools.survey.readings import of_messages
+from buddyline.tools.survey.rests import rests
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
+from buddyline.tools.survey.sights import sights
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from protocol.messages import Imu, Mark, Rejected, RelativePose
 from tests.tools import survey_world as world
-from tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
-from tools.survey.chain import Stop, stand
-from tools.survey.derive import Derived, ranges
-from tools.survey.live import LiveAlarms
-from tools.survey.network import adjust
-from tools.survey.project import Leg
-from tools.survey.readings import of_messages
-from tools.survey.rests import rests
-from tools.survey.settings import AlarmSettings, SurveySettings
-from tools.survey.sights import sights
 
 COURSE = world.line(np.random.default_rng(2), 5)
 

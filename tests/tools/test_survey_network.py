@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.geodesy import convergence_rad, declination, from_utm, grid_of, to_utm
+from buddyline.tools.survey.lines import bearing_of, line_of
+from buddyline.tools.survey.network import adjust
+from buddyline.tools.survey.project import Edit, FixedPoint, Place, Project
 from msgspec.structs import replace
 
-from protocol.errors import BuddylineError
 from tests.tools import survey_world as world
-from tools.survey.geodesy import convergence_rad, declination, from_utm, grid_of, to_utm
-from tools.survey.lines import bearing_of, line_of
-from tools.survey.network import adjust
-from tools.survey.project import Edit, FixedPoint, Place, Project
 
 EXACT = {"compass_deg": 0.0, "tape_m": 0.0, "depth_m": 0.0}
 

@@ -7,19 +7,19 @@ import threading
 
 import numpy as np
 import pytest
+from buddyline.protocol.codec import decode
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.topics import MARK, key_of, parse_key
+from buddyline.tools.survey import command, mark
+from buddyline.tools.survey.live import Watch
+from buddyline.tools.survey.project import MARKER, load_project
 from msgspec.structs import replace
 
-from protocol.codec import decode
-from protocol.config import ConfigError
-from protocol.divelog import DiveLogWriter
-from protocol.errors import BuddylineError
-from protocol.local_bus import LocalNetwork
-from protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose
-from protocol.topics import MARK, key_of, parse_key
 from tests.tools import survey_world as world
-from tools.survey import command, mark
-from tools.survey.live import Watch
-from tools.survey.project import MARKER, load_project
 
 COURSE = world.line(np.random.default_rng(2), 3)
 

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from protocol.clock import S_NS
-from protocol.messages import Attitude, CompressedImage, Depth, FoxgloveTime, Message, NodeStatus, SolverStatus
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import (
+    Attitude,
+    CompressedImage,
+    Depth,
+    FoxgloveTime,
+    Message,
+    NodeStatus,
+    SolverStatus,
+)
+from buddyline.tools.monitor.picture import PairPicture
+
 from tests.tools.evaluated import FIRST, INFOS, PERIOD_NS, frame, pose
-from tools.monitor.picture import PairPicture
 
 START_NS = FIRST * PERIOD_NS
 # The smallest picture a browser takes: one grey pixel.

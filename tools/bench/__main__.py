@@ -1,4 +1,4 @@
-"""`python -m tools.bench BENCHMARK`: one each, imported when it is called."""
+"""`python -m buddyline.tools.bench BENCHMARK`: one each, imported when it is called."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from importlib import import_module
 from typing import Final
 
-from protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError
 
 BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
@@ -23,14 +23,14 @@ def main(argv: list[str] | None = None) -> int:
     """Run one benchmark; return the exit status."""
     listing = "\n".join(f"  {name:8} {does}" for name, does in BENCHMARKS.items())
     parser = argparse.ArgumentParser(
-        prog="python -m tools.bench",
+        prog="python -m buddyline.tools.bench",
         description=f"benchmarks:\n{listing}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("benchmark", choices=list(BENCHMARKS), metavar="BENCHMARK")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="its own; see BENCHMARK --help")
     args = parser.parse_args(argv)
-    run = import_module(f"tools.bench.{args.benchmark}").main
+    run = import_module(f"buddyline.tools.bench.{args.benchmark}").main
     try:
         return int(run(args.arguments))
     except BuddylineError as error:

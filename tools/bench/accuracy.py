@@ -17,13 +17,12 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.rotation import matrix_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.trigger import Fix, Settings
+from buddyline.tools.bench.triggers import CAMERA, RIG, Trigger, images, simulate
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from solver_service.geometry.closed_form import closed_form
-from solver_service.geometry.rotation import matrix_of, rotation_exp, rotation_log
-from solver_service.geometry.trigger import Fix, Settings
-from tools.bench.triggers import CAMERA, RIG, Trigger, images, simulate
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ STEP: Final = 1e-6
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench accuracy", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench accuracy", description=__doc__)
     parser.add_argument("--triggers", type=int, default=200, metavar="N", help="of each kind")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args(argv)

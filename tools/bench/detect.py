@@ -22,15 +22,14 @@ from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
+from buddyline.node.detect import METHODS, make_detector
+from buddyline.node.drivers.stored import decode_picture
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import CompressedImage
+from buddyline.protocol.topics import IMAGE
+from buddyline.tools.dives import Dive
 from numpy.typing import NDArray
-
-from node.detect import METHODS, make_detector
-from node.drivers.stored import decode_picture
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import CompressedImage
-from protocol.topics import IMAGE
-from tools.dives import Dive
 
 Pictures: TypeAlias = list[NDArray[np.uint8]]
 Finder: TypeAlias = Callable[[NDArray[np.uint8]], object]
@@ -59,7 +58,7 @@ print(*times)
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench detect", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench detect", description=__doc__)
     parser.add_argument(
         "dives", nargs="*", metavar="DIVE.mcap", help="one environment each; default: rendered pictures"
     )
@@ -211,9 +210,9 @@ def _stored(path: str) -> Iterator[NDArray[np.uint8]]:
 
 
 def _rendered(environment: str, size: tuple[int, int], count: int) -> Iterator[NDArray[np.uint8]]:
-    from node.sim.scenario import ENVIRONMENTS as KNOWN
-    from node.sim.scenario import Scenario
-    from node.sim.world import World
+    from buddyline.node.sim.scenario import ENVIRONMENTS as KNOWN
+    from buddyline.node.sim.scenario import Scenario
+    from buddyline.node.sim.world import World
 
     if environment not in KNOWN:
         raise BuddylineError(f"{environment}: is neither a dive (.mcap) nor one of {', '.join(KNOWN)}")

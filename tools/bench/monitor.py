@@ -26,13 +26,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-
-from protocol.bus import Bus, Received
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.errors import BuddylineError
-from protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
-from protocol.topics import CANDIDATES, IMAGE, POSE
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
+from buddyline.protocol.topics import CANDIDATES, IMAGE, POSE
 
 RATE_HZ: Final = 30
 DIVE_S: Final = 120
@@ -50,7 +49,7 @@ CHROMIUM_FLAGS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-un
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench monitor", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench monitor", description=__doc__)
     parser.add_argument("--minutes", type=float, default=2.0, help="when CPU and memory are read again; default: 2")
     parser.add_argument("--viewers", type=int, nargs="+", default=[1, 3], metavar="N", help="default: 1 3")
     parser.add_argument("--rounds", type=int, default=4, help="of latency with and without; default: 4")
@@ -84,7 +83,7 @@ def running(*words: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a `buddyline` command until left."""
     with tempfile.TemporaryFile() as said:
         child = subprocess.Popen(
-            [sys.executable, "-m", "tools", *words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
+            [sys.executable, "-P", "-m", "buddyline", *words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
         )
         try:
             yield child
@@ -105,10 +104,10 @@ def running(*words: str) -> Iterator[subprocess.Popen[bytes]]:
 @contextmanager
 def playing(directory: Path, endpoint: str) -> Iterator[Bus]:
     """Run hub, solver and a dive over and over, with previews; give a bus to listen on once poses come."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     dive = str(directory / "dive.mcap")
-    made = [sys.executable, "-m", "tools", "simulate", dive, "--rate", str(RATE_HZ), "--seconds", str(DIVE_S)]
+    made = [sys.executable, "-P", "-m", "buddyline", "simulate", dive, "--rate", str(RATE_HZ), "--seconds", str(DIVE_S)]
     subprocess.run([*made, "--undisturbed", "--range-max", "8"], check=True, capture_output=True)
     stop = threading.Event()
     with running("hub", "--listen", endpoint), running("solver", "--connect", endpoint):

@@ -25,19 +25,25 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 import numpy as np
+from buddyline.node.attitude import VqfAttitude
+from buddyline.node.config import (
+    CalibrationConfig,
+    CameraConfig,
+    NodeConfig,
+    RecordConfig,
+    SensorsConfig,
+    SimulationConfig,
+)
+from buddyline.node.devices import Frame, Source
+from buddyline.node.drivers.devices import ImuSource
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.samples import ImuSample
+from buddyline.node.geomagnetism import MagnetometerCalibration
+from buddyline.node.service import NodeService
+from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, Message, NodeInfo
 from numpy.typing import NDArray
-
-from node.attitude import VqfAttitude
-from node.config import CalibrationConfig, CameraConfig, NodeConfig, RecordConfig, SensorsConfig, SimulationConfig
-from node.devices import Frame, Source
-from node.drivers.devices import ImuSource
-from node.drivers.i2c import I2cBus
-from node.drivers.samples import ImuSample
-from node.geomagnetism import MagnetometerCalibration
-from node.service import NodeService
-from protocol.clock import S_NS, Clock
-from protocol.errors import BuddylineError
-from protocol.messages import Candidates, Message, NodeInfo
 
 PICTURES: Final = 24
 WARM_UP_S: Final = 5.0
@@ -49,7 +55,7 @@ FIELD_T: Final = np.array([2.2e-5, 0.0, 4.4e-5])
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench node", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench node", description=__doc__)
     parser.add_argument("--environment", default="cavern")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="default: 60, after 5 to warm up")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="default: 10")
@@ -86,7 +92,7 @@ def measure(environment: str, seconds: float, rate_hz: float, width_px: int, ima
         camera = PreparedCamera(pictures, config.trigger_period_ns)
         service = MeasuredNode(config, camera)
         hub = subprocess.Popen(
-            [sys.executable, "-m", "tools", "hub", "--listen", endpoint],
+            [sys.executable, "-P", "-m", "buddyline", "hub", "--listen", endpoint],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
@@ -203,8 +209,8 @@ class MeasuredNode(NodeService):
 
 
 def _sensors(config: NodeConfig, clock: Clock) -> list[Source]:
-    from node.sim.devices import SimulatedSensor, scenario_of
-    from node.sim.world import World
+    from buddyline.node.sim.devices import SimulatedSensor, scenario_of
+    from buddyline.node.sim.world import World
 
     world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
     calibrated = MagnetometerCalibration(np.full(3, 1e-12), np.eye(3))
@@ -254,9 +260,8 @@ def _prepared(config: NodeConfig, path: Path) -> tuple[NDArray[np.uint8], NodeIn
 def _render(config: NodeConfig, path: str) -> NodeInfo:
     """Render what the camera's driver would give: luminance."""
     import cv2
-
-    from node.sim.devices import scenario_of
-    from node.sim.world import World
+    from buddyline.node.sim.devices import scenario_of
+    from buddyline.node.sim.world import World
 
     cv2.setNumThreads(1)
     world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))

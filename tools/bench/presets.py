@@ -14,10 +14,9 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-
-from node.detect import ENVIRONMENTS, METHODS
-from protocol.errors import BuddylineError
-from tools.tune import Picture, judge, load_pictures
+from buddyline.node.detect import ENVIRONMENTS, METHODS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.tune import Picture, judge, load_pictures
 
 RENDERED: Final = ("cavern", "night_reef", "lake", "basin", "day_reef")
 SEED: Final = 5
@@ -25,7 +24,7 @@ SEED: Final = 5
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench presets", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench presets", description=__doc__)
     parser.add_argument(
         "dives", nargs="*", metavar="DIVE.mcap", help="one environment each; default: rendered pictures"
     )
@@ -77,8 +76,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _rendered(environment: str, count: int) -> list[Picture]:
-    from node.sim.scenario import Scenario
-    from node.sim.world import World
+    from buddyline.node.sim.scenario import Scenario
+    from buddyline.node.sim.world import World
 
     scenario = Scenario(environment=environment, seed=SEED)  # type: ignore[arg-type]
     world = World(scenario)

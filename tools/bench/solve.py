@@ -21,12 +21,11 @@ from shutil import which
 from typing import Any, Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.solver_service.geometry.closed_form import eq1_range_m
+from buddyline.solver_service.geometry.trigger import Fix, Settings
+from buddyline.tools.bench.triggers import Trigger, simulate
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from solver_service.geometry.closed_form import eq1_range_m
-from solver_service.geometry.trigger import Fix, Settings
-from tools.bench.triggers import Trigger, simulate
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +48,7 @@ EVALUATIONS: Final = 200_000
 
 def main(argv: list[str]) -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m tools.bench solve", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench solve", description=__doc__)
     parser.add_argument("--candidates", type=int, nargs="+", default=list(COUNTS), metavar="N", help="a side")
     parser.add_argument("--repeats", type=int, default=15, help="of each trigger; the fastest counts")
     parser.add_argument("--json", action="store_true")

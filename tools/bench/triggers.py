@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.rotation import quaternion_of
+from buddyline.solver_service.geometry.trigger import Camera, Fix, NoFix, Rig, Sensed, Settings, View, solve_trigger
 from numpy.typing import NDArray
-
-from solver_service.geometry.rotation import quaternion_of
-from solver_service.geometry.trigger import Camera, Fix, NoFix, Rig, Sensed, Settings, View, solve_trigger
 
 Floats = NDArray[np.float64]
 

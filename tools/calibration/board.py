@@ -8,9 +8,8 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
 
 # Five bits and a border are seven modules; a square of ten leaves a white rim around the marker, and makes the
 # whole board a raster of modules.

@@ -8,11 +8,10 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel
+from buddyline.tools.calibration.board import Board
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel
-from tools.calibration.board import Board
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -12,10 +12,9 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import ClockBeacon
 from numpy.typing import NDArray
-
-from protocol.clock import S_NS
-from protocol.messages import ClockBeacon
 
 # A way there and one back belong to one exchange where they are not farther apart: 40 ppm make 40 us of it.
 APART_NS: Final = 1 * S_NS

@@ -10,18 +10,17 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
+from buddyline.protocol.topics import CLOCK, NODE_STATUS, check_sender
+from buddyline.tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.dives import Dive
+from buddyline.tools.progress import Progress
 from msgspec import UNSET
-
-from protocol.bus import Bus, Received
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import ClockBeacon, Message, NodeStatus
-from protocol.topics import CLOCK, NODE_STATUS, check_sender
-from tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
-from tools.client import ClientConfig
-from tools.dives import Dive
-from tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +50,7 @@ class Heard:
 
 def listen(config: ClientConfig, seconds: float, connect_within_s: float = HUB_WITHIN_S) -> Heard:
     """Hear the bus for this long; raise BuddylineError where there is no hub, or a node falls silent meanwhile."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     stop = threading.Event()
     giving_up = threading.Timer(connect_within_s, stop.set)

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
 
 Floats = NDArray[np.float64]
 

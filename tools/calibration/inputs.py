@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from buddyline.node.drivers.stored import decode_picture, picture_files
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
+from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.tools.calibration.lights import Station
+from buddyline.tools.dives import Dive
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-from node.drivers.stored import decode_picture, picture_files
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
-from solver_service.geometry.rotation import matrix_of
-from tools.calibration.lights import Station
-from tools.dives import Dive
 
 Floats = NDArray[np.float64]
 

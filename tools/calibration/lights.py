@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import rotation_exp
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from solver_service.geometry.camera import Camera
-from solver_service.geometry.rotation import rotation_exp
 
 Floats = NDArray[np.float64]
 

@@ -7,11 +7,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.calibration.ellipsoid import EllipsoidFit
+from buddyline.tools.calibration.lights import LightsFit, Station
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from tools.calibration.ellipsoid import EllipsoidFit
-from tools.calibration.lights import LightsFit, Station
 
 Image = NDArray[np.uint8]
 

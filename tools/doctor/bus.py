@@ -6,13 +6,13 @@ import threading
 from dataclasses import dataclass, field
 from typing import Final
 
-from protocol.bus import Bus, Received
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import NodeInfo, NodeStatus
-from protocol.security import Tls
-from protocol.topics import INFO, NODE_STATUS, check_sender
-from tools.doctor.finding import Finding
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import NodeInfo, NodeStatus
+from buddyline.protocol.security import Tls
+from buddyline.protocol.topics import INFO, NODE_STATUS, check_sender
+from buddyline.tools.doctor.finding import Finding
 
 HUB_WITHIN_S: Final = 3.0
 # A node says how it is once a second.
@@ -49,7 +49,7 @@ class Seen:
 
 def look(connect_to: str, namespace: str, tls: Tls | None) -> Seen:
     """Connect for a moment and see who is there."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     stop = threading.Event()
     timer = threading.Timer(HUB_WITHIN_S, stop.set)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from buddyline.node.chrony import Tracking
+from buddyline.node.config import CalibrationConfig
+from buddyline.node.detect import Detection
+from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2
+from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu, Message, NodeInfo
+from buddyline.tools.doctor.finding import Finding, Level
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-from node.chrony import Tracking
-from node.config import CalibrationConfig
-from node.detect import Detection
-from node.drivers.samples import STANDARD_GRAVITY_MPS2
-from protocol.messages import Attitude, CameraModel, Depth, Imu, Message, NodeInfo
-from tools.doctor.finding import Finding, Level
 
 CLOCK_LIMIT_S: Final = 2e-3
 HOT_DEGC: Final = 70.0

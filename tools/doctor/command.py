@@ -13,14 +13,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from node.chrony import ChronyError, read_tracking
-from node.config import NodeConfig, load_node_config
-from protocol.config import load_config
-from protocol.errors import BuddylineError
-from protocol.security import check_identity, node_name
-from tools.client import ClientConfig
-from tools.doctor import bus, checks, machine, rig
-from tools.doctor.finding import Finding, Level, status_of
+from buddyline.node.chrony import ChronyError, read_tracking
+from buddyline.node.config import NodeConfig, load_node_config
+from buddyline.protocol.config import load_config
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.security import check_identity, node_name
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.doctor import bus, checks, machine, rig
+from buddyline.tools.doctor.finding import Finding, Level, status_of
 
 WITHIN_S: Final = 10.0
 SAY_AFTER_S: Final = 2.0

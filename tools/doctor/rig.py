@@ -7,16 +7,15 @@ import threading
 import time
 from typing import Final
 
+from buddyline.node.config import NodeConfig
+from buddyline.node.detect import make_detector
+from buddyline.node.devices import Frame, Source, open_camera, open_sensors
+from buddyline.protocol.clock import SystemClock
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Message, NodeInfo
+from buddyline.tools.doctor import checks
+from buddyline.tools.doctor.finding import Finding
 from msgspec.structs import replace
-
-from node.config import NodeConfig
-from node.detect import make_detector
-from node.devices import Frame, Source, open_camera, open_sensors
-from protocol.clock import SystemClock
-from protocol.errors import BuddylineError
-from protocol.messages import Message, NodeInfo
-from tools.doctor import checks
-from tools.doctor.finding import Finding
 
 FRAMES: Final = 3
 FRAMES_WITHIN_S: Final = 5.0

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.tools.evaluation.lights import Blobs, TrueLights
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.evaluation.statistics import share
 from numpy.typing import NDArray
-
-from tools.evaluation.lights import Blobs, TrueLights
-from tools.evaluation.rotation import Floats
-from tools.evaluation.statistics import share
 
 CLOSE_PX: Final = 2.0
 FIRST: Final = (3, 5, 8)

@@ -8,11 +8,10 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.protocol.messages import CameraModel, Candidates, LightTruth, NodeInfo, RelativePose
+from buddyline.tools.evaluation.rotation import Floats, conjugate, rotate
+from buddyline.tools.evaluation.truth import TruthTrack
 from numpy.typing import NDArray
-
-from protocol.messages import CameraModel, Candidates, LightTruth, NodeInfo, RelativePose
-from tools.evaluation.rotation import Floats, conjugate, rotate
-from tools.evaluation.truth import TruthTrack
 
 NAMES: Final = ("left", "right")
 

@@ -6,13 +6,33 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from protocol.divelog import DiveLogReader
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, Candidates, LightTruth, Message, NodeInfo, Rejected, RelativePose, Truth
-from protocol.topics import ARTAG, ATTITUDE, CANDIDATES, INFO, LIGHT_TRUTH, POSE, REJECTED, TRUTH, Topic, parse_key
-from tools.evaluation.recorded import Pair, Recorded
-from tools.evaluation.truth import inverted
-from tools.progress import Progress
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    LightTruth,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    Truth,
+)
+from buddyline.protocol.topics import (
+    ARTAG,
+    ATTITUDE,
+    CANDIDATES,
+    INFO,
+    LIGHT_TRUTH,
+    POSE,
+    REJECTED,
+    TRUTH,
+    Topic,
+    parse_key,
+)
+from buddyline.tools.evaluation.recorded import Pair, Recorded
+from buddyline.tools.evaluation.truth import inverted
+from buddyline.tools.progress import Progress
 
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.

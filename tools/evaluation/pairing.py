@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from protocol.messages import Rejected, RelativePose
-from tools.evaluation.lights import Blobs, TrueLights, is_right_pair
-from tools.evaluation.statistics import share
+from buddyline.protocol.messages import Rejected, RelativePose
+from buddyline.tools.evaluation.lights import Blobs, TrueLights, is_right_pair
+from buddyline.tools.evaluation.statistics import share
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.evaluation.result import Result
+from buddyline.tools.evaluation.rotation import Floats
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError
-from tools.evaluation.result import Result
-from tools.evaluation.rotation import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

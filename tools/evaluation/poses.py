@@ -7,12 +7,11 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.messages import NodeInfo, RelativePose
+from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
+from buddyline.tools.evaluation.truth import Track, TruthTrack
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-from protocol.messages import NodeInfo, RelativePose
-from tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
-from tools.evaluation.truth import Track, TruthTrack
 
 # A pose is wrong where its position is off by more than this share of the true range.
 WRONG_SHARE: Final = 0.1

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from tools.evaluation.detection import Detection
-from tools.evaluation.pairing import Pairing
-from tools.evaluation.poses import WRONG_SHARE
-from tools.evaluation.result import Accuracy, RangeBin, Result
-from tools.evaluation.statistics import Stats
+from buddyline.tools.evaluation.detection import Detection
+from buddyline.tools.evaluation.pairing import Pairing
+from buddyline.tools.evaluation.poses import WRONG_SHARE
+from buddyline.tools.evaluation.result import Accuracy, RangeBin, Result
+from buddyline.tools.evaluation.statistics import Stats
 
 _DEGREES = 180.0 / math.pi
 

@@ -8,16 +8,15 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-
-from protocol.messages import Candidates, LightTruth
-from tools.evaluation.detection import Detection, detection_figures
-from tools.evaluation.lights import Blobs, is_right_pair, true_lights
-from tools.evaluation.pairing import Pairing, Sighting, pairing_figures, sightings_of
-from tools.evaluation.poses import PoseErrors, pose_errors
-from tools.evaluation.recorded import Recorded
-from tools.evaluation.statistics import Stats, share
-from tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
-from tools.evaluation.truth import Track, TruthTrack
+from buddyline.protocol.messages import Candidates, LightTruth
+from buddyline.tools.evaluation.detection import Detection, detection_figures
+from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
+from buddyline.tools.evaluation.pairing import Pairing, Sighting, pairing_figures, sightings_of
+from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
+from buddyline.tools.evaluation.recorded import Recorded
+from buddyline.tools.evaluation.statistics import Stats, share
+from buddyline.tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
+from buddyline.tools.evaluation.truth import Track, TruthTrack
 
 RANGE_EDGES_M: Final = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, float("inf"))
 # The 95 % points of chi-square with 6 and 3 degrees of freedom.

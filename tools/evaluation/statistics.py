@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
-from tools.evaluation.rotation import Floats
+from buddyline.tools.evaluation.rotation import Floats
 
 
 @dataclass(frozen=True)

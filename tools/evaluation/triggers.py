@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-
-from protocol.messages import Candidates, Rejected, RelativePose
-from tools.evaluation.statistics import share
+from buddyline.protocol.messages import Candidates, Rejected, RelativePose
+from buddyline.tools.evaluation.statistics import share
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,10 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.messages import Attitude, Truth
+from buddyline.tools.evaluation.rotation import Floats, conjugate, interpolate, normalized, rotate
 from msgspec import UNSET
 from msgspec.structs import replace
-
-from protocol.messages import Attitude, Truth
-from tools.evaluation.rotation import Floats, conjugate, interpolate, normalized, rotate
 
 # Divers turn and move within a second, not within half of one: across longer gaps a straight line is a guess.
 MAX_GAP_NS: Final = 500_000_000

@@ -11,13 +11,23 @@ from typing import Any
 
 import cv2
 import numpy as np
-
-from protocol.errors import BuddylineError
-from tools.evaluation.logs import load
-from tools.evaluation.truth import TruthTrack
-from tools.experiments import figures, numbers, page, tank, timing
-from tools.experiments.runs import ENVIRONMENTS, FULL, OURS, QUICK, SEED, TAGS, Rendered, Size, long_dive, rendered
-from tools.progress import Progress
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.evaluation.logs import load
+from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.experiments import figures, numbers, page, tank, timing
+from buddyline.tools.experiments.runs import (
+    ENVIRONMENTS,
+    FULL,
+    OURS,
+    QUICK,
+    SEED,
+    TAGS,
+    Rendered,
+    Size,
+    long_dive,
+    rendered,
+)
+from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
+from buddyline.node.detect import draw, make_detector
+from buddyline.node.drivers.stored import decode_picture
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.messages import CompressedImage
+from buddyline.tools.dives import Dive
+from buddyline.tools.evaluation.poses import PoseErrors
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.experiments.runs import OURS, TAGS, Rendered
 from numpy.typing import NDArray
-
-from node.detect import draw, make_detector
-from node.drivers.stored import decode_picture
-from protocol.clock import trigger_index
-from protocol.messages import CompressedImage
-from tools.dives import Dive
-from tools.evaluation.poses import PoseErrors
-from tools.evaluation.rotation import Floats
-from tools.experiments.runs import OURS, TAGS, Rendered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

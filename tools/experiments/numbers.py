@@ -7,15 +7,14 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
-
-from protocol.messages import NodeInfo
-from tools.bound import pose_bounds
-from tools.evaluation.poses import PoseErrors
-from tools.evaluation.report import as_dict
-from tools.evaluation.rotation import Floats
-from tools.evaluation.statistics import Stats, share
-from tools.evaluation.truth import TruthTrack
-from tools.experiments.runs import OURS, OURS_CAMERA, PAPER, PAPER_CAMERA, TAGS, Rendered
+from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.bound import pose_bounds
+from buddyline.tools.evaluation.poses import PoseErrors
+from buddyline.tools.evaluation.report import as_dict
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.evaluation.statistics import Stats, share
+from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.experiments.runs import OURS, OURS_CAMERA, PAPER, PAPER_CAMERA, TAGS, Rendered
 
 EDGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.5, 15.0, 17.5, 20.0)
 # What the paper reports.

@@ -11,9 +11,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Final
 
-from protocol.errors import BuddylineError
-from tools.evaluation.logs import load_for_evaluation
-from tools.evaluation.result import Result, evaluate
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.evaluation.logs import load_for_evaluation
+from buddyline.tools.evaluation.result import Result, evaluate
 
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
 # Seeds that nothing was tuned on.
@@ -53,7 +53,7 @@ QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.
 
 def call(module: str, *words: str) -> None:
     """Run one command of the program, without its summary; raise BuddylineError where it fails."""
-    command = import_module(f"tools.{module}")
+    command = import_module(f"buddyline.tools.{module}")
     parser = argparse.ArgumentParser(prog=f"buddyline {module}")
     command.add_arguments(parser)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -99,7 +99,7 @@ def rendered(environment: str, size: Size, directory: Path) -> Rendered:
 
 def has_poses(path: Path) -> bool:
     """Whether a log has any result: tags may have none at all."""
-    from protocol.divelog import DiveLogReader
+    from buddyline.protocol.divelog import DiveLogReader
 
     with DiveLogReader(path) as reader:
         return any(key.endswith(("/pose", "/rejected", "/artag")) for key in reader.keys)

@@ -10,12 +10,11 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-
-from protocol.errors import BuddylineError
-from protocol.messages import CameraModel
-from tools.tags.detection import TagFinder
-from tools.tags.layout import Layout
-from tools.tags.pose import TagPose, readings_of, tag_pose
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CameraModel
+from buddyline.tools.tags.detection import TagFinder
+from buddyline.tools.tags.layout import Layout
+from buddyline.tools.tags.pose import TagPose, readings_of, tag_pose
 
 VIDEO: Final = "test_vid.mp4"
 CAMERA: Final = CameraModel(

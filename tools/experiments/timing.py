@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-
-from node.detect import make_detector
-from node.drivers.stored import decode_picture
-from protocol.messages import Candidates, CompressedImage
-from solver_service.config import SolveConfig
-from solver_service.core import SolverCore
-from solver_service.geometry.closed_form import eq1_range_m
-from tools.dives import Dive
+from buddyline.node.detect import make_detector
+from buddyline.node.drivers.stored import decode_picture
+from buddyline.protocol.messages import Candidates, CompressedImage
+from buddyline.solver_service.config import SolveConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.closed_form import eq1_range_m
+from buddyline.tools.dives import Dive
 
 _PICTURES: Final = 12
 _TRIGGERS: Final = 100

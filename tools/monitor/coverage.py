@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import Final
 
-from protocol.clock import S_NS
-from tools.monitor.health import duration_words, reason_words
+from buddyline.protocol.clock import S_NS
+from buddyline.tools.monitor.health import duration_words, reason_words
 
 SOLVED_COLOUR: Final = "#3f9a5a"
 PARTLY_COLOUR: Final = "#c9a227"

@@ -6,10 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from buddyline.protocol.clock import S_NS
+from buddyline.tools.monitor.picture import SILENT_NS, STALE_NS, NodePicture, PairPicture
 from msgspec import UNSET
-
-from protocol.clock import S_NS
-from tools.monitor.picture import SILENT_NS, STALE_NS, NodePicture, PairPicture
 
 # How long a pair may be without a pose before it is said, and over how long its reasons are counted.
 NO_FIX_NS: Final = 2 * S_NS

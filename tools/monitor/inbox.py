@@ -11,9 +11,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from protocol.codec import decode
-from protocol.errors import MessageError
-from protocol.topics import (
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.topics import (
     ATTITUDE,
     CANDIDATES,
     DEPTH,
@@ -25,11 +25,11 @@ from protocol.topics import (
     SOLVER_STATUS,
     parse_key,
 )
-from tools.monitor.picture import PairPicture
+from buddyline.tools.monitor.picture import PairPicture
 
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Received
-    from protocol.clock import Clock
+    from buddyline.protocol.bus import Bus, Received
+    from buddyline.protocol.clock import Clock
 
 QUEUED: Final = 2048
 # Of these the page shows the newest alone; those before it are never decoded.

@@ -7,12 +7,12 @@ import logging
 import webbrowser
 from typing import Final
 
-from protocol.clock import Clock, SystemClock
-from protocol.service import Service
-from tools.client import ClientConfig, add_client_arguments, client_config
-from tools.monitor.inbox import Inbox
-from tools.monitor.page import DEFAULT_HOST, DEFAULT_PORT, Page, open_server
-from tools.monitor.picture import PairPicture
+from buddyline.protocol.clock import Clock, SystemClock
+from buddyline.protocol.service import Service
+from buddyline.tools.client import ClientConfig, add_client_arguments, client_config
+from buddyline.tools.monitor.inbox import Inbox
+from buddyline.tools.monitor.page import DEFAULT_HOST, DEFAULT_PORT, Page, open_server
+from buddyline.tools.monitor.picture import PairPicture
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _follow(service: Service, config: ClientConfig, inbox: Inbox) -> None:
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     bus = connect(
         config.connect,

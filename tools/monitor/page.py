@@ -9,13 +9,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import NodeInfo
-from tools.monitor import panel
-from tools.monitor.picture import KEPT_NS, PairPicture, Point
-from tools.monitor.scene import Floats, age_colours, ellipsoid, fields_of_view, fit, holds, wxyz
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.monitor import panel
+from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, Point
+from buddyline.tools.monitor.scene import Floats, age_colours, ellipsoid, fields_of_view, fit, holds, wxyz
 
 if TYPE_CHECKING:
     import viser

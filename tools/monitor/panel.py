@@ -9,13 +9,12 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Final
 
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Candidates, CompressedImage, Rejected, RelativePose
+from buddyline.tools.monitor.health import Finding, duration_words, findings, reason_words, sentence
+from buddyline.tools.monitor.picture import STALE_NS, Miss, NodePicture, PairPicture, Point
+from buddyline.tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 from msgspec import UNSET
-
-from protocol.clock import S_NS
-from protocol.messages import Candidates, CompressedImage, Rejected, RelativePose
-from tools.monitor.health import Finding, duration_words, findings, reason_words, sentence
-from tools.monitor.picture import STALE_NS, Miss, NodePicture, PairPicture, Point
-from tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 
 # A status older than this says nothing of now.
 STATUS_STALE_NS: Final = 3 * S_NS

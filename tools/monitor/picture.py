@@ -11,8 +11,8 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final
 
-from protocol.clock import S_NS
-from protocol.messages import (
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import (
     Attitude,
     Candidates,
     CompressedImage,
@@ -24,7 +24,7 @@ from protocol.messages import (
     RelativePose,
     SolverStatus,
 )
-from tools.monitor.scene import Frame, frame_of
+from buddyline.tools.monitor.scene import Frame, frame_of
 
 KEPT_NS: Final = 150 * S_NS
 # Poses closer together than this are one point of trail and plots.

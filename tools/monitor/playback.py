@@ -7,13 +7,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, Self
 
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.divelog import DiveLogReader, Record, read_logs
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import NodeInfo, Rejected, RelativePose
-from protocol.pictures import with_pictures
-from protocol.topics import (
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.divelog import DiveLogReader, Record, read_logs
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
+from buddyline.protocol.pictures import with_pictures
+from buddyline.protocol.topics import (
     ATTITUDE,
     CANDIDATES,
     DEPTH,
@@ -26,8 +26,8 @@ from protocol.topics import (
     Topic,
     parse_key,
 )
-from tools.monitor.coverage import Coverage
-from tools.monitor.picture import PairPicture
+from buddyline.tools.monitor.coverage import Coverage
+from buddyline.tools.monitor.picture import PairPicture
 
 SHOWN: Final = (INFO, CANDIDATES, ATTITUDE, DEPTH, IMAGE, NODE_STATUS, POSE, REJECTED, SOLVER_STATUS)
 # Before an instant that was jumped to, this much of the dive is read for trail and plots.

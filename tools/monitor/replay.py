@@ -6,10 +6,9 @@ import json
 from collections.abc import Sequence
 from typing import Any, Final
 
+from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.monitor.scene import fields_of_view
 from msgspec import Struct
-
-from protocol.messages import NodeInfo
-from tools.monitor.scene import fields_of_view
 
 
 class Keyframe(Struct, frozen=True, array_like=True):

@@ -11,20 +11,19 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from buddyline.protocol import __version__
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.dives import Dive
+from buddyline.tools.monitor.coverage import clock_words
+from buddyline.tools.monitor.health import duration_words, reason_words
+from buddyline.tools.monitor.panel import REJECTED_COLOUR, stretches, time_plots
+from buddyline.tools.monitor.picture import Point
+from buddyline.tools.monitor.replay import replay_html, rig_outline
+from buddyline.tools.monitor.summary import Summary, summarize
+from buddyline.tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 from msgspec import UNSET
-
-from protocol import __version__
-from protocol.clock import S_NS
-from protocol.errors import BuddylineError
-from protocol.messages import NodeInfo
-from tools.dives import Dive
-from tools.monitor.coverage import clock_words
-from tools.monitor.health import duration_words, reason_words
-from tools.monitor.panel import REJECTED_COLOUR, stretches, time_plots
-from tools.monitor.picture import Point
-from tools.monitor.replay import replay_html, rig_outline
-from tools.monitor.summary import Summary, summarize
-from tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 
 log = logging.getLogger(__name__)
 

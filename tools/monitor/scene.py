@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
+from buddyline.protocol.messages import Attitude, NodeInfo, RelativePose
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-from protocol.messages import Attitude, NodeInfo, RelativePose
-from solver_service.geometry.rotation import matrix_of, quaternion_of
 
 Floats: TypeAlias = NDArray[np.float64]
 

@@ -8,18 +8,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-
-from protocol.clock import S_NS
-from protocol.divelog import Record
-from protocol.errors import MessageError
-from protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
-from protocol.topics import CANDIDATES, IMAGE, parse_key
-from tools.dives import Dive
-from tools.monitor.coverage import Coverage
-from tools.monitor.panel import marked_picture, result_words
-from tools.monitor.picture import Miss, PairPicture, Point, point_of
-from tools.monitor.replay import Keyframe
-from tools.monitor.scene import Floats
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import Record
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
+from buddyline.protocol.topics import CANDIDATES, IMAGE, parse_key
+from buddyline.tools.dives import Dive
+from buddyline.tools.monitor.coverage import Coverage
+from buddyline.tools.monitor.panel import marked_picture, result_words
+from buddyline.tools.monitor.picture import Miss, PairPicture, Point, point_of
+from buddyline.tools.monitor.replay import Keyframe
+from buddyline.tools.monitor.scene import Floats
 
 TOPICS: Final = (
     "info", "candidates", "attitude", "depth", "image", "status", "node_status", "pose", "rejected", "truth",

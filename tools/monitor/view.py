@@ -7,15 +7,15 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Any, Final
 
-from protocol.clock import S_NS, Clock, SystemClock
-from protocol.service import Service
-from tools.monitor import panel
-from tools.monitor.coverage import Coverage, clock_words
-from tools.monitor.live import PLOTS_EVERY, TEXTS_EVERY, TICK_S, add_page_arguments, open_page
-from tools.monitor.playback import Playback, survey
+from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.service import Service
+from buddyline.tools.monitor import panel
+from buddyline.tools.monitor.coverage import Coverage, clock_words
+from buddyline.tools.monitor.live import PLOTS_EVERY, TEXTS_EVERY, TICK_S, add_page_arguments, open_page
+from buddyline.tools.monitor.playback import Playback, survey
 
 if TYPE_CHECKING:
-    from tools.monitor.page import Page
+    from buddyline.tools.monitor.page import Page
 
 log = logging.getLogger(__name__)
 

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.tools.survey.averages import wrap
+from buddyline.tools.survey.magnetism import Field
+from buddyline.tools.survey.project import Leg
+from buddyline.tools.survey.settings import AlarmSettings
+from buddyline.tools.survey.shots import Shot
 from msgspec import UNSET
 from msgspec.structs import replace
-
-from tools.survey.averages import wrap
-from tools.survey.magnetism import Field
-from tools.survey.project import Leg
-from tools.survey.settings import AlarmSettings
-from tools.survey.shots import Shot
 
 # Sights further apart than this many of their sigmas, and a field this share of its limit off, are suspect together.
 SUSPECT_SIGMAS: Final = 2.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from tools.survey.averages import Floats
-from tools.survey.rests import same_line
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.rests import same_line
 
 # Who has not moved is at the depth it was at; a node that is turned about on its station is so within this.
 LEVEL_M: Final = 0.35

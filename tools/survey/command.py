@@ -11,17 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.security import SURVEYOR
+from buddyline.tools.client import add_client_arguments
 from msgspec.structs import replace
-
-from protocol.errors import BuddylineError
-from protocol.security import SURVEYOR
-from tools.client import add_client_arguments
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tools.survey.network import Adjusted
-    from tools.survey.project import Project
+    from buddyline.tools.survey.network import Adjusted
+    from buddyline.tools.survey.project import Project
 
 FORMATS: Final = ("svx", "svx-cartesian", "th", "dat", "csv", "stations", "geojson", "svg", "profile", "pdf")
 SUFFIXES: Final = {
@@ -77,14 +76,14 @@ def _depth_argument(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run a subcommand; return 1 where adjustment finds a blunder."""
     if args.does == "watch":
-        from tools.survey.live import run_watch
+        from buddyline.tools.survey.live import run_watch
 
         return run_watch(args, args.seconds)
     path = Path(args.project)
     if args.does == "legs":
         return _legs(path, args.dive, args.marks)
-    from tools.survey.network import adjust
-    from tools.survey.project import AdjustSettings, load_project
+    from buddyline.tools.survey.network import adjust
+    from buddyline.tools.survey.project import AdjustSettings, load_project
 
     project = load_project(path)
     if args.depth:
@@ -92,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     adjusted = adjust(project)
     if args.does == "export":
         return _export(path, args, project, adjusted)
-    from tools.survey import report
+    from buddyline.tools.survey import report
 
     if args.does == "report":
         output = args.output or str(path.with_suffix(".html"))
@@ -106,10 +105,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
-    from tools.survey.derive import Derived
-    from tools.survey.marks import of_project, of_table
-    from tools.survey.project import load_project, new_project, write_derived
-    from tools.survey.readings import of_logs
+    from buddyline.tools.survey.derive import Derived
+    from buddyline.tools.survey.marks import of_project, of_table
+    from buddyline.tools.survey.project import load_project, new_project, write_derived
+    from buddyline.tools.survey.readings import of_logs
 
     if dive:
         new_project(path, path.stem, [os.path.relpath(log, path.parent) for log in dive])
@@ -138,7 +137,7 @@ def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
 
 
 def _export(path: Path, args: argparse.Namespace, project: Project, adjusted: Adjusted) -> int:
-    from tools.survey import compass, drawing, survex, tables, therion
+    from buddyline.tools.survey import compass, drawing, survex, tables, therion
 
     kind = args.format
     if args.style != "auto" and kind != "svx":

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from datetime import datetime
 
-from protocol.errors import BuddylineError
-from tools.survey.heading import heading_of, reading_of
-from tools.survey.network import Adjusted, held_depths
-from tools.survey.project import Project
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.heading import heading_of, reading_of
+from buddyline.tools.survey.network import Adjusted, held_depths
+from buddyline.tools.survey.project import Project
 
 FOOT_M = 0.3048
 MISSING = "-999.00"

@@ -9,18 +9,17 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
+from buddyline.tools.survey import alarms
+from buddyline.tools.survey.averages import Mean
+from buddyline.tools.survey.chain import BOTH, Standing, Stop, Who, stand
+from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
+from buddyline.tools.survey.readings import Readings
+from buddyline.tools.survey.rests import Rest, rests
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
+from buddyline.tools.survey.shots import Shot, Sight, shoot
+from buddyline.tools.survey.sights import Sights, sights
 from msgspec import UNSET
 from msgspec.structs import replace
-
-from tools.survey import alarms
-from tools.survey.averages import Mean
-from tools.survey.chain import BOTH, Standing, Stop, Who, stand
-from tools.survey.project import STATION_NAME, Leg, Problem, Station
-from tools.survey.readings import Readings
-from tools.survey.rests import Rest, rests
-from tools.survey.settings import AlarmSettings, SurveySettings
-from tools.survey.shots import Shot, Sight, shoot
-from tools.survey.sights import Sights, sights
 
 # A mark this far from any rest says nothing of one.
 MARK_NEAR_NS: Final = 20_000_000_000

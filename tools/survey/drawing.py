@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-
-from tools.survey.averages import Floats
-from tools.survey.network import Adjusted, Position
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.network import Adjusted, Position
 
 Colour = Literal["line", "alarm", "point", "faint", "text"]
 COLOURS: Final[dict[Colour, str]] = {

@@ -8,11 +8,10 @@ from datetime import UTC, date, datetime
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.project import FixedPoint, Project
 from msgspec import UNSET
-
-from protocol.errors import BuddylineError
-from tools.survey.averages import Floats
-from tools.survey.project import FixedPoint, Project
 
 # WGS 84.
 SEMI_MAJOR_M: Final = 6378137.0
@@ -118,7 +117,7 @@ def declination(project: Project) -> Declination | None:
     where, when = _somewhere(project), survey_date(project)
     if where is None or when is None:
         return None
-    from node.geomagnetism import earth_field
+    from buddyline.node.geomagnetism import earth_field
 
     noon_ns = int(datetime(when.year, when.month, when.day, 12, tzinfo=UTC).timestamp()) * 1_000_000_000
     field = earth_field(*where, noon_ns)

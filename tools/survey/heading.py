@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from buddyline.tools.survey.geodesy import declination, survey_date
+from buddyline.tools.survey.lines import Line, bearing_of
+from buddyline.tools.survey.network import Adjusted
+from buddyline.tools.survey.project import Project
 from msgspec import UNSET
-
-from tools.survey.geodesy import declination, survey_date
-from tools.survey.lines import Line, bearing_of
-from tools.survey.network import Adjusted
-from tools.survey.project import Project
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.tools.survey.averages import Floats, wrap
+from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET
-
-from tools.survey.averages import Floats, wrap
-from tools.survey.project import Leg, Project
 
 # Of two sights, the mean is worse than the better one alone where their sigmas differ by more than this.
 WORTH_BOTH: Final = math.sqrt(3)

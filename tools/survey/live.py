@@ -9,25 +9,25 @@ from collections import deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from protocol.clock import S_NS
-from protocol.codec import decode
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
-from protocol.security import SURVEYOR
-from protocol.service import Service
-from protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
-from tools.client import client_config
-from tools.survey import alarms
-from tools.survey.derive import one_leg
-from tools.survey.magnetism import Field, field_of
-from tools.survey.readings import Readings, of_messages
-from tools.survey.rests import rests
-from tools.survey.settings import AlarmSettings, SurveySettings
-from tools.survey.shots import shoot
-from tools.survey.sights import sights
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import decode
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
+from buddyline.protocol.security import SURVEYOR
+from buddyline.protocol.service import Service
+from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
+from buddyline.tools.client import client_config
+from buddyline.tools.survey import alarms
+from buddyline.tools.survey.derive import one_leg
+from buddyline.tools.survey.magnetism import Field, field_of
+from buddyline.tools.survey.readings import Readings, of_messages
+from buddyline.tools.survey.rests import rests
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
+from buddyline.tools.survey.shots import shoot
+from buddyline.tools.survey.sights import sights
 
 if TYPE_CHECKING:
-    from protocol.bus import Bus, Publisher, Received
+    from buddyline.protocol.bus import Bus, Publisher, Received
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class Watch:
 
 def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
     """Watch a bus until stopped."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     service = Service("survey watch")
     service.handle_signals()

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-from tools.survey.readings import Node
+from buddyline.tools.survey.readings import Node
 
 
 @dataclass(frozen=True)

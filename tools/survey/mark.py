@@ -6,14 +6,14 @@ import argparse
 import logging
 import threading
 
-from protocol.clock import SystemClock
-from protocol.errors import BuddylineError
-from protocol.messages import Mark
-from protocol.security import SURVEYOR
-from protocol.topics import MARK, check_node_id
-from tools.client import add_client_arguments, client_config
-from tools.survey.marks import KINDS, stamp_ns_of
-from tools.survey.project import STATION_NAME
+from buddyline.protocol.clock import SystemClock
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Mark
+from buddyline.protocol.security import SURVEYOR
+from buddyline.protocol.topics import MARK, check_node_id
+from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.survey.marks import KINDS, stamp_ns_of
+from buddyline.tools.survey.project import STATION_NAME
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
 
 def run(args: argparse.Namespace) -> int:
     """Publish one mark."""
-    from protocol.zenoh_bus import connect
+    from buddyline.protocol.zenoh_bus import connect
 
     mark = mark_of(args, SystemClock().now_ns())
     stop = threading.Event()

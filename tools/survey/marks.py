@@ -7,13 +7,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, cast
 
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.messages import Mark
+from buddyline.protocol.topics import check_node_id
+from buddyline.tools.survey.project import HandMark
 from msgspec import UNSET
-
-from protocol.clock import S_NS
-from protocol.config import ConfigError
-from protocol.messages import Mark
-from protocol.topics import check_node_id
-from tools.survey.project import HandMark
 
 Kind = Literal["station", "point", "note"]
 KINDS: tuple[str, ...] = ("station", "point", "note")

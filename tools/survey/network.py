@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.geodesy import Grid, grid_of
+from buddyline.tools.survey.lines import Line, line_of
+from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET
-
-from protocol.errors import BuddylineError
-from tools.survey.averages import Floats
-from tools.survey.geodesy import Grid, grid_of
-from tools.survey.lines import Line, line_of
-from tools.survey.project import Leg, Project
 
 # Chi^2 of three degrees of freedom that one leg in a thousand exceeds.
 BLUNDER_CHI2: Final = 16.27

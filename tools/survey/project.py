@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.config import Config, ConfigError, load_config
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodeId, NonNegative, Positive
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec import UNSET, Meta, UnsetType, field
-
-from protocol.clock import S_NS
-from protocol.config import Config, ConfigError, load_config
-from protocol.errors import BuddylineError
-from protocol.messages import NodeId, NonNegative, Positive
-from tools.survey.settings import AlarmSettings, SurveySettings
 
 MARKER: Final = "# ---- From the dives, by `buddyline survey legs`: made anew each time. Edit above. ----"
 STATION_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,12}\Z")

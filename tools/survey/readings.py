@@ -7,14 +7,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
+from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
+from buddyline.tools.dives import Dive
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.rotations import matrices_of
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-from protocol.errors import BuddylineError, MessageError
-from protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
-from tools.dives import Dive
-from tools.survey.averages import Floats
-from tools.survey.rotations import matrices_of
 
 Stamps = NDArray[np.int64]
 # An attitude is taken from neighbours no further apart than this.

@@ -5,13 +5,12 @@ from __future__ import annotations
 import html
 import math
 
+from buddyline.tools.survey.drawing import plan, profile
+from buddyline.tools.survey.heading import heading_of
+from buddyline.tools.survey.lines import bearing_of
+from buddyline.tools.survey.network import Adjusted
+from buddyline.tools.survey.project import Project
 from msgspec import UNSET
-
-from tools.survey.drawing import plan, profile
-from tools.survey.heading import heading_of
-from tools.survey.lines import bearing_of
-from tools.survey.network import Adjusted
-from tools.survey.project import Project
 
 CLASS_ALARM = ' class="alarm"'
 STYLE = (

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-
-from tools.survey.averages import Bools, Floats
-from tools.survey.readings import Node, Readings, Stamps
-from tools.survey.settings import SurveySettings
-from tools.survey.sights import Sights
+from buddyline.tools.survey.averages import Bools, Floats
+from buddyline.tools.survey.readings import Node, Readings, Stamps
+from buddyline.tools.survey.settings import SurveySettings
+from buddyline.tools.survey.sights import Sights
 
 # A speed is the slope over this long; headings wander within it, by a share of what they state, or by this.
 SLOPE_NS: Final = 4_000_000_000

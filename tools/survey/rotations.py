@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-
-from tools.survey.averages import Floats
+from buddyline.tools.survey.averages import Floats
 
 
 def matrices_of(q_xyzw: Floats) -> Floats:

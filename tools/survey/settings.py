@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from buddyline.protocol.config import Config
+from buddyline.protocol.messages import NonNegative, Positive, Vector3
 from msgspec import Meta, field
-
-from protocol.config import Config
-from protocol.messages import NonNegative, Positive, Vector3
 
 
 class SurveySettings(Config, frozen=True, kw_only=True):

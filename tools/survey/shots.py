@@ -6,13 +6,12 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from buddyline.tools.survey.averages import Bools, Floats, Mean, inliers, mean_of_slow, mean_of_white, unwrapped
+from buddyline.tools.survey.magnetism import Field, field_of
+from buddyline.tools.survey.readings import Node, Readings
+from buddyline.tools.survey.settings import SurveySettings
+from buddyline.tools.survey.sights import Sights
 from numpy.typing import NDArray
-
-from tools.survey.averages import Bools, Floats, Mean, inliers, mean_of_slow, mean_of_white, unwrapped
-from tools.survey.magnetism import Field, field_of
-from tools.survey.readings import Node, Readings
-from tools.survey.settings import SurveySettings
-from tools.survey.sights import Sights
 
 
 @dataclass(frozen=True)

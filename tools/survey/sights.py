@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
-from tools.survey.averages import Floats
-from tools.survey.readings import Readings, Stamps
-from tools.survey.rotations import matrices_of
-from tools.survey.settings import SurveySettings
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.readings import Readings, Stamps
+from buddyline.tools.survey.rotations import matrices_of
+from buddyline.tools.survey.settings import SurveySettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,10 @@ import math
 from typing import Final, Literal
 
 import numpy as np
-
-from tools.survey.heading import Heading, Reading, heading_of, reading_of
-from tools.survey.lines import Line
-from tools.survey.network import Adjusted, fixed_points, held_depths
-from tools.survey.project import Project
+from buddyline.tools.survey.heading import Heading, Reading, heading_of, reading_of
+from buddyline.tools.survey.lines import Line
+from buddyline.tools.survey.network import Adjusted, fixed_points, held_depths
+from buddyline.tools.survey.project import Project
 
 
 def quoted(text: str) -> str:

@@ -8,12 +8,11 @@ import json
 import math
 from typing import Any
 
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.heading import heading_of
+from buddyline.tools.survey.network import Adjusted, Position
+from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, to_builtins
-
-from protocol.errors import BuddylineError
-from tools.survey.heading import heading_of
-from tools.survey.network import Adjusted, Position
-from tools.survey.project import Leg, Project
 
 STATION_COLUMNS = (
     *("name", "kind", "east_m", "north_m", "up_m", "depth_m"),

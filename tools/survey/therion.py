@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from tools.survey.heading import heading_of, reading_of
-from tools.survey.network import Adjusted, fixed_points, held_depths
-from tools.survey.project import Project
-from tools.survey.survex import quoted
+from buddyline.tools.survey.heading import heading_of, reading_of
+from buddyline.tools.survey.network import Adjusted, fixed_points, held_depths
+from buddyline.tools.survey.project import Project
+from buddyline.tools.survey.survex import quoted
 
 
 def centreline(project: Project, adjusted: Adjusted) -> str:

@@ -6,10 +6,9 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.tags.layout import FAMILIES, Layout
 from numpy.typing import NDArray
-
-from tools.evaluation.rotation import Floats
-from tools.tags.layout import FAMILIES, Layout
 
 # Water leaves little contrast: OpenCV's own 7 grey levels lose half of the range in turbid water.
 _CONTRAST_LEVELS: Final = 3

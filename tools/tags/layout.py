@@ -10,10 +10,9 @@ from typing import Final
 import cv2
 import msgspec
 import numpy as np
-
-from protocol.errors import BuddylineError
-from protocol.messages import ArTag
-from tools.evaluation.rotation import Floats
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import ArTag
+from buddyline.tools.evaluation.rotation import Floats
 
 FAMILIES: Final = {
     "36h11": cv2.aruco.DICT_APRILTAG_36h11,

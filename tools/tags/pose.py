@@ -12,10 +12,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-
-from protocol.messages import CameraModel
-from tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
-from tools.tags.layout import Layout
+from buddyline.protocol.messages import CameraModel
+from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
+from buddyline.tools.tags.layout import Layout
 
 # Noise of a refined corner, per axis, and how many residuals' worth that is believed against a picture's own.
 CORNER_SIGMA_PX: Final = 0.5

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.protocol.clock import ManualClock
 
-from node.drivers.i2c import I2cBus
-from protocol.clock import ManualClock
 from tests.node.drivers.wire import Adapter
 
 START_NS = 1_764_000_000_000_000_000

@@ -14,8 +14,7 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-
-from protocol.clock import ManualClock
+from buddyline.protocol.clock import ManualClock
 
 BOOT_NS = 4_321_000_000_000
 PIPELINE_NS = 12_000_000  # from the end of readout to the completed request

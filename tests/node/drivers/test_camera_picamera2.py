@@ -9,13 +9,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from buddyline.node.config import CameraConfig, NodeConfig
+from buddyline.node.devices import Frame
+from buddyline.node.drivers.camera_picamera2 import Picamera2Camera, choose_mode, open_camera
+from buddyline.node.drivers.samples import DeviceError
+from buddyline.node.trigger import LOCKED_NS
+from buddyline.protocol.clock import MS_NS, S_NS, ManualClock, trigger_index
 
-from node.config import CameraConfig, NodeConfig
-from node.devices import Frame
-from node.drivers.camera_picamera2 import Picamera2Camera, choose_mode, open_camera
-from node.drivers.samples import DeviceError
-from node.trigger import LOCKED_NS
-from protocol.clock import MS_NS, S_NS, ManualClock, trigger_index
 from tests.node.drivers import standin_picamera2 as standin
 
 START_NS = 1_764_000_000 * S_NS + 33 * MS_NS
@@ -103,7 +103,7 @@ def test_colour_comes_as_bgr(sensor):
 
 
 def test_pictures_are_in_colour_where_nothing_else_is_asked_for(sensor, monkeypatch):
-    monkeypatch.setattr("node.drivers.camera_picamera2.boottime_ns", sensor.boottime_ns)
+    monkeypatch.setattr("buddyline.node.drivers.camera_picamera2.boottime_ns", sensor.boottime_ns)
     for asked, dimensions in (({}, 3), ({"colour": False}, 2)):
         config = NodeConfig(node="a", camera=CameraConfig(name="picamera2", **asked))
         camera = open_camera(config, Wall(sensor))
@@ -289,7 +289,7 @@ def test_stop_ends_the_waiting_and_cancels_the_job(sensor):
 
 
 def test_a_close_that_hangs_does_not_hold_the_node_up(sensor, monkeypatch, caplog):
-    monkeypatch.setattr("node.drivers.camera_picamera2.CLOSE_S", 0.05)
+    monkeypatch.setattr("buddyline.node.drivers.camera_picamera2.CLOSE_S", 0.05)
     camera = make(sensor)
     gate = threading.Event()
     camera._camera.close = gate.wait

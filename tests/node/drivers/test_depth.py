@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
-
-from node.drivers.depth import STANDARD_AIR_PA, ZERO_SAMPLES, SurfaceZero, depth_m, load_zero, save_zero
-from node.drivers.samples import DepthSample
+from buddyline.node.drivers.depth import STANDARD_AIR_PA, ZERO_SAMPLES, SurfaceZero, depth_m, load_zero, save_zero
+from buddyline.node.drivers.samples import DepthSample
 
 
 def feed(zero: SurfaceZero, pressures_pa: list[float]) -> list[bool]:

@@ -8,15 +8,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from buddyline.node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
+from buddyline.node.drivers.devices import Metronome, open_sensors
+from buddyline.node.drivers.ms5837 import compensate_30ba
+from buddyline.node.drivers.samples import DeviceError
+from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
+from buddyline.protocol.codec import encode
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu
 
-from node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
-from node.drivers.devices import Metronome, open_sensors
-from node.drivers.ms5837 import compensate_30ba
-from node.drivers.samples import DeviceError
-from protocol.clock import MS_NS, S_NS, ManualClock
-from protocol.codec import encode
-from protocol.errors import BuddylineError
-from protocol.messages import Attitude, CameraModel, Depth, Imu
 from tests.node.drivers import wire
 from tests.node.drivers.wire import Adapter, Sky
 
@@ -119,7 +119,7 @@ def test_a_disk_that_cannot_be_written_does_not_stop_the_depth(config, clock, bo
     def refuse(*_: object) -> None:
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("node.drivers.devices.save_zero", refuse)
+    monkeypatch.setattr("buddyline.node.drivers.devices.save_zero", refuse)
     imu, depth = open_sensors(config, clock)
     with caplog.at_level(logging.WARNING):
         assert depth.next_messages(NEVER)

@@ -7,10 +7,10 @@ import sys
 import threading
 
 import pytest
+from buddyline.node.drivers.i2c import ATTEMPTS, I2cBus
+from buddyline.node.drivers.samples import DeviceError
+from buddyline.protocol.clock import ManualClock
 
-from node.drivers.i2c import ATTEMPTS, I2cBus
-from node.drivers.samples import DeviceError
-from protocol.clock import ManualClock
 from tests.node.drivers.conftest import START_NS
 from tests.node.drivers.wire import Adapter, Sky, l3gd20h, lis3mdl
 
@@ -89,7 +89,7 @@ def test_an_adapter_that_refuses_its_timeout_is_closed_again(adapter: Adapter, m
     def refuse(*_: object) -> int:
         raise OSError(errno.ENOTTY, "Inappropriate ioctl for device")
 
-    monkeypatch.setattr("node.drivers.i2c.ioctl", refuse)
+    monkeypatch.setattr("buddyline.node.drivers.i2c.ioctl", refuse)
     with pytest.raises(DeviceError, match="timeout"):
         I2cBus(1)
     assert adapter.opened == 0

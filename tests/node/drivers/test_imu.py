@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.node.drivers import l3gd20h, lis3mdl, lsm6ds, lsm303d
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.imu import FROZEN_READINGS, Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
+from buddyline.node.drivers.ms5837 import Ms5837
+from buddyline.node.drivers.registry import open_depth, open_imu
+from buddyline.node.drivers.samples import DeviceError
+from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.errors import BuddylineError
 
-from node.drivers import l3gd20h, lis3mdl, lsm6ds, lsm303d
-from node.drivers.i2c import I2cBus
-from node.drivers.imu import FROZEN_READINGS, Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
-from node.drivers.ms5837 import Ms5837
-from node.drivers.registry import open_depth, open_imu
-from node.drivers.samples import DeviceError
-from protocol.clock import MS_NS, S_NS
-from protocol.errors import BuddylineError
 from tests.node.drivers import wire
 from tests.node.drivers.wire import Adapter, Sky, StWire
 

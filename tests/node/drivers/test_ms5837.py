@@ -5,9 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
-
-from node.drivers.i2c import I2cBus
-from node.drivers.ms5837 import (
+from buddyline.node.drivers.i2c import I2cBus
+from buddyline.node.drivers.ms5837 import (
     RETRY_NS,
     Ms5837,
     compensate_02ba,
@@ -20,9 +19,10 @@ from node.drivers.ms5837 import (
     second_order_02ba,
     second_order_30ba,
 )
-from node.drivers.samples import DepthSample, DeviceError
-from protocol.clock import MS_NS, S_NS, ManualClock
-from protocol.errors import BuddylineError
+from buddyline.node.drivers.samples import DepthSample, DeviceError
+from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
+from buddyline.protocol.errors import BuddylineError
+
 from tests.node.drivers.wire import D1_30BA, D2_30BA, WORDS_30BA, Adapter, Ms5837Wire
 
 C_30BA = WORDS_30BA[1:]

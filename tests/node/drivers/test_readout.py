@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
-
-from node.drivers.readout import Readout, boottime_ns, line_time_ns, wall_offset_ns
+from buddyline.node.drivers.readout import Readout, boottime_ns, line_time_ns, wall_offset_ns
 
 FULL = (0, 0, 3280, 2464)
 

@@ -14,12 +14,11 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
+import buddyline.node.drivers.i2c as i2c_module
 import numpy as np
 import pytest
 import smbus2.smbus2 as smbus2_module
-
-import node.drivers.i2c as i2c_module
-from protocol.clock import ManualClock
+from buddyline.protocol.clock import ManualClock
 
 I2C_TIMEOUT, I2C_SLAVE, I2C_FUNCS, I2C_RDWR = 0x0702, 0x0703, 0x0705, 0x0707
 I2C_M_RD = 0x0001
