@@ -22,13 +22,10 @@ from buddyline.protocol.messages import (
     RelativePose,
 )
 from buddyline.solver_service.alignment import ClockAlignment
-from buddyline.solver_service.geometry.evidence import heading_offset
 from buddyline.solver_service.geometry.observation import Heading
-from buddyline.solver_service.geometry.rotation import matrix_of
-from buddyline.solver_service.geometry.trigger import Fix, Rig, Settings, solve_trigger
-from buddyline.solver_service.headings import HeadingOffset
-from buddyline.solver_service.prior import PosePrior
-from buddyline.solver_service.results import relative_pose, sensed_of, view_of
+from buddyline.solver_service.geometry.trigger import NoFix, Rig, Settings
+from buddyline.solver_service.pair import Matched, PairSolver
+from buddyline.solver_service.results import relative_pose, sensed_of
 from buddyline.solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream
 from msgspec.structs import replace
 
@@ -76,10 +73,8 @@ class SolverCore:
         self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
         self._newest_resolved = -1
         self._came_ns: int | None = None
-        self._prior = PosePrior()
-        self._headings = HeadingOffset()
+        self._solver = PairSolver(settings, alignment)
         self._clock_offset_ns = clock_offset_ns
-        self._alignment = alignment
 
     @property
     def received(self) -> tuple[int, int]:
@@ -95,7 +90,7 @@ class SolverCore:
     def heading(self) -> Heading | None:
         """How far the headings disagree by the poses up to the newest frame, None where they have not told."""
         newest_ns = max((ns for ns in self.newest_ns if ns is not None), default=0)
-        return self._headings.at(newest_ns)
+        return self._solver.heading(newest_ns)
 
     @property
     def pending(self) -> int:
@@ -143,8 +138,7 @@ class SolverCore:
             # The same triggers may come again, as in a dive played twice; those that told of the new time are done.
             self._resolved = OrderedDict.fromkeys(self._far)
             self._newest_resolved = -1
-            self._prior.lose()
-            self._headings.lose()
+            self._solver.forget()
             if frame.trigger in self._resolved:
                 stream.frames.pop(frame.trigger, None)
                 self.late += 1
@@ -214,14 +208,7 @@ class SolverCore:
         covered = self._a.sensors_cover(frame_a.stamp_ns, held_up) and self._b.sensors_cover(frame_b.stamp_ns, held_up)
         if not covered and not at_once:
             return None
-        try:
-            return self._solve(frame_a, frame_b, known_a, known_b)
-        except (ArithmeticError, ValueError) as error:
-            # Finite numbers that no camera, sensor or rig gives, such as 1e300, overflow or leave nothing to solve.
-            self._prior.lose()
-            self._headings.lose()
-            detail = f"numbers of {self.node_a} or {self.node_b} are beyond all measure ({error})"
-            return self._reject(frame_a, "degenerate", detail)
+        return self._solve(frame_a, frame_b, known_a, known_b)
 
     def _expired(self, frame: Candidates, other: NodeStream) -> bool:
         """Whether the other node's frame for the same trigger can be given up."""
@@ -253,33 +240,22 @@ class SolverCore:
                     f"its calibration {info.width_px}x{info.height_px}"
                 )
                 return self._reject(frame, "no_info", detail)
-        stamp_ns = (frame_a.stamp_ns + frame_b.stamp_ns) // 2
-        sensed_a = sensed_of(self._a.attitude, self._a.depth, frame_a.stamp_ns)
-        sensed_b = sensed_of(self._b.attitude, self._b.depth, frame_b.stamp_ns)
-        outcome = solve_trigger(
-            view_of(frame_a),
-            view_of(frame_b),
-            rig_a,
-            rig_b,
-            sensed_a,
-            sensed_b,
-            self.settings,
-            self._prior.at(stamp_ns),
-            self._headings.at(stamp_ns),
+        matched = Matched(
+            trigger=frame_a.trigger,
+            stamp_ns=(frame_a.stamp_ns + frame_b.stamp_ns) // 2,
+            frame_a=frame_a,
+            frame_b=frame_b,
+            info_a=info_a,
+            info_b=info_b,
+            rig_a=rig_a,
+            rig_b=rig_b,
+            sensed_a=sensed_of(self._a.attitude, self._a.depth, frame_a.stamp_ns),
+            sensed_b=sensed_of(self._b.attitude, self._b.depth, frame_b.stamp_ns),
         )
-        if not isinstance(outcome, Fix):
-            return self._reject(frame_a, outcome.reason, outcome.detail, stamp_ns)
-        self._prior.update(stamp_ns, outcome)
-        attitudes = sensed_a.q_ned_body_xyzw, sensed_b.q_ned_body_xyzw
-        if attitudes[0] is not None and attitudes[1] is not None and outcome.method != "three_lights":
-            R_a_b, covariance = matrix_of(outcome.q_a_b_xyzw), outcome.covariance[3:, 3:]
-            told = heading_offset(R_a_b, covariance, (rig_a, rig_b), (attitudes[0], attitudes[1]))
-            self._headings.update(stamp_ns, *told)
-        if self._alignment is not None:
-            known_s = (frame_b.stamp_ns - frame_a.stamp_ns) / S_NS
-            sigma_rad = info_a.sigma_px / info_a.camera.fx_px, info_b.sigma_px / info_b.camera.fx_px
-            self._alignment.add(frame_a.stamp_ns, outcome, (rig_a, rig_b), known_s, sigma_rad)
-        pose = relative_pose(frame_a, frame_b, rig_a, sensed_a, outcome)
+        (found,) = self._solver.solve([matched])
+        if isinstance(found, NoFix):
+            return self._reject(frame_a, found.reason, found.detail, matched.stamp_ns)
+        pose = relative_pose(frame_a, frame_b, rig_a, matched.sensed_a, found)
         self._finish(frame_a.trigger)
         self.counts["solved"] += 1
         return pose

@@ -32,9 +32,9 @@ class HeadingOffset:
     """Follows what is to be added to B's heading so that both agree with the poses."""
 
     def __init__(self) -> None:
-        self.lose()
+        self.reset()
 
-    def lose(self) -> None:
+    def reset(self) -> None:
         """Forget it."""
         self._stamp_ns: int | None = None
         self._offset_rad = 0.0
@@ -42,7 +42,7 @@ class HeadingOffset:
         self._noise = START_NOISE
         self._count = 0
 
-    def at(self, stamp_ns: int) -> Heading | None:
+    def predict(self, stamp_ns: int) -> Heading | None:
         """Return it for stamp_ns, None where too few poses, too old or later ones, have told it."""
         if self._count < ENOUGH or not self._follows(stamp_ns):
             return None
@@ -51,7 +51,7 @@ class HeadingOffset:
     def update(self, stamp_ns: int, offset_rad: float, variance: float) -> None:
         """Take what one pose tells, with the variance (rad^2) that the pose itself has."""
         if not self._follows(stamp_ns):
-            self.lose()
+            self.reset()
         predicted = self._predicted(stamp_ns)
         self._stamp_ns = stamp_ns
         total = predicted + self._noise + variance

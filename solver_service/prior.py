@@ -42,11 +42,11 @@ class PosePrior:
         self._P: NDArray[np.float64] = np.zeros((12, 12))
         self._last: tuple[tuple[int, int], _State] | None = None
 
-    def lose(self) -> None:
+    def reset(self) -> None:
         """Forget it."""
         self._stamp_ns = None
 
-    def at(self, stamp_ns: int) -> Prior | None:
+    def predict(self, stamp_ns: int) -> Prior | None:
         """Return the prediction for stamp_ns, None where the last fix is too old, or later."""
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None

@@ -141,5 +141,5 @@ def depth_at(stream: SampleStream[Depth], stamp_ns: int) -> tuple[float, float] 
     middle_s = sum(ages_s) / count
     spread = sum((age_s - middle_s) ** 2 for age_s in ages_s)
     slope_mps = sum((age_s - middle_s) * depth_m for age_s, depth_m in zip(ages_s, depths_m, strict=True)) / spread
-    variance = sigma_m**2 * (1 / count + middle_s**2 / spread)
+    variance = sigma_m * sigma_m * (1 / count + middle_s**2 / spread)
     return sum(depths_m) / count - slope_mps * middle_s, math.hypot(math.sqrt(variance), drift_m)

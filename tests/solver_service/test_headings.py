@@ -36,7 +36,7 @@ def test_a_drifting_bias_is_followed_and_the_variance_is_true():
             # Two thirds of a turn to start with: the angle comes round.
             bias_rad = 4.2 + math.radians(8.0) * math.sin(0.02 * k)
             told_rad = math.remainder(bias_rad + math.radians(sigma_deg) * rng.normal(), 2.0 * math.pi)
-            heading = headings.at(k * STEP_NS)
+            heading = headings.predict(k * STEP_NS)
             if k > 100:
                 off_rad = math.remainder(told_rad - heading.offset_rad, 2.0 * math.pi)
                 squares.append(off_rad * off_rad / heading.variance)
@@ -46,20 +46,20 @@ def test_a_drifting_bias_is_followed_and_the_variance_is_true():
 
 
 def test_a_few_poses_and_an_old_one_tell_nothing():
-    assert fed([0.3] * (ENOUGH - 1)).at(ENOUGH * STEP_NS) is None
+    assert fed([0.3] * (ENOUGH - 1)).predict(ENOUGH * STEP_NS) is None
     headings = fed([0.3] * ENOUGH)
-    assert headings.at(ENOUGH * STEP_NS).offset_rad == pytest.approx(0.3, abs=0.01)
-    assert headings.at(-1) is None
-    assert headings.at((ENOUGH - 1) * STEP_NS + LIFETIME_NS + 1) is None
+    assert headings.predict(ENOUGH * STEP_NS).offset_rad == pytest.approx(0.3, abs=0.01)
+    assert headings.predict(-1) is None
+    assert headings.predict((ENOUGH - 1) * STEP_NS + LIFETIME_NS + 1) is None
 
 
 def test_one_wrong_pose_moves_nothing_and_steel_is_followed():
     headings = fed([0.1] * 50)
     fed([1.5], headings, 50)
-    assert headings.at(51 * STEP_NS).offset_rad == pytest.approx(0.1, abs=0.01)
+    assert headings.predict(51 * STEP_NS).offset_rad == pytest.approx(0.1, abs=0.01)
     fed([0.1] * 20, headings, 51)
     fed([1.5] * 10, headings, 71)
-    assert headings.at(81 * STEP_NS).offset_rad == pytest.approx(1.5, abs=0.1)
+    assert headings.predict(81 * STEP_NS).offset_rad == pytest.approx(1.5, abs=0.1)
 
 
 def test_what_a_pose_tells_is_the_error_of_the_heading():

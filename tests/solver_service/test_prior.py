@@ -43,7 +43,7 @@ def test_predictions_cover_what_comes():
     rng = np.random.default_rng(1)
     prior, errors = PosePrior(), []
     for stamp_ns, t, R, seen in moving(60, rng):
-        predicted = prior.at(stamp_ns)
+        predicted = prior.predict(stamp_ns)
         if predicted is not None and stamp_ns > 20 * STEP_NS:
             off = np.concatenate((t - predicted.t_a_b_m, rotation_log(R @ matrix_of(predicted.q_a_b_xyzw).T)))
             errors.append(off @ np.linalg.solve(predicted.covariance, off))
@@ -57,7 +57,7 @@ def test_velocity_is_followed():
     prior = PosePrior()
     for stamp_ns, _, _, seen in moving(5, np.random.default_rng(2), noise=0.0):
         prior.update(stamp_ns, seen)
-    predicted = prior.at(stamp_ns)
+    predicted = prior.predict(stamp_ns)
     s = stamp_ns / 1e9
     expected = [0.3 * 0.7 * np.cos(0.7 * s), -0.2 * 0.5 * np.sin(0.5 * s), 0.1]
     assert predicted.rates[:3] == pytest.approx(expected, abs=0.05)
@@ -66,18 +66,18 @@ def test_velocity_is_followed():
 
 def test_lost_after_a_while_and_found_again():
     prior = PosePrior()
-    assert prior.at(0) is None
+    assert prior.predict(0) is None
     fixes = list(moving(1, np.random.default_rng(3)))
     stamp_ns, _, _, seen = fixes[0]
     prior.update(stamp_ns, seen)
-    assert prior.at(stamp_ns + LIFETIME_NS) is not None
-    assert prior.at(stamp_ns + LIFETIME_NS + 1) is None
-    assert prior.at(stamp_ns - 1) is None
+    assert prior.predict(stamp_ns + LIFETIME_NS) is not None
+    assert prior.predict(stamp_ns + LIFETIME_NS + 1) is None
+    assert prior.predict(stamp_ns - 1) is None
     later_ns = stamp_ns + 10 * LIFETIME_NS
     prior.update(later_ns, fixes[5][3])
-    assert prior.at(later_ns).t_a_b_m == pytest.approx(fixes[5][3].t_a_b_m)
-    prior.lose()
-    assert prior.at(later_ns) is None
+    assert prior.predict(later_ns).t_a_b_m == pytest.approx(fixes[5][3].t_a_b_m)
+    prior.reset()
+    assert prior.predict(later_ns) is None
 
 
 def test_a_fix_elsewhere_starts_it_anew():
@@ -88,6 +88,6 @@ def test_a_fix_elsewhere_starts_it_anew():
     stamp_ns, _, R, seen = fixes[-1]
     elsewhere = fix([5.0, -3.0, 9.0], rotation_exp(np.array([0.0, 1.0, 0.0])) @ R, seen.covariance)
     prior.update(stamp_ns + STEP_NS, elsewhere)
-    predicted = prior.at(stamp_ns + STEP_NS)
+    predicted = prior.predict(stamp_ns + STEP_NS)
     assert predicted.t_a_b_m == pytest.approx(elsewhere.t_a_b_m)
     assert not predicted.rates.any()
