@@ -35,7 +35,10 @@ Reason: TypeAlias = Literal[
     "degenerate",
     "late",
     "duplicate",
+    "heading",
+    "other_lights",
 ]
+TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
 
 
 def _check_unit(field: str, q_xyzw: Quaternion) -> None:
@@ -93,7 +96,8 @@ class NodeInfo(Message, frozen=True, kw_only=True):
 
     light_left_m, light_right_m, depth_port_m: in the node's camera frame. sigma_px: candidate noise, 1 sd.
     row_time_ns: 0 for a global shutter. q_body_camera_xyzw: camera to body. declination_rad: 0 where headings
-    are magnetic. tags: AR tags that the node carries, to compare with.
+    are magnetic. tags: AR tags that the node carries, to compare with. imu_m: the inertial unit's place in the camera
+    frame. imu_delay_ns: stamp of an inertial sample minus its true time.
     """
 
     node: NodeId
@@ -112,6 +116,8 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     software: str = ""
     config_sha256: str = ""
     tags: list[ArTag] | UnsetType = UNSET
+    imu_m: Vector3 | UnsetType = UNSET
+    imu_delay_ns: int | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check the mount's quaternion and that the two lights are apart."""
@@ -305,6 +311,39 @@ class RelativePose(Message, frozen=True, kw_only=True):
     t_ned_m: Vector3 | UnsetType = UNSET
     azimuth_rad: float | UnsetType = UNSET
     inclination_rad: float | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        _check_unit("q_a_b_xyzw", self.q_a_b_xyzw)
+
+
+class Track(Message, frozen=True, kw_only=True):
+    """The fused estimate of T_a_b at stamp_ns, also between triggers.
+
+    covariance: 6x6 row-major as in RelativePose. v_a_b_mps: velocity of B's camera relative to A's, in A's camera
+    frame, A's turning not counted; v_covariance: 3x3 row-major. lights: how many lights the last trigger before
+    stamp_ns told. age_s: since a light was last used. With attitude: t_ned_m and the angles, whose sigmas include the
+    compass's error.
+    """
+
+    node_a: NodeId
+    node_b: NodeId
+    stamp_ns: StampNs
+    t_a_b_m: Vector3
+    q_a_b_xyzw: Quaternion
+    covariance: Annotated[list[float], Meta(min_length=36, max_length=36)]
+    v_a_b_mps: Vector3
+    v_covariance: Annotated[list[float], Meta(min_length=9, max_length=9)]
+    mode: TrackMode
+    lights: Annotated[int, Meta(ge=0, le=4)]
+    age_s: NonNegative
+    range_m: NonNegative
+    t_ned_m: Vector3 | UnsetType = UNSET
+    sigma_ned_m: tuple[NonNegative, NonNegative, NonNegative] | UnsetType = UNSET
+    azimuth_rad: float | UnsetType = UNSET
+    sigma_azimuth_rad: NonNegative | UnsetType = UNSET
+    inclination_rad: float | UnsetType = UNSET
+    sigma_inclination_rad: NonNegative | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check the quaternion's norm."""

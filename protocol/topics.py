@@ -155,6 +155,27 @@ REJECTED: Final = Topic(
     express=True,
     retained=True,
 )
+TRACK: Final = Topic(
+    "track",
+    "buddyline/pair/{a}/{b}/track",
+    messages.Track,
+    "buddyline.Track",
+    20.0,
+    "interactive_high",
+    express=True,
+    stale_s=1.0,
+    retained=True,
+)
+# After TRACK, which carries the same schema: topic_of goes by the message's mode.
+TRACK_LAG: Final = Topic(
+    "track_lag",
+    "buddyline/pair/{a}/{b}/track_lag",
+    messages.Track,
+    "buddyline.Track",
+    20.0,
+    "data",
+    stale_s=3.0,
+)
 TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(
     "solver_status",
@@ -181,6 +202,8 @@ TOPICS: Final = (
     POSE,
     ARTAG,
     REJECTED,
+    TRACK,
+    TRACK_LAG,
     TRUTH,
     SOLVER_STATUS,
 )
@@ -230,7 +253,9 @@ def check_sender(key: str, message: Message) -> None:
 
 
 def topic_of(message: Message) -> Topic:
-    """Return the topic of a message by its type."""
+    """Return the topic of a message by its type, and of a Track by its mode."""
+    if isinstance(message, messages.Track) and message.mode == "lag":
+        return TRACK_LAG
     for topic in TOPICS:
         if topic.schema is type(message):
             return topic

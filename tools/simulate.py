@@ -9,7 +9,7 @@ from dataclasses import asdict, fields
 
 import cv2
 from buddyline.node.sim.dive import Plan, messages
-from buddyline.node.sim.scenario import ENVIRONMENTS, TRAJECTORIES, Scenario
+from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.divelog import DiveLogWriter
@@ -29,6 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=1, help="another seed is another dive; default: %(default)s")
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
     parser.add_argument("--imu", action="store_true", help="raw inertial samples, too")
+    parser.add_argument(
+        "--inertial",
+        choices=INERTIAL_GRADES,
+        default=scenario.inertial,
+        help="poor: mounted 1 deg off, stamped late, with walking biases, shaken by fins; default: %(default)s",
+    )
     parser.add_argument("--width", type=int, default=scenario.width_px, metavar="PX", help="default: %(default)s")
     world = parser.add_argument_group("the dive")
     world.add_argument("--trajectory", choices=TRAJECTORIES, default=scenario.trajectory, help="default: circles")
@@ -77,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
         interruptions=not args.undisturbed,
         clock_offset_ns=round(args.clock_offset_ms * MS_NS),
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
+        inertial=args.inertial,
     )
     plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}

@@ -12,8 +12,10 @@ from buddyline.protocol.topics import check_node_id
 
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
 Trajectory: TypeAlias = Literal["circles", "rest"]
+InertialGrade: TypeAlias = Literal["good", "poor"]
 ENVIRONMENTS: Final[tuple[str, ...]] = get_args(Environment)
 TRAJECTORIES: Final[tuple[str, ...]] = get_args(Trajectory)
+INERTIAL_GRADES: Final[tuple[str, ...]] = get_args(InertialGrade)
 
 Bgr: TypeAlias = tuple[float, float, float]
 
@@ -77,7 +79,8 @@ class Scenario:
     false_lights are put in at random places of each picture. other_lamps: other divers' lamps in the water.
     tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
-    magnetometer_off_rad: constant error of B's heading, outside what its sigma says.
+    magnetometer_off_rad: constant error of B's heading, outside what its sigma says. inertial: how good the inertial
+    units are.
     """
 
     environment: Environment = "cavern"
@@ -106,6 +109,7 @@ class Scenario:
     interruptions: bool = True
     clock_offset_ns: int = 0
     magnetometer_off_rad: float = 0.0
+    inertial: InertialGrade = "good"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be simulated, naming the field."""
@@ -113,7 +117,11 @@ class Scenario:
         check_node_id(self.node_b)
         if self.node_a == self.node_b:
             raise BuddylineError(f"node_b: {self.node_b!r} is node_a's name as well")
-        for name, known in (("environment", ENVIRONMENTS), ("trajectory", TRAJECTORIES)):
+        for name, known in (
+            ("environment", ENVIRONMENTS),
+            ("trajectory", TRAJECTORIES),
+            ("inertial", INERTIAL_GRADES),
+        ):
             if getattr(self, name) not in known:
                 raise BuddylineError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
         for name, lowest in _LOWEST.items():

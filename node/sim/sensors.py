@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numpy as np
 from buddyline.node.sim import rotation
+from buddyline.node.sim.inertial import GRAVITY_MPS2, InertialUnit
 from buddyline.node.sim.randomness import Sway, generator
 from buddyline.node.sim.rig import R_BODY_CAMERA
 from buddyline.node.sim.rotation import Vector
@@ -14,18 +14,11 @@ from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.scene import Scene
 from buddyline.protocol.messages import Attitude, Depth, Imu
 
-GRAVITY_MPS2: Final = 9.80665
 SURFACE_PA: Final = 101325.0
-STEP_S: Final = 0.005
 
 TILT_SIGMA_RAD: Final = math.radians(1.0)
 DEPTH_SIGMA_M: Final = 0.02
 DEPTH_STEP_M: Final = 0.005
-ACCEL_SIGMA_MPS2: Final = 0.03
-GYRO_SIGMA_RADPS: Final = 0.004
-GYRO_BIAS_RADPS: Final = 0.003
-MAG_SIGMA_T: Final = 0.3e-6
-FIELD_NED_T: Final = np.array([48e-6 * math.cos(math.radians(60)), 0.0, 48e-6 * math.sin(math.radians(60))])
 
 SLOW_SHARE: Final = 0.8
 """Share of an attitude error's variance that wanders slowly; the rest is new in every sample."""
@@ -41,8 +34,8 @@ class Sensors:
         yaw_sigma_rad = math.radians(rng.uniform(3, 5))
         self._sigma_rad = (TILT_SIGMA_RAD, TILT_SIGMA_RAD, yaw_sigma_rad)
         self._wander = [Sway(rng, 8.0, 40.0, 6), Sway(rng, 8.0, 40.0, 6), Sway(rng, 40.0, 400.0, 6)]
-        self._gyro_bias_radps = rng.normal(0, GYRO_BIAS_RADPS, 3)
         self._off_rad = scenario.magnetometer_off_rad if index == 1 else 0.0
+        self.unit = InertialUnit(scenario.seed, index, scene.motion, scenario.inertial, self._off_rad)
 
     def attitude(self, stamp_ns: int, t_s: float) -> Attitude:
         """Return what an attitude filter would say; its sigmas are true, but for a magnetometer that is off."""
@@ -74,23 +67,9 @@ class Sensors:
         )
 
     def imu(self, stamp_ns: int, t_s: float) -> Imu:
-        """Return specific force, turn rate and magnetic field in the body frame."""
-        rng = generator(self._scenario.seed, "imu", self._index, stamp_ns)
-        before, now, after = (self._scene.motion.placement(self._index, t_s + step) for step in (-STEP_S, 0.0, STEP_S))
-        R_body_ned = now.R_ned_body.T
-        accel_ned_mps2 = (after.position_ned_m - 2 * now.position_ned_m + before.position_ned_m) / STEP_S**2 - np.array(
-            [0.0, 0.0, GRAVITY_MPS2]
-        )
-        rate_radps = rotation.to_vector(before.R_ned_body.T @ after.R_ned_body) / (2 * STEP_S)
-        field_t = R_body_ned @ rotation.from_euler(0.0, 0.0, self._off_rad).T @ FIELD_NED_T
-        noise = rng.standard_normal((3, 3))
-        return Imu(
-            node=self._node,
-            stamp_ns=stamp_ns,
-            accel_mps2=_triple(R_body_ned @ accel_ned_mps2 + ACCEL_SIGMA_MPS2 * noise[0]),
-            gyro_radps=_triple(rate_radps + self._gyro_bias_radps + GYRO_SIGMA_RADPS * noise[1]),
-            mag_t=_triple(field_t + MAG_SIGMA_T * noise[2]),
-        )
+        """Return specific force, turn rate and magnetic field in the stated body frame."""
+        accel_mps2, gyro_radps, mag_t = map(_triple, self.unit.sample(stamp_ns, t_s))
+        return Imu(node=self._node, stamp_ns=stamp_ns, accel_mps2=accel_mps2, gyro_radps=gyro_radps, mag_t=mag_t)
 
 
 def _triple(vector: Vector) -> tuple[float, float, float]:

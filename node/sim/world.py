@@ -66,6 +66,7 @@ class World:
             depth_port_m=_triple(rig.depth_port_m),
             software=SOFTWARE,
             tags=carried or UNSET,
+            imu_m=_triple(self._sensors[index].unit.stated_lever_m),
         )
 
     def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:

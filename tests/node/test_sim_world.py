@@ -1,5 +1,6 @@
 """The simulated world against the known answers, itself, and OpenCV's camera model."""
 
+import dataclasses
 from itertools import pairwise
 
 import cv2
@@ -7,9 +8,9 @@ import numpy as np
 import pytest
 from buddyline.node.sim import rotation
 from buddyline.node.sim.camera import pinhole, project
+from buddyline.node.sim.inertial import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRADES, GRAVITY_MPS2, Grade
 from buddyline.node.sim.rig import R_BODY_CAMERA
 from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
-from buddyline.node.sim.sensors import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRAVITY_MPS2
 from buddyline.node.sim.world import World
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.errors import BuddylineError
@@ -171,6 +172,50 @@ def test_lights_are_mostly_in_view_but_not_always():
     assert 0.5 < np.mean(all_four) < 0.95
 
 
+def _unit_ned_m(world, stamp_ns):
+    R, t = world.T_ned_camera("b", stamp_ns)
+    return t + R @ world.info("b", stamp_ns, S_NS).imu_m
+
+
+EXACT = Grade(
+    lever_sigma_m=0.0, misalignment_rad=0.0, delay_ns=(0, 0), gyro_bias_radps=0.0, accel_bias_mps2=0.0,
+    gyro_walk_radps=0.0, accel_walk_mps2=0.0, shake_mps2=0.0, shake_radps=0.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("off", [{"misalignment_rad": 0.02}, {"delay_ns": (4_000_000, 4_000_000)}])
+def test_a_poor_inertial_unit_is_turned_and_late_by_what_its_grade_says(monkeypatch, off):
+    monkeypatch.setattr("buddyline.node.sim.inertial.GYRO_SIGMA_RADPS", 0.0)
+    monkeypatch.setitem(GRADES, "good", EXACT)
+    exact = World(Scenario(seed=6))
+    monkeypatch.setitem(GRADES, "good", dataclasses.replace(EXACT, **off))
+    other = World(Scenario(seed=6))
+    late_ns = off.get("delay_ns", (0,))[0]
+    true_s = [1.0 + 0.1 * k for k in range(50)]
+    stamps = [round(t_s * S_NS) for t_s in true_s]
+    rates = np.array([exact._sensors[0].unit.sample(stamp, t_s)[1] for stamp, t_s in zip(stamps, true_s, strict=True)])
+    seen = np.array(
+        [
+            other._sensors[0].unit.sample(stamp, t_s + late_ns / S_NS)[1]
+            for stamp, t_s in zip(stamps, true_s, strict=True)
+        ]
+    )
+    if late_ns:
+        np.testing.assert_allclose(seen, rates, atol=1e-9)
+    else:
+        turned = np.linalg.norm(np.cross(seen, rates), axis=1) / np.linalg.norm(rates, axis=1) ** 2
+        assert 0.25 * 0.02 < turned.max() < 1.001 * 0.02
+
+
+def test_a_poor_inertial_unit_is_worse_than_a_good_one():
+    off_mps2 = []
+    for grade in ("good", "poor"):
+        world = World(Scenario(seed=6, inertial=grade))
+        samples = [np.linalg.norm(world.imu("b", S_NS + k * S_NS // 100).accel_mps2) for k in range(300)]
+        off_mps2.append(np.std(np.diff(samples)))
+    assert off_mps2[1] > 1.1 * off_mps2[0]
+
+
 def test_the_inertial_sensor_measures_the_motion():
     world = World(Scenario(seed=6))
     dt_s, n = 0.01, 300
@@ -186,13 +231,13 @@ def test_the_inertial_sensor_measures_the_motion():
     # Specific force in NED adds up to the change of velocity, but for gravity; the field stands still.
     force = np.mean([R @ s.accel_mps2 for R, s in zip(R_ned_body, imu, strict=True)], axis=0)
     field = np.mean([R @ s.mag_t for R, s in zip(R_ned_body, imu, strict=True)], axis=0)
+    grade = GRADES["good"]
     begin_mps, end_mps = (
-        (world.T_ned_camera("b", at_ns + S_NS // 100)[1] - world.T_ned_camera("b", at_ns - S_NS // 100)[1]) / 0.02
-        for at_ns in (S_NS, round((1 + n * dt_s) * S_NS))
+        (_unit_ned_m(world, at_ns + S_NS // 100) - _unit_ned_m(world, at_ns - S_NS // 100)) / 0.02
+        for at_ns in (stamps[0], stamps[-1])
     )
-    np.testing.assert_allclose(
-        force, (end_mps - begin_mps) / (n * dt_s) - (0, 0, GRAVITY_MPS2), atol=4 * ACCEL_SIGMA_MPS2 / n**0.5
-    )
+    unsure = 4 * ACCEL_SIGMA_MPS2 / n**0.5 + 3 * grade.accel_bias_mps2 + grade.misalignment_rad * GRAVITY_MPS2
+    np.testing.assert_allclose(force, (end_mps - begin_mps) / (n * dt_s) - (0, 0, GRAVITY_MPS2), atol=unsure)
     np.testing.assert_allclose(field, FIELD_NED_T, atol=0.1e-6)
 
 
