@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.node.chrony import ChronyError, Tracking, read_tracking
 from buddyline.protocol.clock import Clock
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import MessageError
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.messages import MAX_HEARD, ClockBeacon, HeardClock
-from buddyline.protocol.topics import CLOCK, check_sender
+from buddyline.protocol.topics import CLOCK
 
 if TYPE_CHECKING:
     from buddyline.node.outlet import Outlet
@@ -33,7 +32,7 @@ class Beacons:
     """
 
     def __init__(self, node: str, boot: str) -> None:
-        self.bad = 0
+        self.refusals = Refusals("clock")
         self._node = node
         self._boot = boot
         self._lock = threading.Lock()
@@ -41,13 +40,9 @@ class Beacons:
 
     def hear(self, received: Received, now_s: float) -> None:
         """Take another node's beacon; what is none, or from whom nobody can know, is counted."""
-        try:
-            beacon = decode(received.payload, ClockBeacon)
-            check_sender(received.key, beacon)
-        except MessageError:
-            self.bad += 1
-            return
-        if beacon.node == self._node:
+        envelope = self.refusals.open(received)
+        beacon = envelope.message if envelope else None
+        if not isinstance(beacon, ClockBeacon) or beacon.node == self._node:
             return
         heard = HeardClock(node=beacon.node, boot=beacon.boot, sent_ns=beacon.stamp_ns, received_ns=received.receive_ns)
         with self._lock:

@@ -17,6 +17,7 @@ from typing import Final, Protocol, Self, TypeAlias
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.delivery import FailureLatch, RateCap, ThreadDiedError
+from buddyline.protocol.envelope import Envelope, open_envelope
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import Topic, parse_key
 
@@ -30,12 +31,16 @@ _ALIVE_NAME = re.compile(r"[a-z0-9_]{1,64}(/[a-z0-9_]{1,64})*\Z")
 
 @dataclass(frozen=True)
 class Received:
-    """One message off the bus, not yet decoded; receive_ns is this process's clock."""
+    """One message off the bus, not yet opened; receive_ns is this process's clock."""
 
     key: str
     payload: bytes
     receive_ns: int
     encoding: str
+
+    def open(self) -> Envelope:
+        """Return its sound message; raise MessageError."""
+        return open_envelope(self.key, self.payload, self.receive_ns)
 
 
 class Publisher(ABC):

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import IO, Final, cast
 
 from buddyline.protocol import topics
-from buddyline.protocol.codec import decode, encode, payload_stamp_ns
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.envelope import Envelope, open_envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
 from buddyline.protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
@@ -44,10 +45,13 @@ class Record:
     payload: bytes
     sequence: int = 0
 
+    def open(self) -> Envelope:
+        """Return its sound message; raise MessageError."""
+        return open_envelope(self.key, self.payload, self.log_time_ns)
+
     def decode(self) -> Message | None:
         """Return the message, None where the key is none of ours; raise MessageError where it is not sound."""
-        parsed = topics.parse_key(self.key)
-        return decode(self.payload, parsed[0].schema) if parsed else None
+        return self.open().message if topics.parse_key(self.key) else None
 
 
 class DiveLogWriter:

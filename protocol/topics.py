@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Final, Literal
 
 from buddyline.protocol import messages
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NODE_ID_PATTERN, Message
 
 Priority = Literal["interactive_high", "data_high", "data", "data_low", "background"]
@@ -240,16 +240,6 @@ def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
         if match:
             return topic, match.groups()
     return None
-
-
-def check_sender(key: str, message: Message) -> None:
-    """Raise MessageError where a message says that it is of another node, or pair, than its key."""
-    parsed = parse_key(key)
-    fields = ("node",) if parsed is None or "{node}" in parsed[0].template else ("node_a", "node_b")
-    said = tuple(getattr(message, field, None) for field in fields)
-    if parsed is not None and said[0] is not None and said != parsed[1]:
-        words = ", ".join(f"{field} {value!r}" for field, value in zip(fields, said, strict=True))
-        raise MessageError(f"{parsed[0].schema_name}: {words} on key {key}")
 
 
 def topic_of(message: Message) -> Topic:

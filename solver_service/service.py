@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
-from buddyline.protocol.codec import decode
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.service import Service
@@ -25,8 +25,6 @@ from buddyline.protocol.topics import (
     POSE,
     REJECTED,
     SOLVER_STATUS,
-    check_sender,
-    parse_key,
 )
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.answered import Answered
@@ -61,7 +59,7 @@ class SolverService(Service):
         self.problems = ["no hub yet"]
         self.config = config
         self.clock = clock or SystemClock()
-        self.bad_messages = 0
+        self.refusals = Refusals("solver")
         self._settings = config.solve.settings(source)
         self._core: SolverCore | None = None
         self._before_pair: deque[Message] = deque(maxlen=BUFFERED_BEFORE_PAIR)
@@ -122,19 +120,13 @@ class SolverService(Service):
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus; a bad one is counted and reported, and stops nothing."""
-        parsed = parse_key(received.key)
-        if parsed is None:
-            return
-        topic, (node,) = parsed
         try:
-            message = decode(received.payload, topic.schema)
-            check_sender(received.key, message)
+            envelope = received.open()
         except MessageError as error:
-            self.bad_messages += 1
+            self.refusals.note(received.key, error)
             self._reported_bad = f"bad message on {received.key}: {error}"
-            if self.bad_messages.bit_count() == 1:  # the 1st, 2nd, 4th ...: said, and never a flood
-                log.warning("solver: %s (%d so far)", self._reported_bad, self.bad_messages)
             return
+        message, node = envelope.message, envelope.node
         with self._lock:
             if isinstance(message, Candidates):
                 new = self._joined_ns is not None and received.receive_ns > self._joined_ns
@@ -253,7 +245,7 @@ class SolverService(Service):
             rejected={reason: count for reason, count in sorted(core.counts.items()) if reason != "solved"},
             late=core.late,
             duplicates=core.duplicates,
-            bad_messages=self.bad_messages,
+            bad_messages=self.refusals.count,
             pending=core.pending,
             latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
             latency_p99_s=latencies_s[min(len(latencies_s) * 99 // 100, len(latencies_s) - 1)]
@@ -266,14 +258,6 @@ class SolverService(Service):
 
 def _said_before(bus: Bus) -> list[RelativePose | Rejected]:
     """Return the last of what solvers before this one have said of each pair."""
-    said = []
-    for topic in (POSE, REJECTED):
-        for received in bus.newest(topic):
-            try:
-                message = decode(received.payload, topic.schema)
-            except MessageError as error:
-                log.warning("solver: what the hub holds on %s: %s", received.key, error)
-                continue
-            if isinstance(message, RelativePose | Rejected):
-                said.append(message)
-    return said
+    refusals = Refusals("solver, of what the hub holds")
+    held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]
+    return [one.message for one in held if one and isinstance(one.message, RelativePose | Rejected)]

@@ -169,8 +169,6 @@ def run(args: argparse.Namespace) -> int:
             poses = solver.poses(Track.of_attitudes(attitudes))
             for pose in poses:
                 writer.write_message(pose, key=ARTAG.key(*nodes))
-        for text in dive.damage:
-            log.warning("%s", text)
     summary = {
         "output": args.output,
         "poses": len(poses),

@@ -75,8 +75,6 @@ def run(args: argparse.Namespace) -> int:
                     record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
                 )
                 added[record.key] += 1
-        for line in dive.damage:
-            print(line, file=sys.stderr)
     if not added:
         Path(args.output).unlink()
         raise BuddylineError(f"{dive.name}: no message can be read")

@@ -12,6 +12,7 @@ from typing import Final
 
 from buddyline.protocol import __version__
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.losses import collected
 
 SUMMARY: Final = "Two underwater nodes see each other's lights; Buddyline says where they are."
 
@@ -201,7 +202,10 @@ def overview() -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the program; return its exit status: 0 done, 1 a check failed, 2 a known error, 130 interrupted."""
+    """Run the program; return its exit status.
+
+    0 done, 1 a check failed or input was damaged, 2 a known error, 130 interrupted.
+    """
     words = sys.argv[1:] if argv is None else argv
     if not words or words[0] in ("-h", "--help", "help"):
         print(overview())
@@ -216,7 +220,13 @@ def main(argv: list[str] | None = None) -> int:
         print(f"buddyline: no command {words[0]!r}; {hint}", file=sys.stderr)
         return 2
     try:
-        return _run(command, words[1:])
+        with collected() as lost:
+            try:
+                status = _run(command, words[1:])
+            finally:
+                for line in lost:
+                    print(f"buddyline {command.name}: {line}", file=sys.stderr)
+        return status or (1 if lost else 0)
     except BuddylineError as error:
         print(f"buddyline {command.name}: {error}", file=sys.stderr)
         return 2

@@ -175,8 +175,6 @@ def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
         finally:
             if writer is not None:
                 writer.close()
-        for text in dive.damage:
-            log.warning("%s", text)
     print(f"{detector.pictures} pictures, {detector.skipped} skipped", file=sys.stderr)
     return 0
 

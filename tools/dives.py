@@ -1,41 +1,79 @@
-"""Stored dives as the tools take them: several logs as one, checked to belong together."""
+"""Stored dives as the tools read them: several logs as one, and one policy for damage.
+
+What can be read is used. What cannot is in `Dive.losses`, by file and byte, and reaches the command line by itself:
+`buddyline` prints it on stderr and exits with 1.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import heapq
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
+from typing import Final
 
 import msgspec
-from buddyline.protocol.codec import decode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader, Record, read_logs
+from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import NodeInfo
+from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
-from buddyline.protocol.topics import INFO, parse_key
+from buddyline.protocol.topics import INFO, POSE, REJECTED, TOPICS, parse_key
+from buddyline.tools import losses
+
+log = logging.getLogger(__name__)
+
+_NAMES: Final = frozenset(topic.name for topic in TOPICS)
+_OUTCOMES: Final = (POSE, REJECTED)
+
+
+@dataclass
+class _Pass:
+    """What one reading of a dive left out: bad messages by log, and outcomes of triggers that had one, by key."""
+
+    refusals: dict[Path, Refusals] = field(default_factory=dict)
+    repeated: Counter[str] = field(default_factory=Counter)
 
 
 class Dive:
-    """One dive out of one or more logs (each node's own, say), with the pictures beside them."""
+    """One dive out of one or more logs (each node's own, say), with the pictures beside them.
 
-    def __init__(self, paths: list[str] | list[Path]) -> None:
+    A log that is empty is left out where there are others. Raises BuddylineError for a file that is no dive log,
+    and where two logs cannot be of one dive.
+    """
+
+    def __init__(self, paths: Sequence[str] | Sequence[Path]) -> None:
         self._stack = ExitStack()
-        self.readers = []
+        self._passes: list[_Pass] = []
+        self._left_out: list[str] = []
+        self.readers: list[DiveLogReader] = []
         try:
-            seen: set[Path] = set()
-            for path in map(Path, paths):
-                if path.resolve() in seen:
-                    raise BuddylineError(f"{path}: is named twice")
-                seen.add(path.resolve())
-            for path in with_pictures(paths):
+            for path in self._with_content([Path(path) for path in paths]):
                 self.readers.append(self._stack.enter_context(DiveLogReader(path)))
             self._infos = self._check_one_dive()
         except BaseException:
-            self._stack.close()
+            self.close()
             raise
+
+    def _with_content(self, paths: list[Path]) -> list[Path]:
+        """Return the logs and their pictures but for empty ones, of which at least one is not."""
+        seen: set[Path] = set()
+        for path in paths:
+            if path.resolve() in seen:
+                raise BuddylineError(f"{path}: is named twice")
+            seen.add(path.resolve())
+        files = with_pictures(paths)
+        empty = [path for path in files if path.exists() and path.stat().st_size == 0]
+        if len(empty) == len(files):
+            return files
+        self._left_out += [f"{path}: is empty (0 bytes): nothing was recorded in it; left out" for path in empty]
+        return [path for path in files if path not in empty]
 
     @property
     def name(self) -> str:
@@ -52,7 +90,7 @@ class Dive:
         """Log time of the first message; raises where no log has any."""
         starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
         if not starts:
-            raise BuddylineError(f"{self.name}: no message can be read{self._damage_text()}")
+            raise BuddylineError(f"{self.name}: no message can be read")
         return min(starts)
 
     @cached_property
@@ -61,30 +99,55 @@ class Dive:
         return max((reader.end_ns for reader in self.readers if reader.end_ns is not None), default=0)
 
     @property
-    def damage(self) -> list[str]:
-        """What could not be read, a line each."""
-        return [f"{reader.path}: {text}" for reader in self.readers for text in reader.damage]
-
-    def _damage_text(self) -> str:
-        return "".join(f"; {text}" for text in self.damage)
+    def losses(self) -> list[str]:
+        """What has not been read so far, though it should have been: a line each, with file and byte."""
+        found = [*self._left_out, *(f"{reader.path}: {text}" for reader in self.readers for text in reader.damage)]
+        for path in dict.fromkeys(path for reading in self._passes for path in reading.refusals):
+            # A dive that is read twice has lost its bad messages once.
+            most = max((one.refusals[path] for one in self._passes if path in one.refusals), key=lambda r: r.count)
+            found += [f"{path}: {line}" for line in most.lines()]
+        return found
 
     def nodes(self, *topic_names: str) -> list[str]:
         """Return the ids of the nodes that sent on any of these topics, sorted."""
-        found = set()
-        for key in self.keys:
-            parsed = parse_key(key)
-            if parsed and parsed[0].name in topic_names:
-                found.add(parsed[1][0])
-        return sorted(found)
+        return sorted({ids[0] for ids in self.ids(*topic_names)})
+
+    def ids(self, *topic_names: str) -> list[tuple[str, ...]]:
+        """Return the ids, of nodes or pairs, that these topics have in the logs, sorted."""
+        wanted = _wanted(topic_names)
+        return sorted({parsed[1] for key in self.keys if wanted(key) and (parsed := parse_key(key))})
+
+    def messages(self, *topic_names: str, since_ns: int | None = None) -> Iterator[Envelope]:
+        """Yield the sound messages of these topics (none named: of all), by log time.
+
+        Of two outcomes of one trigger the first counts. since_ns: the least log time.
+        """
+        reading = _Pass()
+        wanted = _wanted(topic_names)
+        streams = [self._open(reader, wanted, since_ns, reading) for reader in self.readers]
+        answered: set[tuple[tuple[str, ...], int]] = set()
+        self._passes.append(reading)
+        for envelope in heapq.merge(*streams, key=lambda envelope: envelope.time_ns):
+            message = envelope.message
+            if envelope.topic in _OUTCOMES and isinstance(message, RelativePose | Rejected):
+                if (envelope.ids, message.trigger) in answered:
+                    reading.repeated["/".join(envelope.ids)] += 1
+                    continue
+                answered.add((envelope.ids, message.trigger))
+            yield envelope
+
+    def _open(
+        self, reader: DiveLogReader, wanted: Callable[[str], bool], since_ns: int | None, reading: _Pass
+    ) -> Iterator[Envelope]:
+        for record in reader.records(wanted, since_ns):
+            try:
+                yield record.open()
+            except MessageError as error:
+                reading.refusals.setdefault(reader.path, Refusals()).note(record.key, error)
 
     def records(self, *topic_names: str) -> Iterator[Record]:
-        """Yield the records of these topics (none named: of all), by log time."""
-
-        def wanted(key: str) -> bool:
-            parsed = parse_key(key)
-            return parsed is not None and (not topic_names or parsed[0].name in topic_names)
-
-        return read_logs(self.readers, wanted)
+        """Yield the records of these topics (none named: of all) unopened, by log time, for who copies them."""
+        return read_logs(self.readers, _wanted(topic_names))
 
     def metadata(self) -> dict[str, str]:
         """Return what the logs say about themselves; the first named prevails."""
@@ -100,8 +163,13 @@ class Dive:
     def _check_one_dive(self) -> dict[str, NodeInfo]:
         """Return the first NodeInfo of each node; refuse logs of which two describe one differently at one time."""
         first: dict[str, tuple[DiveLogReader, NodeInfo]] = {}
+        reading = _Pass()
+        self._passes.append(reading)
         for reader in self.readers:
-            for info in _infos_of(reader):
+            for envelope in self._open(reader, _wanted((INFO.name,)), None, reading):
+                info = envelope.message
+                if not isinstance(info, NodeInfo):
+                    continue
                 other, known = first.setdefault(info.node, (reader, info))
                 if other is reader or _rig(known) == _rig(info):
                     continue
@@ -113,8 +181,13 @@ class Dive:
         return {node: info for node, (_, info) in first.items()}
 
     def close(self) -> None:
-        """Close all logs."""
+        """Close all logs, and let the command line say what was lost."""
         self._stack.close()
+        losses.report(self.losses)
+        repeated = {key: max(one.repeated[key] for one in self._passes) for one in self._passes for key in one.repeated}
+        for pair, count in repeated.items():
+            log.warning("%s: %d second outcomes of triggers of %s left out: the first counts", self.name, count, pair)
+        self._passes.clear()
 
     def __enter__(self) -> Dive:
         return self
@@ -123,18 +196,16 @@ class Dive:
         self.close()
 
 
-def _infos_of(reader: DiveLogReader) -> Iterator[NodeInfo]:
+def _wanted(topic_names: Iterable[str]) -> Callable[[str], bool]:
+    names = frozenset(topic_names)
+    if names - _NAMES:
+        raise ValueError(f"no topic is named {', '.join(sorted(names - _NAMES))}")
+
     def wanted(key: str) -> bool:
         parsed = parse_key(key)
-        return parsed is not None and parsed[0] is INFO
+        return parsed is not None and (not names or parsed[0].name in names)
 
-    if not any(wanted(key) for key in reader.keys):
-        return
-    for record in reader.records(wanted):
-        try:
-            yield decode(record.payload, NodeInfo)
-        except MessageError:
-            continue
+    return wanted
 
 
 def _rig(info: NodeInfo) -> NodeInfo:
@@ -151,14 +222,12 @@ def load_info(path: str) -> NodeInfo:
     """Read a NodeInfo from a JSON file, or the first one of a dive log; raise an error naming the file."""
     file = Path(path)
     if file.suffix == ".mcap":
-        with DiveLogReader(file) as reader:
-            info = next(_infos_of(reader), None)
+        with Dive([file]) as dive:
+            info = next(iter(dive.infos().values()), None)
         if info is None:
             raise ConfigError(f"{path}: holds no NodeInfo")
         return info
     try:
-        return decode(file.read_bytes(), NodeInfo)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+        return read_message(file, NodeInfo)
     except MessageError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(str(error)) from error

@@ -219,8 +219,6 @@ def run(args: argparse.Namespace) -> int:
                 lap += 1
             # What was just sent is on its way: leave the recovery of lost samples its time.
             service.stop.wait(1.0)
-        for text in dive.damage:
-            log.warning("%s", text)
     log.info("play: %d messages sent, %d bad", player.sent, player.bad)
     return service.join()
 

@@ -9,11 +9,10 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import MessageError
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.service import Service
-from buddyline.protocol.topics import EVERYTHING, check_sender, parse_key
+from buddyline.protocol.topics import EVERYTHING
 from buddyline.tools.client import add_client_arguments, client_config
 
 if TYPE_CHECKING:
@@ -34,23 +33,15 @@ class BusRecorder:
 
     def __init__(self, recorder: Recorder) -> None:
         self.counts: Counter[str] = Counter()
-        self.bad = 0
+        self.refusals = Refusals("record")
         self._recorder = recorder
 
     def receive(self, received: Received) -> None:
         """Record one message; one that is not sound is counted, and said."""
-        parsed = parse_key(received.key)
-        if parsed is None:
-            self.bad += 1
+        envelope = self.refusals.open(received)
+        if envelope is None:
             return
-        try:
-            check_sender(received.key, decode(received.payload, parsed[0].schema))
-        except MessageError as error:
-            self.bad += 1
-            if self.bad.bit_count() == 1:
-                log.warning("record: bad message on %s: %s (%d so far)", received.key, error, self.bad)
-            return
-        self.counts[parsed[0].name] += 1
+        self.counts[envelope.topic.name] += 1
         self._recorder.write(received.key, received.payload, received.receive_ns)
 
 
@@ -86,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
                     print(f"\r{sum(sink.counts.values())} messages", end="\x1b[K", file=sys.stderr, flush=True)
         lost = subscriber.dropped + recorder.dropped
     total = sum(sink.counts.values())
-    print(f"{args.output}: {total} messages, {lost} dropped, {sink.bad} bad", file=sys.stderr)
+    print(f"{args.output}: {total} messages, {lost} dropped, {sink.refusals.count} bad", file=sys.stderr)
     for name, count in sorted(sink.counts.items()):
         print(f"  {count:8d} {name}", file=sys.stderr)
     return service.join()

@@ -87,8 +87,6 @@ def run(args: argparse.Namespace) -> int:
                     writer.write(key, payload, log_time_ns, getattr(message, "stamp_ns", None))
                     _write(writer, core.handle(message))
             _write(writer, core.flush())
-        for text in dive.damage:
-            log.warning("%s", text)
     _summarize(args, core, bad, time.monotonic() - began_s)
     resolved = sum(core.counts.values())
     if resolved == 0:

@@ -21,7 +21,8 @@ from buddyline.node.devices import Frame
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader, read_logs
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, CompressedImage, Depth, Imu, Message, NodeInfo
 from buddyline.protocol.pictures import with_pictures
 from buddyline.protocol.topics import ATTITUDE, DEPTH, IMAGE, IMU, INFO
@@ -100,26 +101,21 @@ class FolderCamera:
 
 
 class _Paced:
-    """Messages of one node of a log, each when its time has come."""
+    """Messages of some keys of a log, each when its time has come."""
 
-    def __init__(self, path: Path, node: str, kinds: frozenset[str], clock: Clock) -> None:
+    def __init__(self, path: Path, kinds: frozenset[str], clock: Clock) -> None:
         self._logs = ExitStack()
         self._readers = [self._logs.enter_context(DiveLogReader(file)) for file in with_pictures([path])]
-        self._path = path
-        self._node = node
+        self._refusals = Refusals(str(path))
         self._messages = self._decoded(kinds)
         self._clock = clock
         self._began_ns: int | None = None
 
     def _decoded(self, kinds: frozenset[str]) -> Iterator[Message]:
         for record in read_logs(self._readers, lambda key: key in kinds):
-            try:
-                message = record.decode()
-            except MessageError as error:
-                log.warning("%s: skipped: %s", self._path, error)
-                continue
-            if message is not None:
-                yield message
+            envelope = self._refusals.open(record)
+            if envelope is not None:
+                yield envelope.message
 
     def next_message(self, stop: threading.Event) -> Message | None:
         message = next(self._messages, None)
@@ -146,11 +142,11 @@ class DiveCamera:
             readers = [stack.enter_context(DiveLogReader(file)) for file in with_pictures([path])]
             key = INFO.key(node)
             found = next(iter(readers[0].records(lambda topic: topic == key)), None)
-            message = found.decode() if found else None
+            message = found.open().message if found else None
             if not any(IMAGE.key(node) in reader.keys for reader in readers):
                 raise ConfigError(f"{path}: holds no pictures of node {node}; topics: {', '.join(readers[0].keys)}")
         self._info = message if isinstance(message, NodeInfo) else None
-        self._paced = _Paced(path, node, frozenset({IMAGE.key(node)}), clock)
+        self._paced = _Paced(path, frozenset({IMAGE.key(node)}), clock)
         self.skipped: Counter[str] = Counter()
 
     def info(self) -> NodeInfo | None:
@@ -185,7 +181,7 @@ class DiveSensors:
 
     def __init__(self, path: Path, node: str, clock: Clock) -> None:
         kinds = frozenset({ATTITUDE.key(node), DEPTH.key(node), IMU.key(node)})
-        self._paced = _Paced(path, node, kinds, clock)
+        self._paced = _Paced(path, kinds, clock)
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample's time and return it."""

@@ -44,7 +44,7 @@ def test_own_forged_and_broken_beacons_are_not_heard():
     a.hear(received(of("b", NOW_NS), key=CLOCK.key("c")), 0.0)
     a.hear(Received(CLOCK.key("b"), b"{}", NOW_NS, CLOCK.encoding), 0.0)
     assert a.beacon(ManualClock(NOW_NS), 0.0).heard == []
-    assert a.bad == 2
+    assert a.refusals.count == 2
 
 
 def test_no_crowd_makes_a_beacon_that_nobody_takes():

@@ -3,10 +3,10 @@
 import json
 
 import pytest
-from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Mark, Rejected
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime
 from buddyline.protocol.schemas import json_schema
-from buddyline.protocol.topics import CANDIDATES, POSE, TOPICS, check_sender, key_of, parse_key
+from buddyline.protocol.topics import CANDIDATES, POSE, TOPICS, key_of, parse_key
 
 
 def test_keys_parse_back():
@@ -42,17 +42,3 @@ def test_schemas_are_flat():
         assert set(schema["required"]) <= set(schema["properties"])
         for word in ("$ref", "$defs", "anyOf", "prefixItems"):
             assert word not in text.decode()
-
-
-def test_a_message_on_the_key_of_another_is_refused():
-    mark = Mark(node="a", stamp_ns=1)
-    check_sender("buddyline/node/a/mark", mark)
-    check_sender("buddyline/node/b/unknown", mark)
-    with pytest.raises(MessageError, match="node 'a' on key buddyline/node/b/mark"):
-        check_sender("buddyline/node/b/mark", mark)
-    rejected = Rejected(node_a="a", node_b="b", stamp_ns=1, trigger=1, reason="late")
-    check_sender("buddyline/pair/a/b/rejected", rejected)
-    with pytest.raises(MessageError, match="node_a 'a', node_b 'b' on key"):
-        check_sender("buddyline/pair/b/a/rejected", rejected)
-    image = CompressedImage(timestamp=FoxgloveTime(sec=1, nsec=0), frame_id="x", data=b"", format="jpeg")
-    check_sender("buddyline/node/a/image", image)

@@ -148,8 +148,9 @@ def test_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path):
                 writer.flush()
     data = (tmp_path / "chunked.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 6 // 10])
-    status, out, _ = run(capsys, "solve", tmp_path / "cut.mcap", "-o", tmp_path / "out.mcap", "--json")
-    assert status == 0
+    status, out, err = run(capsys, "solve", tmp_path / "cut.mcap", "-o", tmp_path / "out.mcap", "--json")
+    assert status == 1
+    assert "cut.mcap: breaks off at byte" in err
     assert 5 < json.loads(out)["solved"] < 28
 
 

@@ -12,10 +12,10 @@ from typing import Any, Final
 
 from buddyline.protocol.bus import Bus, Received
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
-from buddyline.protocol.topics import CLOCK, NODE_STATUS, check_sender
+from buddyline.protocol.topics import CLOCK, NODE_STATUS
 from buddyline.tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.dives import Dive
@@ -38,7 +38,7 @@ class Heard:
     statuses: dict[str, tuple[NodeStatus, NodeStatus]] = field(default_factory=dict)
     last_s: dict[str, float] = field(default_factory=dict)
 
-    def add(self, message: Message | None, now_s: float = 0.0) -> None:
+    def add(self, message: Message, now_s: float = 0.0) -> None:
         """Take a beacon or a status; others are passed over."""
         if isinstance(message, ClockBeacon):
             self.legs.add(message)
@@ -70,15 +70,12 @@ def listen(config: ClientConfig, seconds: float, connect_within_s: float = HUB_W
 def hear(bus: Bus, seconds: float) -> Heard:
     """Hear a bus for this long; raise BuddylineError where a node falls silent meanwhile."""
     heard, began_s = Heard(), time.monotonic()
+    refusals = Refusals("calibrate clock")
 
     def take(received: Received) -> None:
-        schema = ClockBeacon if received.key.endswith("/clock") else NodeStatus
-        try:
-            message = decode(received.payload, schema)
-            check_sender(received.key, message)
-        except MessageError:
-            return
-        heard.add(message, time.monotonic() - began_s)
+        envelope = refusals.open(received)
+        if envelope is not None:
+            heard.add(envelope.message, time.monotonic() - began_s)
 
     subscriptions = [bus.subscribe(CLOCK.key_any(), take, history=False), bus.subscribe(NODE_STATUS.key_any(), take)]
     over = threading.Event()
@@ -100,11 +97,8 @@ def read(paths: list[str]) -> Heard:
     """Return what a dive's logs hold of the clocks."""
     heard = Heard()
     with Dive(paths) as dive:
-        for record in dive.records(CLOCK.name, NODE_STATUS.name):
-            try:
-                heard.add(record.decode())
-            except MessageError:
-                continue
+        for envelope in dive.messages(CLOCK.name, NODE_STATUS.name):
+            heard.add(envelope.message)
     return heard
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from buddyline.protocol.bus import Bus, Received
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo, NodeStatus
 from buddyline.protocol.security import Tls
-from buddyline.protocol.topics import INFO, NODE_STATUS, check_sender
+from buddyline.protocol.topics import INFO, NODE_STATUS
 from buddyline.tools.doctor.finding import Finding
 
 HUB_WITHIN_S: Final = 3.0
@@ -27,20 +27,17 @@ class Seen:
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
     alive: set[str] = field(default_factory=set)
+    refusals: Refusals = field(default_factory=lambda: Refusals("doctor"))
 
     def take(self, received: Received) -> None:
         """Take an info or a status; what is neither is passed over."""
-        try:
-            if received.key.endswith("/info"):
-                info = decode(received.payload, NodeInfo)
-                check_sender(received.key, info)
-                self.infos[info.node] = info
-            else:
-                status = decode(received.payload, NodeStatus)
-                check_sender(received.key, status)
-                self.statuses[status.node] = status
-        except MessageError:
+        envelope = self.refusals.open(received)
+        if envelope is None:
             return
+        if isinstance(envelope.message, NodeInfo):
+            self.infos[envelope.node] = envelope.message
+        elif isinstance(envelope.message, NodeStatus):
+            self.statuses[envelope.node] = envelope.message
 
     def alive_changed(self, name: str, alive: bool) -> None:
         """Take note of who comes and goes."""

@@ -76,7 +76,7 @@ def report_html(dive: Dive) -> str:
     title = ", ".join(reader.path.name for reader in dive.readers)
     begun = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(dive.start_ns / S_NS))
     whole_s = (dive.end_ns - dive.start_ns) / S_NS
-    warnings = [*dive.damage]
+    warnings = [*dive.losses]
     if summary.bad:
         warnings.append(f"{summary.bad} messages of the log could not be used")
     if not summary.picture.solved:
