@@ -22,13 +22,13 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import ROS
-from buddyline.protocol.service import Service
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.live import LiveClient
 
 if TYPE_CHECKING:
-    from buddyline.protocol.bus import Received
+    from buddyline.protocol.bus import Bus, Received
 
 log = logging.getLogger(__name__)
 
@@ -243,39 +243,26 @@ def type_store() -> Any:
 def run(args: argparse.Namespace) -> int:
     """Translate until stopped."""
     store = type_store()
-    config = client_config(args, ROS)
-    service = Service("ros2")
-    service.handle_signals()
+    client = LiveClient("ros2", client_config(args, ROS), args.seconds)
 
-    def follow() -> None:
-        from buddyline.protocol.zenoh_bus import connect, open_session
+    def translate(bus: Bus) -> None:
+        from buddyline.protocol.zenoh_bus import open_session
 
-        def waits(text: str) -> None:
-            log.info("ros2: %s", text)
-
-        session: Any = open_session(config.connect, stop=service.stop, on_wait=waits, tls=config.tls)
+        # ROS's keys and payloads are not ours: they go by a session of their own.
+        tls = client.config.tls
+        session: Any = open_session(client.config.connect, stop=client.stop, on_wait=log.info, tls=tls)
         if session is None:
             return
-        namespace = config.namespace or None
-        bus = connect(config.connect, namespace=namespace, stop=service.stop, on_wait=waits, tls=config.tls)
-        if bus is None:
-            session.close()
-            return
         try:
-            with bus:
-                bus.on_failure(lambda error: service.fail("bus", error))
-                graph = RosGraph(session, store, SystemClock(), args.domain)
-                bridge = Bridge(Translation(store.types), graph)
-                bus.subscribe(INFO.key_any(), bridge.receive, capacity=64)
-                for topic in (ATTITUDE, DEPTH, POSE):
-                    bus.subscribe(topic.key_any(), bridge.receive, capacity=256, history=False)
-                service.stop.wait()
+            bridge = Bridge(Translation(store.types), RosGraph(session, store, SystemClock(), args.domain))
+            bus.subscribe(INFO.key_any(), bridge.receive, capacity=64)
+            for topic in (ATTITUDE, DEPTH, POSE):
+                bus.subscribe(topic.key_any(), bridge.receive, capacity=256, history=False)
+            client.wait()
         finally:
             session.close()
 
-    service.spawn("bus", follow)
-    service.wait(args.seconds)
-    return service.join()
+    return client.run(translate)
 
 
 class Bridge:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
-from buddyline.node.sim.camera import pinhole
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel
 from buddyline.protocol.topics import check_node_id
@@ -152,7 +151,12 @@ class Scenario:
     def camera(self, index: int) -> CameraModel:
         """Return the camera of A (0) or B (1)."""
         own = (self.camera_a, self.camera_b)[index]
-        return own if own is not None else pinhole(self.width_px, self.height_px)
+        if own is not None:
+            return own
+        # Commands name the environments in their help: it shall not take the time to import numpy.
+        from buddyline.node.sim.camera import pinhole
+
+        return pinhole(self.width_px, self.height_px)
 
     def baseline_m(self, index: int) -> float:
         """Return the spacing of the lights of A (0) or B (1)."""

@@ -5,14 +5,18 @@ from __future__ import annotations
 import argparse
 import logging
 import webbrowser
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.service import Service
-from buddyline.tools.client import ClientConfig, add_client_arguments, client_config
+from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.live import LiveClient
 from buddyline.tools.monitor.inbox import Inbox
 from buddyline.tools.monitor.page import DEFAULT_HOST, DEFAULT_PORT, Page, open_server
 from buddyline.tools.monitor.picture import PairPicture
+
+if TYPE_CHECKING:
+    from buddyline.protocol.bus import Bus
 
 log = logging.getLogger(__name__)
 
@@ -53,36 +57,20 @@ def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until stopped."""
-    config = client_config(args)
-    service = Service("monitor")
-    service.handle_signals()
+    client = LiveClient("monitor", client_config(args), args.seconds)
     page = open_page(args, "Buddyline", live=True)
     clock = SystemClock()
     inbox = Inbox(clock)
-    service.spawn("bus", lambda: _follow(service, config, inbox))
-    service.spawn("page", lambda: _draw(service, page, inbox, clock))
-    service.wait(args.seconds)
-    status = service.join()
-    page.close()
-    return status
+    client.spawn("page", lambda: _draw(client, page, inbox, clock))
 
-
-def _follow(service: Service, config: ClientConfig, inbox: Inbox) -> None:
-    from buddyline.protocol.zenoh_bus import connect
-
-    bus = connect(
-        config.connect,
-        namespace=config.namespace or None,
-        stop=service.stop,
-        on_wait=lambda text: log.info("monitor: %s", text),
-        tls=config.tls,
-    )
-    if bus is None:
-        return
-    with bus:
-        bus.on_failure(lambda error: service.fail("bus", error))
+    def follow(bus: Bus) -> None:
         inbox.subscribe(bus)
-        service.stop.wait()
+        client.wait()
+
+    try:
+        return client.run(follow)
+    finally:
+        page.close()
 
 
 def _draw(service: Service, page: Page, inbox: Inbox, clock: Clock) -> None:

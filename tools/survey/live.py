@@ -14,9 +14,9 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import SURVEYOR
-from buddyline.protocol.service import Service
 from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
 from buddyline.tools.client import client_config
+from buddyline.tools.live import LiveClient
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.derive import one_leg
 from buddyline.tools.survey.magnetism import Field, field_of
@@ -149,22 +149,10 @@ class Watch:
 
 def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
     """Watch a bus until stopped."""
-    from buddyline.protocol.zenoh_bus import connect
+    client = LiveClient("survey watch", client_config(args, SURVEYOR), seconds)
 
-    service = Service("survey watch")
-    service.handle_signals()
-    config = client_config(args, SURVEYOR)
-    bus = connect(
-        config.connect,
-        namespace=config.namespace or None,
-        stop=service.stop,
-        on_wait=lambda text: log.info("survey watch: %s", text),
-        tls=config.tls,
-    )
-    if bus is None:
-        return service.join()
-    with bus:
-        bus.on_failure(lambda error: service.fail("bus", error))
+    def watch(bus: Bus) -> None:
         Watch(bus).attach()
-        service.wait(seconds)
-    return service.join()
+        client.wait()
+
+    return client.run(watch)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import logging
-import threading
+from typing import TYPE_CHECKING
 
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
@@ -12,10 +11,12 @@ from buddyline.protocol.messages import Mark
 from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.live import LiveClient
 from buddyline.tools.survey.marks import KINDS, stamp_ns_of
 from buddyline.tools.survey.project import STATION_NAME
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from buddyline.protocol.bus import Bus
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--note", default="", metavar="TEXT")
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
     add_client_arguments(parser, SURVEYOR)
+    parser.add_argument(
+        "--seconds", type=float, metavar="S", help="give up after this long without a hub; default: wait for it"
+    )
     parser.add_argument("--linger", type=float, default=1.0, metavar="S", help="stay on the bus so long; default: 1")
 
 
@@ -44,23 +48,17 @@ def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
 
 def run(args: argparse.Namespace) -> int:
     """Publish one mark."""
-    from buddyline.protocol.zenoh_bus import connect
-
     mark = mark_of(args, SystemClock().now_ns())
-    stop = threading.Event()
-    config = client_config(args, SURVEYOR)
-    bus = connect(
-        config.connect,
-        namespace=config.namespace or None,
-        stop=stop,
-        on_wait=lambda text: log.info("mark: %s", text),
-        tls=config.tls,
-    )
-    if bus is None:
-        return 2
-    with bus:
-        bus.publisher(MARK, mark.node).put(mark)
+    client = LiveClient("mark", client_config(args, SURVEYOR), args.seconds)
+    marked = False
+
+    def publish(bus: Bus) -> None:
+        nonlocal marked
+        marked = bus.publisher(MARK, mark.node).put(mark)
         # Who records subscribes to the cache as well: leaving at once could take the mark along.
-        stop.wait(args.linger)
-    print(f"{mark.kind} {mark.name or mark.note}: node {mark.node}")
-    return 0
+        client.stop.wait(args.linger)
+
+    status = client.run(publish)
+    if marked:
+        print(f"{mark.kind} {mark.name or mark.note}: node {mark.node}")
+    return status

@@ -1,0 +1,132 @@
+"""Commands on the bus end in good order, whether a hub answers or not; the demo tells at once what died."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.live import LiveClient, NoHubError, open_bus_within
+from buddyline.tools.measure.children import Child, end_all, free_endpoint
+
+from tests.processes import Process, buddyline
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["record", "out.mcap"],
+        ["survey", "watch"],
+        ["mark", "T4", "--node", "a"],
+        ["ros2"],
+        ["monitor", "--port", "0"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_command_without_a_hub_ends_when_its_time_is_over(tmp_path, words):
+    for module in {"ros2": ["rosbags"], "monitor": ["viser"]}.get(words[0], []):
+        pytest.importorskip(module)
+    endpoint = free_endpoint()
+    done = buddyline(*words, "--connect", endpoint, "--seconds", "0.5", timeout=30.0, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert f"no hub at {endpoint} within 0.5 s" in done.stderr
+
+
+def test_ctrl_c_ends_the_wait_for_a_hub(tmp_path):
+    with Process("record", tmp_path / "out.mcap", "--connect", free_endpoint()) as record:
+        record.wait_for("waiting for it")
+        record.send(signal.SIGINT)
+        assert record.wait(timeout=10.0) == 130
+
+
+def test_a_hub_that_does_not_answer_in_time_is_an_error():
+    with pytest.raises(NoHubError, match=r"within 0\.2 s"):
+        open_bus_within(ClientConfig(connect=free_endpoint()), 0.2)
+
+
+def test_time_over_with_a_hub_is_no_error(monkeypatch):
+    endpoint = free_endpoint()
+    monkeypatch.setattr(LiveClient, "handle_signals", lambda self: None)
+    with Child("hub", "--listen", endpoint):
+        open_bus_within(ClientConfig(connect=endpoint), 20.0).close()
+        client = LiveClient("test", ClientConfig(connect=endpoint), seconds=1.0)
+        assert client.run(lambda bus: client.wait()) == 0
+
+        def fails(_):
+            raise BuddylineError("no disk")
+
+        with pytest.raises(BuddylineError, match="no disk"):
+            LiveClient("test", ClientConfig(connect=endpoint)).run(fails)
+
+
+def test_a_child_says_how_it_died_and_what_it_takes():
+    child, dead = Child("hub", "--listen", free_endpoint()), Child("hub", "--config", "none.toml", name="second")
+    try:
+        assert child.load().rss_bytes > 2**20
+        assert child.death() is None
+        while (death := dead.death()) is None:
+            time.sleep(0.02)
+        assert death.startswith("second ended with status 2: ")
+        assert "none.toml" in death
+    finally:
+        assert end_all([child, dead], within_s=20.0) == []
+
+
+def children_named(pid: int) -> dict[str, int]:
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
+            words = (process / "cmdline").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if parent == pid and b"buddyline" in words:
+            found[words[words.index(b"buddyline") + 1].decode()] = int(process.name)
+    return found
+
+
+def test_a_demo_whose_solver_dies_says_so_and_ends():
+    demo = Process("demo", "--environment", "basin", "--rate", "4")
+    try:
+        demo.wait_for(" s  ", timeout=60.0)
+        os.kill(children_named(demo.pid)["solver"], signal.SIGKILL)
+        assert demo.wait(timeout=20.0) == 2
+        assert "solver ended with status -9" in demo.lines[-1]
+        assert children_named(demo.pid) == {}
+    finally:
+        demo.end()
+
+
+STUB = """
+import sys
+from buddyline.tools.measure import children
+children.free_endpoint = lambda: "tcp/127.0.0.1:{port}"
+from buddyline.tools.cli import main
+sys.exit(main(["demo"]))
+"""
+
+
+def test_a_demo_whose_hub_cannot_start_ends_with_the_reason(tmp_path):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        program = STUB.format(port=taken.getsockname()[1])
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "hub ended with status 2" in done.stderr.splitlines()[-1]
+
+
+def test_nothing_in_the_current_folder_takes_the_place_of_the_program(tmp_path):
+    for name in ("protocol", "tools", "node", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not me')\n")
+    script = Path(sys.executable).with_name("buddyline")
+    words = [script, "demo", "--environment", "basin", "--rate", "4", "--seconds", "5", "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["poses"] > 0

@@ -1,0 +1,39 @@
+"""What a process takes of the machine: memory, open files, processor time (Linux)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from buddyline.protocol.errors import BuddylineError
+
+
+@dataclass(frozen=True)
+class Load:
+    """rss_bytes: resident memory; files: open file descriptors; cpu_s: processor time since the process began."""
+
+    rss_bytes: int
+    files: int
+    cpu_s: float
+
+    @property
+    def rss_mib(self) -> float:
+        """Resident memory, MiB."""
+        return self.rss_bytes / 2**20
+
+
+def load_of(pid: int | None = None) -> Load:
+    """Return what a process takes (None: this one); raise BuddylineError where it has ended, or on another system."""
+    process = Path(f"/proc/{os.getpid() if pid is None else pid}")
+    try:
+        fields = (process / "stat").read_text().rpartition(")")[2].split()
+        pages = int((process / "statm").read_text().split()[1])
+        files = len(os.listdir(process / "fd"))
+    except (OSError, ValueError, IndexError) as error:
+        raise BuddylineError(f"process {process.name} cannot be measured: {error}") from error
+    return Load(
+        rss_bytes=pages * os.sysconf("SC_PAGE_SIZE"),
+        files=files,
+        cpu_s=(int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"),
+    )
