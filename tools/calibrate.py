@@ -15,6 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, NodeInfo, Vector3
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.dives import load_info
+from buddyline.tools.newfile import write_new
 
 log = logging.getLogger(__name__)
 
@@ -246,13 +247,7 @@ def _millimetres(sigma_m: np.ndarray) -> str:
 
 
 def _write_info(path: str, info: NodeInfo) -> None:
-    try:
-        with open(path, "xb") as file:
-            file.write(encode(info))
-    except FileExistsError:
-        raise BuddylineError(f"{path}: exists; name another or remove it first") from None
-    except OSError as error:
-        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    write_new(path, encode(info))
     log.info("%s: for solve --info %s=%s", path, info.node, path)
 
 

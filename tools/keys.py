@@ -12,6 +12,7 @@ from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 from buddyline.protocol.topics import check_node_id
+from buddyline.tools.newfile import write_new
 
 if TYPE_CHECKING:
     from buddyline.tools.authority import Authority
@@ -74,7 +75,7 @@ def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Pa
         f"{_tls_table(HUB)}"
     )
     path = directory / "hub.toml"
-    _write_new(path, text)
+    write_new(path, text)
     _say(f"{authority.key_path} makes certificates: it stays on this machine, and is copied nowhere")
     return [*made, path]
 
@@ -85,7 +86,7 @@ def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[P
     path = authority.directory / f"{name}.toml"
     connect = f'connect = "tls/{authority.hub_host()}:{PORT}"\n\n{_tls_table(name)}'
     first = f'node = "{args.node}"\n' if args.whose == "node" else ""
-    _write_new(
+    write_new(
         path, f"# For the configuration of {name}; ca.crt, {name}.crt and {name}.key go beside it.\n{first}{connect}"
     )
     if args.whose == "node":
@@ -114,16 +115,6 @@ def _admit(path: Path, node: str) -> None:
     listed = ", ".join(f'"{word}"' for word in sorted(nodes))
     path.write_text(f"{text[: line.start()]}nodes = [{listed}]{text[line.end() :]}", encoding="utf-8")
     _say(f"{path}: node {node} may publish; a hub that runs reads it when it is started again")
-
-
-def _write_new(path: Path, text: str) -> None:
-    try:
-        with open(path, "x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise BuddylineError(f"{path}: exists; nothing is overwritten, remove it first") from None
-    except OSError as error:
-        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def _say(text: str) -> None:

@@ -23,6 +23,7 @@ from buddyline.tools.survey.lines import bearing_of, line_of
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.readings import of_messages
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
+from buddyline.tools.survey.sheet import Sheet
 
 from tests.tools import survey_world as world
 
@@ -92,8 +93,8 @@ def _cavern(legs, directory, figures):
     for depth in ("absolute", "readings"):
         project = world.project_of(legs, depth)
         adjusted = adjust(project)
-        texts = {style: survex.readings(project, adjusted, style) for style in ("auto", "diving", "normal")}
-        for style, text in (texts | {"cartesian": survex.cartesian(project, adjusted)}).items():
+        texts = {style: survex.svx(Sheet(project, adjusted), style) for style in ("auto", "diving", "normal")}
+        for style, text in (texts | {"cartesian": survex.svx_cartesian(Sheet(project, adjusted))}).items():
             said, ratios, found = world.cavern(directory, text)
             which = f"{style}, {depth}"
             figures[f"cavern's warnings, {which}"].append(len(said))

@@ -182,7 +182,7 @@ def test_help_is_quick_because_heavy_imports_stay_where_they_are_used():
     import subprocess
     import sys
 
-    code = "import sys; from tools.cli import main; main(['--help']); print(sorted(sys.modules))"
+    code = "import sys; from buddyline.tools.cli import main; main(['--help']); print(sorted(sys.modules))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     for heavy in ("numpy", "cv2", "zenoh", "mcap", "msgspec", "matplotlib"):
         assert f"'{heavy}'" not in out

@@ -9,9 +9,10 @@ import subprocess
 import numpy as np
 import pytest
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey import compass, drawing, report, survex, tables, therion
+from buddyline.tools.survey import drawing, report, survex, tables
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import Edit, FixedPoint, Place
+from buddyline.tools.survey.sheet import Sheet
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
@@ -49,7 +50,7 @@ def differences(adjusted, found, *, shift=False):
 @pytest.mark.parametrize("make", [world.line, world.loop])
 def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
     project, adjusted = survey(make, depth=depth, **PLACES[place])
-    said, ratios, found = world.cavern(tmp_path, survex.readings(project, adjusted))
+    said, ratios, found = world.cavern(tmp_path, survex.svx(Sheet(project, adjusted)))
     assert not said
     assert max(differences(adjusted, found)) <= SAME_M
     assert len(ratios) == len(adjusted.loops)
@@ -62,9 +63,9 @@ def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
 @pytest.mark.parametrize("style", ["diving", "normal"])
 def test_cavern_takes_all_legs_in_one_style(tmp_path, style):
     project, adjusted = survey(depth="readings")
-    text = survex.readings(project, adjusted, style)
-    assert (survex.DIVING in text) == (style == "diving")
-    assert (survex.NORMAL in text) == (style == "normal")
+    text = survex.svx(Sheet(project, adjusted), style)
+    assert (survex.SURVEX.diving in text) == (style == "diving")
+    assert (survex.SURVEX.normal in text) == (style == "normal")
     said, ((h, v),), found = world.cavern(tmp_path, text)
     assert not said
     assert h == pytest.approx(adjusted.loops[0].horizontal_ratio, rel=0.1)
@@ -76,7 +77,7 @@ def test_cavern_takes_all_legs_in_one_style(tmp_path, style):
 @CAVERN
 def test_held_depths_cost_nothing_but_cavern_s_own_rounding(tmp_path):
     project, adjusted = survey(legs=25, seed=4)
-    _, _, found = world.cavern(tmp_path, survex.readings(project, adjusted))
+    _, _, found = world.cavern(tmp_path, survex.svx(Sheet(project, adjusted)))
     assert max(differences(adjusted, found)) <= 0.0055
 
 
@@ -88,9 +89,9 @@ def test_cavern_agrees_on_crossing_loops_side_shots_and_steep_legs(tmp_path):
     course.legs += [(2, 8, 0), (4, 12, 0), (2, 13, 1), (4, 5, 0)]
     project = world.project_of(world.readings_of(course, np.random.default_rng(2)))
     adjusted = adjust(project)
-    text = survex.readings(project, adjusted)
-    assert survex.NORMAL in text
-    assert survex.DIVING in text
+    text = survex.svx(Sheet(project, adjusted))
+    assert survex.SURVEX.normal in text
+    assert survex.SURVEX.diving in text
     said, _, found = world.cavern(tmp_path, text)
     assert not said
     assert max(differences(adjusted, found)) <= SAME_M
@@ -102,7 +103,7 @@ def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
     legs = world.readings_of(course, np.random.default_rng(2))
     legs[1] = replace(legs[1], back_azimuth_deg=(legs[1].back_azimuth_deg + 15) % 360)
     project = world.project_of(legs)
-    said, _, found = world.cavern(tmp_path, survex.readings(project, adjust(project)))
+    said, _, found = world.cavern(tmp_path, survex.svx(Sheet(project, adjust(project))))
     assert not said
     assert found
 
@@ -111,7 +112,7 @@ def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
 @pytest.mark.parametrize("place", list(PLACES))
 def test_cavern_takes_cartesian_vectors(tmp_path, place):
     project, adjusted = survey(world.line, **PLACES[place])
-    said, _, found = world.cavern(tmp_path, survex.cartesian(project, adjusted))
+    said, _, found = world.cavern(tmp_path, survex.svx_cartesian(Sheet(project, adjusted)))
     assert not said
     assert max(differences(adjusted, found)) <= SAME_M
 
@@ -122,7 +123,7 @@ def test_cavern_reads_compass_data(tmp_path):
     # Of a .dat file cavern 1.4 reads foresights alone.
     project = replace(project, edit=[Edit(leg=leg.name, compass="fore") for leg in project.leg], leg=project.leg)
     adjusted = adjust(replace(project, leg=[replace(leg, disturbed=[]) for leg in project.leg]))
-    said, _, found = world.cavern(tmp_path, compass.dat(project, adjusted), "survey.dat")
+    said, _, found = world.cavern(tmp_path, tables.compass_dat(Sheet(project, adjusted)), "survey.dat")
     assert not said
     assert max(differences(adjusted, found, shift=True)) <= 2 * SAME_M
 
@@ -131,7 +132,7 @@ def test_cavern_reads_compass_data(tmp_path):
 @pytest.mark.parametrize("place", ["nowhere", "declination"])
 def test_therion_compiles(tmp_path, place):
     project, adjusted = survey(world.line, **PLACES[place])
-    (tmp_path / "survey.th").write_text(therion.centreline(project, adjusted))
+    (tmp_path / "survey.th").write_text(survex.th(Sheet(project, adjusted)))
     (tmp_path / "thconfig").write_text("source survey.th\nexport model -o survey.3d -fmt survex\n")
     done = subprocess.run(["therion", "-q"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stdout[-500:]
@@ -141,14 +142,14 @@ def test_therion_compiles(tmp_path, place):
 
 def test_an_unknown_declination_is_never_written():
     project, adjusted = survey(place=Place())
-    text = survex.readings(project, adjusted)
+    text = survex.svx(Sheet(project, adjusted))
     assert "*declination" not in text
     assert "declination not known" in text
-    assert "\n    declination" not in therion.centreline(project, adjusted)
+    assert "\n    declination" not in survex.th(Sheet(project, adjusted))
     with pytest.raises(BuddylineError, match="declination"):
-        compass.dat(project, adjusted)
+        tables.compass_dat(Sheet(project, adjusted))
     with pytest.raises(BuddylineError, match="declination"):
-        tables.geojson(project, adjusted)
+        tables.geojson(Sheet(project, adjusted))
 
 
 def test_readings_people_instruments_and_notes_are_in_the_export():
@@ -158,7 +159,7 @@ def test_readings_people_instruments_and_notes_are_in_the_export():
         survey=replace(project.survey, notes="silt at 4", instruments={"depth": "MS5837"}),
         edit=[Edit(leg="0-1", note="second try")],
     )
-    text = survex.readings(project, adjusted)
+    text = survex.svx(Sheet(project, adjusted))
     for words in ('*team "A. Diver"', '*instrument depth "MS5837"', "; silt at 4", "second try", "*date 2026.05.01"):
         assert words in text
     assert "*declination -12.3000 degrees" in text
@@ -179,14 +180,14 @@ def test_readings_people_instruments_and_notes_are_in_the_export():
 def test_tables():
     point = replace(survey()[0].leg[0], to="amphora", note="neck up")
     project, adjusted = survey(points=[point], **PLACES["utm"])
-    legs = list(csv.DictReader(io.StringIO(tables.legs_csv(project, adjusted))))
+    legs = list(csv.DictReader(io.StringIO(tables.legs_csv(Sheet(project, adjusted)))))
     assert [row["from"] for row in legs] == [leg.from_ for leg in [*project.leg, point]]
     assert legs[3]["alarms"].startswith("field")
-    stations = {row["name"]: row for row in csv.DictReader(io.StringIO(tables.stations_csv(project, adjusted)))}
+    stations = {row["name"]: row for row in csv.DictReader(io.StringIO(tables.stations_csv(Sheet(project, adjusted))))}
     assert stations["amphora"]["kind"] == "point"
     assert float(stations["0"]["latitude_deg"]) == pytest.approx(45.5, abs=1e-7)
     assert float(stations["amphora"]["ellipse_major_m"]) > 0
-    collection = json.loads(tables.geojson(project, adjusted))
+    collection = json.loads(tables.geojson(Sheet(project, adjusted)))
     kinds = [feature["properties"]["kind"] for feature in collection["features"]]
     assert (kinds.count("station"), kinds.count("point"), kinds.count("leg")) == (14, 1, 14)
     longitude, latitude, _ = collection["features"][0]["geometry"]["coordinates"]
@@ -197,8 +198,8 @@ def test_geojson_of_a_local_grid_is_where_the_survey_is():
     fix = FixedPoint(station="0", latitude_deg=45.5, longitude_deg=9.2)
     project, adjusted = survey(fix=[fix], place=Place(declination_deg=3.65, declination_source="chart"))
     utm, _ = survey(**PLACES["utm"])
-    one = json.loads(tables.geojson(project, adjusted))["features"]
-    other = json.loads(tables.geojson(utm, adjust(utm)))["features"]
+    one = json.loads(tables.geojson(Sheet(project, adjusted)))["features"]
+    other = json.loads(tables.geojson(Sheet(utm, adjust(utm))))["features"]
     for a, b in zip(one, other, strict=True):
         if a["geometry"]["type"] == "Point":
             # A ten-millionth of a degree is a centimetre; the grids differ by UTM's scale.
@@ -217,7 +218,7 @@ def test_drawings_and_report_hold_every_station():
     assert pdf.rstrip().endswith(b"%%EOF")
     start = int(pdf.split(b"startxref\n")[1].split()[0])
     assert pdf[start:].startswith(b"xref")
-    page = report.page(project, adjusted)
+    page = report.page(Sheet(project, adjusted))
     assert page.count("<svg") == 2
     assert "misclosure" in page
     assert "ALARM: leg 3-4" in page

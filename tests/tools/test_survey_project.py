@@ -72,6 +72,17 @@ def test_a_project_from_dive_to_exports(tmp_path, logs, capsys):
     assert "<svg" in (tmp_path / "cave.html").read_text()
 
 
+@pytest.mark.parametrize("words", [["report"], ["export", "--format", "svx"], ["export", "--format", "pdf"]])
+def test_exports_and_reports_refuse_to_overwrite(tmp_path, logs, words):
+    path = tmp_path / "cave.toml"
+    run("legs", path, "--dive", *logs)
+    for precious in (tmp_path / "solved.mcap", path):
+        before = precious.read_bytes()
+        with pytest.raises(BuddylineError, match=f"{precious.name}: exists"):
+            run(words[0], path, *words[1:], "-o", precious)
+        assert precious.read_bytes() == before
+
+
 def test_what_people_write_stays_and_the_old_file_is_kept(tmp_path, logs):
     path = tmp_path / "cave.toml"
     run("legs", path, "--dive", *logs)

@@ -9,6 +9,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.newfile import write_new
 from numpy.typing import NDArray
 
 # Five bits and a border are seven modules; a square of ten leaves a white rim around the marker, and makes the
@@ -62,13 +63,7 @@ class Board:
 
     def write_pdf(self, path: Path) -> None:
         """Write one page of the board's true size."""
-        try:
-            with path.open("xb") as file:
-                file.write(self._pdf())
-        except FileExistsError:
-            raise BuddylineError(f"{path}: exists; name another or remove it first") from None
-        except OSError as error:
-            raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+        write_new(path, self._pdf())
 
     def _pdf(self) -> bytes:
         black = self.modules()

@@ -5,113 +5,97 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
+from collections.abc import Callable
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import SURVEYOR
 from buddyline.tools.client import add_client_arguments
-from msgspec.structs import replace
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from buddyline.tools.survey.network import Adjusted
-    from buddyline.tools.survey.project import Project
+    from buddyline.tools.survey.sheet import Sheet
 
-FORMATS: Final = ("svx", "svx-cartesian", "th", "dat", "csv", "stations", "geojson", "svg", "profile", "pdf")
-SUFFIXES: Final = {
+# Format to the ending of its file, beside the project.
+FORMATS: Final = {
+    "svx": ".svx",
     "svx-cartesian": ".svx",
+    "th": ".th",
+    "dat": ".dat",
+    "csv": ".csv",
     "stations": ".stations.csv",
+    "geojson": ".geojson",
+    "svg": ".svg",
     "profile": ".profile.svg",
+    "pdf": ".pdf",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     does = parser.add_subparsers(dest="does", required=True, metavar="{legs,adjust,report,export,watch}")
-    legs = does.add_parser("legs", help="make legs of the project's dives, or begin a project with --dive")
-    legs.add_argument("project", metavar="PROJECT.toml")
+
+    def add(name: str, text: str, runs: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+        one = does.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        one.set_defaults(survey=runs)
+        if runs is not _watch:
+            one.add_argument("project", metavar="PROJECT.toml", type=Path)
+        if runs not in (_watch, _legs):
+            one.add_argument(
+                "--depth",
+                choices=("absolute", "readings"),
+                help="absolute: hold each station at the mean of its gauges; readings: each leg keeps its own two "
+                "depths; default: what the project says",
+            )
+        return one
+
+    legs = add("legs", "make legs from the project's dives; with --dive, begin a new project", _legs)
     legs.add_argument("--dive", nargs="+", metavar="LOG.mcap", help="new project: the solved log, and each node's own")
-    legs.add_argument("--marks", metavar="TIMES.csv", help="columns time, node, name, and perhaps kind and note")
-    for name, text in (
-        ("adjust", "adjust the network: loops, residuals, blunders"),
-        ("report", "write an HTML report"),
-    ):
-        one = does.add_parser(name, help=text)
-        one.add_argument("project", metavar="PROJECT.toml")
-        _depth_argument(one)
-        if name == "adjust":
-            one.add_argument("--json", action="store_true")
-        else:
-            one.add_argument("-o", "--output", metavar="REPORT.html")
-    export = does.add_parser("export", help="write the survey for other programs")
-    export.add_argument("project", metavar="PROJECT.toml")
+    legs.add_argument(
+        "--marks", type=Path, metavar="TIMES.csv", help="columns: time, node, name, and optionally kind and note"
+    )
+    adjust = add("adjust", "adjust the network and print loops, residuals and probable blunders", _adjust)
+    adjust.add_argument("--json", action="store_true", help="print everything as one JSON object")
+    report = add("report", "write an HTML report", _report)
+    report.add_argument("-o", "--output", metavar="REPORT.html", help="default: beside the project")
+    export = add("export", "write the survey for other programs", _export)
     export.add_argument("--format", choices=FORMATS, default="svx", help="default: svx (Survex)")
     export.add_argument(
         "--style",
         choices=("auto", "diving", "normal"),
         default="auto",
         help="of svx: diving (tape, compass, depths) or normal (tape, compass, clino); default: diving, but normal for "
-        "legs of loops, because no Survex up to 1.4.22 adjusts loops of diving legs rightly",
+        "legs in loops, because no Survex up to 1.4.22 adjusts loops of diving legs correctly",
     )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
-    _depth_argument(export)
-    watch = does.add_parser("watch", help="say on the bus, live, when sights, fields or depths disagree")
+    watch = add("watch", "publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch)
     add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
-def _depth_argument(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--depth",
-        choices=("absolute", "readings"),
-        help="hold stations at their gauges' mean, or let each leg keep its two readings; default: the project's",
-    )
-
-
 def run(args: argparse.Namespace) -> int:
-    """Run a subcommand; return 1 where adjustment finds a blunder."""
-    if args.does == "watch":
-        from buddyline.tools.survey.live import run_watch
-
-        return run_watch(args, args.seconds)
-    path = Path(args.project)
-    if args.does == "legs":
-        return _legs(path, args.dive, args.marks)
-    from buddyline.tools.survey.network import adjust
-    from buddyline.tools.survey.project import AdjustSettings, load_project
-
-    project = load_project(path)
-    if args.depth:
-        project = replace(project, adjust=AdjustSettings(depth=args.depth))
-    adjusted = adjust(project)
-    if args.does == "export":
-        return _export(path, args, project, adjusted)
-    from buddyline.tools.survey import report
-
-    if args.does == "report":
-        output = args.output or str(path.with_suffix(".html"))
-        _write(output, report.page(project, adjusted))
-        return 0
-    if args.json:
-        print(json.dumps(_as_json(adjusted), allow_nan=False))
-    else:
-        print("\n".join(report.summary(project, adjusted)))
-    return 1 if adjusted.blunders else 0
+    """Run a subcommand."""
+    status: int = args.survey(args)
+    return status
 
 
-def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
+def _watch(args: argparse.Namespace) -> int:
+    from buddyline.tools.survey.live import run_watch
+
+    return run_watch(args, args.seconds)
+
+
+def _legs(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.derive import Derived
     from buddyline.tools.survey.marks import of_project, of_table
     from buddyline.tools.survey.project import load_project, new_project, write_derived
     from buddyline.tools.survey.readings import of_logs
 
-    if dive:
-        new_project(path, path.stem, [os.path.relpath(log, path.parent) for log in dive])
+    path: Path = args.project
+    if args.dive:
+        new_project(path, path.stem, [os.path.relpath(log, path.parent) for log in args.dive])
     project = load_project(path)
     if not project.dive:
         raise BuddylineError(f"{path}: names no dive; add [[dive]] with its logs")
@@ -120,8 +104,8 @@ def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
         readings = of_logs([str(path.parent / log) for log in one.logs])
         start_ns = int(readings.stamps_ns[0])
         by_hand = of_project(project.mark, number, start_ns)
-        if table and number == 1:
-            by_hand += of_table(Path(table), start_ns)
+        if args.marks and number == 1:
+            by_hand += of_table(args.marks, start_ns)
         readings.marks.extend(by_hand)
         readings.marks.sort(key=lambda mark: mark.stamp_ns)
         derived.add(readings, project.settings, project.alarms, number)
@@ -136,47 +120,71 @@ def _legs(path: Path, dive: list[str] | None, table: str | None) -> int:
     return 0 if derived.legs or derived.points else 1
 
 
-def _export(path: Path, args: argparse.Namespace, project: Project, adjusted: Adjusted) -> int:
-    from buddyline.tools.survey import compass, drawing, survex, tables, therion
+def _sheet(args: argparse.Namespace) -> Sheet:
+    """Return the project's survey, adjusted."""
+    from buddyline.tools.survey.network import adjust
+    from buddyline.tools.survey.project import AdjustSettings, load_project
+    from buddyline.tools.survey.sheet import Sheet
+    from msgspec.structs import replace
 
-    kind = args.format
-    if args.style != "auto" and kind != "svx":
-        raise BuddylineError(f"--style is of svx; {kind} has one style")
-    title = project.survey.title or project.survey.name
-    target = args.output or str(path.with_suffix(SUFFIXES.get(kind, f".{kind}")))
-    if kind == "pdf":
-        content: str | bytes = drawing.pdf([drawing.plan(adjusted, title), drawing.profile(adjusted, title)])
-    elif kind in ("svg", "profile"):
-        content = (drawing.plan if kind == "svg" else drawing.profile)(adjusted, title).svg()
+    project = load_project(args.project)
+    if args.depth:
+        project = replace(project, adjust=AdjustSettings(depth=args.depth))
+    return Sheet(project, adjust(project))
+
+
+def _adjust(args: argparse.Namespace) -> int:
+    """Print the adjustment; return 1 where it finds a blunder."""
+    from buddyline.tools.survey import report
+
+    sheet = _sheet(args)
+    if args.json:
+        print(json.dumps(as_json(sheet.adjusted), allow_nan=False))
     else:
-        writers: dict[str, Callable[[Project, Adjusted], str]] = {
-            "svx": partial(survex.readings, style=args.style),
-            "svx-cartesian": survex.cartesian,
-            "th": therion.centreline,
-            "dat": compass.dat,
-            "csv": tables.legs_csv,
-            "stations": tables.stations_csv,
-            "geojson": tables.geojson,
-        }
-        content = writers[kind](project, adjusted)
-    _write(target, content)
+        print("\n".join(report.summary(sheet)))
+    return 1 if sheet.adjusted.blunders else 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    from buddyline.tools.newfile import write_output
+    from buddyline.tools.survey import report
+
+    write_output(args.output or str(args.project.with_suffix(".html")), report.page(_sheet(args)))
     return 0
 
 
-def _write(target: str, content: str | bytes) -> None:
-    data = content.encode() if isinstance(content, str) else content
-    if target == "-":
-        sys.stdout.buffer.write(data)
-        sys.stdout.flush()
-        return
-    try:
-        Path(target).write_bytes(data)
-    except OSError as error:
-        raise BuddylineError(f"{target}: cannot be written: {error.strerror}") from error
-    print(f"wrote {target}", file=sys.stderr)
+def _export(args: argparse.Namespace) -> int:
+    from buddyline.tools.newfile import write_output
+
+    if args.style != "auto" and args.format != "svx":
+        raise BuddylineError(f"--style is an option of svx; {args.format} has one style")
+    target = args.output or str(args.project.with_suffix(FORMATS[args.format]))
+    write_output(target, exported(_sheet(args), args.format, args.style))
+    return 0
 
 
-def _as_json(adjusted: Adjusted) -> dict[str, object]:
+def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
+    """Return a survey in one of FORMATS."""
+    from buddyline.tools.survey import drawing, survex, tables
+
+    adjusted, title = sheet.adjusted, sheet.title
+    writers: dict[str, Callable[[], str | bytes]] = {
+        "svx": lambda: survex.svx(sheet, style),
+        "svx-cartesian": lambda: survex.svx_cartesian(sheet),
+        "th": lambda: survex.th(sheet),
+        "dat": lambda: tables.compass_dat(sheet),
+        "csv": lambda: tables.legs_csv(sheet),
+        "stations": lambda: tables.stations_csv(sheet),
+        "geojson": lambda: tables.geojson(sheet),
+        "svg": lambda: drawing.plan(adjusted, title).svg(),
+        "profile": lambda: drawing.profile(adjusted, title).svg(),
+        "pdf": lambda: drawing.pdf([drawing.plan(adjusted, title), drawing.profile(adjusted, title)]),
+    }
+    return writers[kind]()
+
+
+def as_json(adjusted: Adjusted) -> dict[str, object]:
+    """Return an adjustment as JSON takes it."""
     return {
         "length_m": adjusted.length_m,
         "north": adjusted.grid.north,

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.project import Leg, Project
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 # Of two sights, the mean is worse than the better one alone where their sigmas differ by more than this.
 WORTH_BOTH: Final = math.sqrt(3)
@@ -22,10 +22,10 @@ ABSOLUTE_DEPTH_SIGMA_M: Final = 0.002
 
 
 @dataclass(frozen=True)
-class Sights:
-    """Foresight and backsight in use, radians, magnetic for azimuths; sigma as they deserve to be weighed.
+class SightPair:
+    """Foresight and backsight in use, radians, magnetic for azimuths; sigmas as they are weighed.
 
-    back is as read, from the far station. None: not taken, or not to be believed.
+    back is as read, from the far station; gap: fore against back. None: not taken, or not believed.
     """
 
     fore: float | None
@@ -44,21 +44,19 @@ class Sights:
         return 0.5 * math.hypot(self.fore_sigma, self.back_sigma)
 
 
-def bearing_of(leg: Leg, project: Project) -> Sights | None:
+def bearing_of(leg: Leg, project: Project) -> SightPair | None:
     """Return the compasses of a leg that are to be used; None where there are none.
 
-    One that is disturbed gives way to one that is not; a person's edit goes before both.
+    A disturbed compass gives way to an undisturbed one; a person's edit goes before both.
     """
-    fore = _radians(leg.azimuth_deg)
-    back = _radians(leg.back_azimuth_deg)
-    fore_sigma = _radians(leg.azimuth_sigma_deg) or 0.0
-    back_sigma = _radians(leg.back_azimuth_sigma_deg) or 0.0
+    fore, back, fore_sigma, back_sigma = map(
+        _radians, (leg.azimuth_deg, leg.back_azimuth_deg, leg.azimuth_sigma_deg, leg.back_azimuth_sigma_deg)
+    )
     gap = None if fore is None or back is None else wrap(fore - back - math.pi)
     bad_fore, bad_back = leg.from_node in leg.disturbed, leg.to_node in leg.disturbed
-    if bad_fore:
-        fore_sigma = math.hypot(fore_sigma, math.radians(project.settings.disturbed_deg))
-    if bad_back:
-        back_sigma = math.hypot(back_sigma, math.radians(project.settings.disturbed_deg))
+    disturbed = math.radians(project.settings.disturbed_deg)
+    fore_sigma = math.hypot(fore_sigma or 0.0, disturbed * bad_fore)
+    back_sigma = math.hypot(back_sigma or 0.0, disturbed * bad_back)
     edit = project.edit_of(leg)
     if edit is not None and edit.compass is not UNSET:
         fore = None if edit.compass == "back" else fore
@@ -68,22 +66,23 @@ def bearing_of(leg: Leg, project: Project) -> Sights | None:
     return _weighed(fore, back, fore_sigma, back_sigma, gap)
 
 
-def clino_of(leg: Leg) -> Sights | None:
+def clino_of(leg: Leg) -> SightPair | None:
     """Return the inclinations of a leg by the nodes' own tilt, up positive, as read; None where there are none."""
-    fore, back = _radians(leg.inclination_deg), _radians(leg.back_inclination_deg)
-    gap = None if fore is None or back is None else fore + back
-    return _weighed(
-        fore, back, _radians(leg.inclination_sigma_deg) or 0.0, _radians(leg.back_inclination_sigma_deg) or 0.0, gap
+    fore, back, fore_sigma, back_sigma = map(
+        _radians,
+        (leg.inclination_deg, leg.back_inclination_deg, leg.inclination_sigma_deg, leg.back_inclination_sigma_deg),
     )
+    gap = None if fore is None or back is None else fore + back
+    return _weighed(fore, back, fore_sigma or 0.0, back_sigma or 0.0, gap)
 
 
-def _radians(value: object) -> float | None:
-    return math.radians(value) if isinstance(value, float | int) else None
+def _radians(angle_deg: float | UnsetType) -> float | None:
+    return None if angle_deg is UNSET else math.radians(angle_deg)
 
 
 def _weighed(
     fore: float | None, back: float | None, fore_sigma: float, back_sigma: float, gap: float | None
-) -> Sights | None:
+) -> SightPair | None:
     if fore is None and back is None:
         return None
     if fore is not None and back is not None and gap is not None:
@@ -94,7 +93,7 @@ def _weighed(
             chi = abs(gap) / math.hypot(fore_sigma, back_sigma)
             grown = chi if chi > CONTRADICT else 1.0
             fore_sigma, back_sigma = grown * fore_sigma, grown * back_sigma
-    return Sights(fore, back, fore_sigma, back_sigma, gap)
+    return SightPair(fore, back, fore_sigma, back_sigma, gap)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,31 +131,40 @@ def line_of(
     bearing = bearing_of(leg, project)
     if bearing is None:
         return None
-    both = (bearing.fore, None if bearing.back is None else wrap(bearing.back + math.pi))
-    known = [angle for angle in both if angle is not None]
-    magnetic = known[0] if len(known) == 1 else known[0] + 0.5 * wrap(known[1] - known[0])
-    azimuth = magnetic + to_grid_rad
+    fore = wrap(bearing.back + math.pi) if bearing.back is not None else bearing.fore
+    if fore is None:
+        return None
+    azimuth = to_grid_rad + (fore if bearing.fore is None else fore + 0.5 * wrap(bearing.fore - fore))
     distance_m, distance_sigma_m = leg.distance_m, leg.distance_sigma_m
-    rise = _rise(leg, depths_m, alone)
+    held = leg.from_ in depths_m and leg.to in depths_m
+    own = leg.depth_from_m, leg.depth_to_m
+    from_m, to_m = (depths_m[leg.from_], depths_m[leg.to]) if held else own
     clino = clino_of(leg)
-    steep = rise is None or abs(rise[0]) > distance_m * math.sin(STEEP_RAD)
+    steep = from_m is UNSET or to_m is UNSET or abs(from_m - to_m) > distance_m * math.sin(STEEP_RAD)
     if steep and clino is not None:
         known = [a for a in (clino.fore, None if clino.back is None else -clino.back) if a is not None]
         slope = sum(known) / len(known)
         run_m, rise_m = distance_m * math.cos(slope), distance_m * math.sin(slope)
         by_distance, by_other = (math.cos(slope), math.sin(slope)), (-rise_m, run_m)
         other_sigma, rise_sigma_m = clino.sigma, distance_m * clino.sigma
-    elif rise is not None and abs(rise[0]) < distance_m:
-        rise_m, rise_sigma_m = rise
-        if leg.from_ in depths_m and leg.to in depths_m:
+    elif from_m is not UNSET and to_m is not UNSET and abs(from_m - to_m) < distance_m:
+        rise_m = from_m - to_m
+        gauges_m = _hypot(leg.depth_from_sigma_m, leg.depth_to_sigma_m)
+        noises = leg.depth_from_noise_m, leg.depth_to_noise_m
+        if held:
+            rise_sigma_m = math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
             # Held depths err as well; what that does to the run along is put on the distance.
-            distance_sigma_m = math.hypot(distance_sigma_m, rise_m / distance_m * _depth_sigma_m(leg))
+            distance_sigma_m = math.hypot(distance_sigma_m, rise_m / distance_m * gauges_m)
+        else:
+            # A node keeps its gauge, and mostly its place, from leg to leg: slow errors cancel along the line.
+            rise_sigma_m = gauges_m if alone or UNSET in noises else _hypot(*noises)
         run_m = math.sqrt(distance_m**2 - rise_m**2)
         by_distance, by_other = (distance_m / run_m, 0.0), (-rise_m / run_m, 1.0)
         other_sigma = rise_sigma_m
     else:
         return None
     east, north = math.sin(azimuth), math.cos(azimuth)
+    # Columns: by distance, by azimuth, by rise or slope.
     jacobian = np.array(
         [
             [by_distance[0] * east, run_m * north, by_other[0] * east],
@@ -164,31 +172,17 @@ def line_of(
             [by_distance[1], 0.0, by_other[1]],
         ]
     )
-    variances = np.array([distance_sigma_m, bearing.sigma, other_sigma]) ** 2
     return Line(
-        leg,
-        np.array([run_m * east, run_m * north, rise_m]),
-        jacobian @ np.diag(variances) @ jacobian.T,
-        jacobian[:, 1],
-        rise_m,
-        rise_sigma_m,
-        distance_sigma_m,
-        steep,
+        leg=leg,
+        vector_m=np.array([run_m * east, run_m * north, rise_m]),
+        covariance=jacobian @ np.diag(np.array([distance_sigma_m, bearing.sigma, other_sigma]) ** 2) @ jacobian.T,
+        turn_m=jacobian[:, 1],
+        rise_m=rise_m,
+        rise_sigma_m=rise_sigma_m,
+        distance_sigma_m=distance_sigma_m,
+        by_clino=steep,
     )
 
 
-def _rise(leg: Leg, depths_m: dict[str, float], alone: bool) -> tuple[float, float] | None:
-    if leg.from_ in depths_m and leg.to in depths_m:
-        return depths_m[leg.from_] - depths_m[leg.to], math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
-    if leg.depth_from_m is UNSET or leg.depth_to_m is UNSET:
-        return None
-    noises = leg.depth_from_noise_m, leg.depth_to_noise_m
-    if alone or UNSET in noises:
-        return leg.depth_from_m - leg.depth_to_m, _depth_sigma_m(leg)
-    # A node keeps its gauge, and mostly its place, from leg to leg: what errs slowly cancels along the line.
-    return leg.depth_from_m - leg.depth_to_m, math.hypot(*(float(s) for s in noises if s is not UNSET))
-
-
-def _depth_sigma_m(leg: Leg) -> float:
-    sigmas = leg.depth_from_sigma_m, leg.depth_to_sigma_m
-    return math.hypot(*(float(s) for s in sigmas if s is not UNSET))
+def _hypot(*sigmas: float | UnsetType) -> float:
+    return math.hypot(*(sigma for sigma in sigmas if sigma is not UNSET))

@@ -1,11 +1,11 @@
-"""The survey as a network: weighted least squares with full covariances, loops, and who is to blame."""
+"""The survey as a network: adjusted positions, loops, residuals, and the legs that are probably wrong."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
@@ -17,9 +17,13 @@ from msgspec import UNSET
 
 # Chi^2 of three degrees of freedom that one leg in a thousand exceeds.
 BLUNDER_CHI2: Final = 16.27
+MOST_BLUNDERS: Final = 10
 # Legs that explain a misclosure nearly as well as the best one are named with it.
 AS_GOOD: Final = 0.8
 EXACT_M: Final = 1e-4
+
+Fixed: TypeAlias = dict[str, tuple[Floats, float]]
+Triple: TypeAlias = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,25 +35,25 @@ class Position:
     covariance: Floats
 
     @property
-    def ellipse(self) -> tuple[float, float, float]:
+    def ellipse(self) -> Triple:
         """Semi-axes (m, 1 sd) of the horizontal ellipse, the larger first, and its azimuth (rad)."""
         values, vectors = np.linalg.eigh(self.covariance[:2, :2])
-        major, minor = math.sqrt(max(float(values[1]), 0.0)), math.sqrt(max(float(values[0]), 0.0))
-        return major, minor, math.atan2(float(vectors[0, 1]), float(vectors[1, 1])) % math.pi
+        minor_m, major_m = np.sqrt(np.maximum(values, 0.0)).tolist()
+        return major_m, minor_m, math.atan2(float(vectors[0, 1]), float(vectors[1, 1])) % math.pi
 
     @property
-    def up_sigma_m(self) -> float:
-        """Standard deviation of the altitude."""
-        return math.sqrt(max(float(self.covariance[2, 2]), 0.0))
+    def sigmas_m(self) -> Floats:
+        """Standard deviations (3,) of east, north and up."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A closed round of legs, or a way between two fixed points. H, V: misclosure over its expected rms."""
+    """A closed round of legs, or a way between two fixed points. The ratios: misclosure over its expected rms."""
 
     stations: tuple[str, ...]
     length_m: float
-    misclosure_m: tuple[float, float, float]
+    misclosure_m: Triple
     horizontal_ratio: float
     vertical_ratio: float
 
@@ -61,10 +65,10 @@ class Loop:
 
 @dataclass(frozen=True)
 class Residual:
-    """What adjustment did to a leg. chi2: of what it moved against what it was free to; None: nothing checks it."""
+    """What the adjustment did to a leg. chi2: of the change, by its own covariance; None where nothing checks it."""
 
     leg: Leg
-    moved_m: tuple[float, float, float]
+    moved_m: Triple
     chi2: float | None
 
 
@@ -79,7 +83,7 @@ class Blunder:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """A survey adjusted. left_out: legs without a place in it, with the reason."""
+    """An adjusted survey. left_out: legs without a place in it, each with the reason."""
 
     grid: Grid
     positions: dict[str, Position]
@@ -93,34 +97,32 @@ class Adjusted:
     @property
     def length_m(self) -> float:
         """Length of all legs that took part, repeats once."""
-        once = {frozenset((line.leg.from_, line.leg.to)): line.leg.distance_m for line in self.lines}
-        return sum(once.values())
+        return sum({frozenset((line.leg.from_, line.leg.to)): line.leg.distance_m for line in self.lines}.values())
+
+
+def station_depths(project: Project) -> dict[str, float]:
+    """Return the mean depth of every station whose gauges were read."""
+    return {station.name: station.depth_m for station in project.station if station.depth_m is not UNSET}
 
 
 def held_depths(project: Project) -> dict[str, float]:
     """Return the stations held at their gauges' mean depth, and it; none where each leg keeps its readings."""
-    if project.adjust.depth != "absolute":
-        return {}
-    return {s.name: s.depth_m for s in project.station if s.depth_m is not UNSET}
+    return station_depths(project) if project.adjust.depth == "absolute" else {}
 
 
 def water_level_m(project: Project) -> float:
     """Return the surface's altitude: stated, or from a fixed point's altitude and depth, or 0."""
     if project.place.water_level_m is not UNSET:
         return project.place.water_level_m
-    depths = {s.name: s.depth_m for s in project.station}
-    for fix in project.fix:
-        depth_m = depths.get(fix.station, UNSET)
-        if fix.altitude_m is not UNSET and depth_m is not UNSET:
-            return fix.altitude_m + depth_m
-    return 0.0
+    depths = station_depths(project)
+    known = (f.altitude_m + depths[f.station] for f in project.fix if f.altitude_m is not UNSET and f.station in depths)
+    return next(known, 0.0)
 
 
-def fixed_points(project: Project, grid: Grid) -> dict[str, tuple[Floats, float]]:
+def fixed_points(project: Project, grid: Grid) -> Fixed:
     """Return the fixed stations' positions (3,) and sigmas; without any, the first leg's start at east 0, north 0."""
-    depths = {s.name: s.depth_m for s in project.station if s.depth_m is not UNSET}
-    level_m = water_level_m(project)
-    fixed: dict[str, tuple[Floats, float]] = {}
+    depths, level_m = station_depths(project), water_level_m(project)
+    fixed: Fixed = {}
     for fix in project.fix:
         altitude_m = fix.altitude_m
         if altitude_m is UNSET or project.adjust.depth == "absolute":
@@ -147,22 +149,21 @@ def adjust(project: Project) -> Adjusted:
     lines: list[Line] = []
     left_out: list[tuple[Leg, str]] = []
     for leg in project.leg:
-        if leg not in project.used([leg]):
-            edit = project.edit_of(leg)
-            left_out.append((leg, f"taken out{': ' + edit.note if edit and edit.note else ''}"))
-            continue
+        edit = project.edit_of(leg)
         line = line_of(leg, project, grid.to_grid_rad, depths)
-        if line is None or leg.from_ == leg.to:
+        if edit is not None and not edit.use:
+            left_out.append((leg, f"taken out{': ' + edit.note if edit.note else ''}"))
+        elif line is None or leg.from_ == leg.to:
             left_out.append((leg, "no bearing, or no slope that its distance allows"))
         else:
             lines.append(line)
-    reached = _reached(lines, fixed)
+    reached = _tree(lines, fixed)
     left_out += [(line.leg, "not connected to a fixed point") for line in lines if line.leg.from_ not in reached]
     lines = [line for line in lines if line.leg.from_ in reached]
     solution = _Solution(lines, fixed)
     positions = solution.positions(math.radians(project.settings.compass_common_deg))
     for held in project.station:
-        # An altitude is as good as the gauge: what that errs slowly is in no leg's noise.
+        # An altitude is as good as the gauge: the gauge's slow error is in no leg's noise.
         if held.name in positions and held.depth_sigma_m is not UNSET:
             positions[held.name].covariance[2, 2] += held.depth_sigma_m**2
     points = []
@@ -173,160 +174,148 @@ def adjust(project: Project) -> Adjusted:
             left_out.append((leg, "no bearing or no slope" if line is None else f"station {leg.from_} has no position"))
             continue
         points.append(Position(leg.to, station.position_m + line.vector_m, station.covariance + line.covariance))
-    return Adjusted(
-        grid=grid,
-        positions=positions,
-        lines=lines,
-        residuals=solution.residuals(),
-        loops=loops(lines, fixed),
-        blunders=_blunders(lines, fixed),
-        points=points,
-        left_out=left_out,
-    )
+    residuals = [
+        Residual(line.leg, _triple(moved_m), chi2)
+        for line, moved_m, chi2 in zip(lines, solution.moved_m, solution.chi2(), strict=True)
+    ]
+    return Adjusted(grid, positions, lines, residuals, loops(lines, fixed), _blunders(lines, fixed), points, left_out)
 
 
 class _Solution:
-    """Weighted least squares of lines between fixed points; x: (3 n,), east, north, up of each station."""
+    """Weighted least squares of lines between fixed points.
 
-    def __init__(self, lines: list[Line], fixed: dict[str, tuple[Floats, float]]) -> None:
-        self.lines, self.fixed = lines, fixed
-        names = [name for line in lines for name in (line.leg.from_, line.leg.to)]
-        self.names = list(dict.fromkeys([name for name in fixed if name in set(names)] + names)) or list(fixed)
-        self.at = {name: 3 * i for i, name in enumerate(self.names)}
-        size = 3 * len(self.names)
-        self.normal = np.zeros((size, size))
-        right = np.zeros(size)
-        self.weights = [np.linalg.inv(line.covariance) for line in lines]
-        for line, weight in zip(lines, self.weights, strict=True):
-            start, end = self._slices(line)
-            for rows, sign in ((start, -1.0), (end, 1.0)):
-                self.normal[rows, start] -= sign * weight
-                self.normal[rows, end] += sign * weight
-                right[rows] += sign * (weight @ line.vector_m)
+    x: (n, 3), east, north, up of each station. covariance: (n, n, 3, 3), of each station with each. moved_m: (m, 3),
+    what the adjustment added to each line.
+    """
+
+    def __init__(self, lines: list[Line], fixed: Fixed) -> None:
+        ends = dict.fromkeys(name for line in lines for name in (line.leg.from_, line.leg.to))
+        # Fixed points first; a survey without lines is its fixed points.
+        names = list(dict.fromkeys([*(name for name in fixed if name in ends or not lines), *ends]))
+        self.at = {name: i for i, name in enumerate(names)}
+        self.start = np.array([self.at[line.leg.from_] for line in lines], dtype=int)
+        self.end = np.array([self.at[line.leg.to] for line in lines], dtype=int)
+        n = len(names)
+        vectors = np.array([line.vector_m for line in lines]).reshape(-1, 3)
+        self._turns = np.array([line.turn_m for line in lines]).reshape(-1, 3, 1)
+        self._stated = np.array([line.covariance for line in lines]).reshape(-1, 3, 3)
+        self._weights = np.linalg.inv(self._stated)
+        normal = np.zeros((n, n, 3, 3))
+        for rows, columns, sign in (
+            (self.start, self.start, 1.0),
+            (self.end, self.end, 1.0),
+            (self.start, self.end, -1.0),
+            (self.end, self.start, -1.0),
+        ):
+            np.add.at(normal, (rows, columns), sign * self._weights)
+        right = self._pushed(vectors[..., None])
+        # Coordinates count from the first fixed point, so that UTM's millions cost no digits.
         origin = next((position for position, _ in fixed.values()), np.zeros(3))
         for name, (position, sigma_m) in fixed.items():
             if name in self.at:
-                rows = slice(self.at[name], self.at[name] + 3)
-                weight = np.eye(3) / max(sigma_m, EXACT_M) ** 2
-                self.normal[rows, rows] += weight
-                right[rows] += weight @ (position - origin)
-        self.covariance = np.linalg.inv(self.normal)
-        self.x = self.covariance @ right + np.tile(origin, len(self.names))
+                weight = max(sigma_m, EXACT_M) ** -2
+                normal[self.at[name], self.at[name]] += weight * np.eye(3)
+                right[self.at[name]] += weight * (position - origin)
+        flat = np.linalg.inv(normal.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n))
+        self.covariance = flat.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+        self.x = (flat @ right.ravel()).reshape(n, 3) + origin
+        self.moved_m = self.x[self.end] - self.x[self.start] - vectors
+        self._flat = flat
 
-    def _slices(self, line: Line) -> tuple[slice, slice]:
-        i, j = self.at[line.leg.from_], self.at[line.leg.to]
-        return slice(i, i + 3), slice(j, j + 3)
+    def _pushed(self, vectors: Floats) -> Floats:
+        """Return the normal equations' right side (n, 3) of a vector (m, 3, 1) for each line."""
+        right = np.zeros((len(self.at), 3))
+        pushed = (self._weights @ vectors)[..., 0]
+        np.add.at(right, self.end, pushed)
+        np.add.at(right, self.start, -pushed)
+        return right
 
     def positions(self, common_rad: float) -> dict[str, Position]:
-        """Return all stations; common_rad: 1 sd of an error that turns every leg alike, in no single one's sigma."""
-        push = np.zeros(len(self.x))
-        for line, weight in zip(self.lines, self.weights, strict=True):
-            start, end = self._slices(line)
-            pushed = weight @ line.turn_m
-            push[start] -= pushed
-            push[end] += pushed
-        turn = common_rad * (self.covariance @ push)
-        result = {}
-        for name, i in self.at.items():
-            part = slice(i, i + 3)
-            covariance = self.covariance[part, part] + np.outer(turn[part], turn[part])
-            result[name] = Position(name, self.x[part], covariance)
-        return result
+        """Return all stations; common_rad: 1 sd of an error that turns every leg alike, in no single leg's sigma."""
+        turn = common_rad * (self._flat @ self._pushed(self._turns).ravel()).reshape(-1, 3)
+        return {
+            name: Position(name, self.x[i], self.covariance[i, i] + np.outer(turn[i], turn[i]))
+            for name, i in self.at.items()
+        }
 
-    def residual(self, line: Line) -> Floats:
-        """Return what adjustment added to a line."""
-        start, end = self._slices(line)
-        moved: Floats = self.x[end] - self.x[start] - line.vector_m
-        return moved
-
-    def chi2(self, line: Line) -> float | None:
-        """Return the residual's chi^2 by its own covariance (data snooping, Baarda 1968); None: nothing checks it."""
-        start, end = self._slices(line)
-        S = self.covariance
-        adjusted = S[start, start] + S[end, end] - S[start, end] - S[end, start]
-        free = line.covariance - adjusted
-        values, vectors = np.linalg.eigh(free / np.trace(line.covariance))
-        seen = values > 1e-6
-        if not seen.any():
-            return None
-        moved = vectors.T @ self.residual(line)
-        return float((moved[seen] ** 2 / (values[seen] * np.trace(line.covariance))).sum())
-
-    def residuals(self) -> list[Residual]:
-        """Return every line's residual."""
-        return [Residual(line.leg, _triple(self.residual(line)), self.chi2(line)) for line in self.lines]
+    def chi2(self) -> list[float | None]:
+        """Return each residual's chi^2 by its own covariance (data snooping, Baarda 1968); None: nothing checks it."""
+        S, i, j = self.covariance, self.start, self.end
+        scale = np.trace(self._stated, axis1=1, axis2=2)[:, None]
+        free = self._stated - (S[i, i] + S[j, j] - S[i, j] - S[j, i])
+        values, axes = np.linalg.eigh(free / scale[..., None])
+        seen = np.asarray(values > 1e-6)
+        along = (axes.transpose(0, 2, 1) @ self.moved_m[..., None])[..., 0]
+        chi2 = np.where(seen, along**2 / np.where(seen, values * scale, 1.0), 0.0).sum(axis=1)
+        checked = np.atleast_1d(seen.any(axis=1)).tolist()
+        return [one if any_seen else None for one, any_seen in zip(chi2.tolist(), checked, strict=True)]
 
 
-def _triple(vector: Floats) -> tuple[float, float, float]:
+def _triple(vector: Floats) -> Triple:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-def _reached(lines: list[Line], fixed: dict[str, tuple[Floats, float]]) -> set[str]:
-    neighbours: dict[str, set[str]] = {}
-    for line in lines:
-        neighbours.setdefault(line.leg.from_, set()).add(line.leg.to)
-        neighbours.setdefault(line.leg.to, set()).add(line.leg.from_)
-    reached = set(fixed)
-    queue = deque(reached)
+@dataclass(frozen=True)
+class _Step:
+    """One line of the tree of shortest ways: from `back`, nearer to a fixed point, along line `index`."""
+
+    back: str
+    index: int
+    sign: float
+
+
+def _tree(lines: list[Line], fixed: Fixed) -> dict[str, _Step | None]:
+    """Return the last step of the shortest way from a fixed point to each station; None at the fixed points."""
+    touching: dict[str, list[tuple[str, _Step]]] = {}
+    for i, line in enumerate(lines):
+        touching.setdefault(line.leg.from_, []).append((line.leg.to, _Step(line.leg.from_, i, 1.0)))
+        touching.setdefault(line.leg.to, []).append((line.leg.from_, _Step(line.leg.to, i, -1.0)))
+    tree: dict[str, _Step | None] = dict.fromkeys(fixed)
+    queue = deque(fixed)
     while queue:
-        for name in neighbours.get(queue.popleft(), set()) - reached:
-            reached.add(name)
-            queue.append(name)
-    return reached
+        for other, step in touching.get(queue.popleft(), []):
+            if other not in tree:
+                tree[other] = step
+                queue.append(other)
+    return tree
 
 
-def loops(lines: list[Line], fixed: dict[str, tuple[Floats, float]]) -> list[Loop]:
+def loops(lines: list[Line], fixed: Fixed) -> list[Loop]:
     """Return independent loops: each line that is not in the tree of shortest ways closes one.
 
     Fixed points count as joined, so that a way between two of them is a loop.
     """
-    parent: dict[str, tuple[str, int, float] | None] = {name: None for name in fixed}
-    queue = deque(fixed)
-    in_tree: set[int] = set()
-    touching: dict[str, list[tuple[int, str, float]]] = {}
-    for i, line in enumerate(lines):
-        touching.setdefault(line.leg.from_, []).append((i, line.leg.to, 1.0))
-        touching.setdefault(line.leg.to, []).append((i, line.leg.from_, -1.0))
-    while queue:
-        name = queue.popleft()
-        for i, other, sign in touching.get(name, []):
-            if other not in parent:
-                parent[other] = (name, i, sign)
-                in_tree.add(i)
-                queue.append(other)
+    tree = _tree(lines, fixed)
+    in_tree = {step.index for step in tree.values() if step is not None}
 
-    def way(name: str) -> list[tuple[str, int, float]]:
-        steps = []
-        while (step := parent.get(name)) is not None:
-            steps.append((name, step[1], step[2]))
-            name = step[0]
-        return [*steps, (name, -1, 0.0)]
+    def way(name: str) -> tuple[list[str], list[_Step]]:
+        """Return the stations from `name` back to a fixed point, and the steps between them."""
+        names, steps = [name], []
+        while (step := tree[names[-1]]) is not None:
+            steps.append(step)
+            names.append(step.back)
+        return names, steps
 
     found = []
     for i, line in enumerate(lines):
-        if i in in_tree or line.leg.from_ not in parent:
+        if i in in_tree or line.leg.from_ not in tree:
             continue
-        out, back = way(line.leg.from_), way(line.leg.to)
-        while len(out) > 1 and len(back) > 1 and out[-2][0] == back[-2][0]:
-            out.pop()
-            back.pop()
-        vector = line.vector_m.copy()
-        covariance = line.covariance.copy()
-        length_m = line.length_m
-        for steps, sense in ((out[:-1], 1.0), (back[:-1], -1.0)):
-            for _, k, sign in steps:
-                vector += sense * sign * lines[k].vector_m
-                covariance = covariance + lines[k].covariance
-                length_m += lines[k].length_m
-        if out[-1][0] != back[-1][0]:
-            for (end, _, _), sign in ((out[-1], 1.0), (back[-1], -1.0)):
-                vector += sign * fixed[end][0]
+        (out, out_steps), (back, back_steps) = way(line.leg.from_), way(line.leg.to)
+        while len(out) > 1 and len(back) > 1 and out[-2] == back[-2]:
+            for common in (out, out_steps, back, back_steps):
+                common.pop()
+        signed = [(line, 1.0), *((lines[s.index], s.sign) for s in out_steps)]
+        signed += [(lines[s.index], -s.sign) for s in back_steps]
+        vector = sum((sign * one.vector_m for one, sign in signed), np.zeros(3))
+        covariance = sum((one.covariance for one, _ in signed), np.zeros((3, 3)))
+        if out[-1] != back[-1]:
+            for end, sign in ((out[-1], 1.0), (back[-1], -1.0)):
+                vector = vector + sign * fixed[end][0]
                 covariance = covariance + fixed[end][1] ** 2 * np.eye(3)
-        names = [step[0] for step in reversed(out)] + [step[0] for step in back]
         found.append(
             Loop(
-                tuple(names),
-                length_m,
+                (*reversed(out), *back),
+                sum(one.length_m for one, _ in signed),
                 _triple(vector),
                 math.hypot(vector[0], vector[1]) / math.sqrt(covariance[0, 0] + covariance[1, 1]),
                 abs(float(vector[2])) / math.sqrt(covariance[2, 2]),
@@ -335,22 +324,22 @@ def loops(lines: list[Line], fixed: dict[str, tuple[Floats, float]]) -> list[Loo
     return found
 
 
-def _blunders(lines: list[Line], fixed: dict[str, tuple[Floats, float]]) -> list[Blunder]:
+def _blunders(lines: list[Line], fixed: Fixed) -> list[Blunder]:
     """Name the worst leg, take it out, and look again; with it those that would explain it as well."""
     left = list(lines)
     found: list[Blunder] = []
-    while len(left) > 1 and len(found) < 10:
-        solution = _Solution(left, fixed)
-        chi2 = [solution.chi2(line) or 0.0 for line in left]
-        worst = int(np.argmax(chi2))
+    while len(left) > 1 and len(found) < MOST_BLUNDERS:
+        chi2 = np.array([one or 0.0 for one in _Solution(left, fixed).chi2()])
+        worst = int(chi2.argmax())
         if chi2[worst] <= BLUNDER_CHI2:
             break
-        order = sorted(range(len(left)), key=lambda i: -chi2[i])
+        order = np.argsort(-chi2, kind="stable").tolist()
         named = tuple(left[i].leg.name for i in order if chi2[i] >= AS_GOOD * chi2[worst])
         line = left.pop(worst)
         without = _Solution(left, fixed)
         off_m = math.nan
         if line.leg.from_ in without.at and line.leg.to in without.at:
-            off_m = float(np.linalg.norm(without.residual(line)))
-        found.append(Blunder(named, off_m, chi2[worst]))
+            way_m = without.x[without.at[line.leg.to]] - without.x[without.at[line.leg.from_]]
+            off_m = float(np.linalg.norm(way_m - line.vector_m))
+        found.append(Blunder(named, off_m, float(chi2[worst])))
     return found

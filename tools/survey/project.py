@@ -6,18 +6,19 @@ which nobody changes. The file as it was before is kept beside it.
 
 from __future__ import annotations
 
-import math
+import json
 import os
 import re
 from datetime import UTC, date, datetime
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import Config, ConfigError, load_config
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId, NonNegative, Positive
+from buddyline.tools.newfile import write_new
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec import UNSET, Meta, UnsetType, field
 
@@ -47,6 +48,11 @@ class Place(Config, frozen=True, kw_only=True):
     declination_source: str = ""
     utm_zone: Annotated[str, Meta(pattern=r"^\d{1,2}[NS]$")] | UnsetType = UNSET
 
+    @property
+    def degrees(self) -> tuple[float, float] | None:
+        """Latitude and longitude, where both are given."""
+        return _pair(self.latitude_deg, self.longitude_deg)
+
 
 class FixedPoint(Config, frozen=True, kw_only=True):
     """[[fix]]: a station known from elsewhere, in metres (UTM where the place names a zone) or in degrees.
@@ -62,6 +68,20 @@ class FixedPoint(Config, frozen=True, kw_only=True):
     altitude_m: float | UnsetType = UNSET
     sigma_m: NonNegative = 0.0
     entrance: bool = False
+
+    @property
+    def degrees(self) -> tuple[float, float] | None:
+        """Latitude and longitude, where both are given."""
+        return _pair(self.latitude_deg, self.longitude_deg)
+
+    @property
+    def metres(self) -> tuple[float, float] | None:
+        """East and north, where both are given."""
+        return _pair(self.east_m, self.north_m)
+
+
+def _pair(one: float | UnsetType, other: float | UnsetType) -> tuple[float, float] | None:
+    return None if one is UNSET or other is UNSET else (one, other)
 
 
 class DiveFiles(Config, frozen=True, kw_only=True):
@@ -201,9 +221,7 @@ def load_project(path: Path | str) -> Project:
     """Read a project file; raise ConfigError naming file, field and value."""
     project = load_config(path, Project)
     for fix in project.fix:
-        metres = fix.east_m is not UNSET and fix.north_m is not UNSET
-        degrees = fix.latitude_deg is not UNSET and fix.longitude_deg is not UNSET
-        if metres == degrees:
+        if (fix.metres is None) == (fix.degrees is None):
             raise ConfigError(
                 f"{path}: fix of {fix.station!r}: give east_m and north_m, or latitude_deg and longitude_deg"
             )
@@ -222,10 +240,8 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
     if text == old:
         return
     if MARKER in old:
-        number = 1
-        while (kept := path.with_name(f"{path.name}.{number}")).exists():
-            number += 1
-        kept.write_text(old, encoding="utf-8")
+        numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
+        write_new(next(kept for kept in numbered if not kept.exists()), old)
     fresh = path.with_name(f"{path.name}.new")
     fresh.write_text(text, encoding="utf-8")
     os.replace(fresh, path)
@@ -233,14 +249,8 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
 
 def new_project(path: Path, name: str, logs: list[str]) -> None:
     """Write a project file to fill in; raise BuddylineError where one exists."""
-    text = TEMPLATE.format(name=_scalar(name), logs=_scalar(logs))
-    try:
-        with open(path, "x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise BuddylineError(f"{path}: exists; add the dive to it as another [[dive]]") from None
-    except OSError as error:
-        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    text = TEMPLATE.format(name=_toml_value(name), logs=_toml_value(logs))
+    write_new(path, text, hint="add the dive to it as another [[dive]]")
 
 
 TEMPLATE: Final = """\
@@ -284,31 +294,18 @@ logs = {logs}
 
 
 def _toml(tables: dict[str, list[Any]]) -> str:
-    """Write arrays of tables, of structs or dicts whose values are scalars, lists of them, or flat dicts."""
+    """Write arrays of tables, of structs whose values are scalars, lists of them, or flat dicts; empty ones not."""
     lines: list[str] = []
     for name, rows in tables.items():
         for row in rows:
             lines.append(f"\n[[{name}]]")
-            values = row if isinstance(row, dict) else msgspec.to_builtins(row)
-            lines += [f"{key} = {_scalar(value)}" for key, value in values.items() if value not in ({}, [], "")]
+            values = msgspec.to_builtins(row).items()
+            lines += [f"{key} = {_toml_value(value)}" for key, value in values if value not in ({}, [], "")]
     return "\n".join(lines) + "\n"
 
 
-def _scalar(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        escaped = "".join(_ESCAPES.get(c) or (c if c.isprintable() else f"\\U{ord(c):08X}") for c in value)
-        return f'"{escaped}"'
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            raise ValueError(f"cannot write {value}")
-        return repr(round(value, 6))
-    if isinstance(value, list):
-        return f"[{', '.join(map(_scalar, value))}]"
+def _toml_value(value: Any) -> str:
+    """Write a value: TOML's strings, numbers and arrays are JSON's, but for one forbidden character and for tables."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_scalar(key)} = {_scalar(one)}" for key, one in value.items()) + " }"
-    return str(value)
-
-
-_ESCAPES: Final = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+        return "{ " + ", ".join(f"{_toml_value(key)} = {_toml_value(one)}" for key, one in value.items()) + " }"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).replace("\x7f", "\\u007F")

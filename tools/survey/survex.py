@@ -1,15 +1,80 @@
-"""Survex: a survey as readings, in diving style where Survex adjusts that rightly, or as cartesian vectors."""
+"""Survex and Therion: the same readings in two languages that differ in little more than their signs."""
 
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
 
-import numpy as np
-from buddyline.tools.survey.heading import Heading, Reading, heading_of, reading_of
-from buddyline.tools.survey.lines import Line
-from buddyline.tools.survey.network import Adjusted, fixed_points, held_depths
-from buddyline.tools.survey.project import Project
+from buddyline.tools.survey.sheet import Reading, Sheet
+
+
+@dataclass(frozen=True)
+class Language:
+    """How a language writes its data. command, comment: what begins them; ending: what closes a list of columns."""
+
+    command: str
+    comment: str
+    tape: str
+    gap: str
+    ending: str = ""
+    back_sd: bool = False
+
+    @property
+    def normal(self) -> str:
+        """The columns of legs with an inclination."""
+        return f"{self.command}data normal from to {self.tape} compass backcompass clino{self.ending}"
+
+    @property
+    def diving(self) -> str:
+        """The columns of legs with two depths."""
+        return f"{self.command}data diving from to {self.tape} compass backcompass fromdepth todepth{self.ending}"
+
+    def data(self, sheet: Sheet, by_clino: Callable[[Reading], bool]) -> Iterator[str]:
+        """Yield every leg's row, and before it what has changed: standard deviations and the columns' names."""
+        state: dict[str, str] = {}
+        for reading in sheet.readings:
+            clino = by_clino(reading)
+            now = {f"{self.command}sd {name}": value for name, value in self._sds(reading, clino).items()}
+            now[self.normal if clino else self.diving] = ""
+            for name, value in now.items():
+                if state.get(name) != value:
+                    yield f"{name} {value}".rstrip()
+            state |= now
+            state.pop(self.diving if clino else self.normal, None)
+            rise = [reading.clino_deg] if clino else [reading.depth_from_m, reading.depth_to_m]
+            numbers = [f"{value:+.3f}" if clino else f"{value:.4f}" for value in rise]
+            angles = [self._angle(angle) for angle in (reading.compass_deg, reading.back_deg)]
+            leg = reading.leg
+            row = [leg.from_, leg.to, f"{leg.distance_m:.4f}", *angles, *numbers, f"{self.comment} {reading.remark}"]
+            yield self.gap.join(row)
+
+    def _sds(self, reading: Reading, clino: bool) -> dict[str, str]:
+        line, distance_m = reading.line, reading.leg.distance_m
+        tape_m, level = line.distance_sigma_m, math.cos(math.radians(reading.clino_deg))
+        if not clino:
+            rise = {"depth": f"{line.rise_sigma_m / math.sqrt(2):.4f} metres"}
+        else:
+            clino_rad = line.rise_sigma_m / (distance_m * level)
+            if reading.held:
+                # The rise is exact, so an error of the tape is one of the run, and none of the height. Equal sds
+                # along the leg and across its slope say that: then no misclosure on the map moves a height.
+                tape_m /= level
+                clino_rad = tape_m / distance_m
+            rise = {"clino": f"{max(math.degrees(clino_rad), 0.001):.3f} degrees"}
+        compass = f"{reading.compass_sigma_deg:.3f} degrees"
+        back = {"backcompass": compass} if self.back_sd else {}
+        return {self.tape: f"{tape_m:.4f} metres", "compass": compass} | back | rise
+
+    @staticmethod
+    def _angle(angle_deg: float | None) -> str:
+        return "-" if angle_deg is None else f"{angle_deg % 360:07.3f}".replace("360.000", "000.000")
+
+
+SURVEX: Final = Language("*", ";", "tape", "\t", " ignoreall", back_sd=True)
+THERION: Final = Language("", "#", "length", " ")
+THERION_INSTRUMENTS: Final = ("tape", "length", "compass", "backcompass", "clino", "depth")
 
 
 def quoted(text: str) -> str:
@@ -17,111 +82,93 @@ def quoted(text: str) -> str:
     return '"' + text.replace('"', "'").replace("\n", " ") + '"'
 
 
-Style = Literal["auto", "diving", "normal"]
-
-
-def readings(project: Project, adjusted: Adjusted, style: Style = "auto") -> str:
+def svx(sheet: Sheet, style: str = "auto") -> str:
     """Return .svx text: tape, compass, backcompass and depths or clino, each leg with its own sds.
 
-    auto: diving style, but the clino that follows from the depths for legs that close a loop. diving, normal: all
+    auto: diving style, but for legs that close a loop the clino that follows from the depths. diving, normal: all
     legs alike, but steep ones and those without depths never in diving style.
 
-    No Survex up to 1.4.22 adjusts diving legs rightly (datain.c, process_diving: the covariance of east and north
-    has a wrong sign, and the three go on in another order than they are taken in), which bends the loops they are
-    in by metres. Elsewhere covariances move nothing. Fore- and backsight have one sd, because it weighs unequal
+    No Survex up to 1.4.22 adjusts diving legs correctly (datain.c, process_diving: the covariance of east and north
+    has a wrong sign, and the three are passed on in another order than they are read), which bends loops by metres.
+    Outside of loops covariances move nothing. Foresight and backsight have one sd, because Survex weighs unequal
     ones wrongly.
     """
-    depths = held_depths(project)
-    in_loop = {id(one.leg) for one in adjusted.residuals if one.chi2 is not None}
+
+    def by_clino(reading: Reading) -> bool:
+        return reading.by_clino or style == "normal" or (style == "auto" and reading.looped)
+
     body = [
         "*calibrate depth 0 -1 ; gauges read down, Survex wants altitude",
         "*units tape depth metres",
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
+        *SURVEX.data(sheet, by_clino),
     ]
-    state: dict[str, str] = {}
-    last = ""
-    for line in adjusted.lines:
-        reading = reading_of(line, project, depths)
-        by_clino = line.by_clino or style == "normal" or (style == "auto" and id(line.leg) in in_loop)
-        held = line.leg.from_ in depths and line.leg.to in depths and not line.by_clino
-        sds = _sds(reading, by_clino, held)
-        body += [f"*sd {name} {value}" for name, value in sds.items() if state.get(name) != value]
-        state |= sds
-        wanted = NORMAL if by_clino else DIVING
-        if wanted != last:
-            body.append(wanted)
-            last = wanted
-        body.append(_row(line, reading, by_clino))
-    return _file(project, adjusted, heading_of(project, adjusted), body)
+    north = [] if sheet.angle_deg is None else [f"*declination {sheet.angle_deg:.4f} degrees"]
+    return _svx_file(sheet, north, body)
 
 
-NORMAL: Final = "*data normal from to tape compass backcompass clino ignoreall"
-DIVING: Final = "*data diving from to tape compass backcompass fromdepth todepth ignoreall"
-
-
-def _sds(reading: Reading, by_clino: bool, held: bool) -> dict[str, str]:
-    """Return a leg's sds as Survex takes them; held: its stations are held at their depths."""
-    compass = f"{reading.compass_sigma_deg:.3f} degrees"
-    sds = {"tape": f"{reading.tape_sigma_m:.4f} metres", "compass": compass, "backcompass": compass}
-    if not by_clino:
-        return sds | {"depth": f"{reading.rise_sigma_m / math.sqrt(2):.4f} metres"}
-    level = math.cos(math.radians(reading.clino_deg))
-    if held:
-        # The rise is exact, so an error of the tape is one of the run, and none of the height. Equal sds along the
-        # leg and across its slope say that: then no misclosure on the map moves a height.
-        run_sigma_m = reading.tape_sigma_m / level
-        clino_rad = run_sigma_m / reading.tape_m
-        sds["tape"] = f"{run_sigma_m:.4f} metres"
-    else:
-        clino_rad = reading.rise_sigma_m / (reading.tape_m * level)
-    return sds | {"clino": f"{max(math.degrees(clino_rad), 0.001):.3f} degrees"}
-
-
-def _row(line: Line, reading: Reading, by_clino: bool) -> str:
-    angles = [_angle(reading.compass_deg), _angle(reading.back_deg)]
-    last = [f"{reading.clino_deg:+.3f}"] if by_clino else [f"{reading.depth_from_m:.4f}", f"{reading.depth_to_m:.4f}"]
-    return "\t".join([line.leg.from_, line.leg.to, f"{reading.tape_m:.4f}", *angles, *last, f"; {reading.remark}"])
-
-
-def _angle(angle_deg: float | None) -> str:
-    return "-" if angle_deg is None else f"{angle_deg % 360:07.3f}".replace("360.000", "000.000")
-
-
-def cartesian(project: Project, adjusted: Adjusted) -> str:
+def svx_cartesian(sheet: Sheet) -> str:
     """Return .svx text of full vectors, grid east, north and up; sds are each axis's own, without correlations."""
     body = [
         "; vectors are turned to the grid's north already",
         "*sd position 0.001 metres",
         "*data cartesian from to easting northing altitude ignoreall",
     ]
-    for line in adjusted.lines:
-        sigma = np.sqrt(np.diag(line.covariance))
-        body += [f"*sd {axis} {value:.4f} metres" for axis, value in zip(("dx", "dy", "dz"), sigma, strict=True)]
+    for line in sheet.adjusted.lines:
+        for i, axis in enumerate(("dx", "dy", "dz")):
+            body.append(f"*sd {axis} {math.sqrt(line.covariance[i, i]):.4f} metres")
         values = "\t".join(f"{value:.4f}" for value in line.vector_m)
         body.append(f"{line.leg.from_}\t{line.leg.to}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
-    return _file(project, adjusted, heading_of(project, adjusted), body, compass=False)
+    return _svx_file(sheet, [], body)
 
 
-def _file(project: Project, adjusted: Adjusted, heading: Heading, body: list[str], *, compass: bool = True) -> str:
-    grid = adjusted.grid
-    fixed = fixed_points(project, grid)
-    entrances = {fix.station for fix in project.fix if fix.entrance}
-    lines = [f"; {heading.title}", f"; {heading.why}", "; Buddyline; from is never swapped with to; sds are 1 sd"]
-    if grid.zone is not None:
-        lines += [f"*cs UTM{grid.zone}", f"*cs out UTM{grid.zone}"]
-    lines += [f"*begin {heading.name}", f"*export {' '.join(fixed)}", f"*title {quoted(heading.title)}"]
-    if heading.date:
-        lines.append(f"*date {heading.date}")
-    lines += [f"*team {quoted(person)}" for person in heading.team]
-    lines += [f"*instrument {kind} {quoted(text)}" for kind, text in heading.instruments.items()]
-    lines += [f"; {note}" for note in heading.notes]
+def _svx_file(sheet: Sheet, north: list[str], body: list[str]) -> str:
+    zone, fixed = sheet.adjusted.grid.zone, sheet.fixed
+    lines = [
+        f"; {sheet.title}",
+        f"; {sheet.why}",
+        "; Buddyline; from is never swapped with to; sds are 1 sd",
+        *([f"*cs UTM{zone}", f"*cs out UTM{zone}"] if zone else []),
+        f"*begin {sheet.name}",
+        f"*export {' '.join(fixed)}",
+        f"*title {quoted(sheet.title)}",
+        *([f"*date {sheet.date}"] if sheet.date else []),
+        *(f"*team {quoted(person)}" for person in sheet.team),
+        *(f"*instrument {kind} {quoted(text)}" for kind, text in sheet.instruments.items()),
+        *(f"; {note}" for note in sheet.notes),
+    ]
     for name, (position, sigma_m) in fixed.items():
         sd = f" {sigma_m:.3f}" if sigma_m else ""
         lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
-    lines += [f"*entrance {name}" for name in sorted(entrances & set(fixed))]
-    if compass and heading.angle_deg is not None:
-        lines.append(f"*declination {heading.angle_deg:.4f} degrees")
-    for leg, why in adjusted.left_out:
-        lines.append(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}")
-    return "\n".join([*lines, *body, f"*end {heading.name}", ""])
+    lines += [f"*entrance {name}" for name in sorted(sheet.entrances)]
+    lines += [
+        *north,
+        *(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out),
+    ]
+    return "\n".join([*lines, *body, f"*end {sheet.name}", ""])
+
+
+def th(sheet: Sheet) -> str:
+    """Return .th text: a centreline in diving style; steep legs, and those without depths, with a clino."""
+    zone = sheet.adjusted.grid.zone
+    rows = [
+        *([f"date {sheet.date}"] if sheet.date else []),
+        *(f"team {quoted(person)}" for person in sheet.team),
+        *(
+            f"instrument {kind} {quoted(what)}"
+            for kind, what in sheet.instruments.items()
+            if kind in THERION_INSTRUMENTS
+        ),
+        *(f"# {note}" for note in sheet.notes),
+        *([f"cs UTM{zone.removesuffix('N')}"] if zone else []),
+        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}" for name, (p, _) in sheet.fixed.items()),
+        *(f'station {name} "" entrance' for name in sheet.entrances),
+        *([] if sheet.angle_deg is None else [f"declination {sheet.angle_deg:.4f} degrees"]),
+        "units length depth metres",
+        "units compass clino degrees",
+        "calibrate depth 0 -1",
+        *THERION.data(sheet, lambda reading: reading.by_clino),
+    ]
+    head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
+    return "\n".join([*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey", ""])

@@ -1,4 +1,4 @@
-"""Plain tables: legs and stations as CSV, the survey as GeoJSON."""
+"""Plain tables: legs and stations as CSV, the survey as GeoJSON, and the .dat file of Compass."""
 
 from __future__ import annotations
 
@@ -6,117 +6,137 @@ import csv
 import io
 import json
 import math
-from typing import Any
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Any, Final
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.heading import heading_of
-from buddyline.tools.survey.network import Adjusted, Position
-from buddyline.tools.survey.project import Leg, Project
-from msgspec import UNSET, to_builtins
+from buddyline.tools.survey.network import station_depths
+from buddyline.tools.survey.project import Leg
+from buddyline.tools.survey.sheet import Sheet
+from msgspec import to_builtins
 
-STATION_COLUMNS = (
-    *("name", "kind", "east_m", "north_m", "up_m", "depth_m"),
-    *("sigma_east_m", "sigma_north_m", "sigma_up_m"),
-    *("ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg", "latitude_deg", "longitude_deg"),
-)
+# A station's columns and their digits after the point; empty where a value is not known.
+STATION_DIGITS: Final = {
+    "name": None,
+    "kind": None,
+    **dict.fromkeys(("east_m", "north_m", "up_m", "depth_m"), 3),
+    **dict.fromkeys(("sigma_east_m", "sigma_north_m", "sigma_up_m"), 3),
+    **{"ellipse_major_m": 3, "ellipse_minor_m": 3, "ellipse_azimuth_deg": 1, "latitude_deg": 8, "longitude_deg": 8},
+}
+# What of it a map shows.
+MAP_PROPERTIES: Final = ("name", "kind", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg", "sigma_up_m")
+
+FOOT_M: Final = 0.3048
+MISSING: Final = "-999.00"
+# Bearings in degrees, lengths and passages in feet, inclinations in degrees; backsights present.
+COMPASS_FORMAT: Final = "DDDDLUDRLADadBF"
 
 
-def legs_csv(project: Project, adjusted: Adjusted) -> str:
-    """Return every leg and point with all its readings, as text; `used` says whether it took part."""
-    fields = [field for field in Leg.__struct_encode_fields__ if field not in ("unused", "alarms", "disturbed")]
-    chi2 = {id(one.leg): one.chi2 for one in adjusted.residuals}
-    left_out = {id(leg): why for leg, why in adjusted.left_out}
+def _csv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> str:
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*fields, "disturbed", "alarms", "used", "why_not", "residual_chi2"])
-    for leg in project.leg + project.point:
-        row = to_builtins(leg)
-        why = left_out.get(id(leg), "")
-        value = chi2.get(id(leg))
-        writer.writerow(
-            [row.get(field, "") for field in fields]
-            + [" ".join(leg.disturbed), "; ".join(leg.alarms), "no" if why else "yes", why]
-            + ["" if value is None else f"{value:.2f}"]
-        )
+    writer = csv.DictWriter(out, list(columns), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return out.getvalue()
 
 
-def stations_csv(project: Project, adjusted: Adjusted) -> str:
-    """Return adjusted stations and points: metres, 1 sd, and the horizontal ellipse."""
-    depths = {station.name: station.depth_m for station in project.station}
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(STATION_COLUMNS)
-    for kind, position in _all(adjusted):
+def legs_csv(sheet: Sheet) -> str:
+    """Return every leg and point with all its readings; `used` says whether it took part."""
+    chi2 = {id(one.leg): one.chi2 for one in sheet.adjusted.residuals}
+    left_out = {id(leg): why for leg, why in sheet.adjusted.left_out}
+    rows = []
+    for leg in sheet.project.leg + sheet.project.point:
+        why, value = left_out.get(id(leg), ""), chi2.get(id(leg))
+        row = to_builtins(leg) | {"disturbed": " ".join(leg.disturbed), "alarms": "; ".join(leg.alarms)}
+        row |= {"used": "no" if why else "yes", "why_not": why}
+        rows.append(row | {"residual_chi2": "" if value is None else f"{value:.2f}"})
+    fields = [name for name in Leg.__struct_encode_fields__ if name not in ("unused", "alarms", "disturbed")]
+    return _csv([*fields, "disturbed", "alarms", "used", "why_not", "residual_chi2"], rows)
+
+
+def _station_rows(sheet: Sheet) -> list[dict[str, Any]]:
+    """Return adjusted stations and points, by STATION_DIGITS' columns; None: not known."""
+    depths = station_depths(sheet.project)
+    rows = []
+    stations = [("station", position) for position in sheet.adjusted.positions.values()]
+    for kind, position in [*stations, *(("point", position) for position in sheet.adjusted.points)]:
         major_m, minor_m, azimuth = position.ellipse
-        depth_m = depths.get(position.name, UNSET)
-        place = adjusted.grid.degrees(position.position_m)
-        writer.writerow(
-            [position.name, kind]
-            + [f"{value:.3f}" for value in position.position_m]
-            + ["" if depth_m is UNSET or kind == "point" else f"{depth_m:.3f}"]
-            + [f"{math.sqrt(max(float(position.covariance[i, i]), 0.0)):.3f}" for i in range(3)]
-            + [f"{major_m:.3f}", f"{minor_m:.3f}", f"{math.degrees(azimuth):.1f}"]
-            + (["", ""] if place is None else [f"{place[0]:.8f}", f"{place[1]:.8f}"])
-        )
-    return out.getvalue()
+        values = [position.name, kind, *position.position_m.tolist()]
+        values += [depths.get(position.name) if kind == "station" else None, *position.sigmas_m.tolist()]
+        values += [major_m, minor_m, math.degrees(azimuth)]
+        values += sheet.adjusted.grid.degrees(position.position_m) or (None, None)
+        rows.append(dict(zip(STATION_DIGITS, values, strict=True)))
+    return rows
 
 
-def _all(adjusted: Adjusted) -> list[tuple[str, Position]]:
-    stations = [("station", position) for position in adjusted.positions.values()]
-    return stations + [("point", position) for position in adjusted.points]
+def stations_csv(sheet: Sheet) -> str:
+    """Return adjusted stations and points: metres, 1 sd, and the horizontal ellipse."""
+
+    def text(value: Any, digits: int | None) -> str:
+        return "" if value is None else str(value) if digits is None else f"{value:z.{digits}f}"
+
+    rows = _station_rows(sheet)
+    return _csv(
+        STATION_DIGITS, ({name: text(row[name], digits) for name, digits in STATION_DIGITS.items()} for row in rows)
+    )
 
 
-def geojson(project: Project, adjusted: Adjusted) -> str:
+def geojson(sheet: Sheet) -> str:
     """Return stations, points and legs as GeoJSON (RFC 7946: WGS 84, longitude first, altitude third)."""
-    if adjusted.grid.north == "magnetic":
+    if sheet.angle_deg is None:
         raise BuddylineError("a map needs a declination: give [place] in the project")
     features: list[dict[str, Any]] = []
     at: dict[str, list[float]] = {}
-    for kind, position in _all(adjusted):
-        place = adjusted.grid.degrees(position.position_m)
-        if place is None:
+
+    def add(kind: str, coordinates: object, properties: dict[str, Any]) -> None:
+        geometry = {"type": kind, "coordinates": coordinates}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+
+    for row in _station_rows(sheet):
+        if row["latitude_deg"] is None:
             raise BuddylineError("a map needs a fixed point in degrees, or place.utm_zone: give them in the project")
-        where = [round(place[1], 8), round(place[0], 8), round(float(position.position_m[2]), 3)]
-        if kind == "station":
-            at[position.name] = where
-        major_m, minor_m, azimuth = position.ellipse
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": where},
-                "properties": {
-                    "name": position.name,
-                    "kind": kind,
-                    "ellipse_major_m": round(major_m, 3),
-                    "ellipse_minor_m": round(minor_m, 3),
-                    "ellipse_azimuth_deg": round(math.degrees(azimuth), 1),
-                    "sigma_up_m": round(position.up_sigma_m, 3),
-                },
-            }
+        where = [round(row["longitude_deg"], 8), round(row["latitude_deg"], 8), round(row["up_m"], 3)]
+        if row["kind"] == "station":
+            at[row["name"]] = where
+        digits = {name: STATION_DIGITS[name] for name in MAP_PROPERTIES}
+        add("Point", where, {name: row[name] if n is None else round(row[name], n) for name, n in digits.items()})
+    for line in sheet.adjusted.lines:
+        leg = line.leg
+        properties = {"name": leg.name, "kind": "leg", "distance_m": leg.distance_m, "grade": leg.grade}
+        add("LineString", [at[leg.from_], at[leg.to]], properties | {"alarms": leg.alarms})
+    description = f"{sheet.title}; {sheet.date}; {sheet.why}"
+    collection = {"type": "FeatureCollection", "name": sheet.name, "description": description, "features": features}
+    return json.dumps(collection, indent=1, allow_nan=False)
+
+
+def compass_dat(sheet: Sheet) -> str:
+    """Return .dat text: feet and degrees; raise BuddylineError without declination or date, which it must state."""
+    if sheet.angle_deg is None:
+        raise BuddylineError("Compass files must state a declination, and it is not known: give [place] in the project")
+    if not sheet.date:
+        raise BuddylineError("Compass files must state a date: give survey.date in the project")
+    when = datetime.strptime(sheet.date, "%Y.%m.%d")
+    comment = f"{sheet.title}; {sheet.why}".replace("\n", " ")[:76]
+    rows = [
+        sheet.name,
+        f"SURVEY NAME: {sheet.name[:12]}",
+        f"SURVEY DATE: {when.month} {when.day} {when.year}  COMMENT:{comment}",
+        "SURVEY TEAM:",
+        ", ".join(sheet.team),
+        f"DECLINATION: {sheet.angle_deg:7.2f}  FORMAT: {COMPASS_FORMAT}  CORRECTIONS:  0.00 0.00 0.00",
+        "",
+        "FROM TO LENGTH BEARING INC LEFT UP DOWN RIGHT AZM2 INC2 FLAGS COMMENTS",
+        "",
+    ]
+    for reading in sheet.readings:
+        leg, fore_deg, back_deg, remark = reading.leg, reading.compass_deg, reading.back_deg, reading.remark
+        if fore_deg is None and back_deg is not None:
+            # The format has no leg without a bearing.
+            fore_deg, remark = (back_deg + 180) % 360, f"bearing by backsight; {remark}"
+        fore, back = (MISSING if angle is None else f"{angle:.2f}" for angle in (fore_deg, back_deg))
+        rows.append(
+            f"{leg.from_:>12} {leg.to:>12} {leg.distance_m / FOOT_M:.3f} {fore} {reading.clino_deg:.3f} "
+            f"-9.90 -9.90 -9.90 -9.90 {back} {MISSING} {remark}"
         )
-    for line in adjusted.lines:
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "LineString", "coordinates": [at[line.leg.from_], at[line.leg.to]]},
-                "properties": {
-                    "name": line.leg.name,
-                    "kind": "leg",
-                    "distance_m": line.leg.distance_m,
-                    "grade": line.leg.grade,
-                    "alarms": line.leg.alarms,
-                },
-            }
-        )
-    heading = heading_of(project, adjusted)
-    return json.dumps(
-        {
-            "type": "FeatureCollection",
-            "name": heading.name,
-            "description": f"{heading.title}; {heading.date}; {heading.why}",
-            "features": features,
-        },
-        indent=1,
-        allow_nan=False,
-    )
+    return "\r\n".join(rows) + "\r\n\f\r\n"
