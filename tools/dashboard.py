@@ -13,10 +13,9 @@ import numpy as np
 from buddyline.node.sim.scenario import Environment, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import MessageError
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus
-from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, parse_key
+from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS
 from buddyline.solver_service.geometry.rotation import matrix_of
 from msgspec import UNSET
 
@@ -35,6 +34,7 @@ class Dashboard:
     def __init__(self, environment: str, seed: int, start_ns: int, rate_hz: float) -> None:
         self._title = f"Buddyline demo: {environment}, seed {seed}, {rate_hz:g} Hz"
         self._world = World(Scenario(environment=cast(Environment, environment), seed=seed, start_ns=start_ns))
+        self.refusals = Refusals("demo")
         self._lock = threading.Lock()
         self._began_s = time.monotonic()
         self._pose: RelativePose | None = None
@@ -55,13 +55,10 @@ class Dashboard:
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus."""
-        parsed = parse_key(received.key)
-        if parsed is None:
+        envelope = self.refusals.open(received)
+        if envelope is None:
             return
-        try:
-            message = decode(received.payload, parsed[0].schema)
-        except MessageError:
-            return
+        message = envelope.message
         with self._lock:
             if isinstance(message, RelativePose):
                 self._take_pose(message, received.receive_ns)

@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import Final
 
 import msgspec
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader, Record, read_logs
 from buddyline.protocol.envelope import Envelope, Refusals, read_message
@@ -44,36 +45,25 @@ class _Pass:
 class Dive:
     """One dive out of one or more logs (each node's own, say), with the pictures beside them.
 
-    A log that is empty is left out where there are others. Raises BuddylineError for a file that is no dive log,
-    and where two logs cannot be of one dive.
+    A log that is empty is left out where there are others. Raises BuddylineError for a file that is no dive log, and
+    where logs of one time describe a node differently. one_rig: False where that may be, as for solved logs beside
+    the logs that were solved.
     """
 
-    def __init__(self, paths: Sequence[str] | Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[str] | Sequence[Path], *, one_rig: bool = True) -> None:
         self._stack = ExitStack()
         self._passes: list[_Pass] = []
         self._left_out: list[str] = []
+        self._one_rig = one_rig
         self.readers: list[DiveLogReader] = []
         try:
-            for path in self._with_content([Path(path) for path in paths]):
+            with_content, self._left_out = _without_empty(with_pictures(_distinct(paths)))
+            for path in with_content:
                 self.readers.append(self._stack.enter_context(DiveLogReader(path)))
-            self._infos = self._check_one_dive()
+            self._infos = self._first_infos()
         except BaseException:
             self.close()
             raise
-
-    def _with_content(self, paths: list[Path]) -> list[Path]:
-        """Return the logs and their pictures but for empty ones, of which at least one is not."""
-        seen: set[Path] = set()
-        for path in paths:
-            if path.resolve() in seen:
-                raise BuddylineError(f"{path}: is named twice")
-            seen.add(path.resolve())
-        files = with_pictures(paths)
-        empty = [path for path in files if path.exists() and path.stat().st_size == 0]
-        if len(empty) == len(files):
-            return files
-        self._left_out += [f"{path}: is empty (0 bytes): nothing was recorded in it; left out" for path in empty]
-        return [path for path in files if path not in empty]
 
     @property
     def name(self) -> str:
@@ -97,6 +87,13 @@ class Dive:
     def end_ns(self) -> int:
         """Log time of the last message."""
         return max((reader.end_ns for reader in self.readers if reader.end_ns is not None), default=0)
+
+    @property
+    def seconds(self) -> float:
+        """From the first message to the last; 0 where there is none."""
+        return (
+            (self.end_ns - self.start_ns) / S_NS if any(reader.start_ns is not None for reader in self.readers) else 0.0
+        )
 
     @property
     def losses(self) -> list[str]:
@@ -160,8 +157,8 @@ class Dive:
         """Return the first sound NodeInfo of each node."""
         return dict(self._infos)
 
-    def _check_one_dive(self) -> dict[str, NodeInfo]:
-        """Return the first NodeInfo of each node; refuse logs of which two describe one differently at one time."""
+    def _first_infos(self) -> dict[str, NodeInfo]:
+        """Return the first NodeInfo of each node, the first named log's where several have one."""
         first: dict[str, tuple[DiveLogReader, NodeInfo]] = {}
         reading = _Pass()
         self._passes.append(reading)
@@ -171,9 +168,7 @@ class Dive:
                 if not isinstance(info, NodeInfo):
                     continue
                 other, known = first.setdefault(info.node, (reader, info))
-                if other is reader or _rig(known) == _rig(info):
-                    continue
-                if _overlap(other, reader):
+                if self._one_rig and _rig(known) != _rig(info) and other is not reader and _overlap(other, reader):
                     raise BuddylineError(
                         f"{other.path} and {reader.path} describe node {info.node} differently at the same time: "
                         "they are of two dives or two rigs; solve them apart"
@@ -194,6 +189,32 @@ class Dive:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close()
+
+
+def open_each(paths: Sequence[str], stack: ExitStack) -> list[Dive]:
+    """Open each log as a dive of its own, for who prefers some logs to others; the stack closes them."""
+    with_content, left_out = _without_empty(_distinct(paths))
+    losses.report(left_out)
+    return [stack.enter_context(Dive([path])) for path in with_content]
+
+
+def _distinct(paths: Sequence[str] | Sequence[Path]) -> list[Path]:
+    """Return the paths; raise BuddylineError where one is named twice."""
+    seen: set[Path] = set()
+    for path in map(Path, paths):
+        if path.resolve() in seen:
+            raise BuddylineError(f"{path}: is named twice")
+        seen.add(path.resolve())
+    return [Path(path) for path in paths]
+
+
+def _without_empty(paths: list[Path]) -> tuple[list[Path], list[str]]:
+    """Leave out empty files, unless all are; return the others, and a line for each that is left out."""
+    empty = [path for path in paths if path.is_file() and path.stat().st_size == 0]
+    if len(empty) == len(paths):
+        return paths, []
+    lines = [f"{path}: is empty (0 bytes): nothing was recorded in it; left out" for path in empty]
+    return [path for path in paths if path not in empty], lines
 
 
 def _wanted(topic_names: Iterable[str]) -> Callable[[str], bool]:

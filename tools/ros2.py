@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import ROS
-from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, parse_key
+from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
@@ -269,24 +269,17 @@ class Bridge:
     """Takes our messages off the bus and gives them to ROS; a bad one is counted and left out."""
 
     def __init__(self, translation: Translation, graph: RosGraph) -> None:
-        self.bad = 0
+        self.refusals = Refusals("ros2")
         self._translation = translation
         self._graph = graph
         self._lock = threading.Lock()
 
     def receive(self, received: Received) -> None:
         """Translate one message."""
-        parsed = parse_key(received.key)
-        if parsed is None:
-            return
-        try:
-            message = decode(received.payload, parsed[0].schema)
-        except MessageError as error:
-            self.bad += 1
-            if self.bad.bit_count() == 1:
-                log.warning("ros2: bad message on %s: %s (%d so far)", received.key, error, self.bad)
+        envelope = self.refusals.open(received)
+        if envelope is None:
             return
         # Each subscription has a thread of its own; sequence numbers must rise one by one.
         with self._lock:
-            for translated in self._translation.messages(message):
+            for translated in self._translation.messages(envelope.message):
                 self._graph.publish(translated)

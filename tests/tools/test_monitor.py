@@ -191,7 +191,7 @@ class TestInbox:
         inbox.receive(Received(POSE.key("a", "b"), b'{"range_m": "far"}', 0, ""))
         inbox.receive(self.received(pose(1), at(1)))
         inbox.empty_into(picture)
-        assert inbox.bad_count == 1
+        assert inbox.refusals.count == 1
         assert picture.solved == 1
 
     def test_who_leaves_is_seen(self) -> None:

@@ -24,8 +24,7 @@ import cv2
 import numpy as np
 from buddyline.node.detect import METHODS, make_detector
 from buddyline.node.drivers.stored import decode_picture
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage
 from buddyline.protocol.topics import IMAGE
 from buddyline.tools.dives import Dive
@@ -201,12 +200,10 @@ def _pictures(source: str, width_px: int, count: int) -> Pictures:
 
 def _stored(path: str) -> Iterator[NDArray[np.uint8]]:
     with Dive([path]) as dive:
-        for record in dive.records(IMAGE.name):
-            try:
-                image = decode(record.payload, CompressedImage)
-            except MessageError:
-                continue
-            yield decode_picture(image.data, f"{path}: picture at {image.stamp_ns}")
+        for envelope in dive.messages(IMAGE.name):
+            image = envelope.message
+            if isinstance(image, CompressedImage):
+                yield decode_picture(image.data, f"{path}: picture at {image.stamp_ns}")
 
 
 def _rendered(environment: str, size: tuple[int, int], count: int) -> Iterator[NDArray[np.uint8]]:

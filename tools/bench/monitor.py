@@ -28,7 +28,6 @@ from typing import Any, Final
 import numpy as np
 from buddyline.protocol.bus import Bus, Received
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
 from buddyline.protocol.topics import CANDIDATES, IMAGE, POSE
@@ -152,12 +151,15 @@ class Listener:
 
     def candidates(self, received: Received) -> None:
         """Take a frame's candidates."""
-        message = decode(received.payload, Candidates)
-        self._frames_ns.setdefault(message.trigger, {})[message.node] = received.receive_ns
+        message = received.open().message
+        if isinstance(message, Candidates):
+            self._frames_ns.setdefault(message.trigger, {})[message.node] = received.receive_ns
 
     def pose(self, received: Received) -> None:
         """Take a pose."""
-        self._poses_ns[decode(received.payload, RelativePose).trigger] = received.receive_ns
+        message = received.open().message
+        if isinstance(message, RelativePose):
+            self._poses_ns[message.trigger] = received.receive_ns
 
     @property
     def latencies_s(self) -> list[float]:

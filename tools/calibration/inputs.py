@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from buddyline.node.drivers.stored import decode_picture, picture_files
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.rotation import matrix_of
 from buddyline.tools.calibration.lights import Station
@@ -39,11 +39,10 @@ def pictures(paths: list[str], node: str | None) -> Iterator[tuple[str, NDArray[
 def _dive_pictures(path: Path, node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:
     with Dive([path]) as dive:
         wanted = _one_node(dive, node, "image")
-        for record in dive.records("image"):
-            message = record.decode()
-            if isinstance(message, CompressedImage) and message.frame_id == f"{wanted}_camera":
-                name = f"{path} at {(record.log_time_ns - dive.start_ns) / S_NS:.1f} s"
-                yield name, decode_picture(message.data, name)
+        for envelope in dive.messages("image"):
+            if isinstance(envelope.message, CompressedImage) and envelope.node == wanted:
+                name = f"{path} at {(envelope.time_ns - dive.start_ns) / S_NS:.1f} s"
+                yield name, decode_picture(envelope.message.data, name)
 
 
 def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
@@ -51,11 +50,8 @@ def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
     mags, accels = [], []
     with Dive(paths) as dive:
         wanted = _one_node(dive, node, "imu")
-        for record in dive.records("imu"):
-            try:
-                message = record.decode()
-            except MessageError:
-                continue
+        for envelope in dive.messages("imu"):
+            message = envelope.message
             if isinstance(message, Imu) and message.node == wanted and message.mag_t is not UNSET:
                 mags.append(message.mag_t)
                 accels.append(message.accel_mps2)
@@ -81,11 +77,8 @@ def stations(
         infos = dive.infos()
         frames: dict[tuple[str, int], Candidates] = {}
         poses: list[tuple[float, RelativePose]] = []
-        for record in dive.records("candidates", "pose"):
-            try:
-                message = record.decode()
-            except MessageError:
-                continue
+        for envelope in dive.messages("candidates", "pose"):
+            message = envelope.message
             if isinstance(message, Candidates):
                 frames[message.node, message.trigger] = message
             elif isinstance(message, RelativePose):

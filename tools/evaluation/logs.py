@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from buddyline.protocol.divelog import DiveLogReader
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -30,6 +29,7 @@ from buddyline.protocol.topics import (
     Topic,
     parse_key,
 )
+from buddyline.tools.dives import Dive, open_each
 from buddyline.tools.evaluation.recorded import Pair, Recorded
 from buddyline.tools.evaluation.truth import inverted
 from buddyline.tools.progress import Progress
@@ -48,68 +48,37 @@ def parse_pair(text: str) -> Pair:
     return parsed[1][0], parsed[1][1]
 
 
-def _names(readers: Sequence[DiveLogReader]) -> str:
-    return ", ".join(str(reader.path) for reader in readers)
+def _names(dives: Sequence[Dive]) -> str:
+    return ", ".join(dive.name for dive in dives)
 
 
-def _ids(readers: Sequence[DiveLogReader], *topics: Topic) -> list[tuple[str, ...]]:
-    parsed = [parse_key(key) for reader in readers for key in reader.keys]
-    return sorted({found[1] for found in parsed if found is not None and found[0] in topics})
+def _ids(dives: Sequence[Dive], *topics: Topic) -> list[tuple[str, ...]]:
+    return sorted({ids for dive in dives for ids in dive.ids(*(topic.name for topic in topics))})
 
 
-def _results(readers: Sequence[DiveLogReader]) -> tuple[Topic, ...]:
-    return _RESULTS if _ids(readers, *_RESULTS) else _TAGS
+def _results(dives: Sequence[Dive]) -> tuple[Topic, ...]:
+    return _RESULTS if _ids(dives, *_RESULTS) else _TAGS
 
 
-def _choose_pair(readers: Sequence[DiveLogReader], wanted: Pair | None) -> Pair:
-    pairs = [(ids[0], ids[1]) for ids in _ids(readers, *_results(readers)) or _ids(readers, TRUTH)]
+def _choose_pair(dives: Sequence[Dive], wanted: Pair | None) -> Pair:
+    pairs = [(ids[0], ids[1]) for ids in _ids(dives, *_results(dives)) or _ids(dives, TRUTH)]
     if not pairs:
-        nodes = [ids[0] for ids in _ids(readers, CANDIDATES)]
+        nodes = [ids[0] for ids in _ids(dives, CANDIDATES)]
         pairs = [(nodes[0], nodes[-1])] if nodes else []
     if wanted is not None:
         if wanted not in pairs and wanted[::-1] not in pairs:
             have = ", ".join("/".join(pair) for pair in pairs) or "none"
-            raise BuddylineError(f"{_names(readers)}: nothing of pair {'/'.join(wanted)}; pairs: {have}")
+            raise BuddylineError(f"{_names(dives)}: nothing of pair {'/'.join(wanted)}; pairs: {have}")
         return wanted if wanted in pairs else (wanted[1], wanted[0])
     if len(pairs) > 1:
         listed = ", ".join("/".join(pair) for pair in pairs)
-        raise BuddylineError(f"{_names(readers)}: holds pairs {listed}; choose one with --pair A/B")
+        raise BuddylineError(f"{_names(dives)}: holds pairs {listed}; choose one with --pair A/B")
     if not pairs:
-        raise BuddylineError(
-            f"{_names(readers)}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap"
-        )
+        raise BuddylineError(f"{_names(dives)}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     return pairs[0]
 
 
-def _messages(
-    reader: DiveLogReader, topics: Sequence[Topic], progress: Progress, problems: list[str]
-) -> Iterator[tuple[Topic, tuple[str, ...], Message]]:
-    """Yield a log's sound messages of these topics with their ids."""
-    bad = 0
-    first_bad = ""
-
-    def wanted(key: str) -> bool:
-        parsed = parse_key(key)
-        return parsed is not None and parsed[0] in topics
-
-    start_ns = reader.start_ns or 0
-    for record in reader.records(wanted):
-        progress.show((record.log_time_ns - start_ns) / 1e9)
-        parsed = parse_key(record.key)
-        try:
-            message = record.decode()
-        except MessageError as error:
-            bad += 1
-            first_bad = first_bad or f"{record.key}: {error}"
-            continue
-        if parsed is not None and message is not None:
-            yield *parsed, message
-    if bad:
-        problems.append(f"{reader.path}: {bad} messages that could not be used, the first: {first_bad}")
-    problems.extend(f"{reader.path}: {text}" for text in reader.damage if f"{reader.path}: {text}" not in problems)
-
-
-def _take(recorded: Recorded, topic: Topic, ids: tuple[str, ...], message: Message) -> None:
+def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
     """Sort one message in; those of other nodes and pairs are dropped, and of two NodeInfo the first stays."""
     nodes = recorded.nodes
     if isinstance(message, Truth):
@@ -142,14 +111,14 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
     they hold it. Of Candidates and NodeInfo of several logs, the first named stand first.
     """
     with ExitStack() as stack:
-        logs = [stack.enter_context(DiveLogReader(path)) for path in paths]
-        truth_logs = [stack.enter_context(DiveLogReader(path)) for path in truth_paths]
+        logs = open_each(paths, stack)
+        truth_logs = open_each(truth_paths, stack)
         recorded = Recorded(_choose_pair([*logs, *truth_logs], pair))
         results = _results(logs)
         answering = [log for log in logs if _ids([log], *results)]
         recorded.environment = next((log.metadata().get("environment", "") for log in [*logs, *truth_logs]), "")
         for log in answering[1:]:
-            recorded.problems.append(f"{log.path}: its poses are left out, those of {answering[0].path} are taken")
+            recorded.problems.append(f"{log.name}: its poses are left out, those of {answering[0].name} are taken")
         sighted = {topic.name for topic in _TRUTHS if _ids(truth_logs, topic)}
         for log in [*logs, *truth_logs]:
             topics: list[Topic] = [INFO, CANDIDATES]
@@ -158,9 +127,10 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
             if answering:
                 topics += [ATTITUDE]
             topics += [topic for topic in _TRUTHS if log in truth_logs or topic.name not in sighted]
-            with Progress(f"read {log.path.name}", ((log.end_ns or 0) - (log.start_ns or 0)) / 1e9) as progress:
-                for topic, ids, message in _messages(log, topics, progress, recorded.problems):
-                    _take(recorded, topic, ids, message)
+            with Progress(f"read {log.name}", log.seconds) as progress:
+                for envelope in log.messages(*(topic.name for topic in topics)):
+                    progress.show((envelope.time_ns - log.start_ns) / 1e9)
+                    _take(recorded, envelope.ids, envelope.message)
     return recorded
 
 

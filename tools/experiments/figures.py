@@ -11,7 +11,7 @@ import numpy as np
 from buddyline.node.detect import draw, make_detector
 from buddyline.node.drivers.stored import decode_picture
 from buddyline.protocol.clock import trigger_index
-from buddyline.protocol.messages import CompressedImage
+from buddyline.protocol.messages import Candidates, CompressedImage, RelativePose
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.poses import PoseErrors
 from buddyline.tools.evaluation.rotation import Floats
@@ -132,25 +132,18 @@ def detections(dive: Rendered, path: Path) -> int | None:
     with Dive([dive.dive]) as log:
         infos = log.infos()
         pictures = {}
-        for record in log.records("image"):
-            message = record.decode()
-            if isinstance(message, CompressedImage):
-                node = message.frame_id.removesuffix("_camera")
-                if trigger_index(message.stamp_ns, infos[node].trigger_period_ns) == trigger:
-                    pictures[node] = decode_picture(message.data, record.key)
+        for envelope in log.messages("image"):
+            message, node = envelope.message, envelope.node
+            if not isinstance(message, CompressedImage):
+                continue
+            if trigger_index(message.stamp_ns, infos[node].trigger_period_ns) == trigger:
+                pictures[node] = decode_picture(message.data, envelope.key)
     with Dive([dive.logs[OURS]]) as log:
-        pose = next(
-            found
-            for record in log.records("pose")
-            if (found := record.decode()) and found.trigger == trigger  # type: ignore[attr-defined]
-        )
-        blobs = {
-            found.node: found.blobs  # type: ignore[attr-defined]
-            for record in log.records("candidates")
-            if (found := record.decode()) and found.trigger == trigger  # type: ignore[attr-defined]
-        }
+        found = [envelope.message for envelope in log.messages("pose", "candidates")]
+        pose = next(one for one in found if isinstance(one, RelativePose) and one.trigger == trigger)
+        blobs = {one.node: one.blobs for one in found if isinstance(one, Candidates) and one.trigger == trigger}
     rows = []
-    for node, chosen in (("a", pose.blobs_a), ("b", pose.blobs_b)):  # type: ignore[attr-defined]
+    for node, chosen in (("a", pose.blobs_a), ("b", pose.blobs_b)):
         raw = pictures[node]
         candidates = draw(raw, make_detector().detect(raw))
         pair = raw.copy()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.result import Result, evaluate
 
@@ -99,10 +100,8 @@ def rendered(environment: str, size: Size, directory: Path) -> Rendered:
 
 def has_poses(path: Path) -> bool:
     """Whether a log has any result: tags may have none at all."""
-    from buddyline.protocol.divelog import DiveLogReader
-
-    with DiveLogReader(path) as reader:
-        return any(key.endswith(("/pose", "/rejected", "/artag")) for key in reader.keys)
+    with Dive([path]) as dive:
+        return bool(dive.ids("pose", "rejected", "artag"))
 
 
 def long_dive(size: Size, directory: Path) -> tuple[Path, dict[str, Result]]:

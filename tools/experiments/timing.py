@@ -43,10 +43,8 @@ def trigger(found: Path) -> dict[str, float]:
     core = SolverCore("a", "b", SolveConfig().settings("experiments"))
     taken_ms = []
     with Dive([found]) as dive:
-        for record in dive.records("info", "attitude", "depth", "candidates"):
-            message = record.decode()
-            if message is None:
-                continue
+        for envelope in dive.messages("info", "attitude", "depth", "candidates"):
+            message = envelope.message
             matched, began_s = core.matched, time.process_time()
             core.handle(message)
             # Most messages resolve nothing: those that do are the triggers.
@@ -61,10 +59,9 @@ def frame(dive: Path) -> dict[str, float]:
     """Return the time of detection in one picture by each detector, ms, the median over pictures of a dive."""
     pictures = []
     with Dive([dive]) as log:
-        for record in log.records("image"):
-            message = record.decode()
-            if isinstance(message, CompressedImage):
-                pictures.append(decode_picture(message.data, record.key))
+        for envelope in log.messages("image"):
+            if isinstance(envelope.message, CompressedImage):
+                pictures.append(decode_picture(envelope.message.data, envelope.key))
             if len(pictures) == _PICTURES:
                 break
     times = {}

@@ -11,8 +11,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import MessageError
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.topics import (
     ATTITUDE,
     CANDIDATES,
@@ -50,8 +49,7 @@ class Inbox:
 
     def __init__(self, clock: Clock) -> None:
         self.dropped = 0
-        self.bad: dict[str, str] = {}
-        self.bad_count = 0
+        self.refusals = Refusals("monitor")
         self._clock = clock
         self._lock = threading.Lock()
         self._queue: deque[Received | Presence] = deque()
@@ -92,7 +90,7 @@ class Inbox:
     def empty_into(self, picture: PairPicture) -> int:
         """Decode all that is here into the picture; return how many messages that were.
 
-        A message that is not sound is counted, and the newest of each key kept in words; it changes nothing.
+        A message that is not sound is counted and named; it changes nothing.
         """
         with self._lock:
             items = list(self._newest.values()) + list(self._queue)
@@ -102,15 +100,7 @@ class Inbox:
             if isinstance(item, Presence):
                 picture.alive(item.name, item.alive, item.at_ns)
                 continue
-            parsed = parse_key(item.key)
-            if parsed is None:
-                continue
-            try:
-                message = decode(item.payload, parsed[0].schema)
-            except MessageError as error:
-                self.bad_count += 1
-                if len(self.bad) < 32 or item.key in self.bad:
-                    self.bad[item.key] = str(error)
-                continue
-            picture.take(message, parsed[1][0], item.receive_ns)
+            envelope = self.refusals.open(item)
+            if envelope is not None:
+                picture.take(envelope.message, envelope.node, envelope.time_ns)
         return len(items)

@@ -77,8 +77,6 @@ def report_html(dive: Dive) -> str:
     begun = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(dive.start_ns / S_NS))
     whole_s = (dive.end_ns - dive.start_ns) / S_NS
     warnings = [*dive.losses]
-    if summary.bad:
-        warnings.append(f"{summary.bad} messages of the log could not be used")
     if not summary.picture.solved:
         warnings.append("this log holds no pose; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     parts = [

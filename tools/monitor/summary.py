@@ -9,10 +9,8 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.divelog import Record
-from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
-from buddyline.protocol.topics import CANDIDATES, IMAGE, parse_key
+from buddyline.protocol.topics import CANDIDATES, IMAGE
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.panel import marked_picture, result_words
@@ -21,7 +19,7 @@ from buddyline.tools.monitor.replay import Keyframe
 from buddyline.tools.monitor.scene import Floats
 
 TOPICS: Final = (
-    "info", "candidates", "attitude", "depth", "image", "status", "node_status", "pose", "rejected", "truth",
+    "info", "candidates", "attitude", "depth", "image", "node_status", "pose", "rejected", "truth",
     "solver_status",
 )  # fmt: skip
 MAX_POINTS: Final = 3000
@@ -58,7 +56,6 @@ class Summary:
     shots: dict[str, Shot] = field(default_factory=dict)
     infos: dict[str, list[NodeInfo]] = field(default_factory=dict)
     errors_m: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    bad: int = 0
 
 
 def summarize(dive: Dive) -> Summary:
@@ -67,33 +64,24 @@ def summarize(dive: Dive) -> Summary:
     spacing_ns = max(MIN_SPACING_NS, (dive.end_ns - dive.start_ns) // MAX_POINTS)
     truths: dict[int, Truth] = {}
     poses: list[tuple[int, Floats, float]] = []
-    for record in dive.records(*TOPICS):
-        parsed = parse_key(record.key)
-        if parsed is None:
-            continue
-        summary.counts[record.key] += 1
-        try:
-            message = record.decode()
-        except MessageError:
-            summary.bad += 1
-            continue
+    for envelope in dive.messages(*TOPICS):
+        message, at_ns = envelope.message, envelope.time_ns
+        summary.counts[envelope.key] += 1
         if isinstance(message, Truth):
-            if message.trigger is not None and isinstance(message.trigger, int):
+            if isinstance(message.trigger, int):
                 truths[message.trigger] = message
             continue
-        if message is None:
-            continue
-        summary.picture.take(message, parsed[1][0], record.log_time_ns)
+        summary.picture.take(message, envelope.node, at_ns)
         if isinstance(message, RelativePose) and summary.picture.pose is message:
             poses.append((message.trigger, np.array(message.t_a_b_m), message.range_m))
-            _take_pose(summary, message, record, spacing_ns)
+            _take_pose(summary, message, at_ns, spacing_ns)
         elif isinstance(message, Rejected):
-            summary.coverage.add(record.log_time_ns, message.reason)
-            summary.misses.append(Miss(record.log_time_ns, message.reason, ""))
+            summary.coverage.add(at_ns, message.reason)
+            summary.misses.append(Miss(at_ns, message.reason, ""))
         elif isinstance(message, Depth):
             line = summary.depths.setdefault(message.node, [])
-            if not line or record.log_time_ns - line[-1][0] >= max(DEPTH_SPACING_NS, spacing_ns):
-                line.append((record.log_time_ns, message.depth_m))
+            if not line or at_ns - line[-1][0] >= max(DEPTH_SPACING_NS, spacing_ns):
+                line.append((at_ns, message.depth_m))
         elif isinstance(message, NodeInfo):
             known = summary.infos.setdefault(message.node, [])
             if not known or known[-1].camera != message.camera or known[-1].light_left_m != message.light_left_m:
@@ -104,8 +92,7 @@ def summarize(dive: Dive) -> Summary:
     return summary
 
 
-def _take_pose(summary: Summary, pose: RelativePose, record: Record, spacing_ns: int) -> None:
-    at_ns = record.log_time_ns
+def _take_pose(summary: Summary, pose: RelativePose, at_ns: int, spacing_ns: int) -> None:
     frame = summary.picture.frame()
     point = point_of(pose, frame, at_ns)
     summary.coverage.add(at_ns, None)
@@ -142,30 +129,16 @@ def _take_shots(summary: Summary, dive: Dive) -> None:
     """Take one picture of each node near the middle of the dive, where there are pictures."""
     middle_ns = (summary.coverage.begin_ns + summary.coverage.end_ns) // 2
     picture = PairPicture()
-    for reader in dive.readers:
-        nodes = [parsed[1][0] for key in reader.keys if (parsed := parse_key(key)) and parsed[0] is IMAGE]
-        if not nodes:
-            continue
-        for record in reader.records(_shot_topic, middle_ns):
-            if record.log_time_ns > middle_ns + 20 * S_NS:
-                break
-            parsed = parse_key(record.key)
-            if parsed is None:
-                continue
-            try:
-                message = record.decode()
-            except MessageError:
-                continue
-            if message is not None:
-                picture.take(message, parsed[1][0], record.log_time_ns)
-                _take_shot(summary, picture, record.log_time_ns)
-            if all(node in summary.shots for node in nodes):
-                break
-
-
-def _shot_topic(key: str) -> bool:
-    parsed = parse_key(key)
-    return parsed is not None and parsed[0].name in (IMAGE.name, CANDIDATES.name, "pose", "rejected")
+    nodes = dive.nodes(IMAGE.name)
+    if not nodes:
+        return
+    for envelope in dive.messages(IMAGE.name, CANDIDATES.name, "pose", "rejected", since_ns=middle_ns):
+        if envelope.time_ns > middle_ns + 20 * S_NS:
+            return
+        picture.take(envelope.message, envelope.node, envelope.time_ns)
+        _take_shot(summary, picture, envelope.time_ns)
+        if all(node in summary.shots for node in nodes):
+            return
 
 
 def _take_shot(summary: Summary, picture: PairPicture, at_ns: int) -> None:

@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import SURVEYOR
-from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, parse_key
+from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient
 from buddyline.tools.survey import alarms
@@ -115,6 +115,7 @@ class Watch:
     """The alarms on a bus: attached, it listens to the pair and publishes marks."""
 
     def __init__(self, bus: Bus) -> None:
+        self.refusals = Refusals("survey watch")
         self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
         self._bus = bus
         self._publishers: dict[str, Publisher] = {}
@@ -129,14 +130,13 @@ class Watch:
 
     def receive(self, received: Received) -> None:
         """Take one message off the bus."""
-        parsed = parse_key(received.key)
-        if parsed is None:
+        envelope = self.refusals.open(received)
+        if envelope is None:
             return
         try:
-            message = decode(received.payload, parsed[0].schema)
             with self._lock:
-                marks = self._alarms.handle(message)
-        except (MessageError, BuddylineError) as error:
+                marks = self._alarms.handle(envelope.message)
+        except BuddylineError as error:
             log.warning("survey watch: %s: %s", received.key, error)
             return
         for mark in marks:

@@ -7,9 +7,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
-from buddyline.tools.dives import Dive
+from buddyline.tools.dives import Dive, open_each
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.rotations import matrices_of
 from msgspec import UNSET
@@ -89,19 +89,16 @@ class Readings:
 
 
 def of_messages(messages: Iterable[Message], name: str = "dive") -> Readings:
-    """Return the readings of a dive's messages, in any order; of two alike (in two logs), one."""
-    poses: dict[int, RelativePose] = {}
-    rejected: dict[int, Rejected] = {}
+    """Return the readings of a dive's messages, in any order; of two alike (in two logs), the first."""
+    outcomes: dict[tuple[str, str, int], RelativePose | Rejected] = {}
     marks: dict[tuple[str, int, str], Mark] = {}
     infos: dict[str, NodeInfo] = {}
     attitudes: dict[str, dict[int, Attitude]] = {}
     depths: dict[str, dict[int, Depth]] = {}
     imus: dict[str, dict[int, Imu]] = {}
     for message in messages:
-        if isinstance(message, RelativePose):
-            poses[message.trigger] = message
-        elif isinstance(message, Rejected):
-            rejected[message.trigger] = message
+        if isinstance(message, RelativePose | Rejected):
+            outcomes.setdefault((message.node_a, message.node_b, message.trigger), message)
         elif isinstance(message, NodeInfo):
             infos.setdefault(message.node, message)
         elif isinstance(message, Mark):
@@ -112,7 +109,9 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> Readings:
             depths.setdefault(message.node, {})[message.stamp_ns] = message
         elif isinstance(message, Imu):
             imus.setdefault(message.node, {})[message.stamp_ns] = message
-    pairs = {(pose.node_a, pose.node_b) for pose in poses.values()}
+    poses = [outcome for outcome in outcomes.values() if isinstance(outcome, RelativePose)]
+    rejected = [outcome for outcome in outcomes.values() if isinstance(outcome, Rejected)]
+    pairs = {(pose.node_a, pose.node_b) for pose in poses}
     if not pairs:
         raise BuddylineError(f"{name}: holds no poses; solve the dive first (buddyline solve)")
     if len(pairs) > 1:
@@ -121,7 +120,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> Readings:
     for node in (a, b):
         if node not in infos:
             raise BuddylineError(f"{name}: holds no NodeInfo of node {node}; name its log as well")
-    fixes = sorted(poses.values(), key=lambda pose: pose.stamp_ns)
+    fixes = sorted(poses, key=lambda pose: pose.stamp_ns)
     nodes = [_node(infos[n], attitudes.get(n, {}), depths.get(n, {}), imus.get(n, {})) for n in (a, b)]
     return Readings(
         nodes[0],
@@ -131,7 +130,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> Readings:
         np.array([fix.t_a_b_m for fix in fixes]),
         np.array([fix.q_a_b_xyzw for fix in fixes]),
         np.array([fix.covariance for fix in fixes]).reshape(-1, 6, 6),
-        sorted(rejected.values(), key=lambda one: one.stamp_ns),
+        sorted(rejected, key=lambda one: one.stamp_ns),
         sorted(marks.values(), key=lambda mark: mark.stamp_ns),
     )
 
@@ -162,16 +161,11 @@ def of_logs(paths: list[str]) -> Readings:
     The solved log goes first: where it was solved with another calibration than the nodes', its own holds.
     """
     with ExitStack() as stack:
-        dives = [stack.enter_context(Dive([path])) for path in paths]
+        dives = open_each(paths, stack)
         dives.sort(key=lambda dive: not dive.nodes("pose"))
         return of_messages((message for dive in dives for message in _messages(dive)), ", ".join(map(str, paths)))
 
 
 def _messages(dive: Dive) -> Iterator[Message]:
-    for record in dive.records("pose", "rejected", "info", "attitude", "depth", "imu", "mark"):
-        try:
-            message = record.decode()
-        except MessageError:
-            continue
-        if message is not None:
-            yield message
+    for envelope in dive.messages("pose", "rejected", "info", "attitude", "depth", "imu", "mark"):
+        yield envelope.message
