@@ -14,7 +14,7 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.truth import TruthTrack
-from buddyline.tools.experiments import figures, numbers, page, tank, timing
+from buddyline.tools.experiments import figures, numbers, page, readme, tank, timing
 from buddyline.tools.experiments.runs import (
     ENVIRONMENTS,
     FULL,
@@ -45,6 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="a new folder for the report")
     parser.add_argument("--quick", action="store_true", help="short dives: a look, not figures to quote")
     parser.add_argument(
+        "--readme",
+        type=Path,
+        metavar="README.md",
+        help="write the table at a glance into this file, between its markers",
+    )
+    parser.add_argument(
         "--tag-video",
         type=Path,
         metavar="FILE",
@@ -60,6 +66,11 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("experiments need matplotlib: pip install 'buddyline[plots]'") from None
     if args.tag_video is not None and not args.tag_video.is_file():
         raise BuddylineError(f"{args.tag_video}: no such video")
+    if args.readme is not None:
+        if args.quick:
+            raise BuddylineError("--readme: a quick run gives no figures to quote; leave --quick out")
+        readme.read_readme(args.readme)
+    code_hash = readme.deciding_hash()
     try:
         args.output.mkdir(parents=True)
     except OSError as error:
@@ -70,10 +81,15 @@ def run(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         found = measure(QUICK if args.quick else FULL, Path(folder), args.output, args.tag_video)
     found["quick"] = args.quick
+    found["code"] = code_hash
     rows = numbers.headline(found)
     (args.output / "experiments.json").write_text(json.dumps(found, allow_nan=False, indent=1) + "\n")
     (args.output / "headline.md").write_text(numbers.markdown(rows))
     (args.output / "report.html").write_text(report(found, rows, args.output), encoding="utf-8")
+    if args.readme is not None:
+        # Read again: a run takes minutes, and the file may have been edited meanwhile.
+        text = readme.with_table(readme.read_readme(args.readme), numbers.markdown(rows), code_hash)
+        args.readme.write_text(text, encoding="utf-8")
     print(args.output / "report.html")
     return 0
 

@@ -1,0 +1,90 @@
+"""The README's table of accuracy belongs to the code that stands beside it."""
+
+from pathlib import Path
+
+import pytest
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.cli import main
+from buddyline.tools.experiments.readme import (
+    COMMAND,
+    deciding_hash,
+    deciding_modules,
+    read_readme,
+    with_table,
+    written_hash,
+)
+
+README = Path(__file__).parents[2] / "README.md"
+SOURCE = '''
+"""What it does."""
+import math
+from a import b
+
+class Light:
+    """One light."""
+    def far(self, range_m: float = 2.0) -> bool:
+        """Whether it is far."""
+        return math.hypot(range_m, 1.0) > 3.0
+'''
+
+
+def test_the_table_is_of_this_code():
+    assert written_hash(README.read_text()) == deciding_hash(), (
+        f"the table in README.md is older than what decides poses (detector or solver); write it anew: {COMMAND}"
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("One light.", "A lamp."),
+        ("import math\n", "import math  # the library\n"),
+        ("from a import b", "from c.a import b"),
+        ("return math", "# far away\n        return math"),
+        ('        """Whether it is far."""\n', ""),
+        ("(range_m, 1.0)", "(range_m,\n            1.0)"),
+    ],
+)
+def test_words_do_not_count(old, new):
+    assert old in SOURCE
+    assert deciding_hash([SOURCE.replace(old, new)]) == deciding_hash([SOURCE])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("3.0", "3.1"), ("> 3", ">= 3"), ("= 2.0", "= 2.5"), ("hypot", "dist"), ("range_m, 1.0", "1.0, range_m")],
+)
+def test_what_decides_counts(old, new):
+    assert old in SOURCE
+    assert deciding_hash([SOURCE.replace(old, new)]) != deciding_hash([SOURCE])
+
+
+def test_modules_that_are_moved_or_renamed_do_not_count():
+    assert deciding_hash([SOURCE, "x = 1"]) == deciding_hash(["x = 1", SOURCE])
+    assert deciding_hash([SOURCE]) != deciding_hash([SOURCE, "x = 1"])
+
+
+def test_detector_and_solver_decide():
+    names = {f"{path.parent.name}/{path.name}" for path in deciding_modules()}
+    assert {"detect/centre.py", "geometry/trigger.py", "solver_service/core.py", "node/pipeline.py"} <= names
+    assert not any(name.startswith(("tools/", "protocol/", "sim/", "drivers/")) for name in names)
+
+
+def test_the_table_is_written_between_its_markers_alone():
+    text = "# Us\n\n<!-- accuracy of code 0123456789abcdef, x -->\n| old |\n<!-- end of accuracy -->\n\nmore\n"
+    new = with_table(text, "| new \\1 |\n", "fedcba9876543210")
+    assert written_hash(new) == "fedcba9876543210"
+    assert new.startswith("# Us\n\n<!-- accuracy of code fedcba9876543210, written by `")
+    assert new.endswith("-->\n| new \\1 |\n<!-- end of accuracy -->\n\nmore\n")
+
+
+def test_a_readme_without_a_place_for_the_table_is_refused_before_the_run(tmp_path, capsys):
+    path = tmp_path / "README.md"
+    with pytest.raises(BuddylineError, match=r"README\.md: cannot be read"):
+        read_readme(path)
+    path.write_text("# Us\n")
+    assert main(["experiments", "-o", str(tmp_path / "report"), "--readme", str(path)]) == 2
+    assert "has no table between" in capsys.readouterr().err
+    assert main(["experiments", "-o", str(tmp_path / "report"), "--readme", str(README), "--quick"]) == 2
+    assert "a quick run gives no figures to quote" in capsys.readouterr().err
+    assert not (tmp_path / "report").exists()
