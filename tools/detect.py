@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
-from buddyline.node.detect import ENVIRONMENTS, METHODS, Detection, draw, make_detector
+from buddyline.node.detect import ENVIRONMENTS, METHODS, Detection, make_detector
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.node.pipeline import Pipeline
@@ -21,6 +21,7 @@ from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo
 from buddyline.protocol.topics import parse_key
 from buddyline.tools.dives import Dive
+from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ def _detect_pictures(args: argparse.Namespace) -> int:
                 )
             )
             if args.draw:
-                cv2.imwrite(str(Path(args.draw) / f"{file.stem}.png"), draw(picture, detections))
+                cv2.imwrite(str(Path(args.draw) / f"{file.stem}.png"), mark_candidates(picture, detections))
     if skipped:
         log.warning("%d of %d pictures skipped", skipped, len(files))
     return 1 if skipped == len(files) else 0
@@ -171,7 +172,7 @@ def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
                         if isinstance(message, Candidates) and args.draw and detector.last:
                             frame, detections = detector.last
                             name = f"{message.node}_{message.trigger}.png"
-                            cv2.imwrite(str(Path(args.draw) / name), draw(frame.image, detections))
+                            cv2.imwrite(str(Path(args.draw) / name), mark_candidates(frame.image, detections))
         finally:
             if writer is not None:
                 writer.close()

@@ -29,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, print, and draw where asked for; return 0."""
     if args.plots is not None:
-        from buddyline.tools.evaluation import plots
+        from buddyline.tools.draw import errors
 
-        plots.check(args.plots)
+        errors.check_folder(args.plots)
     recorded = load_for_evaluation(args.logs, args.truth, args.pair)
     for problem in recorded.problems:
         log.warning("%s", problem)
@@ -40,6 +40,6 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")
     print(json.dumps(as_dict(result), allow_nan=False) if args.json else as_text(result))
     if args.plots is not None:
-        for path in plots.write(result, args.plots):
+        for path in errors.write_figures(result, args.plots):
             log.info("%s", path)
     return 0

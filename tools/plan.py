@@ -16,6 +16,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.tools.bound import pose_bounds
 from buddyline.tools.dives import load_info
+from buddyline.tools.draw.figures import new_figure, save
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized
 
 RANGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
@@ -289,22 +290,15 @@ def _far(end_m: float | None) -> str:
 
 def draw(spacings: dict[float, Plan], tolerances: Tolerances, reach_m: float, path: Path) -> None:
     """Draw position errors by range, a line a spacing."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise BuddylineError("plots need matplotlib: pip install 'buddyline[plots]'") from None
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    axis = figure.subplots()
+    figure, (axis,) = new_figure(7.0, 4.2)
     for spacing, one in spacings.items():
-        ranges_m = [row.range_m for row in one.rows if row.in_view]
-        axis.loglog(ranges_m, [row.position_error_m for row in one.rows if row.in_view], label=f"lights {spacing:g} m")
+        rows = [row for row in one.rows if row.in_view]
+        axis.loglog(
+            [row.range_m for row in rows], [row.position_error_m for row in rows], label=f"lights {spacing:g} m"
+        )
     axis.axhline(tolerances.position_m, color="0.4", linestyle="--", label="tolerance")
     if math.isfinite(reach_m):
         axis.axvline(reach_m, color="tab:brown", linestyle=":", label="lights too faint")
     axis.set(xlabel="range, m", ylabel="position error, RMS, m")
-    axis.grid(visible=True, which="both", linewidth=0.3)
-    axis.legend(fontsize=8)
-    try:
-        figure.savefig(path, dpi=100)
-    except OSError as error:
-        raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    axis.legend()
+    save(figure, path)

@@ -17,7 +17,7 @@ from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
-from buddyline.node.detect import ENVIRONMENTS, METHODS, draw, make_detector, presets
+from buddyline.node.detect import ENVIRONMENTS, METHODS, make_detector, presets
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.codec import decode
@@ -25,6 +25,7 @@ from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import CompressedImage, LightTruth
 from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
 from buddyline.tools.dives import Dive
+from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
@@ -253,7 +254,9 @@ def _write(folder: str, method: str, environment: str, values: Values, pictures:
     path.mkdir(parents=True, exist_ok=True)
     detector = make_detector(method, environment, values)
     for picture in pictures:
-        marked = draw(picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px])
+        marked = mark_candidates(
+            picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px]
+        )
         cv2.imwrite(str(path / f"{Path(picture.name).stem}.png"), marked)
     return path
 

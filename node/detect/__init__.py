@@ -10,13 +10,12 @@ from typing import Final
 
 from buddyline.node.detect import paper, source
 from buddyline.node.detect.detection import Detection, Detector, ImageError
-from buddyline.node.detect.drawing import draw
 from buddyline.protocol.errors import BuddylineError
 
 METHODS: Final = ("source", "paper")
 ENVIRONMENTS: Final = ("auto", "cavern", "night_reef", "lake", "basin")
 
-__all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "draw", "make_detector", "presets"]
+__all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "make_detector", "presets"]
 
 
 def presets(method: str) -> Mapping[str, Mapping[str, float]]:

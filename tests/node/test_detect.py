@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from buddyline.node.detect import ENVIRONMENTS, METHODS, ImageError, draw, make_detector
+from buddyline.node.detect import ENVIRONMENTS, METHODS, ImageError, make_detector
 from buddyline.protocol.errors import BuddylineError
 
 from tests.node.rendered import lamp_picture
@@ -70,16 +70,3 @@ def test_what_is_unknown_is_refused_with_the_choices():
         make_detector("paper", "lake", {"value_mix": 3.0})
     with pytest.raises(BuddylineError, match="finite"):
         make_detector("paper", "lake", {"value_min": float("nan")})
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("grey", [False, True])
-def test_drawing_marks_a_copy(method, grey):
-    image = lamp_picture([(80.0, 60.0)], size=(160, 120), seed=1)
-    image = image[:, :, 1].copy() if grey else image
-    before = image.copy()
-    found = make_detector(method).detect(image)
-    marked = draw(image, found, truth=[(80.0, 60.0)])
-    assert marked.shape == (120, 160, 3)
-    assert np.array_equal(image, before)
-    assert np.any(marked[55:66, 75:86] != np.atleast_3d(before)[55:66, 75:86])

@@ -10,7 +10,7 @@ from buddyline.tools.bound import pose_bounds
 from buddyline.tools.cli import main
 from buddyline.tools.evaluation.poses import pose_errors
 from buddyline.tools.evaluation.truth import Track, TruthTrack
-from buddyline.tools.experiments import numbers, page
+from buddyline.tools.experiments import numbers
 
 from tests.tools.evaluated import INFOS, pose, truth
 
@@ -55,10 +55,6 @@ def test_a_method_ends_where_half_of_the_triggers_give_no_pose():
     assert ends["ends_m"] == 4.0
     assert [row["share"] for row in ends["bins"]] == [1.0, 0.0]
     assert ends["farthest_m"] == 3.0
-
-
-def test_the_page_escapes_what_it_shows():
-    assert "<b>" not in page.table(("<b>",), [["<b>"]])
 
 
 @pytest.mark.slow

@@ -12,9 +12,13 @@ from typing import Any
 import cv2
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.draw import errors as error_figures
+from buddyline.tools.draw import figures
+from buddyline.tools.draw.errors import ErrorCurve
+from buddyline.tools.draw.page import page, picture, section, table
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.truth import TruthTrack
-from buddyline.tools.experiments import figures, numbers, page, readme, tank, timing
+from buddyline.tools.experiments import numbers, pictured, readme, tank, timing
 from buddyline.tools.experiments.runs import (
     ENVIRONMENTS,
     FULL,
@@ -60,10 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run everything and write the report; return 0."""
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise BuddylineError("experiments need matplotlib: pip install 'buddyline[plots]'") from None
+    figures.check()
     if args.tag_video is not None and not args.tag_video.is_file():
         raise BuddylineError(f"{args.tag_video}: no such video")
     if args.readme is not None:
@@ -138,60 +139,97 @@ def measure(size: Size, folder: Path, output: Path, video: Path | None) -> dict[
         progress.show(len(dives) + 2, "pictures")
         if video is not None:
             found["tank"] = tank.figures(video, size.tank_step)
-        figures.trajectories(dives, truths, output / "trajectories.png")
+        curves = {dive.environment: curves_of(dive) for dive in dives}
+        figure = error_figures.trajectories({named(name): (truths[name], curves[name]) for name in ENVIRONMENTS})
+        figures.save(figure, output / "trajectories.png")
         for dive in dives:
-            start_ns = int(starts[dive.environment][0])
-            times_s = (starts[dive.environment] - start_ns) / 1e9
-            path = output / f"over_time_{dive.environment}.png"
-            figures.over_time(dive, times_s, truths[dive.environment], start_ns, path)
-            figures.detections(dive, output / f"detection_{dive.environment}.png")
-        figures.over_range(found["distance"], errors.true_range_m, bound_m, output / "error_over_range.png")
+            name = dive.environment
+            stamps_ns, title = starts[name].tolist(), f"{named(name)}: lights and AR tags"
+            figure = error_figures.over_time(curves[name], stamps_ns, truths[name], title)
+            figures.save(figure, output / f"over_time_{name}.png")
+            pictured.detections(dive, output / f"detection_{name}.png")
+        figure = error_figures.medians_over_range(found["distance"], errors.true_range_m, bound_m)
+        figures.save(figure, output / "error_over_range.png")
     return found
+
+
+def named(environment: str) -> str:
+    """Return an environment's name for a person."""
+    return environment.replace("_", " ")
+
+
+def curves_of(dive: Rendered) -> list[ErrorCurve]:
+    """Return the sound poses of a dive, out of lights and out of tags."""
+    return [
+        ErrorCurve(method, errors.select(~errors.wrong), colour, marker)
+        for method, colour, marker in ((OURS, "tab:blue", "."), (TAGS, "tab:orange", "x"))
+        if method in dive.results
+        for errors in [dive.results[method].errors]
+    ]
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a figure, or a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}f}" if isinstance(value, float) else str(value)
+
+
+def pair_rows(pairs: dict[str, dict[str, dict[str, Any]]]) -> list[list[str]]:
+    """Return the rows of the table of right pairs."""
+    return [
+        [
+            method,
+            named(environment),
+            str(row["visible"]),
+            *(number(None if row[key] is None else 100 * row[key], 1) for key in ("right_share", "right_of_poses")),
+            str(row["other_pair"]),
+            str(row["wrong"]),
+        ]
+        for method, rows in pairs.items()
+        for environment, row in rows.items()
+    ]
 
 
 def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output: Path) -> str:
     """Return the report's HTML."""
     quick = "<p><b>Quick look: short dives, not figures to quote.</b></p>" if found["quick"] else ""
-    head = page.table(("", "ours", "the paper's method (or AR tags) here", "the paper reports"), rows)
+    head = table(rows, ("", "ours", "the paper's method (or AR tags) here", "the paper reports"))
     sections = [
         ("At a glance", quick + head + "<p>Simulated dives, of seeds that nothing was tuned on: not the sea.</p>"),
         (
             "Trajectories",
-            page.picture(output / "trajectories.png", "B before A (triangle), from above and from the side; grid 1 m"),
+            picture(output / "trajectories.png", "B before A (triangle), from above and from the side; grid 1 m"),
         ),
-        ("Error against distance", page.picture(output / "error_over_range.png", "Median position error by range")),
+        ("Error against distance", picture(output / "error_over_range.png", "Median position error by range")),
         (
             "Right pairs",
-            page.table(
+            table(
+                pair_rows(found["right_pairs"]),
                 ("method", "water", "in view", "right, %", "of its poses, %", "another pair", "wrong poses"),
-                page.pair_rows(found["right_pairs"]),
             )
             + PAIRS_NOTE,
         ),
     ]
     for environment in ENVIRONMENTS:
-        name = environment.replace("_", " ")
-        content = page.picture(output / f"over_time_{environment}.png", "Lights and AR tags over time, gaps included")
+        name = named(environment)
+        content = picture(output / f"over_time_{environment}.png", "Lights and AR tags over time, gaps included")
         ends = found["reach"][environment]
-        content += page.table(
+        content += table(
+            [[method, number(one["farthest_m"], 1), number(one["ends_m"], 1)] for method, one in ends.items()],
             ("", "farthest pose, m", "half of the triggers give a pose up to, m"),
-            [
-                [method, page.number(one["farthest_m"], 1), page.number(one["ends_m"], 1)]
-                for method, one in ends.items()
-            ],
         )
         pictured = output / f"detection_{environment}.png"
         if pictured.exists():
-            content += page.picture(pictured, "A above, B below: raw, candidates, chosen pair (red left, green right)")
+            content += picture(pictured, "A above, B below: raw, candidates, chosen pair (red left, green right)")
         sections.append((f"In the {name}", content))
     times = found["time"]
-    costs = [["Eq. 1, both ranges", page.number(times["eq1_ms"], 4)]]
-    costs.append(["a whole trigger, median", page.number(times["trigger"]["median_ms"], 2)])
+    costs = [["Eq. 1, both ranges", number(times["eq1_ms"], 4)]]
+    costs.append(["a whole trigger, median", number(times["trigger"]["median_ms"], 2)])
     for environment, frame in times["frame"].items():
-        costs.append([f"a frame, {environment}: ours", page.number(frame["source_ms"], 1)])
-        costs.append([f"a frame, {environment}: the paper's", page.number(frame["paper_ms"], 1)])
-    sections.append(("Run time", page.table(("processor time of one thread, this machine", "ms"), costs)))
+        costs.append([f"a frame, {environment}: ours", number(frame["source_ms"], 1)])
+        costs.append([f"a frame, {environment}: the paper's", number(frame["paper_ms"], 1)])
+    sections.append(("Run time", table(costs, ("processor time of one thread, this machine", "ms"))))
     if "tank" in found:
-        listed = [[name.replace("_", " "), page.number(value)] for name, value in found["tank"].items()]
-        sections.append(("AR tags in real water", page.table(("underwater-apriltags' video", ""), listed)))
-    return page.page("Buddyline: the paper's experiments, again", sections)
+        listed = [[name.replace("_", " "), number(value)] for name, value in found["tank"].items()]
+        sections.append(("AR tags in real water", table(listed, ("underwater-apriltags' video", ""))))
+    parts = [section(heading, content) for heading, content in sections]
+    return page("Buddyline: the paper's experiments, again", *parts)

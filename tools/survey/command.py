@@ -165,7 +165,9 @@ def _export(args: argparse.Namespace) -> int:
 
 def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
     """Return a survey in one of FORMATS."""
-    from buddyline.tools.survey import drawing, survex, tables
+    from buddyline.tools.draw import figures
+    from buddyline.tools.draw.survey import plan, profile
+    from buddyline.tools.survey import survex, tables
 
     adjusted, title = sheet.adjusted, sheet.title
     writers: dict[str, Callable[[], str | bytes]] = {
@@ -176,9 +178,9 @@ def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
         "csv": lambda: tables.legs_csv(sheet),
         "stations": lambda: tables.stations_csv(sheet),
         "geojson": lambda: tables.geojson(sheet),
-        "svg": lambda: drawing.plan(adjusted, title).svg(),
-        "profile": lambda: drawing.profile(adjusted, title).svg(),
-        "pdf": lambda: drawing.pdf([drawing.plan(adjusted, title), drawing.profile(adjusted, title)]),
+        "svg": lambda: figures.svg(plan(adjusted, title)),
+        "profile": lambda: figures.svg(profile(adjusted, title)),
+        "pdf": lambda: figures.pdf([plan(adjusted, title), profile(adjusted, title)]),
     }
     return writers[kind]()
 

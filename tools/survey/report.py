@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from buddyline.tools.survey.drawing import plan, profile
+from buddyline.tools.draw.figures import inline_svg
+from buddyline.tools.draw.survey import plan, profile
 from buddyline.tools.survey.lines import SightPair, bearing_of
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Sheet
@@ -92,8 +93,8 @@ def page(sheet: Sheet) -> str:
             "<p>" + "<br>".join(html.escape(fact) for fact in [*facts, *sheet.notes] if fact) + "</p><ul>",
             *(_item(line) for line in summary(sheet)),
             "</ul>",
-            plan(sheet.adjusted, sheet.title).svg(),
-            profile(sheet.adjusted, sheet.title).svg(),
+            inline_svg(plan(sheet.adjusted, sheet.title), "plan"),
+            inline_svg(profile(sheet.adjusted, sheet.title), "profile"),
             f"<div class='wide'><table><tr>{''.join(f'<th>{name}</th>' for name in COLUMNS)}</tr>",
             *rows,
             "</table></div></body></html>",

@@ -1,20 +1,28 @@
-"""Pictures marked for a person: what was found, and why."""
+"""Pictures with marks: what was found in them and why, and which lights were chosen."""
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
+from typing import Final
 
 import cv2
 import numpy as np
 from buddyline.node.detect.detection import Detection, check_image
+from buddyline.protocol.messages import Blob, Candidates, CompressedImage
 from numpy.typing import NDArray
 
+LEFT_COLOUR: Final = "#ff5c5c"
+RIGHT_COLOUR: Final = "#4be37a"
+OTHER_COLOUR: Final = "#ffd34d"
+_MIME: Final = {"jpeg": "image/jpeg", "jpg": "image/jpeg", "png": "image/png"}
+# Blue, green, red, as OpenCV has them.
 _LIKELY = (80, 255, 80)
 _UNLIKELY = (60, 60, 255)
 _TRUTH = (255, 80, 255)
 
 
-def draw(
+def mark_candidates(
     image: NDArray[np.uint8],
     detections: Sequence[Detection],
     truth: Sequence[tuple[float, float]] | None = None,
@@ -62,3 +70,51 @@ def _write(marked: NDArray[np.uint8], text: str, at: tuple[float, float], size: 
     u = max(min(round(at[0]), marked.shape[1] - width_px - 2), 0)
     v = max(min(round(at[1]), marked.shape[0] - 3), height_px)
     cv2.putText(marked, text, (u, v), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+
+def mark_lights(
+    image: NDArray[np.uint8], blobs: Sequence[Blob], chosen: tuple[int, int], radius_px: int = 22
+) -> NDArray[np.uint8]:
+    """Return a BGR picture with the chosen left light circled in red, the right one in green; -1: none chosen."""
+    marked = image.copy()
+    for index, colour in zip(chosen, (_UNLIKELY, _LIKELY), strict=True):
+        if index >= 0:
+            at_px = round(blobs[index].u_px), round(blobs[index].v_px)
+            cv2.circle(marked, at_px, radius_px, colour, 2, cv2.LINE_AA)
+    return marked
+
+
+def marked_svg(image: CompressedImage | None, frame: Candidates | None, chosen: tuple[int, int] = (-1, -1)) -> str:
+    """Return a picture as <svg> with a ring around each candidate; L and R: the chosen left and right light.
+
+    chosen: indices into the frame's blobs, -1 for none. The picture's own pixels are passed on as they are.
+    """
+    width, height = (frame.width_px, frame.height_px) if frame is not None else (4, 3)
+    parts = []
+    mime = _MIME.get(image.format.lower()) if image is not None else None
+    if image is not None and mime is not None:
+        data = base64.b64encode(image.data).decode("ascii")
+        fitted = "none" if frame is not None else "xMidYMid meet"
+        parts.append(
+            f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="{fitted}" '
+            f'href="data:{mime};base64,{data}"/>'
+        )
+    for index, blob in enumerate(frame.blobs if frame is not None else ()):
+        parts.append(_ring(blob, width / 100, chosen.index(index) if index in chosen else None))
+    return f'<svg viewBox="-0.5 -0.5 {width} {height}">{"".join(parts)}</svg>'
+
+
+def _ring(blob: Blob, unit_px: float, side: int | None) -> str:
+    """Return a candidate's ring; unit_px: a hundredth of the width; side: 0 left, 1 right light, None not chosen."""
+    radius, thick, colour = (1.3, 0.3, OTHER_COLOUR) if side is None else (2.2, 0.6, (LEFT_COLOUR, RIGHT_COLOUR)[side])
+    ring = (
+        f'<circle cx="{blob.u_px:.1f}" cy="{blob.v_px:.1f}" r="{unit_px * radius:.1f}" fill="none" stroke="{colour}" '
+        f'stroke-width="{unit_px * thick:.1f}"/>'
+    )
+    if side is None:
+        return ring
+    x_px, anchor, name = ((blob.u_px - unit_px * 3, "end", "L"), (blob.u_px + unit_px * 3, "start", "R"))[side]
+    return ring + (
+        f'<text x="{x_px:.1f}" y="{blob.v_px - unit_px * 2:.1f}" fill="{colour}" font-size="{unit_px * 4:.1f}" '
+        f'font-weight="700" text-anchor="{anchor}">{name}</text>'
+    )

@@ -1,0 +1,101 @@
+"""What the tools draw: figures, marked pictures, pages."""
+
+from __future__ import annotations
+
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from buddyline.node.detect import METHODS, make_detector
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.draw import figures
+from buddyline.tools.draw.marks import mark_candidates, mark_lights, marked_svg
+from buddyline.tools.draw.page import page, section, table
+
+from tests.node.rendered import lamp_picture
+from tests.tools.evaluated import OFFSET_PX, frame
+from tests.tools.watched import at, image
+
+
+class TestMarks:
+    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("grey", [False, True])
+    def test_candidates_are_marked_on_a_copy(self, method: str, grey: bool) -> None:
+        picture = lamp_picture([(80.0, 60.0)], size=(160, 120), seed=1)
+        picture = picture[:, :, 1].copy() if grey else picture
+        before = picture.copy()
+        marked = mark_candidates(picture, make_detector(method).detect(picture), truth=[(80.0, 60.0)])
+        assert marked.shape == (120, 160, 3)
+        assert np.array_equal(picture, before)
+        assert np.any(marked[55:66, 75:86] != np.atleast_3d(before)[55:66, 75:86])
+
+    def test_chosen_lights_are_circled_red_left_and_green_right(self) -> None:
+        picture = np.zeros((616, 820, 3), np.uint8)
+        blobs = frame("a", 0).blobs
+        marked = mark_lights(picture, blobs, (0, -1)).astype(int)
+        assert marked[round(blobs[0].v_px), round(blobs[0].u_px) + 22, 2] > 200
+        assert not marked[:, :, 1].max() > 100
+        assert not picture.any()
+
+    def test_the_chosen_pair_is_named_left_and_right(self) -> None:
+        root = ET.fromstring(marked_svg(None, frame("a", 0), (1, 0)))
+        named = {text.text: float(text.attrib["x"]) for text in root.iter("text")}
+        assert named["L"] == pytest.approx(409.5 - OFFSET_PX, abs=30)
+        assert named["R"] == pytest.approx(409.5 + OFFSET_PX, abs=30)
+        assert len(list(root.iter("circle"))) == 3
+
+    def test_of_one_light_only_that_one_is_named(self) -> None:
+        drawn = marked_svg(None, frame("a", 0), (-1, 0))
+        assert [text.text for text in ET.fromstring(drawn).iter("text")] == ["R"]
+
+    def test_a_picture_of_an_unknown_kind_is_not_passed_on(self) -> None:
+        drawn = marked_svg(image("a", at(0), 'svg+xml;"><script>'), frame("a", 0))
+        assert "script" not in drawn
+        assert "<image" not in drawn
+
+
+class TestFigures:
+    def test_an_inline_figure_holds_its_text_and_asks_for_nothing(self) -> None:
+        figure, (axis,) = figures.new_figure(4.0, 3.0)
+        axis.plot(*figures.broken(np.array([0.0, 1.0, 9.0]), np.array([1.0, 2.0, 3.0])))
+        axis.set_title("<range> & $cost$", parse_math=False)
+        drawn = figures.inline_svg(figure, 'a "figure"')
+        assert "http" not in drawn
+        assert 'aria-label="a &quot;figure&quot;"' in drawn
+        assert "&lt;range&gt; &amp; $cost$" in drawn
+
+    def test_the_same_data_give_the_same_file(self) -> None:
+        drawn = set()
+        for _ in range(2):
+            figure, (axis,) = figures.new_figure(4.0, 3.0)
+            axis.plot([0.0, 1.0], [0.0, 1.0], "o-")
+            drawn.add((figures.svg(figure), figures.pdf([figure])))
+        assert len(drawn) == 1
+
+    def test_a_gap_in_time_breaks_the_line(self) -> None:
+        t_s, values = figures.broken(np.array([0.0, 0.5, 3.0]), np.array([1.0, 2.0, 3.0]))
+        np.testing.assert_array_equal(np.isnan(values), [False, False, True, False])
+        np.testing.assert_array_equal(np.isnan(t_s), np.isnan(values))
+
+    def test_without_matplotlib_the_error_says_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        with pytest.raises(BuddylineError, match=r"pip install 'buddyline\[plots\]'"):
+            figures.new_figure(1.0, 1.0)
+
+    def test_a_figure_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
+        figure, _ = figures.new_figure(1.0, 1.0)
+        with pytest.raises(BuddylineError, match="cannot be written"):
+            figures.save(figure, tmp_path / "none" / "f.png")
+
+
+class TestPage:
+    def test_what_a_page_shows_cannot_become_markup(self) -> None:
+        assert "<b>" not in table([["<b>", "<b>\n<b>"]], ("<b>",)) + section("<b>", "x") + page("<b>")
+
+    def test_a_section_without_content_has_no_heading(self) -> None:
+        assert section("Pictures", "", "") == ""
+
+    def test_alarms_are_marked(self) -> None:
+        assert table([["a"], ["b"]], alarms=[1]).count('class="alarm"') == 1

@@ -1,0 +1,175 @@
+"""Errors of poses against truth, as figures: what `evaluate --plots` and `experiments` draw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.draw.figures import broken, check, new_figure, save
+from buddyline.tools.evaluation.poses import PoseErrors
+from buddyline.tools.evaluation.result import Result
+from buddyline.tools.evaluation.rotation import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FILES: Final = ("trajectory.png", "errors_over_time.png", "errors_over_range.png", "normalized_error.png")
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorCurve:
+    """The poses of one method, or of one verdict, under one name."""
+
+    name: str
+    errors: PoseErrors
+    colour: str = "tab:blue"
+    marker: str = "."
+
+    @property
+    def style(self) -> dict[str, Any]:
+        """How matplotlib draws it: markers, no line."""
+        return {"color": self.colour, "marker": self.marker, "linestyle": "none", "label": self.name}
+
+
+def by_verdict(errors: PoseErrors) -> list[ErrorCurve]:
+    """Return the poses that hold and, where there are any, those that are wrong."""
+    curves = [ErrorCurve("poses", errors.select(~errors.wrong))]
+    return (
+        [*curves, ErrorCurve("wrong poses", errors.select(errors.wrong), "tab:red")] if errors.wrong.any() else curves
+    )
+
+
+def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Figure:
+    """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m."""
+    figure, axes = new_figure(max(3.1 * len(dives), 5.0), 6.4, 2, len(dives))
+    for column, (title, (true_m, curves)) in enumerate(dives.items()):
+        # Equal steps in both directions, of a metre or of what leaves twenty of them.
+        step_m = max(1.0, float(np.ceil(np.abs(true_m).max() / 20)))
+        for row, across, name in ((0, 0, "right"), (1, 1, "down")):
+            axis = axes[row * len(dives) + column]
+            axis.plot(true_m[:, across], true_m[:, 2], ".", color="0.7", markersize=3, label="truth")
+            for curve in curves:
+                axis.plot(curve.errors.t_m[:, across], curve.errors.t_m[:, 2], **curve.style)
+            axis.plot(0, 0, "k^", markersize=7)
+            axis.set(xlabel=f"{name}, m", aspect="equal", adjustable="datalim")
+            axis.xaxis.set_major_locator(_multiples(step_m))
+            axis.yaxis.set_major_locator(_multiples(step_m))
+        axes[column].set_title(title)
+    axes[0].set_ylabel("from above: forward, m")
+    axes[len(dives)].set_ylabel("from the side: forward, m")
+    axes[0].legend()
+    return figure
+
+
+def _multiples(step: float) -> Any:
+    from matplotlib.ticker import MultipleLocator
+
+    return MultipleLocator(step)
+
+
+def over_time(curves: Sequence[ErrorCurve], stamps_ns: Sequence[int], true_m: Floats, title: str) -> Figure:
+    """Draw position, its error and the rotation's error over time, with gaps; true_m: (n, 3) at stamps_ns (n,)."""
+    figure, axes = new_figure(9.0, 6.6, 3, 1, sharex=True)
+    start_ns = stamps_ns[0]
+    times_s = np.array([stamp_ns - start_ns for stamp_ns in stamps_ns]) / 1e9
+    for across, shade, name in ((0, "0.75", "right"), (1, "0.5", "down"), (2, "0.25", "forward")):
+        axes[0].plot(times_s, true_m[:, across], ".", color=shade, markersize=2, label=f"truth, {name}")
+    for curve in curves:
+        errors = curve.errors
+        t_s = (errors.stamp_ns - start_ns) / 1e9
+        for across in range(3):
+            axes[0].plot(t_s, errors.t_m[:, across], **(curve.style | ({"label": None} if across else {})))
+        for axis, values in ((axes[1], errors.translation_m), (axes[2], np.degrees(errors.rotation_rad))):
+            axis.semilogy(*broken(t_s, _shown(values)), **(curve.style | {"linestyle": "-", "linewidth": 0.7}))
+    for axis, label in zip(axes, ("position, m", "position error, m", "rotation error, deg"), strict=True):
+        axis.set_ylabel(label)
+    axes[0].legend(ncols=5)
+    axes[0].set_title(title)
+    axes[2].set_xlabel("time, s")
+    return figure
+
+
+def over_range(curves: Sequence[ErrorCurve]) -> Figure:
+    """Draw the errors of position, range and rotation over the true range."""
+    figure, axes = new_figure(9.0, 9.0, 3, 1, sharex=True)
+    for curve in curves:
+        errors = curve.errors
+        for axis, values in zip(
+            axes,
+            (_shown(errors.translation_m), errors.range_m, _shown(np.degrees(errors.rotation_rad))),
+            strict=True,
+        ):
+            axis.plot(errors.true_range_m, values, **curve.style)
+    for axis, label in zip(axes, ("position error, m", "range error, m", "rotation error, deg"), strict=True):
+        axis.set(ylabel=label, yscale="linear" if label.startswith("range") else "log")
+    axes[0].legend()
+    axes[2].set_xlabel("true range, m")
+    return figure
+
+
+def medians_over_range(methods: Mapping[str, Sequence[Mapping[str, Any]]], range_m: Floats, bound_m: Floats) -> Figure:
+    """Draw the median position error by range, a line a method, beside the Cramér-Rao bound and the paper's 0.08 m."""
+    figure, (axis,) = new_figure(7.5, 4.6)
+    known = np.isfinite(bound_m)
+    axis.plot(range_m[known], bound_m[known], ".", color="0.75", markersize=2, label="Cramér-Rao bound (RMS)")
+    for name, rows in methods.items():
+        middles_m = [(row["from_m"] + row["to_m"]) / 2 for row in rows]
+        axis.plot(middles_m, [row["position_median_m"] for row in rows], "o-", label=name)
+    axis.plot([1.5, 4.0], [0.08, 0.08], "k--", label="the paper reports, 1.5 to 4 m")
+    axis.set(xlabel="true range, m", ylabel="position error, median, m", yscale="log")
+    axis.legend()
+    return figure
+
+
+def normalized_errors(errors: PoseErrors) -> Figure:
+    """Draw the shares of poses below a normalized error (NEES), beside an honest covariance's median and 95 % point."""
+    figure, axes = new_figure(9.0, 4.0, 1, 2)
+    for axis, values, name, median, gate in (
+        (axes[0], errors.nees6, "pose", 5.348, 12.592),
+        (axes[1], errors.nees3, "position", 2.366, 7.815),
+    ):
+        known = np.sort(values[np.isfinite(values)])
+        axis.plot(_shown(known), np.arange(1, len(known) + 1) / max(len(known), 1))
+        axis.plot([median, gate], [0.5, 0.95], "o", color="tab:orange", label="an honest covariance")
+        axis.set(xscale="log", xlabel=f"normalized error (NEES), {name}", ylabel="share of poses below")
+        axis.legend()
+    return figure
+
+
+def _shown(errors: Floats) -> Floats:
+    """Return errors with exact zeros raised to 1e-6: a logarithmic axis has no zero."""
+    return np.maximum(errors, 1e-6)
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder for a result's figures; raise BuddylineError where they could not be written."""
+    check()
+    for name in FILES:
+        if (folder / name).exists():
+            raise BuddylineError(f"{folder / name}: exists; name another directory or remove it first")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BuddylineError(f"{folder}: cannot be made: {error.strerror}") from error
+
+
+def write_figures(result: Result, folder: Path) -> list[Path]:
+    """Draw a result's errors into a folder; return the files."""
+    errors = result.errors
+    if not len(errors):
+        return []
+    curves, title = by_verdict(errors), f"{result.node_b} as {result.node_a} sees it"
+    figures = (
+        trajectories({title: (errors.true_t_m, curves)}),
+        over_time(curves, errors.stamp_ns.tolist(), errors.true_t_m, title),
+        over_range(curves),
+        normalized_errors(errors),
+    )
+    paths = [folder / name for name in FILES]
+    for figure, path in zip(figures, paths, strict=True):
+        save(figure, path)
+    return paths

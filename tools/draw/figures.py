@@ -1,0 +1,101 @@
+"""Figures made by matplotlib without a display, and written as PNG, SVG or PDF or put into a page."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Nothing is known between poses that are further apart in time: lines break there.
+GAP_S: Final = 1.5
+COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
+NO_POSE_COLOUR: Final = "#d0483f"
+_STYLE: Final[dict[Any, Any]] = {
+    "axes.formatter.useoffset": False,
+    "axes.grid": True,
+    "figure.constrained_layout.use": True,
+    "font.size": 9.0,
+    "grid.linewidth": 0.4,
+    "legend.fontsize": 8.0,
+    "lines.markersize": 4.0,
+    "savefig.dpi": 90,
+    # Text stays text, which can be searched.
+    "svg.fonttype": "none",
+    # The same data give the same file.
+    "svg.hashsalt": "buddyline",
+}
+
+
+def check() -> None:
+    """Raise BuddylineError where matplotlib is missing: known before the work is done."""
+    try:
+        import matplotlib as mpl
+    except ImportError:
+        raise BuddylineError("drawing needs matplotlib: pip install 'buddyline[plots]'") from None
+    mpl.rcParams.update(_STYLE)
+
+
+def new_figure(
+    width_in: float, height_in: float, rows: int = 1, columns: int = 1, **how: Any
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes, row by row; how: further arguments of matplotlib's `subplots`."""
+    check()
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in))
+    return figure, list(np.ravel(figure.subplots(rows, columns, **how)))
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that the path's suffix names."""
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise BuddylineError(f"{path}: cannot be written: {error}") from error
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as an SVG file."""
+    file = io.StringIO()
+    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return file.getvalue()
+
+
+def inline_svg(figure: Figure, words: str) -> str:
+    """Return a figure as an <svg> element of a page; words: for those who do not see it."""
+    element = svg(figure)
+    element = element[element.index("<svg") :]
+    # A page needs no namespaces, names no element twice, and sets the width itself.
+    element = re.sub(r' xmlns(:\w+)?="[^"]*"| id="[^"]*_\d+"|\s*<metadata>.*?</metadata>', "", element, flags=re.DOTALL)
+    return re.sub(r' width="[^"]*" height="[^"]*"', f' role="img" aria-label="{escape(words)}"', element, count=1)
+
+
+def pdf(figures: Sequence[Figure]) -> bytes:
+    """Return a PDF of one figure a page."""
+    check()
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    file = io.BytesIO()
+    with PdfPages(file, metadata={"CreationDate": None}) as pages:
+        for figure in figures:
+            figure.savefig(pages, format="pdf")
+    return file.getvalue()
+
+
+def broken(
+    t_s: NDArray[np.float64], *values: NDArray[np.float64], gap_s: float = GAP_S
+) -> tuple[NDArray[np.float64], ...]:
+    """Return times (n,) and values (n,) with NaN in each gap of time, so that no line crosses it."""
+    gaps = np.flatnonzero(np.diff(t_s) > gap_s) + 1
+    return tuple(np.insert(column.astype(float), gaps, np.nan) for column in (t_s, *values))

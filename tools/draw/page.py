@@ -1,0 +1,58 @@
+"""HTML pages that stand alone: no file beside them, no request to any network, no markup out of data."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Final
+
+CSS: Final = (
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:1000px;margin:0 auto;padding:12px 16px;color:#1b232b;"
+    "background:#fff}h1{font-size:1.5em;margin:.3em 0}h2{font-size:1.15em;margin:1.6em 0 .4em;border-bottom:1px solid "
+    "#ccd3da}table{border-collapse:collapse;font-variant-numeric:tabular-nums}td,th{padding:2px 14px 2px 0;"
+    "text-align:left;vertical-align:top;overflow-wrap:break-word}.scroll{overflow-x:auto}.alarm{color:#c00000}"
+    ".dim,figcaption{color:#5b6670;font-size:.87em}.warn{background:#fff3d6;border-left:4px solid #d9a520;"
+    "padding:4px 10px}svg,img{max-width:100%;height:auto}"
+)
+# A browser asks nobody for anything, whatever a log holds.
+_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+
+
+def page(title: str, *parts: str, css: str = "") -> str:
+    """Return a whole page with its title as heading; parts: HTML."""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width,initial-scale=1">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f"<title>{escape(title)}</title><style>{CSS}{css}</style></head>"
+        f"<body><h1>{escape(title)}</h1>{''.join(parts)}</body></html>\n"
+    )
+
+
+def section(heading: str, *parts: str) -> str:
+    """Return parts of HTML under a heading, nothing where all are empty."""
+    content = "".join(parts)
+    return f"<h2>{escape(heading)}</h2>{content}" if content else ""
+
+
+def table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), alarms: Sequence[int] = ()) -> str:
+    """Return a table as HTML; rows: plain text, a line break in a cell stays one; alarms: the rows in red."""
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = [f"<tr>{top}</tr>"] if head else []
+    for number, row in enumerate(rows):
+        cells = "".join(f"<td>{escape(cell).replace(chr(10), '<br>')}</td>" for cell in row)
+        lines.append(f'<tr class="alarm">{cells}</tr>' if number in alarms else f"<tr>{cells}</tr>")
+    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+
+
+def image(data: bytes, words: str, kind: str = "png") -> str:
+    """Return a picture inside the page, with its caption."""
+    source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    return f'<figure><img alt="{escape(words)}" src="{source}"><figcaption>{escape(words)}</figcaption></figure>'
+
+
+def picture(path: Path, words: str) -> str:
+    """Return a PNG file inside the page, with its caption."""
+    return image(path.read_bytes(), words)

@@ -1,0 +1,54 @@
+"""Pictures of one trigger, for the report: what a camera saw, what was found, and what was chosen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from buddyline.node.detect import make_detector
+from buddyline.node.drivers.stored import decode_picture
+from buddyline.protocol.clock import trigger_index
+from buddyline.protocol.messages import Candidates, CompressedImage, RelativePose
+from buddyline.tools.dives import Dive
+from buddyline.tools.draw.marks import mark_candidates, mark_lights
+from buddyline.tools.experiments.runs import OURS, Rendered
+from numpy.typing import NDArray
+
+
+def detections(dive: Rendered, path: Path) -> int | None:
+    """Draw A's and B's pictures of one trigger, raw, with candidates, and with the chosen pair; return the trigger."""
+    errors = dive.results[OURS].errors
+    good = errors.select((errors.right_pair == 1.0) & (errors.true_range_m > 2.0))
+    if not len(good):
+        return None
+    trigger = int(good.trigger[len(good) // 2])
+    with Dive([dive.dive]) as log:
+        infos = log.infos()
+        pictures = {}
+        for envelope in log.messages("image"):
+            message, node = envelope.message, envelope.node
+            if not isinstance(message, CompressedImage):
+                continue
+            if trigger_index(message.stamp_ns, infos[node].trigger_period_ns) == trigger:
+                pictures[node] = decode_picture(message.data, envelope.key)
+    chosen: dict[str, tuple[int, int]] = {}
+    frames: dict[str, Candidates] = {}
+    with Dive([dive.logs[OURS]]) as log:
+        for envelope in log.messages("pose", "candidates"):
+            found = envelope.message
+            if isinstance(found, RelativePose) and found.trigger == trigger:
+                chosen = {found.node_a: found.blobs_a, found.node_b: found.blobs_b}
+            elif isinstance(found, Candidates) and found.trigger == trigger:
+                frames[found.node] = found
+    rows = []
+    for node, lights in chosen.items():
+        raw = pictures[node]
+        candidates = mark_candidates(raw, make_detector().detect(raw))
+        rows.append(np.hstack([_small(one) for one in (raw, candidates, mark_lights(raw, frames[node].blobs, lights))]))
+    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return trigger
+
+
+def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
