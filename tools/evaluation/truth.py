@@ -71,4 +71,8 @@ class TruthTrack:
     def at(self, stamp_ns: int, trigger: int) -> tuple[Floats, Floats] | None:
         """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,); None where they are not known."""
         named = self._by_trigger.get(trigger)
-        return named if named is not None else self._track.at(stamp_ns)
+        return named if named is not None else self.interpolated(stamp_ns)
+
+    def interpolated(self, stamp_ns: int) -> tuple[Floats, Floats] | None:
+        """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,) by time alone."""
+        return self._track.at(stamp_ns)

@@ -1,0 +1,75 @@
+"""The figures of a track: coverage, wrong samples, honesty, inside and outside gaps."""
+
+import numpy as np
+import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Track, Truth
+from buddyline.tools.evaluation.tracks import covered_share, tracks_figures
+from buddyline.tools.evaluation.truth import TruthTrack
+
+PERIOD_NS = S_NS // 50
+SIGMA_M = 0.02
+
+
+class Pose:
+    """What coverage asks of a pose."""
+
+    def __init__(self, stamp_ns):
+        self.stamp_ns = stamp_ns
+
+
+def track(k, t_m, age_s=0.0, sigma_m=SIGMA_M, mode="smooth"):
+    covariance = np.diag([sigma_m**2] * 3 + [0.01**2] * 3)
+    return Track(
+        node_a="a",
+        node_b="b",
+        stamp_ns=k * PERIOD_NS,
+        t_a_b_m=tuple(map(float, t_m)),
+        q_a_b_xyzw=(0.0, 1.0, 0.0, 0.0),
+        covariance=covariance.ravel().tolist(),
+        v_a_b_mps=(0.0, 0.0, 0.0),
+        v_covariance=np.eye(3).ravel().tolist(),
+        mode=mode,
+        lights=4,
+        age_s=age_s,
+        range_m=float(np.linalg.norm(t_m)),
+    )
+
+
+def truths(count):
+    return TruthTrack(
+        [Truth(stamp_ns=k * PERIOD_NS, t_a_b_m=(0.0, 0.0, 4.0), q_a_b_xyzw=(0.0, 1.0, 0.0, 0.0)) for k in range(count)]
+    )
+
+
+def test_an_honest_track_has_a_nees_of_its_degrees_of_freedom():
+    rng = np.random.default_rng(1)
+    tracks = [track(k, [0, 0, 4] + SIGMA_M * rng.standard_normal(3)) for k in range(2000)]
+    (figures,) = tracks_figures(tracks, [Pose(0), Pose(1999 * PERIOD_NS)], truths(2000))
+    assert figures.samples == 2000
+    assert figures.covered == pytest.approx(1.0, abs=1e-3)
+    assert figures.wrong == 0
+    assert figures.nees3.mean == pytest.approx(3.0, rel=0.1)
+    assert figures.rotation_rad.median == pytest.approx(0.0, abs=1e-12)
+
+
+def test_errors_in_gaps_stand_apart_and_wrong_means_beyond_sigma_and_range():
+    tracks = [track(0, [0, 0, 4.0]), track(1, [0, 0, 4.5], age_s=1.0), track(2, [0, 0, 4.5], sigma_m=0.4)]
+    (figures,) = tracks_figures(tracks, [Pose(0), Pose(2 * PERIOD_NS)], truths(3))
+    assert (figures.wrong, figures.wrong_in_gaps) == (1, 1)
+    assert figures.in_gaps_m.count == 1
+    assert figures.in_gaps_m.median == pytest.approx(0.5)
+    assert figures.outside_m.count == 2
+
+
+def test_time_without_a_sample_or_with_a_wide_sigma_is_not_covered():
+    poses = [Pose(0), Pose(99 * PERIOD_NS)]
+    half = [track(k, [0, 0, 4.0], sigma_m=0.02 if k < 50 else 0.3) for k in range(100)]
+    assert covered_share(half, poses) == pytest.approx(0.5, abs=0.02)
+    assert covered_share(half[:50], poses) == pytest.approx(0.5, abs=0.02)
+    assert covered_share([], []) is None
+
+
+def test_each_mode_has_its_own_figures():
+    tracks = [track(k, [0, 0, 4.0], mode=mode) for k in range(4) for mode in ("filter", "lag")]
+    assert [figures.mode for figures in tracks_figures(tracks, [], truths(4))] == ["filter", "lag"]

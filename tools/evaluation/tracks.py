@@ -1,0 +1,99 @@
+"""The fused track of one pair, measured against truth: coverage, errors inside and outside gaps, honesty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import RelativePose, Track, TrackMode
+from buddyline.tools.evaluation.poses import WRONG_SHARE, nees
+from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
+from buddyline.tools.evaluation.statistics import Stats, share
+from buddyline.tools.evaluation.truth import TruthTrack
+
+COVERED_SHARE: Final = 0.05
+"""A track covers an instant where its position's sigma is below this share of the range."""
+WRONG_SIGMAS: Final = 3.0
+"""A track is wrong where it is off by more than WRONG_SHARE of the range and by more than this many sigma."""
+GAP_S: Final = 0.5
+"""A track is in a gap where it has used no light for longer than this."""
+
+
+@dataclass(frozen=True)
+class TrackFigures:
+    """One mode of a pair's track. samples: that have truth; wrong_in_gaps: of the wrong ones, those in a gap.
+
+    covered: share of the time from the first to the last pose. nees6, nees3: mean 6 and 3 where the covariance is
+    honest. in_gaps_m, outside_m: position errors in and outside gaps.
+    """
+
+    mode: TrackMode
+    samples: int
+    covered: float | None
+    wrong: int
+    wrong_in_gaps: int
+    position_m: Stats
+    rotation_rad: Stats
+    in_gaps_m: Stats
+    outside_m: Stats
+    nees6: Stats
+    nees3: Stats
+
+
+def tracks_figures(tracks: Sequence[Track], poses: Sequence[RelativePose], truth: TruthTrack) -> list[TrackFigures]:
+    """Measure each mode that stands among the tracks, in the order of the modes' first samples."""
+    modes = dict.fromkeys(track.mode for track in tracks)
+    return [_figures(mode, [track for track in tracks if track.mode == mode], poses, truth) for mode in modes]
+
+
+def _figures(
+    mode: TrackMode, tracks: Sequence[Track], poses: Sequence[RelativePose], truth: TruthTrack
+) -> TrackFigures:
+    found = [(track, known) for track in tracks if (known := truth.interpolated(track.stamp_ns)) is not None]
+    t_m = np.array([track.t_a_b_m for track, _ in found]).reshape(-1, 3)
+    q = normalized(np.array([track.q_a_b_xyzw for track, _ in found]).reshape(-1, 4))
+    true_t_m = np.array([known[0] for _, known in found]).reshape(-1, 3)
+    true_q = np.array([known[1] for _, known in found]).reshape(-1, 4)
+    covariances = np.array([track.covariance for track, _ in found]).reshape(-1, 6, 6)
+    in_gap = np.array([track.age_s > GAP_S for track, _ in found], dtype=bool)
+
+    offset_m = true_t_m - t_m
+    turn_rad = rotation_vector(multiply(true_q, conjugate(q)))
+    away_m = np.linalg.norm(offset_m, axis=1)
+    nees3 = nees(offset_m, covariances[:, :3, :3])
+    wrong = (away_m > WRONG_SHARE * np.linalg.norm(true_t_m, axis=1)) & ~(nees3 <= WRONG_SIGMAS**2)
+    return TrackFigures(
+        mode=mode,
+        samples=len(found),
+        covered=covered_share(tracks, poses),
+        wrong=int(wrong.sum()),
+        wrong_in_gaps=int((wrong & in_gap).sum()),
+        position_m=Stats.of(away_m),
+        rotation_rad=Stats.of(np.linalg.norm(turn_rad, axis=1)),
+        in_gaps_m=Stats.of(away_m[in_gap]),
+        outside_m=Stats.of(away_m[~in_gap]),
+        nees6=Stats.of(nees(np.concatenate([offset_m, turn_rad], axis=1), covariances)),
+        nees3=Stats.of(nees3),
+    )
+
+
+def covered_share(tracks: Sequence[Track], poses: Sequence[RelativePose]) -> float | None:
+    """Return the share of the time from the first to the last pose that the track covers; None without poses.
+
+    Time is counted in the track's own median period, so that a sample that is missing counts as not covered.
+    """
+    if len(poses) < 2 or len(tracks) < 2:
+        return None if not poses else 0.0
+    first_ns, last_ns = min(pose.stamp_ns for pose in poses), max(pose.stamp_ns for pose in poses)
+    stamps_ns = np.sort(np.array([track.stamp_ns for track in tracks]))
+    period_s = float(np.median(np.diff(stamps_ns))) / S_NS
+    if last_ns <= first_ns or period_s <= 0.0:
+        return None
+    sigma_m = np.sqrt([sum(track.covariance[i] for i in (0, 7, 14)) for track in tracks])
+    range_m = np.array([track.range_m for track in tracks])
+    inside = np.array([first_ns <= track.stamp_ns <= last_ns for track in tracks], dtype=bool)
+    covered = int((inside & (sigma_m < COVERED_SHARE * range_m)).sum())
+    return min(share(covered * period_s, (last_ns - first_ns) / S_NS) or 0.0, 1.0)
