@@ -59,7 +59,7 @@ def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:
 
 
 def _check_sender(key: str, topic: Topic, ids: tuple[str, ...], message: Message) -> None:
-    fields = ("node",) if len(ids) == 1 else ("node_a", "node_b")
+    fields = topic.id_fields
     if isinstance(message, CompressedImage):
         # Other programs name frames as they like; `<node>_camera` is ours.
         named = message.frame_id.endswith(CAMERA_FRAME)

@@ -350,6 +350,30 @@ class Track(Message, frozen=True, kw_only=True):
         _check_unit("q_a_b_xyzw", self.q_a_b_xyzw)
 
 
+class NodePose(Message, frozen=True, kw_only=True):
+    """A node's place and attitude in the frame of a net: T_net_camera.
+
+    p_m: of the camera's centre; q_xyzw: camera to net; v_mps; all in the net's frame, which is north-east-down where an
+    attitude or a fixed node gives it. covariance: 6x6 row-major, position, then small rotation, both in the net's
+    frame. fixed: the configuration says that the node stands still.
+    """
+
+    net: NodeId
+    node: NodeId
+    stamp_ns: StampNs
+    p_m: Vector3
+    q_xyzw: Quaternion
+    v_mps: Vector3
+    covariance: Annotated[list[float], Meta(min_length=36, max_length=36)]
+    fixed: bool
+    mode: str
+    age_s: NonNegative
+
+    def __post_init__(self) -> None:
+        """Check the quaternion's norm."""
+        _check_unit("q_xyzw", self.q_xyzw)
+
+
 class Rejected(Message, frozen=True, kw_only=True):
     """A trigger without a pose, and why."""
 

@@ -11,6 +11,9 @@ from buddyline.protocol import messages
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NODE_ID_PATTERN, Message
 
+_PLACES: Final = re.compile(r"{(\w+)}")
+_ID_FIELDS: Final = {"node": "node", "a": "node_a", "b": "node_b", "net": "net"}
+
 Priority = Literal["interactive_high", "data_high", "data", "data_low", "background"]
 
 
@@ -18,10 +21,10 @@ Priority = Literal["interactive_high", "data_high", "data", "data_low", "backgro
 class Topic:
     """One kind of message.
 
-    template: its key, with {node} or {a} and {b}. schema: the message's type; rate_hz: nominal, 0 where it comes
-    on change. latest_only: late joiners get the newest one (else the cache serves to recover what was missed).
-    express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never). retained:
-    the hub keeps the newest of each key, and what was said stays known when who said it is gone.
+    template: its key, with {node}, {a} and {b}, or {net} and {node}. schema: the message's type; rate_hz: nominal, 0
+    where it comes on change. latest_only: late joiners get the newest one (else the cache serves to recover what was
+    missed). express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never).
+    retained: the hub keeps the newest of each key, and what was said stays known when who said it is gone.
     """
 
     name: str
@@ -36,17 +39,22 @@ class Topic:
     retained: bool = False
 
     def key(self, *ids: str) -> str:
-        """Return the Zenoh key and MCAP topic for these node ids: one, or a and b."""
+        """Return the Zenoh key and MCAP topic for these ids: a node's, a pair's two, or a net's and a node's."""
         for node_id in ids:
             check_node_id(node_id)
-        names = ("node",) if "{node}" in self.template else ("a", "b")
+        names = _PLACES.findall(self.template)
         if len(ids) != len(names):
             raise ValueError(f"topic {self.name} takes {len(names)} node ids, got {len(ids)}")
         return self.template.format(**dict(zip(names, ids, strict=True)))
 
+    @property
+    def id_fields(self) -> tuple[str, ...]:
+        """The message's fields that hold the key's ids, in the key's order."""
+        return tuple(_ID_FIELDS[name] for name in _PLACES.findall(self.template))
+
     def key_any(self) -> str:
         """Return the key expression that matches this topic of all nodes or pairs."""
-        return self.template.format(node="*", a="*", b="*")
+        return _PLACES.sub("*", self.template)
 
     @property
     def encoding(self) -> str:
@@ -177,6 +185,9 @@ TRACK_LAG: Final = Topic(
     stale_s=3.0,
 )
 TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low")
+NET_TRUTH: Final = Topic(
+    "net_truth", "buddyline/net/{net}/truth/{node}", messages.NodePose, "buddyline.NodePose", 10.0, "data_low"
+)
 SOLVER_STATUS: Final = Topic(
     "solver_status",
     "buddyline/pair/{a}/{b}/status",
@@ -205,6 +216,7 @@ TOPICS: Final = (
     TRACK,
     TRACK_LAG,
     TRUTH,
+    NET_TRUTH,
     SOLVER_STATUS,
 )
 
@@ -214,12 +226,7 @@ _NODE_ID = re.compile(NODE_ID_PATTERN)
 _PATTERNS: Final = [
     (
         topic,
-        re.compile(
-            topic.template.replace("{node}", "([a-z0-9_]{1,32})")
-            .replace("{a}", "([a-z0-9_]{1,32})")
-            .replace("{b}", "([a-z0-9_]{1,32})")
-            + r"\Z"
-        ),
+        re.compile(_PLACES.sub("([a-z0-9_]{1,32})", topic.template) + r"\Z"),
     )
     for topic in TOPICS
 ]
@@ -257,6 +264,4 @@ def key_of(message: Message) -> str:
     topic = topic_of(message)
     if isinstance(message, messages.CompressedImage):
         return topic.key(message.frame_id.removesuffix("_camera"))
-    if "{node}" in topic.template:
-        return topic.key(str(getattr(message, "node")))  # noqa: B009
-    return topic.key(str(getattr(message, "node_a")), str(getattr(message, "node_b")))  # noqa: B009
+    return topic.key(*(str(getattr(message, field)) for field in topic.id_fields))

@@ -23,7 +23,7 @@ from buddyline.tools.progress import Progress
 log = logging.getLogger(__name__)
 
 # What the output carries beside the poses, so that it can be evaluated and solved again on its own.
-COPIED = ("info", "candidates", "attitude", "depth", "mark", "truth", "light_truth")
+COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

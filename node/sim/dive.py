@@ -17,6 +17,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 
 BOOT: Final = "simulated"
+NET: Final = "main"
 ATTITUDE_NS: Final = S_NS // 50
 DEPTH_NS: Final = S_NS // 10
 IMU_NS: Final = S_NS // 100
@@ -86,10 +87,13 @@ def _triggers(world: World, plan: Plan, end_ns: int) -> Iterator[int]:
 
 def _truth(world: World, plan: Plan, end_ns: int) -> Iterator[Entry]:
     """Yield the truth at the nominal instant of every trigger, whether or not its frames were lost."""
-    key = topics.TRUTH.key(world.scenario.node_a, world.scenario.node_b)
+    nodes = (world.scenario.node_a, world.scenario.node_b)
+    key = topics.TRUTH.key(*nodes)
     for trigger in _triggers(world, plan, end_ns):
         stamp_ns = trigger * plan.period_ns
         yield stamp_ns, key, world.truth(stamp_ns, trigger)
+        for node in nodes:
+            yield stamp_ns, topics.NET_TRUTH.key(NET, node), world.node_truth(node, stamp_ns, NET)
 
 
 def _frames(world: World, plan: Plan, node: str, end_ns: int) -> Iterator[Entry]:

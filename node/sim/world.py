@@ -11,6 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from buddyline.node.sim import candidates, rotation, tags
 from buddyline.node.sim.glow import core_px
+from buddyline.node.sim.inertial import STEP_S
 from buddyline.node.sim.picture import Painter
 from buddyline.node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
 from buddyline.node.sim.rotation import Matrix, Vector
@@ -26,6 +27,7 @@ from buddyline.protocol.messages import (
     Imu,
     LightTruth,
     NodeInfo,
+    NodePose,
     TrueLight,
     Truth,
 )
@@ -87,6 +89,23 @@ class World:
             trigger=trigger,
             t_a_b_m=_triple(t_a_b_m),
             q_a_b_xyzw=rotation.to_quaternion(R_a_b),
+        )
+
+    def node_truth(self, node: str, stamp_ns: int, net: str) -> NodePose:
+        """Return a node's true pose in north-east-down at stamp_ns on A's clock, down from the surface."""
+        index, t_s = self.scenario.index(node), self._seconds(0, stamp_ns)
+        before, now, after = (self._scene.motion.placement(index, t_s + step) for step in (-STEP_S, 0.0, STEP_S))
+        return NodePose(
+            net=net,
+            node=node,
+            stamp_ns=stamp_ns,
+            p_m=_triple(now.position_ned_m),
+            q_xyzw=rotation.to_quaternion(now.R_ned_body @ R_BODY_CAMERA),
+            v_mps=_triple((after.position_ned_m - before.position_ned_m) / (2 * STEP_S)),
+            covariance=[0.0] * 36,
+            fixed=False,
+            mode="truth",
+            age_s=0.0,
         )
 
     def light_truth(self, node: str, stamp_ns: int, trigger: int) -> LightTruth:

@@ -25,6 +25,7 @@ def test_a_dive_holds_every_topic_at_its_rate_in_order_of_time():
     entries = _dive(Plan(seconds=4, rate_hz=5, imu=True, lost_share=0.0))
     counts = Counter(key for _, key, _ in entries)
     assert counts.pop("buddyline/pair/a/b/truth") == 19
+    assert [counts.pop(f"buddyline/net/main/truth/{node}") for node in "ab"] == [19, 19]
     for node in "ab":
         of_node = {key.rsplit("/", 1)[1]: counts.pop(key) for key in list(counts) if f"/{node}/" in key}
         assert of_node == {

@@ -120,6 +120,17 @@ def test_truth_follows_from_both_poses_in_ned():
     assert facing[1] > 5.0
 
 
+def test_true_poses_in_ned_are_those_of_the_pair_also_with_clocks_apart():
+    world = World(Scenario(seed=2, start_ns=START_NS, clock_offset_ns=S_NS))
+    stamp_ns = START_NS + 3 * S_NS
+    a, b = (world.node_truth(node, stamp_ns, "main") for node in "ab")
+    R_ned_a = rotation.from_quaternion(a.q_xyzw)
+    truth = world.truth(stamp_ns, 0)
+    np.testing.assert_allclose(truth.t_a_b_m, R_ned_a.T @ np.subtract(b.p_m, a.p_m), atol=1e-12)
+    later = world.node_truth("b", stamp_ns + S_NS // 100, "main")
+    np.testing.assert_allclose(later.p_m, np.add(b.p_m, np.array(b.v_mps) / 100), atol=1e-3)
+
+
 def test_two_worlds_agree_whatever_the_order_of_questions():
     one, two = (World(Scenario(environment="basin", seed=9, start_ns=START_NS)) for _ in range(2))
     stamps = [START_NS + k * 700_000_001 for k in range(12)]
