@@ -116,7 +116,7 @@ def test_the_oldest_pictures_go_first_and_only_this_nodes(tmp_path):
         assert stamps(path, DEPTH) == list(range(1, sender.count, 2))
         with Dive([path]) as dive:
             kept = [r.log_time_ns for r in dive.records("image")]
-            assert dive.damage == []
+            assert dive.losses == []
         assert kept == list(range(kept[0], sender.count + 1, 2))
         assert kept[0] > 2
 
