@@ -26,13 +26,14 @@ from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.config import ConfigError, config_sha256
+from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import NodeInfo, NodeStatus
 from buddyline.protocol.pictures import PictureLog
 from buddyline.protocol.recorder import Recorder, RecordError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import TOPICS
+from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS
 from msgspec import UNSET
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FRAME_QUEUE: Final = 2
-STALE_S: Final = 2.0
 # A device that has given nothing for so long, and does not say why, hangs; the first may take its time.
 HANGS_S: Final = 5.0
 FIRST_S: Final = 15.0
@@ -332,8 +332,17 @@ class NodeService(Service):
         except OSError:
             return None
 
+    def _stale_after_s(self, device: str) -> float:
+        """Return how long a device may give nothing: as long as what it sends may stay away."""
+        if device == "camera":
+            return stale_after_s(CANDIDATES, self.config.trigger_period_ns / S_NS)
+        # A chip with several readings goes by its inertial unit's.
+        return stale_after_s(next((topic for topic in TOPICS if topic.name == device), IMU))
+
     def _find_problems(self, ages_s: dict[str, float], free_bytes: int | None) -> list[str]:
-        problems = [f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > STALE_S]
+        problems = [
+            f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > self._stale_after_s(name)
+        ]
         problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
         devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
         problems += [f"{name}: {text}" for name, text in devices if text]

@@ -81,7 +81,7 @@ CANDIDATES: Final = Topic(
     express=True,
     stale_s=1.0,
 )
-IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=0.5)
+IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=2.0)
 ATTITUDE: Final = Topic(
     "attitude",
     "buddyline/node/{node}/attitude",
@@ -90,7 +90,7 @@ ATTITUDE: Final = Topic(
     100.0,
     "data_high",
     express=True,
-    stale_s=0.5,
+    stale_s=2.0,
 )
 DEPTH: Final = Topic(
     "depth",
@@ -100,7 +100,7 @@ DEPTH: Final = Topic(
     20.0,
     "data_high",
     express=True,
-    stale_s=1.0,
+    stale_s=2.0,
 )
 IMAGE: Final = Topic(
     "image",
@@ -109,6 +109,7 @@ IMAGE: Final = Topic(
     "foxglove.CompressedImage",
     1.0,
     "background",
+    stale_s=3.0,
 )
 NODE_STATUS: Final = Topic(
     "node_status",

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from buddyline.protocol.clock import S_NS
-
-# Said with the next status, a second later at most: within two seconds together.
-STALE_S: Final = 1.0
-STALE_PERIODS: Final = 3
-# Frames of one instant arrive within the matching window; beyond it, nothing of the two nodes would match.
-APART_NS: Final = 1 * S_NS
+from buddyline.protocol.health import FRAMES_APART_S, stale_after_s
+from buddyline.protocol.topics import CANDIDATES
 
 
 class NodeHealth:
@@ -48,7 +42,7 @@ class NodeHealth:
         if not found and len(self._frames) == 2:
             node_a, node_b = self._nodes
             ahead_ns = self._frames[node_b][1] - self._frames[node_a][1]
-            if abs(ahead_ns) > APART_NS:
+            if abs(ahead_ns) > FRAMES_APART_S * S_NS:
                 first, second = (node_b, node_a) if ahead_ns > 0 else (node_a, node_b)
                 found.append(
                     f"frames of {first} are {abs(ahead_ns) / S_NS:.1f} s ahead of those of {second}: "
@@ -63,6 +57,6 @@ class NodeHealth:
         if seen is None:
             return f"no frame of node {node} yet"
         silent_s = now_s - seen[0]
-        if silent_s > max(STALE_S, STALE_PERIODS * self._period_s.get(node, 0.0)):
+        if silent_s > stale_after_s(CANDIDATES, self._period_s.get(node, 0.0)):
             return f"no frame of node {node} for {silent_s:.0f} s"
         return None

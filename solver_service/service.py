@@ -14,6 +14,7 @@ from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
+from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
 from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
@@ -41,12 +42,9 @@ log = logging.getLogger(__name__)
 
 # A dive that pauses this long is taken as ended: what waits is resolved with what there is.
 PAUSE_S: Final = 2.5
-# The clocks' offset is reported once the dive tells it this well, and complained of beyond the other.
+# The clocks' offset is reported once the dive tells it this well.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
-TOLERATED_OFFSET_S: Final = 0.005
 ALIGN_EVERY_S: Final = 10.0
-# Of two calibrated compasses away from steel: several times what they say of themselves.
-TOLERATED_HEADING_RAD: Final = math.radians(20.0)
 BUFFERED_BEFORE_PAIR: Final = 4096
 SOLVED_FROM: Final = (INFO, ATTITUDE, DEPTH, CANDIDATES)
 
@@ -221,10 +219,10 @@ class SolverService(Service):
             self._offset = found if found is not None and found.sigma_s < REPORTED_OFFSET_SIGMA_S else None
             self._aligned_s = now_s
         offset = self._offset
-        if offset is not None and abs(offset.offset_s) > max(TOLERATED_OFFSET_S, 4 * offset.sigma_s):
+        if offset is not None and abs(offset.offset_s) > max(CLOCKS_APART_S, 4 * offset.sigma_s):
             problems.append(f"clock of {core.node_b} is {offset.offset_s * 1e3:+.1f} ms from that of {core.node_a}")
         heading = core.heading
-        if heading is not None and abs(heading.offset_rad) > TOLERATED_HEADING_RAD:
+        if heading is not None and abs(heading.offset_rad) > HEADINGS_APART_RAD:
             apart_deg = math.degrees(abs(heading.offset_rad))
             nodes = f"{core.node_a} and {core.node_b}"
             problems.append(

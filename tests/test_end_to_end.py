@@ -126,7 +126,7 @@ def test_demo_shows_poses_and_leaves_nothing_running(tmp_path):
             assert reader.damage == []
         with Dive([log]) as dive:
             assert dive.nodes("image") == [log.name[0]]
-            assert dive.damage == []
+            assert dive.losses == []
 
 
 def test_demo_summary_as_json():

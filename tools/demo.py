@@ -56,7 +56,7 @@ start_ns = {start_ns}
 def run(args: argparse.Namespace) -> int:
     """Run the demo until its time is over, or until it is stopped; 2 where one of its processes dies."""
     from buddyline.tools.client import ClientConfig
-    from buddyline.tools.dashboard import Dashboard
+    from buddyline.tools.dashboard import Dashboard, summary_text
     from buddyline.tools.live import open_bus
     from buddyline.tools.measure.children import end_all, free_endpoint
 
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         for name in end_all(children):
             log.warning("demo: %s did not end when asked; killed", name)
         shutil.rmtree(work, ignore_errors=True)
-    print(json.dumps(summary) if args.json else dashboard.summary_text(summary))
+    print(json.dumps(summary) if args.json else summary_text(summary))
     status = service.join()
     return 1 if over and not summary["poses"] else status
 

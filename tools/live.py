@@ -59,18 +59,6 @@ class LiveClient(Service):
             status = self.join()
         return status
 
-    def follow(
-        self, bus: Bus, keys: KeyExprs, take: Callable[[Envelope], None], *, capacity: int = 1024, history: bool = True
-    ) -> Subscription:
-        """Hand the sound messages on these keys to take, as Bus.subscribe does; the others are counted and said."""
-
-        def receive(received: Received) -> None:
-            envelope = self.refusals.open(received)
-            if envelope is not None:
-                take(envelope)
-
-        return bus.subscribe(keys, receive, capacity=capacity, history=history)
-
     def _end(self) -> None:
         self._time_is_over = True
         self.stop.set()
@@ -104,3 +92,22 @@ def open_bus_within(config: ClientConfig, seconds: float) -> Bus:
 def no_hub(config: ClientConfig, seconds: float) -> NoHubError:
     """Return the error of a hub that did not answer."""
     return NoHubError(f"no hub at {config.connect} within {seconds:g} s (start one with `buddyline hub`)")
+
+
+def follow(
+    bus: Bus,
+    keys: KeyExprs,
+    refusals: Refusals,
+    take: Callable[[Envelope], None],
+    *,
+    capacity: int = 1024,
+    history: bool = True,
+) -> Subscription:
+    """Hand the sound messages on these keys to take, as Bus.subscribe does; refusals counts the others."""
+
+    def receive(received: Received) -> None:
+        envelope = refusals.open(received)
+        if envelope is not None:
+            take(envelope)
+
+    return bus.subscribe(keys, receive, capacity=capacity, history=history)

@@ -16,10 +16,10 @@ from buddyline.protocol.divelog import Record
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 from buddyline.protocol.security import PLAYER
-from buddyline.protocol.service import Service
 from buddyline.protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.dives import Dive
+from buddyline.tools.live import LiveClient
 from buddyline.tools.progress import Progress
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -182,45 +182,33 @@ def run(args: argparse.Namespace) -> int:
     """Play until the dive's end, or until stopped."""
     if not (math.isfinite(args.speed) and args.speed >= 0):
         raise BuddylineError(f"--speed {args.speed}: 0 or more")
-    from buddyline.protocol.zenoh_bus import connect
-
-    config = client_config(args, PLAYER)
-    service = Service("play")
-    service.handle_signals()
+    client = LiveClient("play", client_config(args, PLAYER))
     with Dive(args.dives) as dive:
         start_ns, stop_ns = _span(dive, args.start, args.end)
         if not dive.nodes("candidates"):
             log.warning("play: %s holds no candidates: a solver finds nothing; run `buddyline detect` first", dive.name)
-        bus = connect(
-            config.connect,
-            namespace=config.namespace or None,
-            stop=service.stop,
-            on_wait=lambda text: log.info("play: %s", text),
-            tls=config.tls,
-        )
-        if bus is None:
-            return service.join()
-        with bus:
-            bus.on_failure(lambda error: service.fail("bus", error))
+
+        def play(bus: Bus) -> None:
             bus.declare_alive("player")
-            player = Player(bus, dive.nodes("candidates"), args.speed, SystemClock(), service.stop)
+            player = Player(bus, dive.nodes("candidates"), args.speed, SystemClock(), client.stop)
             player.declare(dive.keys)
             player.send_infos(dive.records(INFO.name))
             period_ns = max((info.trigger_period_ns for info in dive.infos().values()), default=S_NS)
             laps_triggers = (stop_ns - start_ns) // period_ns + 2
             lap = 0
-            while not service.stop.is_set() and (lap == 0 or args.loop):
+            while not client.stop.is_set() and (lap == 0 or args.loop):
                 with Progress("play", (stop_ns - start_ns) / S_NS) as progress:
                     for record in _selected(dive, start_ns, stop_ns):
-                        if service.stop.is_set():
+                        if client.stop.is_set():
                             break
                         player.send(record, lap * laps_triggers, period_ns)
                         progress.show((record.log_time_ns - start_ns) / S_NS)
                 lap += 1
             # What was just sent is on its way: leave the recovery of lost samples its time.
-            service.stop.wait(1.0)
-    log.info("play: %d messages sent, %d bad", player.sent, player.bad)
-    return service.join()
+            client.stop.wait(1.0)
+            log.info("play: %d messages sent, %d bad", player.sent, player.bad)
+
+        return client.run(play)
 
 
 def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import EVERYTHING
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.live import LiveClient
+from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
 
         def record(bus: Bus) -> None:
             nonlocal dropped
-            subscription = client.follow(bus, EVERYTHING, write, capacity=65536)
+            subscription = follow(bus, EVERYTHING, client.refusals, write, capacity=65536)
             log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
             while not client.stop.wait(0.5):
                 if recorder.error is not None:

@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
-from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import ROS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.live import LiveClient
+from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
-    from buddyline.protocol.bus import Bus, Received
+    from buddyline.protocol.bus import Bus
+    from buddyline.protocol.envelope import Envelope
 
 log = logging.getLogger(__name__)
 
@@ -254,32 +254,20 @@ def run(args: argparse.Namespace) -> int:
         if session is None:
             return
         try:
-            bridge = Bridge(Translation(store.types), RosGraph(session, store, SystemClock(), args.domain))
-            bus.subscribe(INFO.key_any(), bridge.receive, capacity=64)
+            translation, graph = Translation(store.types), RosGraph(session, store, SystemClock(), args.domain)
+            lock = threading.Lock()
+
+            def publish(envelope: Envelope) -> None:
+                # Each subscription has a thread of its own; sequence numbers must rise one by one.
+                with lock:
+                    for translated in translation.messages(envelope.message):
+                        graph.publish(translated)
+
+            follow(bus, INFO.key_any(), client.refusals, publish, capacity=64)
             for topic in (ATTITUDE, DEPTH, POSE):
-                bus.subscribe(topic.key_any(), bridge.receive, capacity=256, history=False)
+                follow(bus, topic.key_any(), client.refusals, publish, capacity=256, history=False)
             client.wait()
         finally:
             session.close()
 
     return client.run(translate)
-
-
-class Bridge:
-    """Takes our messages off the bus and gives them to ROS; a bad one is counted and left out."""
-
-    def __init__(self, translation: Translation, graph: RosGraph) -> None:
-        self.refusals = Refusals("ros2")
-        self._translation = translation
-        self._graph = graph
-        self._lock = threading.Lock()
-
-    def receive(self, received: Received) -> None:
-        """Translate one message."""
-        envelope = self.refusals.open(received)
-        if envelope is None:
-            return
-        # Each subscription has a thread of its own; sequence numbers must rise one by one.
-        with self._lock:
-            for translated in self._translation.messages(envelope.message):
-                self._graph.publish(translated)

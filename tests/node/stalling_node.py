@@ -47,7 +47,8 @@ def open_sensors(config, clock):
 def main():
     CAMERAS["stalling"] = "tests.node.stalling_node:open_camera"
     SENSORS["stalling"] = "tests.node.stalling_node:open_sensors"
-    service.HANGS_S, service.STALE_S, service.REPORT_S, threads.BEAT_S = 0.6, 0.4, 0.2, 0.2
+    service.HANGS_S, service.REPORT_S, threads.BEAT_S = 0.6, 0.2, 0.2
+    service.stale_after_s = lambda topic, period_s=0.0: 0.4
     recorder.SYNC_INTERVAL_S, recorder.RETRY_S = 0.2, 0.1
     from buddyline.tools.cli import main as program
 

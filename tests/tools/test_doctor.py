@@ -17,8 +17,10 @@ from buddyline.protocol.messages import Attitude, Blob, Depth, Imu, NodeStatus
 from buddyline.protocol.topics import INFO, NODE_STATUS
 from buddyline.tools.cli import main
 from buddyline.tools.client import ClientConfig
-from buddyline.tools.doctor import bus, checks, command, machine, rig
-from buddyline.tools.doctor.finding import Finding, status_of
+from buddyline.tools.doctor import bus, diagnosis, machine, rig
+from buddyline.tools.health import machine as judge_machine
+from buddyline.tools.health import rig as judge_rig
+from buddyline.tools.health.finding import Finding, status_of
 
 from tests.node.test_chrony import FOLLOWS, LOST, SERVES
 from tests.processes import REPOSITORY
@@ -49,14 +51,14 @@ def camera(**changes):
 )
 def test_clock(line, error, timesyncd, stamps, level):
     tracking = None if line is None else decode_tracking(line)
-    found = checks.clock(tracking, error, timesyncd, stamps=stamps)
+    found = judge_machine.clock(tracking, error, timesyncd, stamps=stamps)
     assert found.level == level
     assert bool(found.advice) == (level != "ok")
 
 
 @pytest.mark.parametrize(("degc", "level"), [(None, "skipped"), (45.0, "ok"), (72.0, "warning"), (80.0, "problem")])
 def test_temperature(degc, level):
-    assert checks.temperature(degc).level == level
+    assert judge_machine.temperature(degc).level == level
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_temperature(degc, level):
     ],
 )
 def test_power(bits, level, word):
-    found = checks.power(bits)
+    found = judge_machine.power(bits)
     assert (found.level, word in found.text) == (level, True)
 
 
@@ -85,7 +87,7 @@ def test_power(bits, level, word):
     ],
 )
 def test_disk(free_bytes, rate_px, error, level):
-    assert checks.disk("/d", free_bytes, 200_000_000, rate_px, error).level == level
+    assert judge_machine.disk("/d", free_bytes, 200_000_000, rate_px, error).level == level
 
 
 @pytest.mark.parametrize(
@@ -105,17 +107,17 @@ def test_disk(free_bytes, rate_px, error, level):
     ],
 )
 def test_calibration(info, shape, level, word):
-    found = checks.calibration(CALIBRATION.calibration, info, shape)
+    found = judge_rig.calibration(CALIBRATION.calibration, info, shape)
     assert (found.level, word in found.text) == (level, True), found
 
 
 def test_a_calibration_of_this_camera_is_well():
-    assert checks.calibration(None, INFO_A, (1232, 1640)).level == "ok"
+    assert judge_rig.calibration(None, INFO_A, (1232, 1640)).level == "ok"
 
 
 @pytest.mark.parametrize(("grey", "level"), [(0, "warning"), (30, "ok"), (255, "warning")])
 def test_picture(grey, level):
-    assert checks.picture(np.full((20, 30), grey, np.uint8)).level == level
+    assert judge_rig.picture(np.full((20, 30), grey, np.uint8)).level == level
 
 
 def detection(score):
@@ -125,7 +127,7 @@ def detection(score):
 
 @pytest.mark.parametrize(("scores", "level"), [([[0.9, 0.8]], "ok"), ([[0.9], [0.1, 0.9]], "warning"), ([], "warning")])
 def test_lights(scores, level):
-    assert checks.lights([[detection(score) for score in frame] for frame in scores]).level == level
+    assert judge_rig.lights([[detection(score) for score in frame] for frame in scores]).level == level
 
 
 NODE = {"node": "a", "stamp_ns": STAMP_NS}
@@ -146,7 +148,7 @@ REST = Imu(**NODE, accel_mps2=(0.0, 0.1, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_
     ],
 )
 def test_sensor(messages, problem, level, word):
-    found = checks.sensor("imu", messages, problem)
+    found = judge_rig.sensor("imu", messages, problem)
     assert (found.level, word in found.text) == (level, True), found
 
 
@@ -195,7 +197,7 @@ def levels(findings):
 
 
 def test_hub_and_nodes():
-    absent = bus.check_bus(bus.Seen(error="no hub at tcp/x"), "tcp/x", None)
+    absent = bus.check_bus(bus.Seen(error="no hub at tcp/x", no_hub=True), "tcp/x", None)
     assert levels(absent) == {"hub": "warning", "nodes": "skipped"}
     refused = bus.check_bus(bus.Seen(error="certificate expired"), "tcp/x", None)
     assert levels(refused)["hub"] == "problem"
@@ -223,13 +225,13 @@ def test_a_bus_is_seen_for_a_moment():
 
 
 def test_what_hangs_or_fails_is_named_and_hides_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(command, "SAY_AFTER_S", 0.05)
+    monkeypatch.setattr(diagnosis, "SAY_AFTER_S", 0.05)
     forever = threading.Event()
 
     def fails():
         raise BuddylineError("the cable is out")
 
-    findings = command.together(
+    findings = diagnosis.together(
         {
             "camera": lambda: [Finding("camera", "ok", str(forever.wait()))],
             "bus": fails,
@@ -287,16 +289,16 @@ def test_a_node_that_runs_is_not_disturbed(monkeypatch):
         raise AssertionError("its devices are in use")
 
     running = bus.Seen(infos={"a": INFO_A}, statuses={"a": status()}, alive={"node/a"})
-    monkeypatch.setattr(command.bus, "look", lambda *_: running)
+    monkeypatch.setattr(diagnosis.bus, "look", lambda *_: running)
     monkeypatch.setattr(rig, "check_camera", refuse)
-    found = command.diagnose(NodeConfig(node="a"), ClientConfig())
+    found = diagnosis.diagnose(NodeConfig(node="a"), ClientConfig())
     assert found[-1].level == "skipped"
     assert "in use" in found[-1].text
 
 
 def test_the_program(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(command.bus, "look", lambda *_: bus.Seen(error="no hub at tcp/x"))
-    monkeypatch.setattr(command, "read_tracking", lambda: None)
+    monkeypatch.setattr(diagnosis.bus, "look", lambda *_: bus.Seen(error="no hub at tcp/x", no_hub=True))
+    monkeypatch.setattr(diagnosis, "read_tracking", lambda: None)
     monkeypatch.setattr(rig, "LISTEN_S", 0.3)
     monkeypatch.chdir(tmp_path)
     assert main(["doctor", "--config", str(EXAMPLES / "a.toml")]) == 0
@@ -306,7 +308,7 @@ def test_the_program(capsys, monkeypatch, tmp_path):
     assert said["status"] == status_
     assert {"clock", "disk", "temperature", "power", "hub"} <= {finding["name"] for finding in said["findings"]}
     (tmp_path / "viewer.toml").write_text('connect = "tcp/127.0.0.1:1"\n')
-    assert command.load(str(tmp_path / "viewer.toml")) == (None, ClientConfig(connect="tcp/127.0.0.1:1"))
+    assert diagnosis.load(str(tmp_path / "viewer.toml")) == (None, ClientConfig(connect="tcp/127.0.0.1:1"))
     (tmp_path / "bad.toml").write_text('node = "a"\nrate = 3\n')
     assert main(["doctor", "--config", str(tmp_path / "bad.toml")]) == 2
     assert "unknown key `rate`" in capsys.readouterr().err

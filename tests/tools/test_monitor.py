@@ -13,9 +13,10 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import POSE, key_of
+from buddyline.tools.health.pair import findings
+from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.coverage import Coverage, clock_words
-from buddyline.tools.monitor.health import REASONS, findings, sentence
 from buddyline.tools.monitor.inbox import QUEUED, Inbox
 from buddyline.tools.monitor.picture import KEPT_NS, Miss, PairPicture
 from buddyline.tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
@@ -101,7 +102,7 @@ class TestHealth:
         picture.alive("node/b", False, at(30))
         feed(picture, 31, "a")
         said = findings(picture, at(31))[0]
-        assert (said.level, said.who, said.since_ns) == ("bad", "b", at(30))
+        assert (said.level, said.name, said.since_ns) == ("problem", "node b", at(30))
         assert "power" in said.advice
 
     def test_a_node_that_came_back_is_not_gone(self) -> None:
@@ -120,7 +121,7 @@ class TestHealth:
     def test_a_dead_hub_is_told_from_dead_nodes(self) -> None:
         picture = watched()
         said = findings(picture, at(29) + 5 * S_NS)
-        assert [finding.who for finding in said] == ["bus"]
+        assert [finding.name for finding in said] == ["bus"]
         assert said[0].since_ns == at(29)
 
     def test_the_solver_is_missed(self) -> None:
@@ -135,7 +136,7 @@ class TestHealth:
         for k, figure in ((30, "2.1"), (40, "3.1"), (50, "4.1")):
             picture.take(status("a", at(k), f"camera: nothing for {figure} s"), None, at(k))
             feed(picture, k + 1)
-        said = [finding for finding in findings(picture, at(51)) if "reports" in finding.what]
+        said = [finding for finding in findings(picture, at(51)) if "reports" in finding.text]
         assert [finding.since_ns for finding in said] == [at(30)]
 
     @pytest.mark.parametrize("reason", sorted(REASONS))
@@ -145,8 +146,8 @@ class TestHealth:
             for message in (frame("a", k), frame("b", k), rejection(k, reason)):
                 picture.take(message, None, at(k))
             picture.take(solver_status(at(k)), None, at(k))
-        said = next(finding for finding in findings(picture, at(60)) if finding.who == "pair")
-        assert said.what == f"No pose: {REASONS[reason][0]}."
+        said = next(finding for finding in findings(picture, at(60)) if finding.name == "pair")
+        assert said.text == f"No pose: {REASONS[reason][0]}."
         assert said.advice == REASONS[reason][1]
 
     def test_a_log_without_poses_says_how_to_get_them(self) -> None:

@@ -10,6 +10,7 @@ import pytest
 from buddyline.protocol.codec import decode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, RelativePose
@@ -219,7 +220,7 @@ def test_live_alarms_go_out_on_the_bus(messages):
 
     with network.connect() as nodes, network.connect() as topside, network.connect() as listener:
         listener.subscribe(MARK.key_any(), hear)
-        Watch(topside).attach()
+        Watch(topside, Refusals("test")).attach()
         publishers = {}
         for message in messages:
             parsed = parse_key(key_of(message)) if not isinstance(message, Rejected) else None

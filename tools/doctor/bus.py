@@ -6,13 +6,15 @@ import threading
 from dataclasses import dataclass, field
 from typing import Final
 
-from buddyline.protocol.bus import Bus, Received
-from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.bus import Bus
+from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo, NodeStatus
-from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import INFO, NODE_STATUS
-from buddyline.tools.doctor.finding import Finding
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.health.finding import Finding
+from buddyline.tools.health.pair import START_SOLVER, reported
+from buddyline.tools.live import NoHubError, follow, open_bus_within
 
 HUB_WITHIN_S: Final = 3.0
 # A node says how it is once a second.
@@ -21,19 +23,16 @@ LISTEN_S: Final = 1.5
 
 @dataclass
 class Seen:
-    """Who is on the bus. error: why this machine is not, "" where it is."""
+    """Who is on the bus. error: why this machine is not, "" where it is; no_hub: that none answered."""
 
     error: str = ""
+    no_hub: bool = False
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     statuses: dict[str, NodeStatus] = field(default_factory=dict)
     alive: set[str] = field(default_factory=set)
-    refusals: Refusals = field(default_factory=lambda: Refusals("doctor"))
 
-    def take(self, received: Received) -> None:
-        """Take an info or a status; what is neither is passed over."""
-        envelope = self.refusals.open(received)
-        if envelope is None:
-            return
+    def take(self, envelope: Envelope) -> None:
+        """Take an info or a status."""
         if isinstance(envelope.message, NodeInfo):
             self.infos[envelope.node] = envelope.message
         elif isinstance(envelope.message, NodeStatus):
@@ -44,30 +43,22 @@ class Seen:
         (self.alive.add if alive else self.alive.discard)(name)
 
 
-def look(connect_to: str, namespace: str, tls: Tls | None) -> Seen:
+def look(client: ClientConfig) -> Seen:
     """Connect for a moment and see who is there."""
-    from buddyline.protocol.zenoh_bus import connect
-
-    stop = threading.Event()
-    timer = threading.Timer(HUB_WITHIN_S, stop.set)
-    timer.start()
     try:
-        bus = connect(connect_to, namespace=namespace or None, stop=stop, on_wait=lambda _: None, tls=tls)
+        with open_bus_within(client, HUB_WITHIN_S) as bus:
+            return watch(bus, LISTEN_S)
+    except NoHubError as error:
+        return Seen(error=str(error), no_hub=True)
     except BuddylineError as error:
         return Seen(error=str(error))
-    finally:
-        timer.cancel()
-    if bus is None:
-        return Seen(error=f"no hub at {connect_to}")
-    with bus:
-        return watch(bus, LISTEN_S)
 
 
 def watch(bus: Bus, seconds: float) -> Seen:
     """See who is on a bus for this long."""
-    seen = Seen()
-    bus.subscribe(INFO.key_any(), seen.take)
-    bus.subscribe(NODE_STATUS.key_any(), seen.take)
+    seen, refusals = Seen(), Refusals("doctor")
+    for topic in (INFO, NODE_STATUS):
+        follow(bus, topic.key_any(), refusals, seen.take)
     bus.watch_alive(seen.alive_changed)
     threading.Event().wait(seconds)
     return seen
@@ -76,30 +67,28 @@ def watch(bus: Bus, seconds: float) -> Seen:
 def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
     """Judge hub and nodes. own: this machine's node, None for a laptop."""
     if seen.error:
-        level = "warning" if seen.error.startswith("no hub") else "problem"
-        advice = (
-            "start it: buddyline hub; a node records without it" if level == "warning" else "see README.md, Security"
-        )
         nodes = Finding("nodes", "skipped", "nobody is seen without a hub")
-        return [Finding("hub", level, seen.error, advice), nodes]  # type: ignore[arg-type]
+        if seen.no_hub:
+            advice = "start it: buddyline hub; a node records without it"
+            return [Finding("hub", "warning", seen.error, advice), nodes]
+        return [Finding("hub", "problem", seen.error, "see README.md, Security"), nodes]
     findings = [Finding("hub", "ok", f"answers at {endpoint}")]
     present = sorted(name.removeprefix("node/") for name in seen.alive if name.startswith("node/"))
     for node in present:
-        findings.append(_node(node, seen))
+        findings += _node(node, seen)
     if not [node for node in present if node != own]:
         who = "no other node" if own else "no node"
         findings.append(Finding("nodes", "warning", f"{who} is on the bus", "start it: a pose needs two"))
     if not any(name.partition("/")[0] == "solver" for name in seen.alive):
-        findings.append(Finding("solver", "warning", "none is on the bus", "for live poses: buddyline solver"))
+        findings.append(Finding("solver", "warning", "none is on the bus", f"for live poses, {START_SOLVER}"))
     return findings
 
 
-def _node(node: str, seen: Seen) -> Finding:
+def _node(node: str, seen: Seen) -> list[Finding]:
     name, info, status = f"node {node}", seen.infos.get(node), seen.statuses.get(node)
     if info is None:
-        return Finding(name, "problem", "is on the bus, and its calibration is not known", "restart it")
+        return [Finding(name, "problem", "is on the bus, and its calibration is not known", "restart it")]
     if status is None:
-        return Finding(name, "warning", "is on the bus, and does not say how it is", "look at its log")
-    if status.problem:
-        return Finding(name, "problem", status.problem, "on that node: buddyline doctor --config ...")
-    return Finding(name, "ok", f"runs for {status.uptime_s:.0f} s, {info.width_px}x{info.height_px}, no complaints")
+        return [Finding(name, "warning", "is on the bus, and does not say how it is", "look at its log")]
+    well = f"runs for {status.uptime_s:.0f} s, {info.width_px}x{info.height_px}, no complaints"
+    return reported(name, status) or [Finding(name, "ok", well)]

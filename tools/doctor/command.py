@@ -4,29 +4,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-import threading
-import time
-import tomllib
-from collections.abc import Callable
 from dataclasses import asdict
-from pathlib import Path
 from typing import Final
 
-from buddyline.node.chrony import ChronyError, read_tracking
-from buddyline.node.config import NodeConfig, load_node_config
-from buddyline.protocol.config import load_config
-from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.security import check_identity, node_name
-from buddyline.tools.client import ClientConfig
-from buddyline.tools.doctor import bus, checks, machine, rig
-from buddyline.tools.doctor.finding import Finding, Level, status_of
+from buddyline.tools.health.finding import Finding, Level, status_of
+from msgspec.structs import replace
 
-WITHIN_S: Final = 10.0
-SAY_AFTER_S: Final = 2.0
 MARKS: Final[dict[Level, str]] = {"ok": "OK", "warning": "warning", "problem": "PROBLEM", "skipped": "-"}
-
-Check = Callable[[], list[Finding]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,9 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check everything, within ten seconds; return 1 where there is a problem."""
+    from buddyline.tools.doctor.diagnosis import diagnose, load
+
     node, client = load(args.config)
     if args.connect:
-        client = ClientConfig(connect=args.connect, namespace=client.namespace, tls=client.tls)
+        client = replace(client, connect=args.connect)
     findings = diagnose(node, client)
     if args.json:
         print(json.dumps({"status": status_of(findings), "findings": [asdict(finding) for finding in findings]}))
@@ -55,105 +41,7 @@ def run(args: argparse.Namespace) -> int:
     return status_of(findings)
 
 
-def load(path: str | None) -> tuple[NodeConfig | None, ClientConfig]:
-    """Read a node's configuration, or a client's; raise ConfigError naming file, field and value."""
-    if path is None:
-        return None, ClientConfig()
-    try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        table = {"node": ""}  # the loader says what is wrong with it
-    if "node" not in table:
-        config = load_config(path, ClientConfig)
-        return None, config if config.tls is None else ClientConfig(
-            connect=config.connect, namespace=config.namespace, tls=config.tls.beside(path)
-        )
-    node = load_node_config(path)
-    return node, ClientConfig(connect=node.connect, namespace=node.namespace, tls=node.tls)
-
-
 def lines_of(finding: Finding) -> list[str]:
     """Return a finding as a person reads it."""
     lines = [f"{MARKS[finding.level]:<8} {finding.name:<12} {finding.text}"]
     return lines + ([f"{'':<21} -> {finding.advice}"] if finding.advice else [])
-
-
-def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
-    """Check the machine and the bus, then, where no node has them in use already, camera and sensors."""
-    ends_s = time.monotonic() + WITHIN_S
-    seen = bus.Seen(error=f"{client.connect} did not answer")
-
-    def look() -> list[Finding]:
-        nonlocal seen
-        if client.tls is not None and node is not None:
-            try:
-                check_identity(client.tls, node_name(node.node))
-            except BuddylineError as error:
-                seen = bus.Seen(error=str(error))
-                return bus.check_bus(seen, client.connect, node.node)
-        seen = bus.look(client.connect, client.namespace, client.tls)
-        return bus.check_bus(seen, client.connect, None if node is None else node.node)
-
-    findings = together({"this machine": lambda: check_machine(node), "the bus": look}, ends_s)
-    if node is None:
-        return findings
-    if f"node/{node.node}" in seen.alive:
-        return [*findings, Finding("camera", "skipped", f"in use: node {node.node} runs, and says how it is above")]
-    return findings + together(
-        {"the camera": lambda: rig.check_camera(node), "the sensors": lambda: rig.check_sensors(node)}, ends_s
-    )
-
-
-def check_machine(node: NodeConfig | None) -> list[Finding]:
-    """Check clock, disk, temperature and power."""
-    tracking, error = None, ""
-    try:
-        tracking = read_tracking()
-    except ChronyError as found:
-        error = str(found)
-    stamps = node is not None and node.camera.name == "picamera2"
-    directory = Path(node.record.directory if node else ".")
-    free_bytes, unwritable = machine.space(directory)
-    rate_px = node.record.images_hz * node.camera.width_px * node.camera.height_px if node else 0.0
-    min_free_bytes = node.record.min_free_mb * 1_000_000 if node else 0
-    return [
-        checks.clock(tracking, error, machine.timesyncd(), stamps=stamps),
-        checks.disk(str(directory.absolute()), free_bytes, min_free_bytes, rate_px, unwritable),
-        checks.temperature(machine.temperature_degc()),
-        checks.power(machine.throttled()),
-    ]
-
-
-def together(tasks: dict[str, Check], ends_s: float) -> list[Finding]:
-    """Do all at once, each in a thread of its own; one that is not done in time is a problem, not waited for."""
-    results: dict[str, list[Finding] | Exception] = {}
-    changed = threading.Condition()
-
-    def do(name: str, task: Check) -> None:
-        try:
-            result: list[Finding] | Exception = task()
-        except Exception as error:  # a check that fails must not hide what the others found
-            result = error
-        with changed:
-            results[name] = result
-            changed.notify_all()
-
-    for name, task in tasks.items():
-        threading.Thread(target=do, args=(name, task), name=name, daemon=True).start()
-    with changed:
-        if not changed.wait_for(lambda: len(results) == len(tasks), SAY_AFTER_S):
-            waiting = ", ".join(name for name in tasks if name not in results)
-            print(f"still looking at {waiting} ...", file=sys.stderr, flush=True)
-        changed.wait_for(lambda: len(results) == len(tasks), max(ends_s - time.monotonic(), 0.5))
-        done = dict(results)
-    findings: list[Finding] = []
-    for name in tasks:
-        result = done.get(name)
-        if result is None:
-            findings.append(Finding(name, "problem", "gave no answer in time", "it hangs: check cables, then reboot"))
-        elif isinstance(result, Exception):
-            advice = "" if isinstance(result, BuddylineError) else "this is a fault of the program: please report it"
-            findings.append(Finding(name, "problem", f"{type(result).__name__}: {result}", advice))
-        else:
-            findings += result
-    return findings

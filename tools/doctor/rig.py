@@ -13,8 +13,8 @@ from buddyline.node.devices import Frame, Source, open_camera, open_sensors
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodeInfo
-from buddyline.tools.doctor import checks
-from buddyline.tools.doctor.finding import Finding
+from buddyline.tools.health import rig as judge
+from buddyline.tools.health.finding import Finding
 from msgspec.structs import replace
 
 FRAMES: Final = 3
@@ -56,8 +56,8 @@ def check_camera(config: NodeConfig) -> list[Finding]:
         ]
     detector = make_detector(config.detector.method, config.detector.environment, config.detector.overrides)
     found = [detector.detect(frame.image) for frame in frames]
-    seen = checks.picture(frames[-1].image)
-    return [seen, _calibration(config, info, frames[-1].image.shape), checks.lights(found)]
+    seen = judge.picture(frames[-1].image)
+    return [seen, _calibration(config, info, frames[-1].image.shape), judge.lights(found)]
 
 
 def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:
@@ -70,7 +70,7 @@ def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...
         return Finding("calibration", "skipped", "comes with the simulated camera")
     else:
         info = own  # type: ignore[assignment]
-    return checks.calibration(config.calibration, info, shape)
+    return judge.calibration(config.calibration, info, shape)
 
 
 def check_sensors(config: NodeConfig) -> list[Finding]:
@@ -84,12 +84,12 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
         except BuddylineError as error:
             return [Finding("sensors", "problem", str(error), "check wiring and config.txt: node/README.md")]
         heard = _listen(sources)
-        findings = [checks.sensor(source.name, heard[source.name], source.problem) for source in sources]
+        findings = [judge.sensor(source.name, heard[source.name], source.problem) for source in sources]
         for source in sources:
             source.close()
     sensors = config.sensors
     calibrated = any(sensors.magnetometer_offset_t)
-    return [*findings, checks.magnetometer(calibrated, sensors.name == "i2c" and sensors.imu != "none")]
+    return [*findings, judge.magnetometer(calibrated, sensors.name == "i2c" and sensors.imu != "none")]
 
 
 def _listen(sources: list[Source]) -> dict[str, list[Message]]:

@@ -84,10 +84,10 @@ def _published(values: Sequence[object]) -> Floats:
     return np.array([np.nan if value is UNSET else value for value in values], dtype=float)
 
 
-def _ned_of_a(poses: Sequence[RelativePose], attitude_a: Track, info_a: NodeInfo | None) -> Floats:
+def _ned_of_a(poses: Sequence[RelativePose], attitude_a: Track | None, info_a: NodeInfo | None) -> Floats:
     """Return q_ned_camera (N, 4) of node a at each pose, NaN where unknown."""
     q_ned_camera = np.full((len(poses), 4), np.nan)
-    if info_a is None:
+    if info_a is None or attitude_a is None:
         return q_ned_camera
     q_body_camera = normalized(np.array(info_a.q_body_camera_xyzw))
     for i, pose in enumerate(poses):
@@ -101,7 +101,7 @@ def pose_errors(
     poses: Sequence[RelativePose],
     track: TruthTrack,
     is_right: Callable[[RelativePose], bool | None],
-    attitude_a: Track,
+    attitude_a: Track | None,
     infos: Mapping[str, NodeInfo],
 ) -> PoseErrors:
     """Compare the poses of one pair with truth; poses without truth are left out."""

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.tools.monitor.health import duration_words, reason_words
+from buddyline.tools.health.words import duration_words, reason_words
 
 SOLVED_COLOUR: Final = "#3f9a5a"
 PARTLY_COLOUR: Final = "#c9a227"

@@ -11,13 +11,14 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, CompressedImage, Rejected, RelativePose
-from buddyline.tools.monitor.health import Finding, duration_words, findings, reason_words, sentence
-from buddyline.tools.monitor.picture import STALE_NS, Miss, NodePicture, PairPicture, Point
+from buddyline.protocol.topics import CANDIDATES, IMAGE, NODE_STATUS
+from buddyline.tools.health.finding import Finding
+from buddyline.tools.health.pair import findings
+from buddyline.tools.health.words import duration_words, reason_words, sentence
+from buddyline.tools.monitor.picture import Miss, NodePicture, PairPicture, Point
 from buddyline.tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
 from msgspec import UNSET
 
-# A status older than this says nothing of now.
-STATUS_STALE_NS: Final = 3 * S_NS
 PLOTTED_NS: Final = 120 * S_NS
 # Poses further apart than this are not joined by a line: between them nothing is known.
 BREAK_NS: Final = 3 * S_NS // 2
@@ -29,7 +30,7 @@ CSS: Final = (
     "<style>"
     ".bl{font:13px/1.4 system-ui,sans-serif;padding:2px 12px;container-type:inline-size}"
     ".bl .banner{border-radius:6px;padding:6px 10px;margin:2px 0 6px;font-weight:600;color:#fff}"
-    ".bl .good{background:#2b7a43}.bl .warn{background:#8a6410}.bl .bad{background:#a32f2a}"
+    ".bl .ok{background:#2b7a43}.bl .warning{background:#8a6410}.bl .problem{background:#a32f2a}"
     ".bl .big{font-size:clamp(17px,6.4cqw,25px);font-weight:650;font-variant-numeric:tabular-nums;"
     "letter-spacing:-.5px;white-space:nowrap}"
     ".bl .old,.bl .old *{color:#8b8f96!important;text-decoration:line-through}"
@@ -38,8 +39,8 @@ CSS: Final = (
     ".bl table{width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums}"
     ".bl td{padding:1px 4px 1px 0;vertical-align:top}.bl td.n{text-align:right;white-space:nowrap}"
     ".bl .find{border-left:4px solid;padding:1px 8px;margin:4px 0;background:rgba(128,128,128,.1)}"
-    ".bl .find.bad{border-color:#e0574f;background:rgba(224,87,79,.14)}.bl .find.warn{border-color:#e0a93b;"
-    "background:rgba(224,169,59,.12)}.bl .find.good{border-color:#4caf6a;background:rgba(76,175,106,.12)}"
+    ".bl .find.problem{border-color:#e0574f;background:rgba(224,87,79,.14)}.bl .find.warning{border-color:#e0a93b;"
+    "background:rgba(224,169,59,.12)}.bl .find.ok{border-color:#4caf6a;background:rgba(76,175,106,.12)}"
     ".bl .cam{position:relative;margin:4px 0}.bl .cam svg{width:100%;height:auto;display:block;background:#05080c;"
     "border-radius:4px}.bl .cam.stale svg{filter:grayscale(1) brightness(.55)}" + STYLE + "</style>"
 )
@@ -65,7 +66,7 @@ def _figures(picture: PairPicture, now_ns: int) -> str:
     pose, age_ns = picture.pose, picture.pose_age_ns(now_ns)
     if pose is None or age_ns is None:
         return '<div class="dim">No pose yet.</div>'
-    stale = age_ns > STALE_NS
+    stale = picture.is_stale(now_ns)
     sigma_m = math.sqrt(sum(max(pose.covariance[i], 0.0) for i in (0, 7, 14)))
     azimuth = UNKNOWN if pose.azimuth_rad is UNSET else f"{math.degrees(pose.azimuth_rad):.1f}°"
     inclination = UNKNOWN if pose.inclination_rad is UNSET else f"{math.degrees(pose.inclination_rad):+.1f}°"
@@ -105,11 +106,11 @@ def _finding(finding: Finding, now_ns: int) -> str:
 
 
 def _node_row(node: NodePicture, now_ns: int) -> str:
-    age_ns = node.age_ns("candidates", now_ns)
+    age_ns = node.age_ns(CANDIDATES.name, now_ns)
     pictures = "no pictures yet" if age_ns is None else f"newest picture {duration_words(age_ns / S_NS)} ago"
     facts = [pictures]
-    status, said_ns = node.status, node.age_ns("status", now_ns)
-    if status is not None and said_ns is not None and said_ns < STATUS_STALE_NS:
+    status = node.status
+    if status is not None and not node.is_stale(NODE_STATUS, now_ns):
         facts += [f"{escape(what)} {rate:.0f}/s" for what, rate in sorted(status.rates_hz.items()) if rate >= 0.5]
         facts += [
             f"{count} {escape(cause.replace('_', ' '))} dropped" for cause, count in status.drops.items() if count
@@ -155,11 +156,11 @@ def camera(picture: PairPicture, node: NodePicture, now_ns: int) -> str:
     """Return a node's newest picture with what was found in it and what became of it, or its candidates alone."""
     image = node.image
     frame = node.seen_at(image.stamp_ns) if image is not None else (node.candidates[-1] if node.candidates else None)
-    age_ns = node.age_ns("image" if image is not None else "candidates", now_ns)
+    topic = CANDIDATES if image is None else IMAGE
+    age_ns = node.age_ns(topic.name, now_ns)
     if age_ns is None:
         return block(f'<div class="dim">Node {escape(node.node)}: no picture yet.</div>')
-    # Previews come slowly: a few seconds without are no fault, but what is shown is then said to be old.
-    old = age_ns > (3 * S_NS if image is not None else STALE_NS)
+    old = node.is_stale(topic, now_ns)
     result = picture.results.get(frame.trigger) if frame is not None else None
     heading = f'<b>Node {escape(node.node)}</b> <span class="dim">{_picture_words(image, frame, age_ns, old)}</span>'
     drawing = marked_picture(image, frame, result, node.node)

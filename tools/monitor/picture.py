@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -24,6 +25,7 @@ from buddyline.protocol.messages import (
     RelativePose,
     SolverStatus,
 )
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMAGE, INFO, NODE_STATUS, POSE, Topic
 from buddyline.tools.monitor.scene import Frame, frame_of
 
 KEPT_NS: Final = 150 * S_NS
@@ -31,9 +33,6 @@ KEPT_NS: Final = 150 * S_NS
 POINT_SPACING_NS: Final = S_NS // 5
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
-STALE_NS: Final = S_NS * 8 // 10
-# A node is silent when neither candidates nor its 1 Hz status came for this long.
-SILENT_NS: Final = 3 * S_NS // 2
 LIVE_WITHIN_NS: Final = 60 * S_NS
 
 
@@ -63,7 +62,7 @@ class Miss:
 
 @dataclass
 class NodePicture:
-    """What is known of one node; times are those at which the newest message came."""
+    """What is known of one node. heard_ns: by topic's name, when its newest message came."""
 
     node: str
     info: NodeInfo | None = None
@@ -76,6 +75,15 @@ class NodePicture:
     problem_since_ns: int = 0
     left_ns: int | None = None
 
+    def stale_after_ns(self, topic: Topic) -> int:
+        """Return the age from which what it sends on a topic is stale."""
+        return round(stale_after_s(topic, 0.0 if self.info is None else self.info.trigger_period_ns / S_NS) * S_NS)
+
+    def is_stale(self, topic: Topic, now_ns: int) -> bool:
+        """Return whether the newest message of a topic is stale; False where none ever came."""
+        heard_ns = self.heard_ns.get(topic.name)
+        return heard_ns is not None and now_ns - heard_ns >= self.stale_after_ns(topic)
+
     def age_ns(self, what: str, now_ns: int) -> int | None:
         """Return how long ago a message of this kind came, None where none ever did."""
         heard_ns = self.heard_ns.get(what)
@@ -83,7 +91,7 @@ class NodePicture:
 
     def alive_ns(self) -> int:
         """Return when the last sign of life came (0: never)."""
-        return max((ns for what, ns in self.heard_ns.items() if what != "info"), default=0)
+        return max((ns for what, ns in self.heard_ns.items() if what != INFO.name), default=0)
 
     def seen(self, trigger: int) -> Candidates | None:
         """Return this node's candidates of one trigger, where they are still kept."""
@@ -158,8 +166,9 @@ class PairPicture:
 
     def is_stale(self, now_ns: int) -> bool:
         """Return whether what the scene shows of B is no longer so."""
-        age_ns = self.pose_age_ns(now_ns)
-        return age_ns is None or age_ns > STALE_NS
+        age_ns, a = self.pose_age_ns(now_ns), self.nodes.get(self.ends()[0] or "")
+        stale_ns = round(stale_after_s(POSE) * S_NS) if a is None else a.stale_after_ns(POSE)
+        return age_ns is None or age_ns >= stale_ns
 
     def frame(self) -> Frame:
         """Return how A's camera stands in the scene, by A's newest attitude."""
@@ -170,10 +179,11 @@ class PairPicture:
         return [point for point in self.points if now_ns - within_ns <= point.at_ns <= now_ns]
 
     def _take_node(self, node: NodePicture, message: Message, at_ns: int) -> None:
-        name = _KINDS.get(type(message))
-        if name is None:
+        kind = _KINDS.get(type(message))
+        if kind is None:
             return
-        node.heard_ns[name] = at_ns
+        topic, field_name = kind
+        node.heard_ns[topic.name] = at_ns
         if isinstance(message, Candidates):
             node.candidates.append(message)
             return
@@ -181,7 +191,7 @@ class PairPicture:
             before = node.status.problem if node.status else ""
             if _subject(message.problem) != _subject(before):
                 node.problem_since_ns = at_ns
-        setattr(node, name, message)
+        setattr(node, field_name, message)
         if isinstance(message, NodeInfo | Attitude) and node.node == self.ends()[0]:
             self._frame = frame_of(node.info, node.attitude)
 
@@ -211,13 +221,13 @@ class PairPicture:
             self.points.popleft()
 
 
-_KINDS: Final[dict[type[Message], str]] = {
-    NodeInfo: "info",
-    Attitude: "attitude",
-    Depth: "depth",
-    NodeStatus: "status",
-    CompressedImage: "image",
-    Candidates: "candidates",
+_KINDS: Final[dict[type[Message], tuple[Topic, str]]] = {
+    NodeInfo: (INFO, "info"),
+    Attitude: (ATTITUDE, "attitude"),
+    Depth: (DEPTH, "depth"),
+    NodeStatus: (NODE_STATUS, "status"),
+    CompressedImage: (IMAGE, "image"),
+    Candidates: (CANDIDATES, "candidates"),
 }
 
 

@@ -16,8 +16,8 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
+from buddyline.tools.health.words import duration_words, reason_words
 from buddyline.tools.monitor.coverage import clock_words
-from buddyline.tools.monitor.health import duration_words, reason_words
 from buddyline.tools.monitor.panel import REJECTED_COLOUR, stretches, time_plots
 from buddyline.tools.monitor.picture import Point
 from buddyline.tools.monitor.replay import replay_html, rig_outline

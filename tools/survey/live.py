@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE
 from buddyline.tools.client import client_config
-from buddyline.tools.live import LiveClient
+from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.derive import one_leg
 from buddyline.tools.survey.magnetism import Field, field_of
@@ -27,7 +27,7 @@ from buddyline.tools.survey.shots import shoot
 from buddyline.tools.survey.sights import sights
 
 if TYPE_CHECKING:
-    from buddyline.protocol.bus import Bus, Publisher, Received
+    from buddyline.protocol.bus import Bus, Publisher
 
 log = logging.getLogger(__name__)
 
@@ -114,30 +114,25 @@ class LiveAlarms:
 class Watch:
     """The alarms on a bus: attached, it listens to the pair and publishes marks."""
 
-    def __init__(self, bus: Bus) -> None:
-        self.refusals = Refusals("survey watch")
+    def __init__(self, bus: Bus, refusals: Refusals) -> None:
         self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
-        self._bus = bus
+        self._bus, self._refusals = bus, refusals
         self._publishers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
 
     def attach(self) -> None:
         """Subscribe."""
-        self._bus.subscribe(INFO.key_any(), self.receive)
+        follow(self._bus, INFO.key_any(), self._refusals, self._take)
         # In one, so that no pose closes a leg ahead of the depths that came before it.
         keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE))
-        self._bus.subscribe(keys, self.receive, capacity=16384, history=False)
+        follow(self._bus, keys, self._refusals, self._take, capacity=16384, history=False)
 
-    def receive(self, received: Received) -> None:
-        """Take one message off the bus."""
-        envelope = self.refusals.open(received)
-        if envelope is None:
-            return
+    def _take(self, envelope: Envelope) -> None:
         try:
             with self._lock:
                 marks = self._alarms.handle(envelope.message)
         except BuddylineError as error:
-            log.warning("survey watch: %s: %s", received.key, error)
+            log.warning("survey watch: %s: %s", envelope.key, error)
             return
         for mark in marks:
             log.warning("%s: %s: %s", mark.node, mark.name, mark.note)
@@ -152,7 +147,7 @@ def run_watch(args: argparse.Namespace, seconds: float | None) -> int:
     client = LiveClient("survey watch", client_config(args, SURVEYOR), seconds)
 
     def watch(bus: Bus) -> None:
-        Watch(bus).attach()
+        Watch(bus, client.refusals).attach()
         client.wait()
 
     return client.run(watch)

@@ -1,99 +1,19 @@
-"""The doctor's judgements, over facts that others have gathered."""
+"""What is said of a node's rig: calibration, camera, lights, sensors. What they gave goes in, findings come out."""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
-from buddyline.node.chrony import Tracking
 from buddyline.node.config import CalibrationConfig
 from buddyline.node.detect import Detection
 from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2
 from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu, Message, NodeInfo
-from buddyline.tools.doctor.finding import Finding, Level
+from buddyline.tools.health.finding import Finding
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-CLOCK_LIMIT_S: Final = 2e-3
-HOT_DEGC: Final = 70.0
-TOO_HOT_DEGC: Final = 80.0  # a Pi slows down from here on
-DIVE_H: Final = 4.0
 LIKELY: Final = 0.5
-# Of JPEGs of quality 90 of dark water with lamps, and of all else that a node records.
-BYTES_A_PIXEL: Final = 0.25
-BYTES_A_SECOND: Final = 50_000
-
-# vcgencmd get_throttled: now, and since the start.
-UNDERVOLTAGE: Final = 1 << 0
-THROTTLED: Final = 1 << 2
-UNDERVOLTAGE_WAS: Final = 1 << 16
-THROTTLED_WAS: Final = 1 << 18
-
-
-def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: bool = True) -> Finding:
-    """Judge whether this machine's clock is that of the others.
-
-    timesyncd: systemd says it is synchronised. stamps: frames are stamped by it; else nothing is worse than a warning.
-    """
-    worst: Level = "problem" if stamps else "warning"
-    if error:
-        return Finding("clock", worst, error, "see node/README.md: chrony on two Pis")
-    if tracking is None:
-        if timesyncd:
-            return Finding("clock", "warning", "set by systemd-timesyncd, to milliseconds", "apt install chrony")
-        return Finding(
-            "clock", "warning", "chrony is not installed: nothing keeps it with the others'", "apt install chrony"
-        )
-    if not tracking.synchronised:
-        return Finding(
-            "clock", worst, "not synchronised: chrony has no source", "connect the tether, then: chronyc sources"
-        )
-    if tracking.local:
-        return Finding("clock", "ok", f"served to others as it stands (stratum {tracking.stratum})")
-    text = f"{1e3 * tracking.offset_s:+.3f} ms from {tracking.source}, RMS {1e3 * tracking.rms_s:.3f} ms"
-    if max(abs(tracking.offset_s), tracking.rms_s) > CLOCK_LIMIT_S:
-        return Finding("clock", worst, text, f"wait until it is within {1e3 * CLOCK_LIMIT_S:g} ms: chronyc waitsync")
-    return Finding("clock", "ok", text)
-
-
-def temperature(degc: float | None) -> Finding:
-    """Judge the processor's temperature."""
-    if degc is None:
-        return Finding("temperature", "skipped", "this machine does not tell")
-    level: Level = "problem" if degc >= TOO_HOT_DEGC else "warning" if degc >= HOT_DEGC else "ok"
-    advice = "" if level == "ok" else "get it into the shade or the water; a Pi slows down at 80 degrees"
-    return Finding("temperature", level, f"{degc:.0f} degrees C", advice)
-
-
-def power(throttled: int | None) -> Finding:
-    """Judge the supply by the firmware's bits (vcgencmd get_throttled)."""
-    if throttled is None:
-        return Finding("power", "skipped", "this machine does not tell of undervoltage")
-    if throttled & UNDERVOLTAGE:
-        return Finding("power", "problem", "undervoltage now", "charge or change the battery; thicker, shorter cables")
-    if throttled & THROTTLED:
-        return Finding("power", "problem", "the processor is slowed down now", "cool it, and check the supply")
-    if throttled & UNDERVOLTAGE_WAS:
-        return Finding("power", "warning", "undervoltage since the start", "charge the battery, check cables, reboot")
-    if throttled & THROTTLED_WAS:
-        return Finding("power", "warning", "was slowed down since the start", "cool it, and check the supply")
-    return Finding("power", "ok", "no undervoltage since the start")
-
-
-def disk(place: str, free_bytes: int, min_free_bytes: int, picture_px_a_second: float, error: str) -> Finding:
-    """Judge whether a dive fits. error: why nothing can be written there, "" where it can."""
-    if error:
-        return Finding("disk", "problem", f"{place}: {error}", "set record.directory to a place this user can write")
-    hours = max(free_bytes - min_free_bytes, 0) / (picture_px_a_second * BYTES_A_PIXEL + BYTES_A_SECOND) / 3600
-    text = (
-        f"{place}: {free_bytes / 1e9:.1f} GB free, for about {hours:.0f} hours"
-        if hours < 1000
-        else (f"{place}: {free_bytes / 1e9:.0f} GB free")
-    )
-    advice = "copy old dives away and delete them, or lower record.images_hz"
-    if free_bytes <= min_free_bytes:
-        return Finding("disk", "problem", text, advice)
-    return Finding("disk", "warning" if hours < DIVE_H else "ok", text, advice if hours < DIVE_H else "")
 
 
 def calibration(entered: CalibrationConfig | None, info: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:

@@ -1,0 +1,82 @@
+"""What is said of this machine: clock, temperature, power, disk. Facts go in, findings come out."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from buddyline.node.chrony import Tracking
+from buddyline.protocol.health import CLOCK_OFF_S, DIVE_H, HOT_DEGC, TOO_HOT_DEGC
+from buddyline.tools.health.finding import Finding, Level
+
+# Of JPEGs of quality 90 of dark water with lamps, and of all else that a node records.
+BYTES_A_PIXEL: Final = 0.25
+BYTES_A_SECOND: Final = 50_000
+
+# vcgencmd get_throttled, the worst first: bits of now, and of since the start.
+_POWER: Final[tuple[tuple[int, Level, str, str], ...]] = (
+    (1 << 0, "problem", "undervoltage now", "charge or change the battery; thicker, shorter cables"),
+    (1 << 2, "problem", "the processor is slowed down now", "cool it, and check the supply"),
+    (1 << 16, "warning", "undervoltage since the start", "charge the battery, check cables, reboot"),
+    (1 << 18, "warning", "was slowed down since the start", "cool it, and check the supply"),
+)
+
+
+def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: bool = True) -> Finding:
+    """Judge whether this machine's clock is that of the others.
+
+    timesyncd: systemd says it is synchronised. stamps: frames are stamped by it; else nothing is worse than a warning.
+    """
+    worst: Level = "problem" if stamps else "warning"
+    if error:
+        return Finding("clock", worst, error, "see node/README.md: chrony on two Pis")
+    if tracking is None:
+        if timesyncd:
+            return Finding("clock", "warning", "set by systemd-timesyncd, to milliseconds", "apt install chrony")
+        return Finding(
+            "clock", "warning", "chrony is not installed: nothing keeps it with the others'", "apt install chrony"
+        )
+    if not tracking.synchronised:
+        return Finding(
+            "clock", worst, "not synchronised: chrony has no source", "connect the tether, then: chronyc sources"
+        )
+    if tracking.local:
+        return Finding("clock", "ok", f"served to others as it stands (stratum {tracking.stratum})")
+    text = f"{1e3 * tracking.offset_s:+.3f} ms from {tracking.source}, RMS {1e3 * tracking.rms_s:.3f} ms"
+    if max(abs(tracking.offset_s), tracking.rms_s) > CLOCK_OFF_S:
+        return Finding("clock", worst, text, f"wait until it is within {1e3 * CLOCK_OFF_S:g} ms: chronyc waitsync")
+    return Finding("clock", "ok", text)
+
+
+def temperature(degc: float | None) -> Finding:
+    """Judge the processor's temperature."""
+    if degc is None:
+        return Finding("temperature", "skipped", "this machine does not tell")
+    level: Level = "problem" if degc >= TOO_HOT_DEGC else "warning" if degc >= HOT_DEGC else "ok"
+    advice = "" if level == "ok" else "get it into the shade or the water; a Pi slows down at 80 degrees"
+    return Finding("temperature", level, f"{degc:.0f} degrees C", advice)
+
+
+def power(throttled: int | None) -> Finding:
+    """Judge the supply by the firmware's bits (vcgencmd get_throttled)."""
+    if throttled is None:
+        return Finding("power", "skipped", "this machine does not tell of undervoltage")
+    for bit, level, text, advice in _POWER:
+        if throttled & bit:
+            return Finding("power", level, text, advice)
+    return Finding("power", "ok", "no undervoltage since the start")
+
+
+def disk(place: str, free_bytes: int, min_free_bytes: int, picture_px_a_second: float, error: str) -> Finding:
+    """Judge whether a dive fits. error: why nothing can be written there, "" where it can."""
+    if error:
+        return Finding("disk", "problem", f"{place}: {error}", "set record.directory to a place this user can write")
+    hours = max(free_bytes - min_free_bytes, 0) / (picture_px_a_second * BYTES_A_PIXEL + BYTES_A_SECOND) / 3600
+    text = (
+        f"{place}: {free_bytes / 1e9:.1f} GB free, for about {hours:.0f} hours"
+        if hours < 1000
+        else (f"{place}: {free_bytes / 1e9:.0f} GB free")
+    )
+    advice = "copy old dives away and delete them, or lower record.images_hz"
+    if free_bytes <= min_free_bytes:
+        return Finding("disk", "problem", text, advice)
+    return Finding("disk", "warning" if hours < DIVE_H else "ok", text, advice if hours < DIVE_H else "")

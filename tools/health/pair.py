@@ -1,0 +1,136 @@
+"""What is wrong with a pair and its nodes, since when, and what to do: of what is known at an instant."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import CLOCK_OFF_S, HOT_DEGC, NO_POSE_S, REASONS_S, SILENT_S, stale_after_s
+from buddyline.protocol.messages import NodeStatus
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, SOLVER_STATUS
+from buddyline.tools.health.finding import Finding, worst_first
+from buddyline.tools.health.words import REASONS, reason_words
+from msgspec import UNSET
+
+if TYPE_CHECKING:
+    from buddyline.tools.monitor.picture import NodePicture, PairPicture
+
+_POWER: Final = "check its power and its cable"
+_CAMERA: Final = "check its camera and the camera's cable"
+START_SOLVER: Final = "start it: buddyline solver"
+
+
+def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Finding]:
+    """Return what there is to say of a pair, the worst first. live: of now, not of a stored dive."""
+    if live:
+        bus = _bus(picture, now_ns)
+        if bus is not None:
+            return [bus]
+    said: list[Finding] = []
+    for node in sorted(picture.nodes):
+        said += _node(picture.nodes[node], now_ns, live)
+    if live:
+        said += _missing(picture)
+        said += _solver(picture, now_ns)
+    said += _pair(picture, now_ns, live)
+    if not said:
+        said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose."))
+    return worst_first(said)
+
+
+def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
+    """Return what a node says of itself, and what its figures say. since_ns: since when it has its problem."""
+    said = []
+    if status.problem:
+        said.append(Finding(name, "problem", f"{_named(name)} reports: {status.problem}", "", since_ns))
+    if status.temperature_degc is not UNSET and status.temperature_degc >= HOT_DEGC:
+        hot = f"{_named(name)} is hot: {status.temperature_degc:.0f} degrees C."
+        said.append(Finding(name, "warning", hot, "cool it, or lower its picture rate"))
+    if status.clock_offset_s is not UNSET and abs(status.clock_offset_s) > CLOCK_OFF_S:
+        off = f"The clock of {name} is off by {status.clock_offset_s * 1e3:.1f} ms."
+        said.append(Finding(name, "warning", off, "wait for chrony, or check the time server"))
+    return said
+
+
+def _named(name: str) -> str:
+    """Return a name as a sentence begins with it."""
+    return f"{name[0].upper()}{name[1:]}"
+
+
+def _bus(picture: PairPicture, now_ns: int) -> Finding | None:
+    if picture.last_ns is None:
+        return Finding("bus", "warning", "Nothing has come over the bus yet.", "start hub, nodes and solver")
+    # Every node and the solver say something each second: without any of it, it is the link.
+    if now_ns - picture.last_ns > SILENT_S * S_NS:
+        advice = "check that the hub runs and the cable to it; the nodes go on recording by themselves"
+        return Finding("bus", "problem", "Nothing comes over the bus any more.", advice, picture.last_ns)
+    return None
+
+
+def _node(node: NodePicture, now_ns: int, live: bool) -> list[Finding]:
+    name, alive_ns = f"node {node.node}", node.alive_ns()
+    # What comes after it left says that it is back; what was on its way does not.
+    if live and node.left_ns is not None and alive_ns <= node.left_ns + node.stale_after_ns(CANDIDATES):
+        advice = f"{_POWER}; if it still runs, it goes on recording by itself"
+        return [Finding(name, "problem", f"{_named(name)} has left the bus.", advice, node.left_ns)]
+    silent_ns = max(SILENT_S * S_NS, node.stale_after_ns(CANDIDATES))
+    if alive_ns and now_ns - alive_ns > silent_ns:
+        return [Finding(name, "problem", f"{_named(name)} is silent.", _POWER, alive_ns)]
+    said = []
+    frames_ns = node.heard_ns.get(CANDIDATES.name)
+    if frames_ns is None:
+        if live and alive_ns:
+            said.append(Finding(name, "problem", f"{_named(name)} sends no pictures' candidates.", "check its camera"))
+    elif now_ns - frames_ns > silent_ns:
+        text = f"{_named(name)} has stopped finding lights in pictures."
+        said.append(Finding(name, "problem", text, _CAMERA, frames_ns))
+    for topic in (ATTITUDE, DEPTH):
+        if node.is_stale(topic, now_ns):
+            text = f"{topic.name.capitalize()} of {name} has stopped."
+            said.append(Finding(name, "warning", text, "check that sensor", node.heard_ns[topic.name]))
+    if node.info is None and alive_ns:
+        said.append(Finding(name, "warning", f"The calibration of {name} is not known.", "restart the node"))
+    return said + ([] if node.status is None else reported(name, node.status, node.problem_since_ns))
+
+
+def _missing(picture: PairPicture) -> list[Finding]:
+    ends = [end for end in picture.ends() if end is not None]
+    absent = [end for end in ends if end not in picture.nodes]
+    said = [Finding(f"node {end}", "problem", f"Node {end} is not on the bus.", _POWER) for end in absent]
+    if len(ends) < 2:
+        only = f"Only node {ends[0]} is on the bus." if ends else "No node is on the bus."
+        said.append(Finding("pair", "problem", only, "start the other one: a pose needs two"))
+    for a, b in sorted(picture.other_pairs):
+        said.append(Finding("pair", "warning", f"Poses of another pair, {a} and {b}, are not shown."))
+    return said
+
+
+def _solver(picture: PairPicture, now_ns: int) -> list[Finding]:
+    if picture.solver_left_ns is not None:
+        return [Finding("solver", "problem", "The solver has left the bus.", START_SOLVER, picture.solver_left_ns)]
+    if picture.solver is None or picture.solver_ns is None:
+        absent = Finding("solver", "problem", "No solver is on the bus.", START_SOLVER)
+        return [absent] if picture.pose is None else []
+    if now_ns - picture.solver_ns > stale_after_s(SOLVER_STATUS) * S_NS:
+        return [Finding("solver", "problem", "The solver is silent.", START_SOLVER, picture.solver_ns)]
+    if picture.solver.problem:
+        text = f"The solver reports: {picture.solver.problem}"
+        return [Finding("solver", "warning", text, "", picture.solver_problem_since_ns)]
+    return []
+
+
+def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
+    """Say that there is no pose, and why, where the nodes themselves are well."""
+    age_ns = picture.pose_age_ns(now_ns)
+    if age_ns is not None and age_ns <= NO_POSE_S * S_NS:
+        return []
+    recent = Counter(miss.reason for miss in picture.misses if 0 <= now_ns - miss.at_ns <= REASONS_S * S_NS)
+    if recent:
+        reason, count = recent.most_common(1)[0]
+        share = "" if len(recent) == 1 else f" ({count} of {recent.total()})"
+        text = f"No pose: {reason_words(reason)}{share}."
+        return [Finding("pair", "problem", text, REASONS.get(reason, ("", ""))[1], picture.pose_ns)]
+    if live or picture.pose is not None or picture.first_ns is None or now_ns - picture.first_ns <= NO_POSE_S * S_NS:
+        return []
+    return [Finding("pair", "warning", "No pose yet in this log.", "solve it first: buddyline solve")]

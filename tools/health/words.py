@@ -1,0 +1,60 @@
+"""Plain words for rejections and durations."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from buddyline.protocol.clock import S_NS
+from buddyline.tools.health.finding import Finding
+
+# Each reason of the contract: what it means, and what may help.
+REASONS: Final[dict[str, tuple[str, str]]] = {
+    "unmatched": (
+        "the other node has no picture of that instant",
+        "check that both nodes run, at one rate, with clocks in step",
+    ),
+    "no_info": ("a node's calibration is not known", "restart that node, or give the solver its calibration"),
+    "too_few_candidates": (
+        "a node does not see both lights",
+        "turn the nodes toward each other; check lights and lens",
+    ),
+    "range_gap": (
+        "the two distances disagree",
+        "check that the lights' spacing in the configuration is what was built",
+    ),
+    "twist_gap": ("the two views disagree on the twist", "check the mounting of lights and camera"),
+    "attitude": (
+        "the attitude sensors contradict what is seen",
+        "keep steel away from the compass; calibrate the sensors",
+    ),
+    "depth": ("the depth gauges contradict what is seen", "check both depth gauges at the surface"),
+    "out_of_range": ("the distance is outside what is possible", "other lamps may be in view: switch them off"),
+    "ambiguous": ("more than one arrangement fits", "other lamps may be in view: switch them off, or move apart"),
+    "degenerate": ("the nodes stand so that no pose follows", "move one node a little aside or turn it"),
+    "late": ("candidates came too late", "check the link's load and the clocks"),
+    "duplicate": ("candidates came twice", "make sure that no two nodes have the same id"),
+}
+
+
+def reason_words(reason: str) -> str:
+    """Return what a rejection's reason means, for a person."""
+    return REASONS.get(reason, (reason.replace("_", " "), ""))[0]
+
+
+def sentence(finding: Finding, now_ns: int) -> str:
+    """Return what a finding says, and since when."""
+    if finding.since_ns is None:
+        return finding.text
+    return f"{finding.text.rstrip('.')}, for {duration_words((now_ns - finding.since_ns) / S_NS)}."
+
+
+def duration_words(seconds: float) -> str:
+    """Return a duration as a person says it."""
+    seconds = max(seconds, 0.0)
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    if seconds < 7200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
