@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from buddyline.protocol.messages import Imu, Mark, Rejected, RelativePose
+from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, stand
 from buddyline.tools.survey.derive import Derived, ranges
@@ -57,7 +57,7 @@ def test_legs_of_a_leapfrog(messages):
 
 
 def test_every_fix_of_a_rest_is_used_or_its_reason_is_given(messages):
-    readings = of_messages(messages)
+    (readings,) = of_messages(messages)
     for leg in derived(messages).legs:
         within = [
             m.trigger for m in messages if isinstance(m, RelativePose) and leg.start_ns <= m.stamp_ns <= leg.end_ns
@@ -187,7 +187,7 @@ def _approaching(message):
 
 
 def test_swimming_is_not_rest(messages):
-    readings = of_messages(messages)
+    (readings,) = of_messages(messages)
     for rest in rests(readings, sights(readings, SurveySettings()), SurveySettings()):
         assert (rest.end_ns - rest.start_ns) / 1e9 < 10.5
 
@@ -318,3 +318,55 @@ def test_ranges():
 
 def test_a_leg_is_named_by_its_ends():
     assert "from" in Leg.__struct_encode_fields__
+
+
+def renamed(message, **names):
+    """Return a message of other nodes: names of the old ones to the new."""
+    fields = {
+        field: names.get(value, value)
+        for field in ("node", "node_a", "node_b")
+        if (value := getattr(message, field, None))
+    }
+    return replace(message, **fields)
+
+
+def test_three_nodes_make_one_network(messages):
+    # c stands beside b and sees a as b does: the two pairs look at the same stations at the same time.
+    both = derived([*messages, *(renamed(message, b="c") for message in messages)])
+    assert len(both.legs) == 10
+    assert {frozenset((leg.from_node, leg.to_node)) for leg in both.legs} == {frozenset("ab"), frozenset("ac")}
+    shared = {leg.from_ for leg in both.legs[:5]} | {leg.to for leg in both.legs[:5]}
+    # Where a stood is known from its legs with b; where c stood has numbers of its own.
+    for first, second in zip(both.legs[:5], both.legs[5:], strict=True):
+        at_a = {leg.from_node: leg.from_ for leg in (first,)} | {first.to_node: first.to}
+        at_a_too = {second.from_node: second.from_, second.to_node: second.to}
+        assert at_a["a"] == at_a_too["a"]
+        assert at_a_too["c"] not in shared
+
+
+def test_two_pairs_are_watched_live():
+    rng = np.random.default_rng(11)
+    course = world.line(rng, 3)
+    messages = world.dive(course, rng, rest_s=8.0, swim_s=2.0)
+    wrong = [replace(m, depth_m=m.depth_m + 3.0) if isinstance(m, Depth) and m.node == "b" else m for m in messages]
+    live = LiveAlarms(SurveySettings(), AlarmSettings())
+    said = []
+    for message in wrong:
+        said += live.handle(message) + live.handle(renamed(message, a="c", b="d"))
+    assert {mark.node for mark in said if mark.name == "depth"} == {"a", "c"}
+
+
+def test_a_second_dive_takes_numbers_of_its_own(messages):
+    found = Derived()
+    for dive in (1, 2):
+        found.add(of_messages(messages), SurveySettings(), AlarmSettings(), dive)
+    names = [{name for leg in found.legs if leg.dive == dive for name in (leg.from_, leg.to)} for dive in (1, 2)]
+    assert not names[0] & names[1]
+    # A mark by a number means the first dive's station, and ties the two.
+    first = found.legs[0]
+    tied = Derived()
+    tied.add(of_messages(messages), SurveySettings(), AlarmSettings(), 1)
+    mark = Mark(node=first.from_node, stamp_ns=first.start_ns, name="3")
+    tied.add(of_messages([*messages, mark]), SurveySettings(), AlarmSettings(), 2)
+    assert tied.legs[5].from_ == "3"
+    assert {leg.name for leg in tied.legs[6:]}.isdisjoint({leg.name for leg in tied.legs[:5]})

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
-import numpy as np
 from buddyline.tools.survey.averages import wrap
-from buddyline.tools.survey.magnetism import Field
+from buddyline.tools.survey.magnetism import Field, field_alarm, off_usual
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.settings import AlarmSettings
 from buddyline.tools.survey.shots import Shot
@@ -22,68 +19,37 @@ SUSPECT_SHARE: Final = 0.25
 # British Cave Research Association's grades as 1 sd: compass (deg), distance (m).
 GRADES: Final = ((5, 0.5, 0.05), (4, 0.85, 0.1), (3, 1.25, 0.25))
 
-
-@dataclass(frozen=True)
-class UsualFields:
-    """Each node's field as it mostly was in the dive; None without a magnetometer."""
-
-    a: Field | None
-    b: Field | None
+# Each node's field as it mostly was in the dive; None without a magnetometer.
+UsualFields: TypeAlias = dict[str, Field | None]
 
 
-def usual_fields(shots: list[Shot]) -> UsualFields:
-    """Return the medians over a dive's rests: what is disturbed must be the exception."""
-    return UsualFields(median_field([s.field_a for s in shots]), median_field([s.field_b for s in shots]))
+def off_fields(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> dict[str, float]:
+    """Return how far each node's field is from its usual one, as a share of what is tolerated."""
+    return {end.node: off_usual(end.field, usual.get(end.node), limits) for end in shot.ends}
 
 
-def median_field(fields: Sequence[Field | None]) -> Field | None:
-    """Return the median of what is known; None where nothing is."""
-    known = [one for one in fields if one is not None]
-    if not known:
-        return None
-    return Field(float(np.median([one.norm_t for one in known])), float(np.median([one.dip_rad for one in known])))
-
-
-def field_alarm(field: Field | None, usual: Field | None, limits: AlarmSettings) -> str:
-    """Say how a field differs from the usual one; empty where it does not, or is not known."""
-    if field is None or usual is None:
-        return ""
-    share = field.norm_t / usual.norm_t - 1
-    turn_deg = math.degrees(field.dip_rad - usual.dip_rad)
-    parts = []
-    if abs(share) > limits.field_share:
-        parts.append(f"strength {share:+.0%}")
-    if abs(turn_deg) > limits.dip_deg:
-        parts.append(f"dip {turn_deg:+.1f} deg")
-    return ", ".join(parts)
-
-
-def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tuple[str, str]) -> list[str]:
+def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str]:
     """Return the nodes whose compasses are not to be believed.
 
-    A field beyond its limits condemns. Where the sights contradict each other, so does less: what is clearly
-    further off its usual field than the other node's.
+    A field beyond its limits condemns. Where the sights contradict each other, a smaller difference does as well, if
+    it is clearly larger than the other node's.
     """
     off = off_fields(shot, usual, limits)
-    found = [node for node, far in zip(nodes, off, strict=True) if far > 1]
-    if found or shot.sight_a is None or shot.sight_b is None:
+    found = [node for node, share in off.items() if share > 1]
+    fore, back = (end.azimuth for end in shot.ends)
+    if found or fore is None or back is None:
         return found
-    gap = wrap(shot.sight_a.azimuth.value - shot.sight_b.azimuth.value - math.pi)
-    if abs(gap) <= SUSPECT_SIGMAS * math.hypot(shot.sight_a.azimuth.sigma, shot.sight_b.azimuth.sigma):
+    gap = wrap(fore.value - back.value - math.pi)
+    if abs(gap) <= SUSPECT_SIGMAS * math.hypot(fore.sigma, back.sigma):
         return []
-    worse = 0 if off[0] > off[1] else 1
-    return [nodes[worse]] if off[worse] > max(SUSPECT_SHARE, 2 * off[1 - worse]) else []
-
-
-def off_fields(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> tuple[float, float]:
-    """Return how far each node's field is from its usual one, as a share of what is tolerated."""
-    return _off(shot.field_a, usual.a, limits), _off(shot.field_b, usual.b, limits)
+    better, worse = sorted(off, key=lambda node: off[node])
+    return [worse] if off[worse] > max(SUSPECT_SHARE, 2 * off[better]) else []
 
 
 def disturbed_alike(legs: list[Leg], off: list[dict[str, float]]) -> list[Leg]:
     """Return legs in which a node that was disturbed at a station is so in the leg before and after as well.
 
-    off: each leg's off_fields by node. A node that turns about at its station stays beside what disturbs it.
+    off: each leg's off_fields. A node that turns about at its station stays beside what disturbs it.
     """
 
     def at(leg: Leg, node: str) -> str:
@@ -91,26 +57,16 @@ def disturbed_alike(legs: list[Leg], off: list[dict[str, float]]) -> list[Leg]:
 
     result = list(legs)
     for k, leg in enumerate(legs):
-        for other in (k - 1, k + 1):
-            if not 0 <= other < len(legs):
-                continue
-            for node in legs[other].disturbed:
-                same = at(leg, node) == at(legs[other], node)
+        for other in legs[max(k - 1, 0) : k + 2]:
+            for node in other.disturbed:
+                same = at(leg, node) == at(other, node)
                 if same and node not in result[k].disturbed and off[k][node] > SUSPECT_SHARE:
                     result[k] = replace(result[k], disturbed=sorted([*result[k].disturbed, node]))
     return result
 
 
-def _off(field: Field | None, usual: Field | None, limits: AlarmSettings) -> float:
-    """Return how far a field is from the usual one, as a share of what is tolerated; 0 where it is not known."""
-    if field is None or usual is None:
-        return 0.0
-    share = abs(field.norm_t / usual.norm_t - 1) / limits.field_share
-    return max(share, abs(math.degrees(field.dip_rad - usual.dip_rad)) / limits.dip_deg)
-
-
-def of_leg(leg: Leg, shot: Shot, usual: UsualFields, limits: AlarmSettings, nodes: tuple[str, str]) -> list[str]:
-    """Return what is wrong with a leg, each as `check: what`. nodes: ids of a and b."""
+def of_leg(leg: Leg, shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str]:
+    """Return what is wrong with a leg, each as `check: what`."""
     found = []
     if leg.azimuth_deg is not UNSET and leg.back_azimuth_deg is not UNSET:
         gap_deg = math.degrees(wrap(math.radians(leg.azimuth_deg - leg.back_azimuth_deg - 180)))
@@ -118,17 +74,16 @@ def of_leg(leg: Leg, shot: Shot, usual: UsualFields, limits: AlarmSettings, node
             found.append(f"sights: foresight and backsight differ by {abs(gap_deg):.1f} deg")
     elif leg.azimuth_deg is UNSET and leg.back_azimuth_deg is UNSET:
         found.append("compass: no attitude of either node; the leg has no direction")
-    for node, field, of_node in zip(nodes, (shot.field_a, shot.field_b), (usual.a, usual.b), strict=True):
-        text = field_alarm(field, of_node, limits)
-        if text:
-            found.append(f"field: at node {node} the magnetic field is not the usual one ({text})")
+    for end in shot.ends:
+        if text := field_alarm(end.field, usual.get(end.node), limits):
+            found.append(f"field: at node {end.node} {text}")
     if leg.heading_gap_deg is not UNSET and abs(leg.heading_gap_deg) > limits.heading_deg:
         found.append(
             f"heading: compasses and what the nodes see of each other differ by {abs(leg.heading_gap_deg):.1f} deg"
         )
     found += _depth_alarms(leg, limits)
     if shot.range_spread > limits.range_sigmas:
-        found.append(f"range: fixes scatter {shot.range_spread:.1f} times what they state")
+        found.append(f"range: fixes scatter {shot.range_spread:.1f} times their stated sigma")
     return found
 
 
@@ -156,12 +111,10 @@ def _depth_alarms(leg: Leg, limits: AlarmSettings) -> list[str]:
 
 
 def grade(leg: Leg) -> int:
-    """Return the leg's grade after the BCRA's, 5 best; 2: it meets none, or an alarm is on it; 1: no compass."""
+    """Return the leg's grade after the BCRA's, 5 best; 2: it meets none, or has an alarm; 1: no compass."""
     sigmas = [s for s in (leg.azimuth_sigma_deg, leg.back_azimuth_sigma_deg) if s is not UNSET]
     if not sigmas:
         return 1
     compass_deg = math.hypot(*sigmas) / len(sigmas)
-    for number, deg, metres in GRADES:
-        if compass_deg <= deg and leg.distance_sigma_m <= metres and not leg.alarms:
-            return number
-    return 2
+    good = (n for n, deg, m in GRADES if compass_deg <= deg and leg.distance_sigma_m <= m and not leg.alarms)
+    return next(good, 2)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
+Ints: TypeAlias = NDArray[np.int64]
 
 OUTLIER_SIGMAS: Final = 4.0
 # Median absolute deviation to standard deviation, of a normal distribution.

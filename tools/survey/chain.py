@@ -1,132 +1,124 @@
-"""Which station each node stands at, rest after rest: by marks, by depths, by the procedure agreed on."""
+"""Which station each node of a pair stands at, rest after rest: by marks, by depths, by the procedure agreed on."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.rests import same_line
 
-# Who has not moved is at the depth it was at; a node that is turned about on its station is so within this.
+# A node that has not moved is at the depth it was at; turning about on its station changes it by less than this.
 LEVEL_M: Final = 0.35
 
-Who = Literal["a", "b"]
-BOTH: Final[tuple[Who, Who]] = ("a", "b")
+Procedure = Literal["leapfrog", "stay"]
 
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """One rest as the chain sees it. named: stations by marks. depth_m: None where a node has no gauge."""
+    """One rest as the chain sees it. By node: depth_m, None without a gauge; named, stations by marks."""
 
     line_m: Floats
-    depth_m: dict[Who, float | None]
-    named: dict[Who, str] = field(default_factory=dict)
+    depth_m: dict[str, float | None]
+    named: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Standing:
     """Where both nodes stand; `rear` came first, so that the leg goes from it. problem: in words, or empty."""
 
-    station: dict[Who, str]
-    rear: Who
+    station: dict[str, str]
+    rear: str
     problem: str = ""
 
 
-def stand(stops: list[Stop], procedure: Literal["leapfrog", "stay"], first: Who) -> list[Standing]:
-    """Return where both nodes stand at each stop; stations without a mark are numbered in their order."""
-    names = _Names()
-    result: list[Standing] = []
-    arrived: dict[Who, int] = {first: 0, _other(first): 1}
-    station: dict[Who, str] = {}
+def stand(stops: list[Stop], procedure: Procedure, first: str, taken: Iterable[str] = ()) -> list[Standing]:
+    """Return where both nodes stand at each stop.
+
+    Stations without a mark are numbered in their order, by the numbers that are not taken; a later mark by such a
+    number means that station. first: the node at the first station.
+    """
+    if not stops:
+        return []
+    nodes = list(stops[0].depth_m)
+    in_use = set(taken)
+    # When each node came to its station, as a number: 0 and 1 at the beginning, later the stop's and one more.
+    arrived = {node: int(node != first) for node in nodes}
+    station: dict[str, str] = {}
     marked: set[str] = set()
+    result: list[Standing] = []
     for k, stop in enumerate(stops):
         problem = ""
-        names.taken |= set(stop.named.values())
-        if k == 0:
-            moved = set(BOTH)
-        else:
+        in_use |= set(stop.named.values())
+        moved = set(nodes)
+        if k:
             guessed = _guessed(stops[k - 1], stop, procedure, first, arrived)
-            for who, name in stop.named.items():
-                if station[who] not in marked and name != station[who] and who not in guessed:
+            for node, name in stop.named.items():
+                if station[node] not in marked and name != station[node] and node not in guessed:
                     # It has stood there since before, under a number: now it has a name.
-                    result = [_renamed(standing, station[who], name) for standing in result]
-                    station[who] = name
+                    result = [_renamed(standing, station[node], name) for standing in result]
+                    station[node] = name
             moved, problem = _moved(stops[k - 1], stop, station, guessed)
         marked |= set(stop.named.values())
-        for who in sorted(moved, key=lambda one: arrived[one]):
-            station[who] = stop.named.get(who) or names.next()
-            if k:
-                arrived[who] = k + 1
-        if station["a"] == station["b"]:
-            problem = f"both nodes at station {station['a']}: one of the marks is wrong"
-        rear: Who = "a" if arrived["a"] < arrived["b"] else "b"
-        if arrived["a"] == arrived["b"]:
-            rear = first
-        result.append(Standing(dict(station), rear, problem))
+        for node in sorted(nodes, key=lambda one: arrived[one]):
+            if node in moved:
+                station[node] = stop.named.get(node) or _number(in_use)
+                in_use.add(station[node])
+                arrived[node] = k + 1 if k else arrived[node]
+        if len(set(station.values())) == 1:
+            problem = f"both nodes at station {station[nodes[0]]}: one of the marks is wrong"
+        result.append(Standing(dict(station), _rear(arrived, first), problem))
     return result
 
 
-class _Names:
-    """Numbers for stations that no mark has named so far: a later mark by such a number means that station."""
-
-    def __init__(self) -> None:
-        self.taken: set[str] = set()
-
-    def next(self) -> str:
-        number = 0
-        while str(number) in self.taken:
-            number += 1
-        self.taken.add(str(number))
-        return str(number)
+def _rear(arrived: dict[str, int], first: str) -> str:
+    """Return the node that came first to its station; of two that came together, `first`."""
+    return min(arrived, key=lambda node: (arrived[node], node != first))
 
 
-def _other(who: Who) -> Who:
-    return "b" if who == "a" else "a"
+def _number(in_use: set[str]) -> str:
+    return next(str(number) for number in range(len(in_use) + 1) if str(number) not in in_use)
 
 
 def _renamed(standing: Standing, old: str, new: str) -> Standing:
-    station = {who: new if name == old else name for who, name in standing.station.items()}
+    station = {node: new if name == old else name for node, name in standing.station.items()}
     return Standing(station, standing.rear, standing.problem)
 
 
-def _levels(before: Stop, stop: Stop) -> dict[Who, bool]:
-    """Tell for each node whether its depth has changed by more than turning about does."""
-    changed: dict[Who, bool] = {}
-    for who in BOTH:
-        old_m, new_m = before.depth_m[who], stop.depth_m[who]
-        changed[who] = old_m is not None and new_m is not None and abs(new_m - old_m) > LEVEL_M
+def _changed_depth(before: Stop, stop: Stop) -> set[str]:
+    """Return the nodes whose depth has changed by more than turning about does."""
+    changed = set()
+    for node, now_m in stop.depth_m.items():
+        before_m = before.depth_m[node]
+        if before_m is not None and now_m is not None and abs(now_m - before_m) > LEVEL_M:
+            changed.add(node)
     return changed
 
 
-def _guessed(
-    before: Stop, stop: Stop, procedure: Literal["leapfrog", "stay"], first: Who, arrived: dict[Who, int]
-) -> set[Who]:
+def _guessed(before: Stop, stop: Stop, procedure: Procedure, first: str, arrived: dict[str, int]) -> set[str]:
     """Return who moved between two stops as far as line, depths and procedure tell."""
     if same_line(before.line_m, stop.line_m):
         return set()
-    moved: set[Who] = {who for who, changed in _levels(before, stop).items() if changed}
-    if moved:
-        return moved
-    rear: Who = "a" if arrived["a"] < arrived["b"] else "b"
-    return {rear if procedure == "leapfrog" else _other(first)}
+    rear = _rear(arrived, first)
+    mover = {rear} if procedure == "leapfrog" else set(arrived) - {first}
+    return _changed_depth(before, stop) or mover
 
 
-def _moved(before: Stop, stop: Stop, station: dict[Who, str], guessed: set[Who]) -> tuple[set[Who], str]:
+def _moved(before: Stop, stop: Stop, station: dict[str, str], guessed: set[str]) -> tuple[set[str], str]:
     """Return who moved by marks and guess, and what is wrong with that."""
-    said: dict[Who, bool] = {who: stop.named[who] != station[who] for who in BOTH if who in stop.named}
-    levels = _levels(before, stop)
-    moved: set[Who] = {who for who, has in said.items() if has}
-    silent: list[Who] = [who for who in BOTH if who not in said]
-    if len(silent) == 2:
-        moved = guessed
-    elif len(silent) == 1 and guessed and (levels[silent[0]] or not moved):
+    changed = _changed_depth(before, stop)
+    moved = {node for node, name in stop.named.items() if name != station[node]}
+    silent = set(station) - set(stop.named)
+    if len(silent) == len(station):
+        moved = set(guessed)
+    elif silent and guessed and (silent & changed or not moved):
         # One of them must have moved, and it is not the one that is said to stand where it stood.
-        moved.add(silent[0])
+        moved |= silent
     problem = ""
-    for who, has in said.items():
-        if not has and levels[who]:
-            problem = f"marked at station {station[who]} again, but its depth has changed"
-    if moved == set(BOTH) and not all(who in stop.named for who in BOTH):
-        problem = "both nodes have moved since the last leg: nothing ties this one to it, unless by a mark"
+    for node in stop.named:
+        if stop.named[node] == station[node] and node in changed:
+            problem = f"marked at station {station[node]} again, but its depth has changed"
+    if moved == set(station) and silent:
+        problem = "both nodes have moved since the last leg: nothing connects this leg to it; mark a station"
     return moved, problem

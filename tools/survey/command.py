@@ -101,14 +101,12 @@ def _legs(args: argparse.Namespace) -> int:
         raise BuddylineError(f"{path}: names no dive; add [[dive]] with its logs")
     derived = Derived()
     for number, one in enumerate(project.dive, 1):
-        readings = of_logs([str(path.parent / log) for log in one.logs])
-        start_ns = int(readings.stamps_ns[0])
+        pairs = of_logs([str(path.parent / log) for log in one.logs])
+        start_ns = int(pairs[0].stamps_ns[0])
         by_hand = of_project(project.mark, number, start_ns)
         if args.marks and number == 1:
             by_hand += of_table(args.marks, start_ns)
-        readings.marks.extend(by_hand)
-        readings.marks.sort(key=lambda mark: mark.stamp_ns)
-        derived.add(readings, project.settings, project.alarms, number)
+        derived.add(pairs, project.settings, project.alarms, number, by_hand)
     stations = derived.stations()
     write_derived(
         path, {"problem": derived.problems, "station": stations, "leg": derived.legs, "point": derived.points}

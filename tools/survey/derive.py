@@ -1,28 +1,33 @@
-"""From a dive's readings to legs, points and stations: the whole of the pure core in one call."""
+"""From dives' readings to legs, points and stations: the whole of the pure core in one call."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Mark
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.averages import Mean
-from buddyline.tools.survey.chain import BOTH, Standing, Stop, Who, stand
+from buddyline.tools.survey.chain import Stop, stand
+from buddyline.tools.survey.magnetism import usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
-from buddyline.tools.survey.readings import Readings
-from buddyline.tools.survey.rests import Rest, rests
+from buddyline.tools.survey.readings import PairReadings
+from buddyline.tools.survey.rests import rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
-from buddyline.tools.survey.shots import Shot, Sight, shoot
-from buddyline.tools.survey.sights import Sights, sights
+from buddyline.tools.survey.shots import Shot, shoot
+from buddyline.tools.survey.sights import sights
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# A mark this far from any rest says nothing of one.
+# A mark belongs to the nearest rest, but not to one further away than this.
 MARK_NEAR_NS: Final = 20_000_000_000
+LEAST_POINT_FIXES: Final = 3
 
 
 class Derived:
@@ -34,9 +39,49 @@ class Derived:
         self.problems: list[Problem] = []
         self.notes: dict[str, list[str]] = defaultdict(list)
 
-    def add(self, readings: Readings, settings: SurveySettings, limits: AlarmSettings, dive: int = 1) -> None:
-        """Add one dive's legs and points."""
-        _OneDive(self, readings, settings, limits, dive).derive()
+    def add(
+        self,
+        pairs: list[PairReadings],
+        settings: SurveySettings,
+        limits: AlarmSettings,
+        dive: int = 1,
+        by_hand: Iterable[Mark] = (),
+    ) -> None:
+        """Add one dive's legs and points; each pair of nodes is a chain of its own. by_hand: marks beside the logs'."""
+        marks = sorted([*pairs[0].marks, *by_hand], key=lambda mark: mark.stamp_ns)
+        chains = []
+        for readings in pairs:
+            chain = _Chain(self, readings, marks, settings, limits, dive)
+            self.legs += chain.legs
+            chains.append(chain)
+        nodes = {node for chain in chains for node in chain.readings.nodes}
+        placed = {id(mark) for chain in chains for mark in chain.placed}
+        points = [mark for mark in marks if mark.kind == "point" and mark.node in nodes]
+        for mark in marks:
+            at = _time_text(mark.stamp_ns)
+            if mark.kind == "note" and mark.note:
+                self.say(f"note at {at}: {mark.note}")
+            elif mark.kind == "station" and mark.node in nodes:
+                if not STATION_NAME.match(mark.name):
+                    self.say(f"mark at {at}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -")
+                    continue
+                if mark.note and mark.note not in self.notes[mark.name]:
+                    self.notes[mark.name].append(mark.note)
+                if id(mark) not in placed and not points:
+                    self.say(f"mark {mark.name} at {at}: no rest near it")
+        for mark in points:
+            name = mark.name or f"p{len(self.points) + 1}"
+            # Of several nodes that saw the point, the first with fixes enough.
+            found = [chain.point(mark, name) for chain in chains if mark.node in chain.readings.nodes]
+            leg = next((one for one in found if isinstance(one, Leg)), None)
+            if leg is not None:
+                self.points.append(leg)
+            else:
+                self.say(f"point {name}: {found[0]}")
+
+    def say(self, text: str) -> None:
+        """Add a problem."""
+        self.problems.append(Problem(text=text))
 
     def stations(self) -> list[Station]:
         """Return all stations in the order of the legs, each with the weighted mean of its gauges' readings."""
@@ -47,7 +92,7 @@ class Derived:
                 (leg.to, leg.depth_to_m, leg.depth_to_sigma_m),
             ):
                 of_station = seen.setdefault(name, [])
-                if isinstance(depth_m, float) and isinstance(sigma_m, float):
+                if depth_m is not UNSET and sigma_m is not UNSET:
                     of_station.append((depth_m, sigma_m))
         return [_station(name, depths, self.notes.get(name, [])) for name, depths in seen.items()]
 
@@ -57,189 +102,147 @@ def _station(name: str, depths: list[tuple[float, float]], notes: list[str]) -> 
         return Station(name=name, notes=notes)
     depth_m, sigma_m = np.array(depths).T
     weight = 1 / sigma_m**2
-    # A gauge errs alike at each of its visits: averaging them gains little, so none is counted on.
     return Station(
         name=name,
         depth_m=round(float(weight @ depth_m / weight.sum()), 4),
+        # A gauge errs alike at each of its visits: averaging them gains little, so none is counted on.
         depth_sigma_m=round(float(sigma_m.min()), 4),
         readings=len(depths),
         notes=notes,
     )
 
 
-class _OneDive:
+class _Chain:
+    """One pair's legs in one dive. placed: marks that name a station of a rest."""
+
     def __init__(
-        self, out: Derived, readings: Readings, settings: SurveySettings, limits: AlarmSettings, dive: int
+        self,
+        out: Derived,
+        readings: PairReadings,
+        marks: list[Mark],
+        settings: SurveySettings,
+        limits: AlarmSettings,
+        dive: int,
     ) -> None:
-        self.out, self.readings, self.settings, self.limits, self.dive = out, readings, settings, limits, dive
-        self.seen: Sights = sights(readings, settings)
-        self.who: dict[str, Who] = dict(zip(readings.nodes, BOTH, strict=True))
-        self.first: Who = self.who.get(settings.first, "a")
-
-    def derive(self) -> None:
-        every = rests(self.readings, self.seen, self.settings)
-        found = [one for one in every if not one.too_short]
-        for one in every:
-            if one.too_short:
-                least = f"a leg takes {self.settings.rest_s:g} s with {self.settings.rest_fixes} fixes"
-                self._say(f"NO LEG: rest at {_time_text(one.start_ns)}: {one.too_short}; {least}")
-        shots = [shoot(self.readings, self.seen, one.chosen, self.settings, one.unused) for one in found]
-        named = self._named(found)
+        self.readings, self.marks, self.settings, self.limits, self.dive = readings, marks, settings, limits, dive
+        self.seen = sights(readings, settings)
+        self.placed: list[Mark] = []
+        every = rests(readings, self.seen, settings)
+        least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
+        for rest in every:
+            if rest.too_short:
+                out.say(f"NO LEG: rest at {_time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
+        # A rest that follows one without a leg: who moved since is a guess.
+        doubtful = {id(rest) for before, rest in pairwise(every) if before.too_short}
+        self.found = [rest for rest in every if not rest.too_short]
+        if not self.found:
+            pair = f", nodes {' and '.join(readings.nodes)}"
+            out.say(f"dive {dive}{pair}: no rest of {least}")
+        shots = [shoot(readings, self.seen, rest.chosen, settings, rest.unused) for rest in self.found]
+        self.usual = {
+            node: usual_field([shot.ends[i].field for shot in shots]) for i, node in enumerate(readings.nodes)
+        }
+        named = self._named(out)
         stops = [
-            Stop(one.line_m, {"a": _value(shot.depth_a), "b": _value(shot.depth_b)}, named[k])
-            for k, (one, shot) in enumerate(zip(found, shots, strict=True))
+            Stop(rest.line_m, {end.node: end.depth.value if end.depth else None for end in shot.ends}, stations)
+            for rest, shot, stations in zip(self.found, shots, named, strict=True)
         ]
-        standings = stand(stops, self.settings.procedure, self.first) if stops else []
-        usual = alarms.usual_fields(shots)
-        legs: list[Leg] = []
-        doubtful = _after_lost(every)
-        for one, shot, standing in zip(found, shots, standings, strict=True):
-            leg = self._leg(shot, standing.station["a"], standing.station["b"], standing.rear, usual)
-            if standing.problem:
-                leg = replace(leg, alarms=[*leg.alarms, f"stations: {standing.problem}"])
-            if one.start_ns in doubtful and len(named[len(legs)]) < 2:
-                said = "stations: a rest before this one makes no leg; mark both nodes' stations, or they may be wrong"
-                leg = replace(leg, alarms=[*leg.alarms, said])
-            legs.append(leg)
-        off = [
-            dict(zip(self.readings.nodes, alarms.off_fields(shot, usual, self.limits), strict=True)) for shot in shots
-        ]
-        self.out.legs += alarms.disturbed_alike(legs, off)
-        self._points(found, standings, usual)
-        if not found:
-            least = f"{self.settings.rest_s:g} s with {self.settings.rest_fixes} fixes"
-            self._say(f"dive {self.dive}: no rest of {least}")
+        first = settings.first if settings.first in readings.nodes else readings.nodes[0]
+        taken = {name for leg in out.legs for name in (leg.from_, leg.to)}
+        self.standings = stand(stops, settings.procedure, first, taken)
+        legs = []
+        for rest, shot, standing, stations in zip(self.found, shots, self.standings, named, strict=True):
+            leg = self._leg(shot, standing.station, standing.rear)
+            said = [standing.problem] if standing.problem else []
+            if id(rest) in doubtful and len(stations) < 2:
+                said.append("a rest before this one makes no leg; mark both nodes' stations, or they may be wrong")
+            legs.append(replace(leg, alarms=[*leg.alarms, *(f"stations: {text}" for text in said)]))
+        self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
 
-    def _say(self, text: str) -> None:
-        self.out.problems.append(Problem(text=text))
+    def _named(self, out: Derived) -> list[dict[str, str]]:
+        """Return, for each rest, the stations that are known by node: by marks, or by another pair's leg meanwhile.
 
-    def _named(self, found: list[Rest]) -> list[dict[Who, str]]:
-        """Give marked stations to the rests nearest to their marks; the last word counts."""
-        named: list[dict[Who, str]] = [{} for _ in found]
-        for mark in self.readings.marks:
-            if mark.kind == "note" and mark.note:
-                self._say(f"note at {_time_text(mark.stamp_ns)}: {mark.note}")
-            if mark.kind != "station" or mark.node not in self.who:
+        A mark belongs to the rest nearest to it; of two marks the later one counts.
+        """
+        named: list[dict[str, str]] = [{} for _ in self.found]
+        for leg in out.legs:
+            for rest, stations in zip(self.found, named, strict=True):
+                if leg.dive == self.dive and leg.start_ns <= rest.end_ns and rest.start_ns <= leg.end_ns:
+                    both = {leg.from_node: leg.from_, leg.to_node: leg.to}
+                    stations |= {node: name for node, name in both.items() if node in self.readings.nodes}
+        for mark in self.marks:
+            if mark.kind != "station" or mark.node not in self.readings.nodes or not STATION_NAME.match(mark.name):
                 continue
-            if not STATION_NAME.match(mark.name):
-                self._say(
-                    f"mark at {_time_text(mark.stamp_ns)}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -"
-                )
-                continue
-            if mark.note and mark.note not in self.out.notes[mark.name]:
-                self.out.notes[mark.name].append(mark.note)
-            gaps = [max(one.start_ns - mark.stamp_ns, mark.stamp_ns - one.end_ns, 0) for one in found]
-            if not gaps or min(gaps) > MARK_NEAR_NS:
-                if not any(other.kind == "point" for other in self.readings.marks):
-                    self._say(f"mark {mark.name} at {_time_text(mark.stamp_ns)}: no rest near it")
-                continue
-            named[gaps.index(min(gaps))][self.who[mark.node]] = mark.name
+            gaps = [max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0) for rest in self.found]
+            if gaps and min(gaps) <= MARK_NEAR_NS:
+                named[gaps.index(min(gaps))][mark.node] = mark.name
+                self.placed.append(mark)
         return named
 
-    def _points(self, found: list[Rest], standings: list[Standing], usual: alarms.UsualFields) -> None:
-        half_ns = round(self.settings.point_s * 1e9)
-        for mark in self.readings.marks:
-            if mark.kind != "point" or mark.node not in self.who:
-                continue
-            name = mark.name or f"p{len(self.out.points) + 1}"
-            other: Who = "b" if self.who[mark.node] == "a" else "a"
-            station = self._standing_at(mark.stamp_ns, other, found, standings)
-            if station is None:
-                node = self.readings.nodes[BOTH.index(other)]
-                self._say(f"point {name}: where node {node} stood is not known")
-                continue
-            near = np.abs(self.seen.stamps_ns - mark.stamp_ns) <= half_ns
-            if int(near.sum()) < 3:
-                within = f"within {self.settings.point_s:g} s of its mark"
-                self._say(f"point {name}: {int(near.sum())} fixes {within}")
-                continue
-            shot = shoot(self.readings, self.seen, near, self.settings)
-            ends = {other: station, self.who[mark.node]: name}
-            leg = self._leg(shot, ends["a"], ends["b"], other, usual)
-            self.out.points.append(replace(leg, note=mark.note))
+    def point(self, mark: Mark, name: str) -> Leg | str:
+        """Return the leg from the other node's station to a marked point, or why there is none."""
+        other = next(node for node in self.readings.nodes if node != mark.node)
+        station = self._standing_at(mark.stamp_ns, other)
+        if station is None:
+            return f"where node {other} stood is not known"
+        near = np.abs(self.seen.stamps_ns - mark.stamp_ns) <= self.settings.point_s * S_NS
+        if int(near.sum()) < LEAST_POINT_FIXES:
+            return f"{int(near.sum())} fixes within {self.settings.point_s:g} s of its mark"
+        shot = shoot(self.readings, self.seen, near, self.settings)
+        return replace(self._leg(shot, {other: station, mark.node: name}, other), note=mark.note)
 
-    def _standing_at(self, stamp_ns: int, who: Who, found: list[Rest], standings: list[Standing]) -> str | None:
-        """Return where a node stood: its last mark's station where it has one, or that of the rests around."""
-        node = self.readings.nodes[BOTH.index(who)]
-        before = [i for i, one in enumerate(found) if one.start_ns <= stamp_ns]
-        after = [i for i, one in enumerate(found) if one.end_ns >= stamp_ns]
-        around = {standings[i].station[who] for i in (before[-1:] + after[:1])}
-        marked = [m for m in self.readings.marks if m.kind == "station" and m.node == node and m.stamp_ns <= stamp_ns]
-        if len(around) == 1:
-            return next(iter(around))
-        return marked[-1].name if marked and not around else None
+    def _standing_at(self, stamp_ns: int, node: str) -> str | None:
+        """Return where a node stood: the station of the rests around, or its last mark's where there are none."""
+        before = [i for i, rest in enumerate(self.found) if rest.start_ns <= stamp_ns]
+        after = [i for i, rest in enumerate(self.found) if rest.end_ns >= stamp_ns]
+        around = {self.standings[i].station[node] for i in (before[-1:] + after[:1])}
+        if around:
+            return around.pop() if len(around) == 1 else None
+        marked = [m.name for m in self.marks if m.kind == "station" and m.node == node and m.stamp_ns <= stamp_ns]
+        return marked[-1] if marked else None
 
-    def _leg(self, shot: Shot, at_a: str, at_b: str, rear: Who, usual: alarms.UsualFields) -> Leg:
-        nodes = self.readings.nodes
-        leg = one_leg(shot, nodes, (at_a, at_b), rear)
-        leg = replace(leg, dive=self.dive, disturbed=alarms.disturbed(shot, usual, self.limits, nodes))
-        leg = replace(leg, alarms=alarms.of_leg(leg, shot, usual, self.limits, nodes))
+    def _leg(self, shot: Shot, station: dict[str, str], rear: str) -> Leg:
+        bad = alarms.disturbed(shot, self.usual, self.limits)
+        leg = replace(one_leg(shot, station, rear), dive=self.dive, disturbed=bad)
+        leg = replace(leg, alarms=alarms.of_leg(leg, shot, self.usual, self.limits))
         return replace(leg, grade=alarms.grade(leg))
 
 
-def one_leg(shot: Shot, nodes: tuple[str, str], at: tuple[str, str] = ("a", "b"), rear: Who = "a") -> Leg:
-    """Return a shot as a leg from the rear node's station; nodes, at: ids and stations of a and b."""
-    a = (at[0], nodes[0], shot.sight_a, shot.depth_a, shot.field_a)
-    b = (at[1], nodes[1], shot.sight_b, shot.depth_b, shot.field_b)
-    (from_, from_node, fore, depth_from, field_from), (to, to_node, back, depth_to, field_to) = (
-        (a, b) if rear == "a" else (b, a)
-    )
+def one_leg(shot: Shot, station: dict[str, str], rear: str) -> Leg:
+    """Return a shot as a leg from the rear node's station; station: by node."""
+    fields: dict[str, Any] = {}
+    ends = sorted(shot.ends, key=lambda end: end.node != rear)
+    for end, at, prefix, name in zip(ends, ("from_", "to"), ("", "back_"), ("from", "to"), strict=True):
+        fields |= {at: station[end.node], f"{name}_node": end.node}
+        for angle, what in ((end.azimuth, "azimuth"), (end.inclination, "inclination")):
+            fields |= _rounded(angle, 3, math.degrees(1), f"{prefix}{what}_deg", f"{prefix}{what}_sigma_deg")
+        fields |= _rounded(end.depth, 4, 1.0, *(f"depth_{name}_{part}" for part in ("m", "sigma_m", "noise_m")))
+        if end.field is not None:
+            fields[f"field_{name}_ut"] = round(end.field.norm_t * 1e6, 2)
+            fields[f"dip_{name}_deg"] = round(math.degrees(end.field.dip_rad), 2)
+    if shot.heading_gap_rad is not None:
+        fields["heading_gap_deg"] = round(math.degrees(shot.heading_gap_rad), 2)
     return Leg(
-        from_=from_,
-        to=to,
-        from_node=from_node,
-        to_node=to_node,
         start_ns=shot.start_ns,
         end_ns=shot.end_ns,
-        distance_m=round(shot.distance.value, 4),
-        distance_sigma_m=round(shot.distance.sigma, 4),
-        **_angles("", fore),
-        **_angles("back_", back),
-        **_depth("from", depth_from),
-        **_depth("to", depth_to),
-        field_from_ut=round(field_from.norm_t * 1e6, 2) if field_from else UNSET,
-        field_to_ut=round(field_to.norm_t * 1e6, 2) if field_to else UNSET,
-        dip_from_deg=round(math.degrees(field_from.dip_rad), 2) if field_from else UNSET,
-        dip_to_deg=round(math.degrees(field_to.dip_rad), 2) if field_to else UNSET,
-        heading_gap_deg=UNSET if shot.heading_gap_rad is None else round(math.degrees(shot.heading_gap_rad), 2),
         fixes=len(shot.used),
         fixes_used=ranges(shot.used.tolist()),
         unused={reason: ranges(triggers) for reason, triggers in sorted(shot.unused.items())},
+        **_rounded(shot.distance, 4, 1.0, "distance_m", "distance_sigma_m"),
+        **fields,
     )
 
 
-def _after_lost(every: list[Rest]) -> set[int]:
-    """Return the starts of the rests that follow one which makes no leg: who moved since is a guess."""
-    return {rest.start_ns for before, rest in pairwise(every) if before.too_short and not rest.too_short}
-
-
-def _angles(prefix: str, sight: Sight | None) -> dict[str, Any]:
-    if sight is None:
+def _rounded(mean: Mean | None, digits: int, scale: float, *names: str) -> dict[str, Any]:
+    """Return a mean's value, sigma and noise, as far as they have a name; nothing where it was not measured."""
+    if mean is None:
         return {}
-    return {
-        f"{prefix}azimuth_deg": round(math.degrees(sight.azimuth.value), 3),
-        f"{prefix}azimuth_sigma_deg": round(math.degrees(sight.azimuth.sigma), 3),
-        f"{prefix}inclination_deg": round(math.degrees(sight.inclination.value), 3),
-        f"{prefix}inclination_sigma_deg": round(math.degrees(sight.inclination.sigma), 3),
-    }
-
-
-def _depth(end: str, depth: Mean | None) -> dict[str, Any]:
-    if depth is None:
-        return {}
-    return {
-        f"depth_{end}_m": round(depth.value, 4),
-        f"depth_{end}_sigma_m": round(depth.sigma, 4),
-        f"depth_{end}_noise_m": round(depth.noise, 4),
-    }
-
-
-def _value(mean: Mean | None) -> float | None:
-    return mean.value if mean else None
+    values = (mean.value, mean.sigma, mean.noise)
+    return {name: round(scale * value, digits) for name, value in zip(names, values, strict=False)}
 
 
 def _time_text(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).isoformat().replace("+00:00", "Z")
+    return datetime.fromtimestamp(stamp_ns // S_NS, UTC).isoformat().replace("+00:00", "Z")
 
 
 def ranges(triggers: list[int]) -> str:

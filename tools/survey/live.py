@@ -6,8 +6,7 @@ import argparse
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
@@ -19,8 +18,8 @@ from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.derive import one_leg
-from buddyline.tools.survey.magnetism import Field, field_of
-from buddyline.tools.survey.readings import Readings, of_messages
+from buddyline.tools.survey.magnetism import Field, field_alarm, field_of, usual_field
+from buddyline.tools.survey.readings import NodeReadings, of_messages
 from buddyline.tools.survey.rests import rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import shoot
@@ -38,15 +37,18 @@ QUIET_NS: Final = 20 * S_NS
 MEMORY: Final = 300
 LEARNED: Final = 5
 
+_Stamped: TypeAlias = RelativePose | Attitude | Depth | Imu
+
 
 class LiveAlarms:
-    """Takes the pair's messages in any order; returns alarms as marks on the node nearest to blame."""
+    """Takes the messages of any number of nodes, in any order; returns alarms as marks on the node nearest to blame."""
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
         self._settings, self._limits = settings, limits
         self._infos: dict[str, NodeInfo] = {}
-        self._recent: dict[tuple[type[Message], str], deque[Message]] = {}
-        self._checked_ns = 0
+        # By kind and by the ids of its node or pair.
+        self._recent: dict[tuple[type[Message], tuple[str, ...]], deque[_Stamped]] = {}
+        self._checked_ns: dict[tuple[str, str], int] = {}
         self._said_ns: dict[str, int] = {}
         self._fields: dict[str, deque[Field]] = {}
 
@@ -55,55 +57,49 @@ class LiveAlarms:
         if isinstance(message, NodeInfo):
             self._infos[message.node] = message
         elif isinstance(message, RelativePose):
-            self._keep(message, "", message.stamp_ns)
-            if abs(message.stamp_ns - self._checked_ns) >= CHECK_NS:
-                self._checked_ns = message.stamp_ns
-                return self._check(message)
+            pair = message.node_a, message.node_b
+            self._keep(message, pair)
+            if abs(message.stamp_ns - self._checked_ns.get(pair, 0)) >= CHECK_NS:
+                self._checked_ns[pair] = message.stamp_ns
+                return self._check(pair, message.stamp_ns)
         elif isinstance(message, Attitude | Depth | Imu):
-            self._keep(message, message.node, message.stamp_ns)
+            self._keep(message, (message.node,))
         return []
 
-    def _keep(self, message: Message, node: str, stamp_ns: int) -> None:
-        recent = self._recent.setdefault((type(message), node), deque())
+    def _keep(self, message: _Stamped, ids: tuple[str, ...]) -> None:
+        recent = self._recent.setdefault((type(message), ids), deque())
         recent.append(message)
-        while recent and abs(stamp_ns - int(getattr(recent[0], "stamp_ns"))) > WINDOW_NS:  # noqa: B009
+        while abs(message.stamp_ns - recent[0].stamp_ns) > WINDOW_NS:
             recent.popleft()
 
-    def _messages(self) -> Iterator[Message]:
-        yield from self._infos.values()
-        for recent in self._recent.values():
-            yield from recent
-
-    def _check(self, pose: RelativePose) -> list[Mark]:
-        if pose.node_a not in self._infos or pose.node_b not in self._infos:
+    def _check(self, pair: tuple[str, str], now_ns: int) -> list[Mark]:
+        if not set(pair) <= set(self._infos):
             return []
-        readings = of_messages(self._messages())
-        found = self._field_alarms(readings, pose.stamp_ns)
+        sensed = (message for (_, ids), recent in self._recent.items() if {*ids} <= {*pair} for message in recent)
+        (readings,) = of_messages([*(self._infos[node] for node in pair), *sensed])
+        found = [(node.info.node, f"field: {text}") for node in readings.pair if (text := self._field(node, now_ns))]
         seen = sights(readings, self._settings)
-        resting = [one for one in rests(readings, seen, self._settings) if not one.too_short]
+        resting = [rest for rest in rests(readings, seen, self._settings) if not rest.too_short]
         if resting:
             shot = shoot(readings, seen, resting[-1].chosen, self._settings)
-            leg = one_leg(shot, readings.nodes)
-            usual = alarms.UsualFields(None, None)
-            for text in alarms.of_leg(leg, shot, usual, self._limits, readings.nodes):
-                check, _, what = text.partition(": ")
-                found.append((readings.nodes[0], check, what))
-        return [mark for node, check, what in found if (mark := self._mark(node, check, what, pose.stamp_ns))]
+            leg = one_leg(shot, {node: node for node in pair}, pair[0])
+            # The usual fields are learned here over minutes, not from one rest.
+            found += [(pair[0], text) for text in alarms.of_leg(leg, shot, {}, self._limits)]
+        return [mark for node, text in found if (mark := self._mark(node, text, now_ns))]
 
-    def _field_alarms(self, readings: Readings, now_ns: int) -> list[tuple[str, str, str]]:
-        found = []
-        for node in (readings.a, readings.b):
-            now = field_of(node, now_ns - CHECK_NS, now_ns)
-            if now is None:
-                continue
-            known = self._fields.setdefault(node.info.node, deque(maxlen=MEMORY))
-            text = alarms.field_alarm(now, alarms.median_field(list(known)), self._limits)
-            if text and len(known) >= LEARNED:
-                found.append((node.info.node, "field", f"the magnetic field is not the usual one ({text})"))
-            known.append(now)
-        return found
+    def _field(self, node: NodeReadings, now_ns: int) -> str:
+        """Return what is wrong with a node's field now, and learn from it; empty where nothing is."""
+        now = field_of(node, now_ns - CHECK_NS, now_ns)
+        if now is None:
+            return ""
+        known = self._fields.setdefault(node.info.node, deque(maxlen=MEMORY))
+        text = field_alarm(now, usual_field(known), self._limits) if len(known) >= LEARNED else ""
+        known.append(now)
+        return text
 
-    def _mark(self, node: str, check: str, what: str, stamp_ns: int) -> Mark | None:
+    def _mark(self, node: str, text: str, stamp_ns: int) -> Mark | None:
+        """Return an alarm (`check: what`) as a mark; None where it was said a moment ago."""
+        check, _, what = text.partition(": ")
         key = f"{node} {check}"
         if abs(stamp_ns - self._said_ns.get(key, -QUIET_NS)) < QUIET_NS:
             return None
@@ -112,7 +108,7 @@ class LiveAlarms:
 
 
 class Watch:
-    """The alarms on a bus: attached, it listens to the pair and publishes marks."""
+    """The alarms on a bus: attached, it listens to all nodes and pairs, and publishes marks."""
 
     def __init__(self, bus: Bus, refusals: Refusals) -> None:
         self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
@@ -136,10 +132,9 @@ class Watch:
             return
         for mark in marks:
             log.warning("%s: %s: %s", mark.node, mark.name, mark.note)
-            publisher = self._publishers.get(mark.node)
-            if publisher is None:
-                publisher = self._publishers[mark.node] = self._bus.publisher(MARK, mark.node)
-            publisher.put(mark)
+            if mark.node not in self._publishers:
+                self._publishers[mark.node] = self._bus.publisher(MARK, mark.node)
+            self._publishers[mark.node].put(mark)
 
 
 def run_watch(args: argparse.Namespace, seconds: float | None) -> int:

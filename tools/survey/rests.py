@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from buddyline.tools.survey.averages import Bools, Floats
-from buddyline.tools.survey.readings import Node, Readings, Stamps
+from buddyline.tools.survey.averages import Bools, Floats, Ints
+from buddyline.tools.survey.readings import NodeReadings, PairReadings
 from buddyline.tools.survey.settings import SurveySettings
 from buddyline.tools.survey.sights import Sights
 
@@ -43,16 +43,16 @@ class Rest:
     unused: dict[str, list[int]] = field(default_factory=dict)
 
 
-def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Rest]:
+def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> list[Rest]:
     """Return the rests of a dive in their order; too_short where not rest_s long with rest_fixes fixes.
 
     What is shorter than half of that is no rest, but a swimmer's pause; unless poses were refused meanwhile, which
     makes up for the fixes in being one, though not in making a leg.
     """
-    held = handled(readings.a, seen.stamps_ns, settings), handled(readings.b, seen.stamps_ns, settings)
-    yaw_rad = np.nan_to_num(np.maximum(seen.sigma_a_rad[:, 2], seen.sigma_b_rad[:, 2]))
+    handled_by = [handled(node, seen.stamps_ns, settings) for node in readings.pair]
+    yaw_rad = np.nan_to_num(seen.sigma_rad[:, :, 2].max(axis=0))
     wander_mps = np.maximum(WANDER_RADPS, WANDER_SHARE_HZ * yaw_rad) * seen.range_m
-    still = (speeds_mps(seen) < settings.rest_speed_mps + wander_mps) & ~held[0] & ~held[1]
+    still = (speeds_mps(seen) < settings.rest_speed_mps + wander_mps) & ~np.any(handled_by, axis=0)
     runs = _merged(_runs(seen, still), seen)
     found: list[Rest] = []
     for run in runs:
@@ -74,7 +74,9 @@ def rests(readings: Readings, seen: Sights, settings: SurveySettings) -> list[Re
     return sorted([*found, *_refused(readings, seen, still, found, settings)], key=lambda one: one.start_ns)
 
 
-def _refused(readings: Readings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings) -> list[Rest]:
+def _refused(
+    readings: PairReadings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings
+) -> list[Rest]:
     """Return stretches outside of the rests found in which both nodes saw lights, but hardly a pose came of it."""
     events = [(int(seen.stamps_ns[i]), "fix") for i in np.flatnonzero(still).tolist()]
     events += [(one.stamp_ns, one.reason) for one in readings.rejected if one.reason not in UNSEEN]
@@ -132,15 +134,15 @@ def speeds_mps(seen: Sights) -> Floats:
     return speed
 
 
-def handled(node: Node, stamps_ns: Stamps, settings: SurveySettings) -> Bools:
+def handled(node: NodeReadings, stamps_ns: Ints, settings: SurveySettings) -> Bools:
     """Tell, for each of stamps_ns (n,), whether the node is turned or jolted; False where it has no IMU."""
     result = np.zeros(len(stamps_ns), dtype=bool)
-    if not len(node.imu_ns):
+    if not len(node.imu):
         return result
-    turn = np.linalg.norm(node.gyro_radps, axis=1)
-    jolt = np.abs(np.linalg.norm(node.accel_mps2, axis=1) - GRAVITY_MPS2)
-    first = np.searchsorted(node.imu_ns, stamps_ns - FEEL_NS)
-    last = np.searchsorted(node.imu_ns, stamps_ns + FEEL_NS, "right")
+    turn = np.linalg.norm(node.imu["gyro_radps"], axis=1)
+    jolt = np.abs(np.linalg.norm(node.imu["accel_mps2"], axis=1) - GRAVITY_MPS2)
+    first = np.searchsorted(node.imu.stamps_ns, stamps_ns - FEEL_NS)
+    last = np.searchsorted(node.imu.stamps_ns, stamps_ns + FEEL_NS, "right")
     for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
         if start < end:
             result[i] = bool(
