@@ -49,10 +49,6 @@ class Record:
         """Return its sound message; raise MessageError."""
         return open_envelope(self.key, self.payload, self.log_time_ns)
 
-    def decode(self) -> Message | None:
-        """Return the message, None where the key is none of ours; raise MessageError where it is not sound."""
-        return self.open().message if topics.parse_key(self.key) else None
-
 
 class DiveLogWriter:
     """Writes one MCAP file, which must not exist yet."""

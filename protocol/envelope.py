@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-from buddyline.protocol.codec import M, decode
+from buddyline.protocol.codec import M, decode, encode
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, Message
-from buddyline.protocol.topics import Topic, parse_key
+from buddyline.protocol.topics import Topic, key_of, parse_key
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,14 @@ def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:
     message = decode(payload, topic.schema)
     _check_sender(key, topic, ids, message)
     return Envelope(key, topic, ids, message, payload, time_ns)
+
+
+def envelope_of(message: Message, time_ns: int) -> Envelope:
+    """Return a message of our own making as if it had come; raise MessageError where it is not sound."""
+    key = key_of(message)
+    parsed = parse_key(key)
+    assert parsed is not None
+    return Envelope(key, *parsed, message, encode(message), time_ns)
 
 
 def _check_sender(key: str, topic: Topic, ids: tuple[str, ...], message: Message) -> None:

@@ -19,7 +19,7 @@ END_WITHIN_S = 2.0
 
 def results_of(path):
     with DiveLogReader(path) as reader:
-        found = [record.decode() for record in reader.records(lambda key: key.startswith("buddyline/pair/"))]
+        found = [record.open().message for record in reader.records(lambda key: key.startswith("buddyline/pair/"))]
     return {m.trigger: m for m in found if isinstance(m, RelativePose | Rejected)}, Counter(
         m.trigger for m in found if isinstance(m, RelativePose | Rejected)
     )
@@ -201,6 +201,6 @@ def test_stored_dive_through_a_node(tmp_path):
         assert node.end() == 0
     (log,) = tmp_path.glob("c-*.mcap")
     with DiveLogReader(log) as reader:
-        frames = [r.decode() for r in reader.records(lambda key: key.endswith("candidates"))]
+        frames = [r.open().message for r in reader.records(lambda key: key.endswith("candidates"))]
     assert len(frames) == 5
     assert all(abs(frame.blobs[0].u_px - (40 + i)) < 1 for i, frame in zip((0, 1, 3, 4, 5), frames, strict=True))

@@ -9,12 +9,11 @@ from dataclasses import asdict
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.dives import Dive
-from buddyline.tools.progress import Progress
 from buddyline.tools.solve import messages_of, pair_of
 
 log = logging.getLogger(__name__)
@@ -66,11 +65,8 @@ def _pass(
     alignment = ClockAlignment()
     settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
     core = SolverCore(*pair, settings, round(offset_s * S_NS), alignment)
-    with Progress(f"align, pass {number}", (dive.end_ns - dive.start_ns) / S_NS) as progress:
-        for _, message, _, log_time_ns in messages_of(dive, args, dive.infos(), *pair):
-            progress.show((log_time_ns - dive.start_ns) / S_NS)
-            if not isinstance(message, MessageError):
-                core.handle(message)
+    for envelope in messages_of(dive, args, dive.infos(), *pair, doing=f"align, pass {number}"):
+        core.handle(envelope.message)
     core.flush()
     if not core.counts["solved"]:
         raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")

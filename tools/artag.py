@@ -12,15 +12,14 @@ import cv2
 import numpy as np
 from buddyline.node.drivers.stored import PictureError, decode_picture
 from buddyline.protocol.clock import trigger_index
-from buddyline.protocol.codec import encode
-from buddyline.protocol.divelog import DiveLogWriter
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, CompressedImage, NodeInfo, RelativePose
-from buddyline.protocol.topics import ARTAG, check_node_id, parse_key
+from buddyline.protocol.topics import ARTAG, check_node_id
+from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized, rotate
 from buddyline.tools.evaluation.truth import Track
-from buddyline.tools.progress import Progress
+from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.solve import COPIED, pair_of
 from buddyline.tools.tags.detection import TagFinder
 from buddyline.tools.tags.layout import Layout, layout_of, load_layout
@@ -59,9 +58,8 @@ class TagSolver:
     _seen: dict[int, dict[str, tuple[int, dict[int, list[Floats]]]]] = field(default_factory=dict)
     _finders: dict[str, TagFinder] = field(default_factory=dict)
 
-    def look(self, image: CompressedImage) -> None:
+    def look(self, node: str, image: CompressedImage) -> None:
         """Take one picture; raise PictureError where it cannot be used."""
-        node = image.frame_id.removesuffix("_camera")
         info = self.infos[node]
         picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
         if picture.shape[:2] != (info.height_px, info.width_px):
@@ -145,25 +143,19 @@ def run(args: argparse.Namespace) -> int:
         attitudes: list[Attitude] = []
         skipped = 0
         topics = [topic for topic in COPIED if topic != "candidates"]
-        with (
-            DiveLogWriter(args.output, metadata=dive.metadata() | {"command": "artag", "method": "artag"}) as writer,
-            Progress("artag", (dive.end_ns - dive.start_ns) / 1e9) as progress,
-        ):
-            for record in dive.records(*topics, "image"):
-                progress.show((record.log_time_ns - dive.start_ns) / 1e9)
-                parsed = parse_key(record.key)
-                if parsed is None or not set(parsed[1]) <= set(nodes):
+        with new_dive_log(args.output, dive.metadata() | {"command": "artag", "method": "artag"}) as writer:
+            for envelope in dive.messages(*topics, "image", doing="artag"):
+                message = envelope.message
+                if not set(envelope.ids) <= set(nodes):
                     continue
-                try:
-                    message = record.decode()
-                    if isinstance(message, CompressedImage):
-                        solver.look(message)
-                    elif message is not None:
-                        writer.write(record.key, encode(message), record.log_time_ns)
-                except (MessageError, PictureError) as error:
-                    skipped += 1
-                    log.warning("skipped: %s", error)
-                    continue
+                if isinstance(message, CompressedImage):
+                    try:
+                        solver.look(envelope.node, message)
+                    except PictureError as error:
+                        skipped += 1
+                        losses.report([str(error)])
+                else:
+                    writer.write(envelope.key, envelope.payload, envelope.time_ns)
                 if isinstance(message, Attitude) and message.node == nodes[0]:
                     attitudes.append(message)
             poses = solver.poses(Track.of_attitudes(attitudes))

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, Record
+from buddyline.protocol.divelog import DiveLogReader, Record
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.dives import Dive
+from buddyline.tools.newfile import new_dive_log
 
 Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns), sorted, and their payloads' CRC-32
 
@@ -57,27 +58,26 @@ class Union:
 def run(args: argparse.Namespace) -> int:
     """Write the union of the logs; say what the topside recording had missed."""
     with Dive([args.topside, *args.nodes]) as dive:
-        topside, *own = dive.readers
         union = Union()
         # A node's own log goes first: its times are those of the measurement, and its pictures are whole.
-        ordered = [*own, topside]
+        topside = Path(args.topside)
+        ordered = sorted(dive.readers, key=lambda reader: reader.path == topside)
         chosen = [union.choose(reader) for reader in ordered]
-        before = {key: len(new) for key, new in chosen[-1].items()}
+        before = {key: len(new) for key, new in chosen[-1].items()} if ordered[-1].path == topside else {}
         added: Counter[str] = Counter()
         streams = [_new(reader, new) for reader, new in zip(ordered, chosen, strict=True)]
         metadata = {
-            **topside.metadata(),
+            **ordered[-1].metadata(),
             "backfilled_from": ", ".join(reader.path.name for reader in ordered),
         }
-        with DiveLogWriter(args.output, metadata=metadata) as writer:
+        with new_dive_log(args.output, metadata) as writer:
             for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):
                 writer.write(
                     record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
                 )
                 added[record.key] += 1
-    if not added:
-        Path(args.output).unlink()
-        raise BuddylineError(f"{dive.name}: no message can be read")
+            if not added:
+                raise BuddylineError(f"{dive.name}: no message can be read")
     for key, count in sorted(added.items()):
         differing = f", {union.differing[key]} differ (the node's own are kept)" if union.differing[key] else ""
         print(f"  {key}: {before.get(key, 0)} topside, {count} now{differing}", file=sys.stderr)

@@ -224,7 +224,7 @@ def main(argv: list[str] | None = None) -> int:
             try:
                 status = _run(command, words[1:])
             finally:
-                for line in lost:
+                for line in lost.lines():
                     print(f"buddyline {command.name}: {line}", file=sys.stderr)
         return status or (1 if lost else 0)
     except BuddylineError as error:

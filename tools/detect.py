@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,18 +16,22 @@ from buddyline.node.drivers.stored import PictureError, decode_picture, picture_
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.codec import encode
-from buddyline.protocol.divelog import DiveLogWriter, Record
-from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo
-from buddyline.protocol.topics import parse_key
+from buddyline.protocol.envelope import Envelope, envelope_of
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, CompressedImage, NodeInfo
+from buddyline.protocol.topics import IMAGE, TOPICS
+from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
+from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
 DEFAULT_METHOD = METHODS[0]
 FOLDER_PERIOD_NS = 100_000_000
+# What was solved or detected before is left out.
+DERIVED_FROM = tuple({topic.name for topic in TOPICS} - {"candidates", "pose", "rejected", "solver_status"})
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,9 +58,11 @@ class DiveDetector:
     _pipelines: dict[str, Pipeline] = field(default_factory=dict)
     last: tuple[Frame, list[Detection]] | None = None
 
-    def candidates(self, image: CompressedImage) -> Candidates | None:
+    def candidates(self, envelope: Envelope) -> Envelope | None:
         """Detect in one picture; None where it cannot be used, with a warning that says why."""
-        node = image.frame_id.removesuffix("_camera")
+        image, node = envelope.message, envelope.node
+        if not isinstance(image, CompressedImage):
+            return None
         info = self.infos.get(node)
         try:
             picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
@@ -68,7 +74,7 @@ class DiveDetector:
                 )
         except PictureError as error:
             self.skipped += 1
-            log.warning("skipped: %s", error)
+            losses.report([str(error)])
             return None
         pipeline = self._pipelines.get(node)
         if pipeline is None:
@@ -79,7 +85,7 @@ class DiveDetector:
         frame = Frame(picture, image.stamp_ns, info.row_time_ns if info else 0)
         candidates = pipeline.candidates(frame)
         self.last = (frame, pipeline.detections)
-        return candidates
+        return envelope_of(candidates, envelope.time_ns) if candidates is not None else None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -117,7 +123,7 @@ def _detect_pictures(args: argparse.Namespace) -> int:
                 detections = detector.detect(picture)
             except (PictureError, OSError) as error:
                 skipped += 1
-                log.warning("skipped: %s", error)
+                losses.report([str(error)])
                 continue
             height, width = picture.shape[:2]
             stamp_ns = i * FOLDER_PERIOD_NS
@@ -159,42 +165,18 @@ def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
         if not dive.nodes("image"):
             raise BuddylineError(f"{dive.name}: holds no pictures; topics: {', '.join(dive.keys) or 'none'}")
         detector = DiveDetector(args.method, args.environment, infos)
-        writer = DiveLogWriter(args.output) if args.output else None
-        try:
-            with Progress("detect", (dive.end_ns - dive.start_ns) / 1e9) as progress:
-                for record in dive.records():
-                    progress.show((record.log_time_ns - dive.start_ns) / 1e9)
-                    for key, message, payload in _derived(record, detector):
-                        if writer is not None:
-                            writer.write(key, payload, record.log_time_ns)
-                        elif isinstance(message, Candidates):
-                            print(payload.decode())
-                        if isinstance(message, Candidates) and args.draw and detector.last:
-                            frame, detections = detector.last
-                            name = f"{message.node}_{message.trigger}.png"
-                            cv2.imwrite(str(Path(args.draw) / name), mark_candidates(frame.image, detections))
-        finally:
-            if writer is not None:
-                writer.close()
+        with new_dive_log(args.output) if args.output else nullcontext() as writer:
+            for envelope in dive.messages(*DERIVED_FROM, doing="detect"):
+                found = detector.candidates(envelope) if envelope.topic is IMAGE else envelope
+                if found is None:
+                    continue
+                if writer is not None:
+                    writer.write(found.key, found.payload, found.time_ns)
+                elif isinstance(found.message, Candidates):
+                    print(found.payload.decode())
+                if isinstance(found.message, Candidates) and args.draw and detector.last:
+                    frame, detections = detector.last
+                    name = f"{found.node}_{found.message.trigger}.png"
+                    cv2.imwrite(str(Path(args.draw) / name), mark_candidates(frame.image, detections))
     print(f"{detector.pictures} pictures, {detector.skipped} skipped", file=sys.stderr)
     return 0
-
-
-def _derived(record: Record, detector: DiveDetector) -> Iterator[tuple[str, Message | None, bytes]]:
-    """Give what a record becomes: pictures turn into candidates, what was solved or detected before is left out."""
-    parsed = parse_key(record.key)
-    if parsed is None or parsed[0].name in ("candidates", "pose", "rejected", "solver_status"):
-        return
-    if parsed[0].name != "image":
-        yield record.key, None, record.payload
-        return
-    try:
-        image = record.decode()
-    except MessageError as error:
-        detector.skipped += 1
-        log.warning("skipped: %s", error)
-        return
-    if isinstance(image, CompressedImage):
-        candidates = detector.candidates(image)
-        if candidates is not None:
-            yield f"buddyline/node/{candidates.node}/candidates", candidates, encode(candidates)

@@ -27,6 +27,7 @@ from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
 from buddyline.protocol.topics import INFO, POSE, REJECTED, TOPICS, parse_key
 from buddyline.tools import losses
+from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -99,10 +100,25 @@ class Dive:
     def losses(self) -> list[str]:
         """What has not been read so far, though it should have been: a line each, with file and byte."""
         found = [*self._left_out, *(f"{reader.path}: {text}" for reader in self.readers for text in reader.damage)]
-        for path in dict.fromkeys(path for reading in self._passes for path in reading.refusals):
-            # A dive that is read twice has lost its bad messages once.
-            most = max((one.refusals[path] for one in self._passes if path in one.refusals), key=lambda r: r.count)
-            found += [f"{path}: {line}" for line in most.lines()]
+        return found + [f"{path}: {line}" for path, refusals in self._refusals().items() for line in refusals.lines()]
+
+    @property
+    def refused(self) -> int:
+        """How many messages were refused so far."""
+        return sum(refusals.count for refusals in self._refusals().values())
+
+    @property
+    def repeated(self) -> dict[str, int]:
+        """How many second outcomes of a trigger were left out so far, by pair (`a/b`)."""
+        return {key: max(one.repeated[key] for one in self._passes) for one in self._passes for key in one.repeated}
+
+    def _refusals(self) -> dict[Path, Refusals]:
+        # A dive that is read twice has lost its bad messages once.
+        found: dict[Path, Refusals] = {}
+        for reading in self._passes:
+            for path, refusals in reading.refusals.items():
+                if path not in found or refusals.count > found[path].count:
+                    found[path] = refusals
         return found
 
     def nodes(self, *topic_names: str) -> list[str]:
@@ -114,11 +130,21 @@ class Dive:
         wanted = _wanted(topic_names)
         return sorted({parsed[1] for key in self.keys if wanted(key) and (parsed := parse_key(key))})
 
-    def messages(self, *topic_names: str, since_ns: int | None = None) -> Iterator[Envelope]:
+    def messages(self, *topic_names: str, since_ns: int | None = None, doing: str = "") -> Iterator[Envelope]:
         """Yield the sound messages of these topics (none named: of all), by log time.
 
-        Of two outcomes of one trigger the first counts. since_ns: the least log time.
+        Of two outcomes of one trigger the first counts. since_ns: the least log time. doing: shows progress under
+        this name.
         """
+        if not doing:
+            yield from self._first_outcomes(topic_names, since_ns)
+            return
+        with Progress(doing, self.seconds) as progress:
+            for envelope in self._first_outcomes(topic_names, since_ns):
+                progress.show((envelope.time_ns - self.start_ns) / S_NS)
+                yield envelope
+
+    def _first_outcomes(self, topic_names: Iterable[str], since_ns: int | None) -> Iterator[Envelope]:
         reading = _Pass()
         wanted = _wanted(topic_names)
         streams = [self._open(reader, wanted, since_ns, reading) for reader in self.readers]
@@ -179,8 +205,7 @@ class Dive:
         """Close all logs, and let the command line say what was lost."""
         self._stack.close()
         losses.report(self.losses)
-        repeated = {key: max(one.repeated[key] for one in self._passes) for one in self._passes for key in one.repeated}
-        for pair, count in repeated.items():
+        for pair, count in self.repeated.items():
             log.warning("%s: %d second outcomes of triggers of %s left out: the first counts", self.name, count, pair)
         self._passes.clear()
 

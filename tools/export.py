@@ -15,6 +15,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Truth
 from buddyline.tools.evaluation.logs import load, parse_pair
+from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
 
 FORMATS: Final = ("tum", "csv", "foxglove")
@@ -54,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.format == "foxglove":
         return _export_foxglove(args)
+    if args.output is not None:
+        check_new(args.output)
     recorded = load(args.logs, pair=args.pair)
     poses: Sequence[RelativePose | Truth] = recorded.truths if args.truth else recorded.poses
     rejected = recorded.rejected if args.rejected else []
@@ -66,13 +69,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output is None:
         sys.stdout.writelines(lines)
         return 0
-    try:
-        with open(args.output, "x", encoding="utf-8", newline="") as file:
-            file.writelines(lines)
-    except FileExistsError:
-        raise BuddylineError(f"{args.output}: exists; name another or remove it first") from None
-    except OSError as error:
-        raise BuddylineError(f"{args.output}: cannot be written: {error.strerror}") from error
+    write_new(args.output, "".join(lines))
     return 0
 
 

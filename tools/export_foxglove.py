@@ -13,14 +13,14 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.envelope import Envelope
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Attitude,
     Blob,
     Candidates,
     CompressedImage,
     Depth,
-    Message,
     NodeInfo,
     RelativePose,
 )
@@ -58,8 +58,9 @@ class Translation:
         if base is not None:
             yield TRANSFORMS, at_ns, self._transform(WORLD, f"{base}_camera", np.zeros(3), R_ENU_LEVEL, at_ns)
 
-    def messages(self, message: Message) -> Iterator[tuple[str, int, Any]]:
+    def messages(self, envelope: Envelope) -> Iterator[tuple[str, int, Any]]:
         """Yield (topic, stamp_ns, Foxglove message) for one of ours."""
+        message = envelope.message
         if isinstance(message, NodeInfo):
             self._infos[message.node] = message
         elif isinstance(message, Depth):
@@ -67,7 +68,7 @@ class Translation:
         elif isinstance(message, Attitude):
             yield from self._attitude(message)
         elif isinstance(message, CompressedImage):
-            yield from self._image(message)
+            yield from self._image(envelope.node, message)
         elif isinstance(message, Candidates):
             self._frames.setdefault(message.node, deque(maxlen=KEPT_FRAMES)).append(message)
             yield f"/{message.node}/camera/candidates", message.stamp_ns, self._candidates(message)
@@ -88,14 +89,13 @@ class Translation:
         transform = self._transform(WORLD, f"{node}_camera", origin_m, R_ENU_NED @ R_ned_camera, stamp_ns)
         yield TRANSFORMS, stamp_ns, transform
 
-    def _image(self, image: CompressedImage) -> Iterator[tuple[str, int, Any]]:
-        node = image.frame_id.removesuffix("_camera")
+    def _image(self, node: str, image: CompressedImage) -> Iterator[tuple[str, int, Any]]:
         stamp_ns = image.stamp_ns
         info = self._infos.get(node)
         if info is not None:
             yield f"/{node}/camera/calibration", stamp_ns, self._calibration(info, stamp_ns)
         picture = self._fox.CompressedImage(
-            timestamp=self._time(stamp_ns), frame_id=image.frame_id, data=image.data, format=image.format
+            timestamp=self._time(stamp_ns), frame_id=f"{node}_camera", data=image.data, format=image.format
         )
         yield f"/{node}/camera/image", stamp_ns, picture
 
@@ -228,13 +228,8 @@ def export_foxglove(dive: Dive, output: Path) -> int:
 def _translated(dive: Dive, translation: Translation) -> Iterator[tuple[str, int, Any]]:
     topics = ("info", "candidates", "attitude", "depth", "image", "pose")
     yield from translation.start(dive.infos(), _base(dive), dive.start_ns)
-    for record in dive.records(*topics):
-        try:
-            message = record.decode()
-        except MessageError:
-            continue
-        if message is not None:
-            yield from translation.messages(message)
+    for envelope in dive.messages(*topics):
+        yield from translation.messages(envelope)
 
 
 def _base(dive: Dive) -> str | None:

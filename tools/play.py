@@ -11,12 +11,12 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
-from buddyline.protocol.codec import encode, payload_stamp_ns
-from buddyline.protocol.divelog import Record
-from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from buddyline.protocol.codec import payload_stamp_ns
+from buddyline.protocol.envelope import Envelope
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodeInfo
 from buddyline.protocol.security import PLAYER
-from buddyline.protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, parse_key
+from buddyline.protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, TOPICS, parse_key
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import LiveClient
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 # Poses and what else a solver made are not sent: a solver on the bus makes them anew. What the clocks were then says
 # nothing of those that are on the bus now.
 NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status", "clock"})
+SENT: Final = tuple({topic.name for topic in TOPICS} - NOT_SENT)
 # Pictures go out as previews: the bus is for what the solver needs.
 IMAGES_HZ: Final = 2.0
 # At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time: less than
@@ -104,7 +105,6 @@ class Player:
 
     def __init__(self, bus: Bus, nodes: Iterable[str], speed: float, clock: Clock, stop: threading.Event) -> None:
         self.sent = 0
-        self.bad = 0
         self._bus = bus
         self._speed = speed
         self._clock = clock
@@ -122,46 +122,36 @@ class Player:
             if parsed and parsed[0].name not in NOT_SENT and key not in self._publishers:
                 self._publishers[key] = self._bus.publisher(parsed[0], *parsed[1])
 
-    def send_infos(self, records: Iterator[Record]) -> None:
+    def send_infos(self, infos: Iterable[NodeInfo]) -> None:
         """Send the first calibration of each node, ahead of everything else."""
-        sent: set[str] = set()
-        for record in records:
-            if record.key not in sent:
-                sent.add(record.key)
-                self._publishers[record.key].put_bytes(record.payload)
+        for info in infos:
+            self._publishers[INFO.key(info.node)].put(info)
         self._stop.wait(INFO_AHEAD_S)
 
-    def send(self, record: Record, shift_triggers: int = 0, period_ns: int = S_NS) -> None:
-        """Wait for a record's time, and send it, so many triggers later than it was recorded."""
-        time_ns = record.log_time_ns + shift_triggers * period_ns
+    def send(self, envelope: Envelope, shift_triggers: int = 0, period_ns: int = S_NS) -> None:
+        """Wait for a message's time, and send it, so many triggers later than it was recorded."""
+        time_ns = envelope.time_ns + shift_triggers * period_ns
         if self._first_ns is None:
             self._first_ns, self._began_ns = time_ns, self._clock.now_ns()
         if self._speed > 0:
             self._clock.wait_until_ns(self._began_ns + round((time_ns - self._first_ns) / self._speed), self._stop)
         if self._stop.is_set():
             return
-        parsed = parse_key(record.key)
-        if parsed is None or (parsed[0] is IMAGE and not self._image_is_due(record, time_ns)):
+        if envelope.topic is IMAGE and not self._image_is_due(envelope.key):
             return
-        try:
-            message = record.decode()
-            payload = record.payload
-            if message is not None and shift_triggers:
-                payload = encode(_shifted(message, shift_triggers, period_ns))
-        except MessageError as error:
-            self.bad += 1
-            if self.bad.bit_count() == 1:
-                log.warning("play: %s: %s (%d so far)", record.key, error, self.bad)
-            return
-        if self._follower is not None and parsed[0] is CANDIDATES:
-            self._follower.wait_to_send(parsed[1][0], time_ns, self._stop)
-        self._publishers[record.key].put_bytes(payload)
+        if self._follower is not None and envelope.topic is CANDIDATES:
+            self._follower.wait_to_send(envelope.node, time_ns, self._stop)
+        publisher = self._publishers[envelope.key]
+        if shift_triggers:
+            publisher.put(_shifted(envelope.message, shift_triggers, period_ns))
+        else:
+            publisher.put_bytes(envelope.payload)
         self.sent += 1
 
-    def _image_is_due(self, record: Record, time_ns: int) -> bool:
-        if self._clock.now_ns() < self._image_due_ns.get(record.key, 0):
+    def _image_is_due(self, key: str) -> bool:
+        if self._clock.now_ns() < self._image_due_ns.get(key, 0):
             return False
-        self._image_due_ns[record.key] = self._clock.now_ns() + round(S_NS / IMAGES_HZ)
+        self._image_due_ns[key] = self._clock.now_ns() + round(S_NS / IMAGES_HZ)
         return True
 
 
@@ -192,21 +182,21 @@ def run(args: argparse.Namespace) -> int:
             bus.declare_alive("player")
             player = Player(bus, dive.nodes("candidates"), args.speed, SystemClock(), client.stop)
             player.declare(dive.keys)
-            player.send_infos(dive.records(INFO.name))
+            player.send_infos(dive.infos().values())
             period_ns = max((info.trigger_period_ns for info in dive.infos().values()), default=S_NS)
             laps_triggers = (stop_ns - start_ns) // period_ns + 2
             lap = 0
             while not client.stop.is_set() and (lap == 0 or args.loop):
                 with Progress("play", (stop_ns - start_ns) / S_NS) as progress:
-                    for record in _selected(dive, start_ns, stop_ns):
+                    for envelope in _selected(dive, start_ns, stop_ns):
                         if client.stop.is_set():
                             break
-                        player.send(record, lap * laps_triggers, period_ns)
-                        progress.show((record.log_time_ns - start_ns) / S_NS)
+                        player.send(envelope, lap * laps_triggers, period_ns)
+                        progress.show((envelope.time_ns - start_ns) / S_NS)
                 lap += 1
             # What was just sent is on its way: leave the recovery of lost samples its time.
             client.stop.wait(1.0)
-            log.info("play: %d messages sent, %d bad", player.sent, player.bad)
+            log.info("play: %d messages sent, %d bad", player.sent, dive.refused)
 
         return client.run(play)
 
@@ -222,13 +212,10 @@ def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
     return start_ns, stop_ns
 
 
-def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Record]:
+def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
     """Yield what is sent of a dive; calibration from before the start comes too."""
-    for record in dive.records():
-        parsed = parse_key(record.key)
-        if parsed is None or parsed[0].name in NOT_SENT:
-            continue
-        if record.log_time_ns >= stop_ns:
+    for envelope in dive.messages(*SENT):
+        if envelope.time_ns >= stop_ns:
             return
-        if record.log_time_ns >= start_ns or parsed[0] is INFO:
-            yield record
+        if envelope.time_ns >= start_ns or envelope.topic is INFO:
+            yield envelope

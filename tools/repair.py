@@ -11,7 +11,9 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.tools import losses
+from buddyline.tools.newfile import new_dive_log
 
 SHOWN_GAPS: Final = 20
 
@@ -28,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     with DiveLogReader(args.input, trust_index=False) as reader:
         numbers, times_ns = array("q"), array("q")
         metadata = {**reader.metadata(), "repaired_from": Path(args.input).name}
-        with DiveLogWriter(args.output, metadata=metadata) as writer:
+        with new_dive_log(args.output, metadata) as writer:
             for record in reader.records():
                 writer.write(
                     record.key, record.payload, record.log_time_ns, record.publish_time_ns, schema=record.schema_name
@@ -36,8 +38,7 @@ def run(args: argparse.Namespace) -> int:
                 numbers.append(record.sequence)
                 times_ns.append(min(record.log_time_ns, 2**63 - 1))
         lines = [*reader.damage, *missing(np.array(numbers, np.int64), np.array(times_ns, np.int64))]
-    for line in lines:
-        print(f"{args.input}: {line}", file=sys.stderr)
+    losses.report([f"{args.input}: {line}" for line in lines])
     verdict = "what could be read of it" if lines else "it was whole"
     print(f"{args.output}: {len(numbers)} messages; {verdict}", file=sys.stderr)
     return 0

@@ -12,7 +12,7 @@ from buddyline.node.sim.dive import Plan, messages
 from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
-from buddyline.protocol.divelog import DiveLogWriter
+from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
     with (
-        DiveLogWriter(args.output, metadata=metadata) as writer,
+        new_dive_log(args.output, metadata) as writer,
         Progress("simulate", plan.seconds) as progress,
     ):
         for stamp_ns, key, message in messages(World(scenario), plan):

@@ -9,16 +9,16 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from buddyline.protocol.codec import encode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
-from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Rejected, RelativePose
-from buddyline.protocol.topics import CANDIDATES, check_node_id, parse_key
+from buddyline.protocol.envelope import Envelope
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import CompressedImage, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.topics import check_node_id
 from buddyline.solver_service.config import CHECKS, METHODS, SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.dives import Dive, load_info
-from buddyline.tools.progress import Progress
+from buddyline.tools.newfile import new_dive_log
 
 log = logging.getLogger(__name__)
 
@@ -67,26 +67,20 @@ def run(args: argparse.Namespace) -> int:
             if node not in infos:
                 raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; give one with --info {node}=FILE")
         core = SolverCore(node_a, node_b, settings, round(args.clock_offset * 1e9))
-        bad = 0
         began_s = time.monotonic()
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
-        with DiveLogWriter(args.output, metadata=metadata) as writer:
+        with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
-            with Progress("solve", (dive.end_ns - dive.start_ns) / 1e9) as progress:
-                for key, message, payload, log_time_ns in messages_of(dive, args, infos, node_a, node_b):
-                    progress.show((log_time_ns - dive.start_ns) / 1e9)
-                    if isinstance(message, MessageError):
-                        bad += 1
-                        if bad.bit_count() == 1:
-                            log.warning("%s: %s (%d so far)", key, message, bad)
-                        continue
-                    if isinstance(message, NodeInfo) and message.node in replaced:
-                        continue
-                    writer.write(key, payload, log_time_ns, getattr(message, "stamp_ns", None))
-                    _write(writer, core.handle(message))
+            for envelope in messages_of(dive, args, infos, node_a, node_b, doing="solve"):
+                message = envelope.message
+                if isinstance(message, NodeInfo) and message.node in replaced:
+                    continue
+                writer.write(envelope.key, envelope.payload, envelope.time_ns)
+                _write(writer, core.handle(message))
             _write(writer, core.flush())
+        bad = dive.refused
     _summarize(args, core, bad, time.monotonic() - began_s)
     resolved = sum(core.counts.values())
     if resolved == 0:
@@ -129,12 +123,9 @@ def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
 
 
 def messages_of(
-    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str
-) -> Iterator[tuple[str, Message | MessageError, bytes, int]]:
-    """Yield what the solver and the output need: key, message, its payload, log time.
-
-    The pictures of a node without candidates are detected.
-    """
+    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str, doing: str
+) -> Iterator[Envelope]:
+    """Yield what the solver and the output need; the pictures of a node without candidates are detected."""
     raw = [node for node in pair if node not in dive.nodes("candidates")]
     detector = None
     if raw:
@@ -142,24 +133,15 @@ def messages_of(
 
         detector = DiveDetector(args.detector, args.environment, infos)
     topics = (*COPIED, "image") if raw else COPIED
-    for record in dive.records(*topics):
-        parsed = parse_key(record.key)
-        if parsed is None or (len(parsed[1]) == 1 and parsed[1][0] not in pair):
+    for envelope in dive.messages(*topics, doing=doing):
+        if len(envelope.ids) == 1 and envelope.node not in pair:
             continue
-        try:
-            message = record.decode()
-            if message is not None and getattr(message, "node", parsed[1][0]) != parsed[1][0]:
-                raise MessageError(f"node {getattr(message, 'node', None)!r} on key {record.key}")
-        except MessageError as error:
-            yield record.key, error, record.payload, record.log_time_ns
-            continue
-        if isinstance(message, CompressedImage):
-            if detector is not None and parsed[1][0] in raw:
-                found = detector.candidates(message)
-                if found is not None:
-                    yield CANDIDATES.key(found.node), found, encode(found), record.log_time_ns
-        elif message is not None:
-            yield record.key, message, record.payload, record.log_time_ns
+        if not isinstance(envelope.message, CompressedImage):
+            yield envelope
+        elif detector is not None and envelope.node in raw:
+            found = detector.candidates(envelope)
+            if found is not None:
+                yield found
 
 
 def _write(writer: DiveLogWriter, results: list[RelativePose | Rejected]) -> None:

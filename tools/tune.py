@@ -20,10 +20,10 @@ import numpy as np
 from buddyline.node.detect import ENVIRONMENTS, METHODS, make_detector, presets
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
-from buddyline.protocol.codec import decode
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, LightTruth
-from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH, parse_key
+from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
+from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.progress import Progress
@@ -192,10 +192,9 @@ def _truths(paths: Sequence[str]) -> dict[tuple[str, int], Points]:
     """Return the visible lights of each node's picture at each trigger, as far as these logs say."""
     known = {}
     with Dive(list(paths)) as dive:
-        for record in dive.records(LIGHT_TRUTH.name):
-            try:
-                said = decode(record.payload, LightTruth)
-            except MessageError:
+        for envelope in dive.messages(LIGHT_TRUTH.name):
+            said = envelope.message
+            if not isinstance(said, LightTruth):
                 continue
             lights = [(light.u_px, light.v_px) for light in said.lights if light.visible]
             known[said.node, said.trigger] = np.array(lights).reshape(-1, 2)
@@ -208,12 +207,9 @@ def _dive_pictures(
     with Dive(list(paths)) as dive:
         infos = dive.infos()
         listed = []
-        for record in dive.records(IMAGE.name):
-            parsed = parse_key(record.key)
-            node = parsed[1][0] if parsed else ""
-            try:
-                image = decode(record.payload, CompressedImage)
-            except MessageError:
+        for envelope in dive.messages(IMAGE.name):
+            node, image = envelope.node, envelope.message
+            if not isinstance(image, CompressedImage):
                 continue
             trigger = trigger_index(image.stamp_ns, infos[node].trigger_period_ns) if node in infos else 0
             if not known or (node, trigger) in known:
@@ -223,7 +219,7 @@ def _dive_pictures(
             try:
                 yield name, known.get((node, trigger)), decode_picture(data, name)
             except PictureError as error:
-                log.warning("skipped: %s", error)
+                losses.report([str(error)])
 
 
 def _files(inputs: Sequence[str]) -> list[Path]:
@@ -236,12 +232,12 @@ def _files(inputs: Sequence[str]) -> list[Path]:
 
 
 def _readable(files: Iterable[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
-    """Yield the pictures that can be used; the others with a warning each."""
+    """Yield the pictures that can be used; the others are losses."""
     for file in files:
         try:
             yield file, decode_picture(file.read_bytes(), str(file))
         except (PictureError, OSError) as error:
-            log.warning("skipped: %s", error)
+            losses.report([str(error)])
 
 
 def _spread(items: list[Any], limit: int) -> list[Any]:

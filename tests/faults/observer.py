@@ -148,7 +148,7 @@ def _disordered(frames: list[Frame]) -> int:
 
 def _messages(path: Path) -> list[Message]:
     with DiveLogReader(path) as reader:
-        decoded = [record.decode() for record in reader.records(lambda key: key.endswith("/candidates"))]
+        decoded = [record.open().message for record in reader.records(lambda key: key.endswith("/candidates"))]
     return [message for message in decoded if message is not None]
 
 

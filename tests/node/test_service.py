@@ -166,8 +166,8 @@ def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
         (log,) = disk.glob("a-*.mcap")
         with DiveLogReader(log) as reader:
             assert reader.damage == []
-            frames = [r.decode().seq for r in reader.records(lambda key: key.endswith("/candidates"))]
-            said = [r.decode().problem for r in reader.records(lambda key: key.endswith("/status"))]
+            frames = [r.open().message.seq for r in reader.records(lambda key: key.endswith("/candidates"))]
+            said = [r.open().message.problem for r in reader.records(lambda key: key.endswith("/status"))]
     assert frames == list(range(len(frames)))
     assert any("No space left" in problem for problem in said)
     assert process.wait_for("written again")

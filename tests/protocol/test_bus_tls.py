@@ -240,7 +240,7 @@ def test_marks_and_stored_dives_reach_a_secured_hub_with_the_right_certificate_a
         assert (plain.returncode, "wants TLS" in plain.stderr) == (2, True)
         assert record.end() == 0
     with DiveLogReader(tmp_path / "r.mcap") as reader:
-        marks = [record.decode() for record in reader.records(lambda key: key.endswith("/mark"))]
+        marks = [record.open().message for record in reader.records(lambda key: key.endswith("/mark"))]
     assert [(m.node, m.name or m.note) for m in marks] == [("b", "T4"), ("a", "from the dive")]
 
 

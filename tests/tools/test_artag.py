@@ -134,7 +134,7 @@ def test_a_dive_of_pictures_becomes_poses_on_their_own_topic_that_evaluate_measu
     assert main(["artag", dive, "-o", out, "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     with DiveLogReader(out) as reader:
-        poses = [record.decode() for record in reader.records(lambda key: key == "buddyline/pair/a/b/artag")]
+        poses = [record.open().message for record in reader.records(lambda key: key == "buddyline/pair/a/b/artag")]
     assert summary["poses"] == len(poses) >= 2
     assert {type(pose) for pose in poses} == {RelativePose}
     assert {pose.method for pose in poses} == {"artag"}

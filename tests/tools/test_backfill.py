@@ -66,7 +66,7 @@ def test_everything_is_there_once_and_in_order(dive):
 def test_the_nodes_own_copy_is_kept_and_the_difference_said(dive, tmp_path, capsys):
     directory, _, _ = dive
     (picture,) = [record for record in read(directory / "out.mcap") if record.key.endswith("/image")]
-    assert picture.decode().data == b"whole picture"
+    assert picture.open().message.data == b"whole picture"
     again = [str(directory / name) for name in ("out.mcap", "b.mcap", "a.mcap")]
     assert main(["backfill", *again, "-o", str(tmp_path / "again.mcap")]) == 0
     assert len(read(tmp_path / "again.mcap")) == len(read(directory / "out.mcap"))

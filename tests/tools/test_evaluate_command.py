@@ -174,7 +174,7 @@ def test_sample_dive_solved_by_its_own_truth(tmp_path, capsys):
     for path in (dive, beside):
         with DiveLogReader(path) as reader:
             for record in reader.records(lambda key: key.endswith(("/info", "/candidates", "/truth"))):
-                message = record.decode()
+                message = record.open().message
                 if isinstance(message, Candidates):
                     frames[message.node, message.trigger] = message
                 elif isinstance(message, NodeInfo):
@@ -211,7 +211,7 @@ def test_projection_of_the_sample_dives_truth_lands_on_their_lights():
         for path in (DIVES / f"{name}.mcap", DIVES / f"{name}.truth.mcap"):
             with DiveLogReader(path) as reader:
                 for record in reader.records(lambda key: key.endswith(("/info", "truth"))):
-                    message = record.decode()
+                    message = record.open().message
                     if isinstance(message, NodeInfo):
                         infos[message.node] = message
                     else:

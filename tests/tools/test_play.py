@@ -125,8 +125,8 @@ def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
         solver = LateSolver(listener, wait_s=1.5)
         player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), threading.Event())
         player.declare(dive.keys)
-        for record in dive.records():
-            player.send(record)
+        for envelope in dive.messages():
+            player.send(envelope)
     assert len(solver.ahead_ns) > 140
     # A solver gives up a silent node after two seconds of the dive.
     assert max(solver.ahead_ns) < 1_700_000_000
@@ -138,15 +138,15 @@ def test_fast_playback_without_a_solver_waits_for_nobody(log, monkeypatch):
     with Dive([log]) as dive, network.connect() as bus:
         player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), stop)
         player.declare(dive.keys)
-        records = list(dive.records(CANDIDATES.name))
+        frames = list(dive.messages(CANDIDATES.name))
         # Far beyond what a solver would have resolved.
-        late = [replace(record, log_time_ns=record.log_time_ns + k * S_NS) for k, record in enumerate(records)]
-        playing = threading.Thread(target=lambda: [player.send(record) for record in late])
+        late = [replace(frame, time_ns=frame.time_ns + k * S_NS) for k, frame in enumerate(frames)]
+        playing = threading.Thread(target=lambda: [player.send(frame) for frame in late])
         playing.start()
         playing.join(20)
         stop.set()
         playing.join()
-    assert player.sent == len(records)
+    assert player.sent == len(frames)
 
 
 @pytest.mark.parametrize(("start_s", "end_s"), [(-1.0, None), (99.0, None), (1.0, 0.5)])

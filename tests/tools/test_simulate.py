@@ -9,7 +9,7 @@ from buddyline.tools.cli import main
 def _simulated(path, *words):
     assert main(["simulate", str(path), "--seconds", "1.5", *words]) == 0
     with DiveLogReader(path) as reader:
-        return reader.metadata(), [record.decode() for record in reader.records()]
+        return reader.metadata(), [record.open().message for record in reader.records()]
 
 
 def test_a_dive_is_written_with_its_truth_and_says_how_it_was_made(tmp_path, capsys):

@@ -32,7 +32,6 @@ from buddyline.protocol.topics import (
 from buddyline.tools.dives import Dive, open_each
 from buddyline.tools.evaluation.recorded import Pair, Recorded
 from buddyline.tools.evaluation.truth import inverted
-from buddyline.tools.progress import Progress
 
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.
@@ -127,10 +126,9 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
             if answering:
                 topics += [ATTITUDE]
             topics += [topic for topic in _TRUTHS if log in truth_logs or topic.name not in sighted]
-            with Progress(f"read {log.name}", log.seconds) as progress:
-                for envelope in log.messages(*(topic.name for topic in topics)):
-                    progress.show((envelope.time_ns - log.start_ns) / 1e9)
-                    _take(recorded, envelope.ids, envelope.message)
+            for envelope in log.messages(*(topic.name for topic in topics), doing=f"read {log.name}"):
+                _take(recorded, envelope.ids, envelope.message)
+            recorded.doubled += log.repeated.get("/".join(recorded.nodes), 0)
     return recorded
 
 

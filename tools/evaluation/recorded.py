@@ -14,6 +14,7 @@ class Recorded:
     """One pair's messages; truths are of T_a_b whichever way the log has them.
 
     nodes: a and b. attitudes_a: node a's, for azimuth and inclination. problems: for a person, a line each.
+    doubled: second outcomes of a trigger, which the logs hold and this does not.
     environment: the water, where a log names it.
     """
 
@@ -26,4 +27,5 @@ class Recorded:
     attitudes_a: list[Attitude] = field(default_factory=list)
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+    doubled: int = 0
     environment: str = ""

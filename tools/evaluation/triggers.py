@@ -16,8 +16,8 @@ from buddyline.tools.evaluation.statistics import share
 class Triggers:
     """What became of the triggers: each is to end as one pose or one rejection.
 
-    unanswered: with Candidates, without a result; None where the logs hold no Candidates. doubled: with more than
-    one result. gap_s: the longest time between two poses.
+    unanswered: with Candidates, without a result; None where the logs hold no Candidates. doubled: second results,
+    which do not count. gap_s: the longest time between two poses.
     """
 
     total: int
@@ -42,20 +42,20 @@ class Skew:
 
 
 def trigger_figures(
-    poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Sequence[Candidates]
+    poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Sequence[Candidates], doubled: int = 0
 ) -> Triggers:
     """Return what became of all triggers, those of frames without a result among them."""
     stamps_ns = {frame.trigger: frame.stamp_ns for frame in frames}
     stamps_ns |= {rejection.trigger: rejection.stamp_ns for rejection in rejected}
     stamps_ns |= {pose.trigger: pose.stamp_ns for pose in poses}
-    results = Counter([pose.trigger for pose in poses]) + Counter([rejection.trigger for rejection in rejected])
+    results = {pose.trigger for pose in poses} | {rejection.trigger for rejection in rejected}
     asked = {frame.trigger for frame in frames}
     span_s = (max(stamps_ns.values()) - min(stamps_ns.values())) / 1e9 if stamps_ns else 0.0
     solved = sorted(pose.stamp_ns for pose in poses)
     return Triggers(
-        total=len(asked | results.keys()),
-        unanswered=len(asked - results.keys()) if frames else None,
-        doubled=sum(count > 1 for count in results.values()),
+        total=len(asked | results),
+        unanswered=len(asked - results) if frames else None,
+        doubled=doubled,
         rejected=dict(Counter(rejection.reason for rejection in rejected).most_common()),
         span_s=span_s,
         triggers_hz=share(len(stamps_ns) - 1, span_s),

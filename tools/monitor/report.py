@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
 from buddyline.tools.health.words import duration_words, reason_words
@@ -23,6 +22,7 @@ from buddyline.tools.monitor.picture import Point
 from buddyline.tools.monitor.replay import replay_html, rig_outline
 from buddyline.tools.monitor.summary import Summary, summarize
 from buddyline.tools.monitor.svg import COLOURS, STYLE, Line, Plot, svg
+from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
 
 log = logging.getLogger(__name__)
@@ -57,15 +57,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the report; return 0."""
-    if args.output.exists():
-        raise BuddylineError(f"{args.output}: exists; name another or remove it first")
+    check_new(args.output)
     with Dive(args.dives) as dive:
         page = report_html(dive)
-    try:
-        with open(args.output, "x", encoding="utf-8") as file:
-            file.write(page)
-    except OSError as error:
-        raise BuddylineError(f"{args.output}: cannot be written: {error.strerror}") from error
+    write_new(args.output, page)
     log.info("%s: %.1f MB", args.output, len(page) / 1e6)
     return 0
 
