@@ -5,17 +5,27 @@ from __future__ import annotations
 import heapq
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import IO, Final, cast
 
 from buddyline.protocol import topics
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.envelope import Envelope, open_envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
-from buddyline.protocol.salvage import CHANNEL_NOTE, MAGIC, MAX_RECORD_BYTES, ChunkAt, read_chunk, walk
+from buddyline.protocol.salvage import (
+    CHANNEL_NOTE,
+    MAGIC,
+    MAX_RECORD_BYTES,
+    ChunkAt,
+    read_chunk,
+    summary_is_sound,
+    walk,
+)
 from buddyline.protocol.schemas import json_schema
 from buddyline.protocol.spool import Spool
 from mcap.exceptions import McapError
@@ -26,6 +36,8 @@ from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 CHUNK_BYTES: Final = 1024 * 1024
+# What one flipped bit takes with it.
+CHUNK_NS: Final = S_NS
 LOG_NOTE: Final = "buddyline.log"
 MAX_NOTES: Final = 100
 _DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError, ZstdError)
@@ -51,7 +63,7 @@ class Record:
 
 
 class DiveLogWriter:
-    """Writes one MCAP file, which must not exist yet."""
+    """Writes one MCAP file, which must not exist yet, in chunks of at most a second of log time."""
 
     def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None) -> None:
         self.path = Path(path)
@@ -67,9 +79,13 @@ class DiveLogWriter:
         self._writer.start(profile="buddyline", library="buddyline")
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
+        self._cut_ns: int | None = None
         self.count = 0
         if metadata:
             self._writer.add_metadata(LOG_NOTE, metadata)
+        # Who loses power in the first second leaves a log that says what it is. A full disk is the next flush's affair.
+        with suppress(OSError):
+            self.flush(sync=True)
 
     @property
     def size_bytes(self) -> int:
@@ -86,6 +102,7 @@ class DiveLogWriter:
         """
         if self._file.stuck:
             self._file.flush()
+        self._cut(log_time_ns)
         if publish_time_ns is None:
             publish_time_ns = payload_stamp_ns(payload)
         if publish_time_ns is None:
@@ -95,6 +112,14 @@ class DiveLogWriter:
             channel = self._channels[key, schema] = self._register(key, schema)
         self._writer.add_message(channel, log_time_ns, payload, publish_time_ns, self.count & 0xFFFFFFFF)
         self.count += 1
+
+    def _cut(self, log_time_ns: int) -> None:
+        """Finish the chunk where it is a second old; messages that go back in time stay in it."""
+        if self._cut_ns is None:
+            self._cut_ns = log_time_ns
+        elif log_time_ns - self._cut_ns >= CHUNK_NS:
+            self._writer.flush()
+            self._cut_ns = log_time_ns
 
     def write_message(self, message: Message, log_time_ns: int | None = None, key: str | None = None) -> None:
         """Add one message; log_time_ns: by default its own stamp; key: by default its topic's."""
@@ -117,6 +142,7 @@ class DiveLogWriter:
     def flush(self, *, sync: bool = False) -> None:
         """Finish the chunk and hand it to the system; sync: and to the disk. Raises OSError; then call it again."""
         self._writer.flush()
+        self._cut_ns = None
         if sync:
             self._file.sync()
 
@@ -218,7 +244,7 @@ class DiveLogReader:
                 continue
             while heap and heap[0][0] < start_ns:
                 yield heapq.heappop(heap)[2]
-            for message in self._chunk_messages(offset):
+            for message in self._chunk_messages(offset, start_ns, end_ns):
                 record = self._record(message, wanted, since_ns)
                 if record is not None:
                     heapq.heappush(heap, (record.log_time_ns, order, record))
@@ -250,11 +276,16 @@ class DiveLogReader:
         if len(self.damage) < MAX_NOTES and text not in self.damage:
             self.damage.append(text if len(self.damage) < MAX_NOTES - 1 else "and more")
 
-    def _chunk_messages(self, offset: int) -> list[McapMessage]:
+    def _chunk_messages(self, offset: int, start_ns: int, end_ns: int) -> list[McapMessage]:
         try:
             contents = read_chunk(self._file, offset, self._size)
         except _DAMAGE as error:
-            self._note(f"chunk at byte {offset}: {error or type(error).__name__}; its messages are lost")
+            lost_s = (end_ns - start_ns) / S_NS
+            from_s = (start_ns - min(chunk[0] for chunk in self._contents.chunks)) / S_NS
+            self._note(
+                f"chunk at byte {offset}: {error or type(error).__name__}; "
+                f"{lost_s:.2f} s of messages are lost, from {from_s:.2f} s on"
+            )
             return []
         self._declare(contents)
         return [record for record in contents if isinstance(record, McapMessage)]
@@ -276,6 +307,9 @@ class DiveLogReader:
         except _DAMAGE:
             return None
         if summary is None or not summary.chunk_indexes or not summary.channels:
+            return None
+        if not summary_is_sound(self._file, self._size):
+            self._note(f"the index before byte {self._size} is damaged; the log is read without it")
             return None
         contents = _Contents()
         for index in summary.chunk_indexes:
@@ -310,8 +344,8 @@ class DiveLogReader:
                 declared.append(found)
         self._declare(declared)
         if not contents.channels:
-            for _, _, offset, _ in contents.chunks:
-                self._chunk_messages(offset)
+            for start_ns, end_ns, offset, _ in contents.chunks:
+                self._chunk_messages(offset, start_ns, end_ns)
         return contents
 
     def _take_note(self, note: Metadata) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import mmap
 import re
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -29,6 +30,7 @@ CHANNEL_NOTE: Final = "buddyline.channel"
 
 _HEAD_BYTES: Final = 9
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, its checksum, length of the compression
+_FOOTER: Final = struct.Struct("<BQQQI")  # kind, length, where the summary and its offsets begin, its checksum
 _COMPRESSIONS: Final = (b"zstd", b"lz4", b"")
 _RESUME: Final = re.compile(
     rb"\x06.{8}.{28}(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
@@ -79,9 +81,9 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
         if last:
             file.seek(offset)
             if file.read(len(MAGIC)) != MAGIC:
-                note("was not closed")
+                note(f"ends at byte {size} without having been closed")
             return
-    note("was not closed")
+    note(f"ends at byte {size} without having been closed")
 
 
 def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
@@ -128,6 +130,16 @@ def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Sc
     if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MAX_RECORD_BYTES:
         raise MalformedError("a chunk too big to unpack")
     return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, _IN_CHUNKS)]
+
+
+def summary_is_sound(file: IO[bytes], size: int) -> bool:
+    """Whether the index at the end of a closed log agrees with its checksum, where it has one."""
+    file.seek(size - len(MAGIC) - _FOOTER.size)
+    _, _, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
+    if checksum == 0:
+        return True
+    file.seek(start)
+    return bool(zlib.crc32(file.read(size - len(MAGIC) - 4 - start)) == checksum)
 
 
 def _chunk_at(file: IO[bytes], offset: int, length: int) -> ChunkAt:

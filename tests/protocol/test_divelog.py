@@ -15,30 +15,30 @@ from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import parse_key
 from mcap.reader import make_reader
 
-S_NS = 1_000_000_000
+TICK_NS = 100_000_000
 
 
-def depth(second: int, node: str = "a") -> Depth:
-    return Depth(node=node, stamp_ns=second * S_NS, depth_m=float(second), sigma_m=0.02)
+def depth(tick: int, node: str = "a") -> Depth:
+    return Depth(node=node, stamp_ns=tick * TICK_NS, depth_m=float(tick), sigma_m=0.02)
 
 
-def write(path, seconds, flush_every=10, node="a"):
+def write(path, ticks, flush_every=10, node="a"):
     with DiveLogWriter(path, metadata={"software": "test"}) as writer:
-        for i, second in enumerate(seconds):
-            writer.write_message(depth(second, node))
+        for i, tick in enumerate(ticks):
+            writer.write_message(depth(tick, node))
             if i % flush_every == flush_every - 1:
                 writer.flush()
 
 
-def seconds_of(reader):
-    return [record.open().message.stamp_ns // S_NS for record in reader.records()]
+def ticks_of(reader):
+    return [record.open().message.stamp_ns // TICK_NS for record in reader.records()]
 
 
 def test_round_trip_and_independent_reader(tmp_path):
     write(tmp_path / "a.mcap", range(100))
     with DiveLogReader(tmp_path / "a.mcap") as reader:
-        assert seconds_of(reader) == list(range(100))
-        assert (reader.start_ns, reader.end_ns, reader.damage) == (0, 99 * S_NS, [])
+        assert ticks_of(reader) == list(range(100))
+        assert (reader.start_ns, reader.end_ns, reader.damage) == (0, 99 * TICK_NS, [])
         assert reader.metadata() == {"software": "test"}
         assert reader.keys == ["buddyline/node/a/depth"]
     with open(tmp_path / "a.mcap", "rb") as file:
@@ -55,18 +55,18 @@ def test_never_overwrites(tmp_path):
 
 
 def test_out_of_order_messages_come_in_order(tmp_path):
-    seconds = list(range(200))
-    random.Random(1).shuffle(seconds)
-    write(tmp_path / "a.mcap", seconds)
+    ticks = list(range(200))
+    random.Random(1).shuffle(ticks)
+    write(tmp_path / "a.mcap", ticks)
     with DiveLogReader(tmp_path / "a.mcap") as reader:
-        assert seconds_of(reader) == list(range(200))
+        assert ticks_of(reader) == list(range(200))
 
 
 def test_several_logs_read_as_one(tmp_path):
     write(tmp_path / "a.mcap", range(0, 100, 2))
     write(tmp_path / "b.mcap", range(1, 100, 2), node="b")
     with DiveLogReader(tmp_path / "a.mcap") as a, DiveLogReader(tmp_path / "b.mcap") as b:
-        assert [r.log_time_ns // S_NS for r in read_logs([a, b])] == list(range(100))
+        assert [r.log_time_ns // TICK_NS for r in read_logs([a, b])] == list(range(100))
         assert [r.key for r in read_logs([a, b], lambda key: "/b/" in key)] == ["buddyline/node/b/depth"] * 50
 
 
@@ -78,7 +78,7 @@ def test_cut_at_any_byte_loses_only_the_chunk_in_progress(tmp_path):
         (tmp_path / "cut.mcap").write_bytes(whole[:cut])
         try:
             with DiveLogReader(tmp_path / "cut.mcap") as reader:
-                found = seconds_of(reader)
+                found = ticks_of(reader)
                 assert reader.damage or cut == len(whole)
         except BuddylineError:
             assert cut < 8
@@ -98,8 +98,49 @@ def test_damaged_chunk_is_left_out_and_said(tmp_path):
     data[offset + 60 : offset + 80] = bytes(20)
     (tmp_path / "a.mcap").write_bytes(data)
     with DiveLogReader(tmp_path / "a.mcap") as reader:
-        assert seconds_of(reader) == [*range(10), *range(20, 50)]
+        assert ticks_of(reader) == [*range(10), *range(20, 50)]
         assert len(reader.damage) == 1
+        assert f"chunk at byte {offset}: " in reader.damage[0]
+        assert "; 0.90 s of messages are lost, from 1.00 s on" in reader.damage[0]
+
+
+def test_chunks_are_cut_by_the_second_of_log_time(tmp_path):
+    ticks = [*range(150), 40, *range(150, 200)]  # and one that comes late
+    write(tmp_path / "a.mcap", ticks, flush_every=10_000)
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        chunks = sorted(reader._contents.chunks)
+        assert len(chunks) == 20
+        whole = (tmp_path / "a.mcap").read_bytes()
+        # Whatever bit is flipped in a chunk: a second is lost, and said.
+        for _, _, offset, _ in chunks:
+            data = bytearray(whole)
+            data[offset + 80] ^= 1
+            (tmp_path / "b.mcap").write_bytes(data)
+            with DiveLogReader(tmp_path / "b.mcap") as damaged:
+                assert len(ticks) - len(ticks_of(damaged)) in (10, 11)
+                assert damaged.damage
+
+
+def test_a_log_says_what_it_is_before_its_first_message(tmp_path):
+    writer = DiveLogWriter(tmp_path / "a.mcap", metadata={"node": "a"})
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "a.mcap").read_bytes())
+    writer.close()
+    with DiveLogReader(tmp_path / "cut.mcap") as reader:
+        assert (reader.metadata(), reader.start_ns, reader.keys) == ({"node": "a"}, None, [])
+        assert "without having been closed" in reader.damage[0]
+
+
+def test_an_index_that_is_damaged_hides_no_chunk(tmp_path):
+    write(tmp_path / "a.mcap", range(50))
+    whole = (tmp_path / "a.mcap").read_bytes()
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        after = max(offset for _, _, offset, _ in reader._contents.chunks) + 400
+    for at in range(after, len(whole) - 8, 11):
+        data = bytearray(whole)
+        data[at] ^= 0xFF
+        (tmp_path / "b.mcap").write_bytes(data)
+        with DiveLogReader(tmp_path / "b.mcap") as damaged:
+            assert ticks_of(damaged) == list(range(50))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +177,7 @@ def test_kill_loses_at_most_two_seconds(tmp_path):
     with DiveLogReader(path) as reader:
         found = [record.publish_time_ns for record in reader.records()]
     assert found == stamps[: len(found)]
-    assert stamps[-1] - found[-1] <= 2 * S_NS
+    assert stamps[-1] - found[-1] <= 2_000_000_000
 
 
 def test_recorder_writes_everything_and_says_where_it_failed(tmp_path):
