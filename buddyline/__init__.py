@@ -1,1 +1,235 @@
-"""Two underwater nodes look at each other's lights; a closed form gives their full relative pose."""
+"""Two underwater nodes look at each other's lights; a closed form gives their full relative pose.
+
+For notebooks and other programs:
+
+    import buddyline
+
+    dive = buddyline.open_dive("a.mcap", "b.mcap")          # columns of numpy arrays
+    dive.depths("a").depth_m, dive.attitudes("a").q_ned_body_xyzw
+    solved = buddyline.solve("a.mcap", "b.mcap")            # in memory
+    solved.poses.t_a_b_m, solved.rejections.reason
+    blobs = buddyline.detect(picture)                       # of an image array
+    info = buddyline.read_info("a.mcap")                    # calibration
+    with buddyline.live_poses() as poses:                   # as the solver finds them
+        for pose in poses:
+            print(pose.range_m)
+
+Whatever goes wrong with a file, a value or the hub is a BuddylineError that names it. Nothing heavy is imported before
+it is called. All other modules may change without notice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+    from buddyline.protocol.errors import BuddylineError
+    from buddyline.protocol.messages import (
+        Attitude,
+        Blob,
+        CameraModel,
+        Candidates,
+        Depth,
+        Imu,
+        Message,
+        NodeInfo,
+        Rejected,
+        RelativePose,
+        Track,
+        Truth,
+    )
+    from buddyline.tools.columns import (
+        AttitudeColumns,
+        CandidateColumns,
+        DepthColumns,
+        DiveColumns,
+        ImuColumns,
+        PoseColumns,
+        RejectionColumns,
+        TrackColumns,
+        TruthColumns,
+    )
+    from buddyline.tools.livestream import LiveStream
+    from buddyline.tools.offline import Solved
+    from numpy.typing import NDArray
+
+__all__ = [
+    "Attitude",
+    "AttitudeColumns",
+    "Blob",
+    "BuddylineError",
+    "CameraModel",
+    "CandidateColumns",
+    "Candidates",
+    "Depth",
+    "DepthColumns",
+    "DiveColumns",
+    "Imu",
+    "ImuColumns",
+    "LiveStream",
+    "Message",
+    "NodeInfo",
+    "PoseColumns",
+    "Rejected",
+    "RejectionColumns",
+    "RelativePose",
+    "Solved",
+    "Track",
+    "TrackColumns",
+    "Truth",
+    "TruthColumns",
+    "__version__",
+    "detect",
+    "live_poses",
+    "live_tracks",
+    "open_dive",
+    "read_info",
+    "solve",
+    "solve_messages",
+]
+
+ALL_CHECKS: Final = ("range", "twist", "attitude", "depth")
+# Where the names live that are imported when they are asked for.
+_MODULES: Final = {
+    "buddyline.protocol": ("__version__",),
+    "buddyline.protocol.errors": ("BuddylineError",),
+    "buddyline.protocol.messages": (
+        *("Attitude", "Blob", "CameraModel", "Candidates", "Depth", "Imu", "Message", "NodeInfo"),
+        *("Rejected", "RelativePose", "Track", "Truth"),
+    ),
+    "buddyline.tools.columns": (
+        *("AttitudeColumns", "CandidateColumns", "DepthColumns", "DiveColumns", "ImuColumns"),
+        *("PoseColumns", "RejectionColumns", "TrackColumns", "TruthColumns"),
+    ),
+    "buddyline.tools.livestream": ("LiveStream",),
+    "buddyline.tools.offline": ("Solved",),
+}
+_MODULE_OF: Final = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public type when it is first asked for."""
+    module = _MODULE_OF.get(name)
+    if module is None:
+        raise AttributeError(f"module 'buddyline' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(module), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted(__all__)
+
+
+def open_dive(*logs: str | Path) -> DiveColumns:
+    """Open a stored dive: its log, or each node's own, with poses or without.
+
+    Poses, attitudes, depths, candidates and truth are then numpy columns. Of damaged logs what can be read is used;
+    `losses` says what is missing.
+    """
+    from buddyline.tools.columns import DiveColumns
+
+    return DiveColumns(*logs)
+
+
+def solve(
+    *logs: str | Path,
+    pair: tuple[str, str] | None = None,
+    method: str = "refined",
+    checks: Sequence[str] = ALL_CHECKS,
+    clock_offset_s: float = 0.0,
+    environment: str = "auto",
+    infos: Mapping[str, NodeInfo] | None = None,
+) -> Solved:
+    """Solve a stored dive in memory, as `buddyline solve` does; pictures are detected first where need be.
+
+    pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's.
+    environment: of the detector. infos: node id to the calibration to use in place of the logs' own.
+    """
+    from buddyline.tools.offline import solve_logs
+
+    return solve_logs(
+        logs,
+        pair=pair,
+        method=method,
+        checks=checks,
+        clock_offset_s=clock_offset_s,
+        environment=environment,
+        infos=infos,
+    )
+
+
+def solve_messages(
+    messages: Iterable[Message],
+    *,
+    pair: tuple[str, str] | None = None,
+    method: str = "refined",
+    checks: Sequence[str] = ALL_CHECKS,
+    clock_offset_s: float = 0.0,
+) -> Solved:
+    """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Attitude and Depth if any.
+
+    They are taken in the order given, which is that of their stamps but for a second at most.
+    """
+    from buddyline.tools.offline import solve_messages as solve_in_memory
+
+    return solve_in_memory(messages, pair=pair, method=method, checks=checks, clock_offset_s=clock_offset_s)
+
+
+def detect(image: NDArray[np.uint8], *, environment: str = "auto", method: str = "source") -> list[Blob]:
+    """Find the light candidates of one picture, the likeliest first.
+
+    image: (H, W, 3) BGR or (H, W) grey, 8 bit. Raises BuddylineError where it is neither.
+    """
+    from buddyline.node.detect import make_detector
+
+    return [detection.blob for detection in make_detector(method, environment).detect(image)]
+
+
+def read_info(path: str | Path) -> NodeInfo:
+    """Read a node's calibration out of a JSON file or the first one of a dive log."""
+    from buddyline.tools.dives import load_info
+
+    return load_info(str(path))
+
+
+def live_poses(
+    connect: str = "",
+    *,
+    config: str | Path | None = None,
+    pair: tuple[str, str] | None = None,
+    seconds: float | None = None,
+) -> LiveStream[RelativePose]:
+    """Follow the solver's poses: `with live_poses() as poses: for pose in poses: ...`, until poses.stop().
+
+    connect: the hub's endpoint; default: the one on this machine. config: a TOML file with [tls] (`buddyline keys
+    viewer`). pair: (a, b); default: all. seconds: end after this long; default: never. Raises BuddylineError where
+    no hub answers within five seconds.
+    """
+    from buddyline.protocol.messages import RelativePose
+    from buddyline.protocol.topics import POSE
+    from buddyline.tools.client import client_config_of
+    from buddyline.tools.livestream import LiveStream
+
+    return LiveStream(POSE, RelativePose, client_config_of(config, connect), ids=pair, seconds=seconds)
+
+
+def live_tracks(
+    connect: str = "",
+    *,
+    config: str | Path | None = None,
+    pair: tuple[str, str] | None = None,
+    seconds: float | None = None,
+) -> LiveStream[Track]:
+    """Follow the fused estimate, which goes on between poses; arguments as of live_poses."""
+    from buddyline.protocol.messages import Track
+    from buddyline.protocol.topics import TRACK
+    from buddyline.tools.client import client_config_of
+    from buddyline.tools.livestream import LiveStream
+
+    return LiveStream(TRACK, Track, client_config_of(config, connect), ids=pair, seconds=seconds)

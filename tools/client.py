@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from buddyline.protocol.config import Config, load_config
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
@@ -26,11 +27,16 @@ def add_client_arguments(parser: argparse.ArgumentParser, role: str = VIEWER) ->
 
 def client_config(args: argparse.Namespace, role: str = VIEWER) -> ClientConfig:
     """Return what the arguments say; raise BuddylineError naming the file and what is wrong with it."""
-    config = load_config(args.config, ClientConfig) if args.config else ClientConfig()
-    if config.tls is not None:
-        config = replace(config, tls=config.tls.beside(args.config))
-    if args.connect:
-        config = replace(config, connect=args.connect)
+    return client_config_of(args.config, args.connect, role)
+
+
+def client_config_of(path: Path | str | None, connect: str | None = None, role: str = VIEWER) -> ClientConfig:
+    """Return what a TOML file says, or the defaults; connect: an endpoint that takes precedence."""
+    config = load_config(path, ClientConfig) if path else ClientConfig()
+    if config.tls is not None and path:
+        config = replace(config, tls=config.tls.beside(path))
+    if connect:
+        config = replace(config, connect=connect)
     if config.tls is not None:
         check_identity(config.tls, role)
     return config

@@ -1,0 +1,102 @@
+"""The whole pipeline in memory: a dive's messages in, poses and rejections out, no file written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo, Rejected, RelativePose
+from buddyline.solver_service.config import CHECKS, SolveConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.tools.columns import Pair, PoseColumns, RejectionColumns, in_order, pose_columns, rejection_columns
+from buddyline.tools.dives import Dive
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What became of a dive's triggers, as columns by time. pair: a and b of T_a_b."""
+
+    pair: Pair
+    poses: PoseColumns
+    rejections: RejectionColumns
+
+
+def solve_messages(
+    messages: Iterable[Message],
+    *,
+    pair: Pair | None = None,
+    method: str = "refined",
+    checks: Sequence[str] = CHECKS,
+    clock_offset_s: float = 0.0,
+) -> Solved:
+    """Solve a pair's messages (NodeInfo, Candidates, Attitude, Depth), in the order in which they were received.
+
+    pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. The results are those
+    of `buddyline solve`. Raises BuddylineError where the pair or its calibration is not there.
+    """
+    taken = list(messages)
+    chosen = _pair(sorted({message.node for message in taken if isinstance(message, Candidates)}), pair)
+    known = {message.node for message in taken if isinstance(message, NodeInfo)}
+    for node in chosen:
+        if node not in known:
+            raise BuddylineError(f"no NodeInfo of node {node}")
+    settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
+    core = SolverCore(*chosen, settings, round(clock_offset_s * S_NS))
+    outcomes = [outcome for message in taken for outcome in core.handle(message)] + core.flush()
+    return Solved(
+        chosen,
+        pose_columns(in_order(one for one in outcomes if isinstance(one, RelativePose))),
+        rejection_columns(sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)),
+    )
+
+
+def solve_logs(
+    logs: Sequence[str | Path],
+    *,
+    pair: Pair | None = None,
+    method: str = "refined",
+    checks: Sequence[str] = CHECKS,
+    clock_offset_s: float = 0.0,
+    environment: str = "auto",
+    infos: Mapping[str, NodeInfo] | None = None,
+) -> Solved:
+    """Solve a stored dive; the pictures of a node without candidates are detected first.
+
+    infos: calibrations in place of the logs' own. environment: of the detector. The others as in solve_messages.
+    """
+    with Dive([Path(log) for log in logs]) as dive:
+        found = list(_messages(dive, environment, dict(infos or {})))
+        return solve_messages(found, pair=pair, method=method, checks=checks, clock_offset_s=clock_offset_s)
+
+
+def _messages(dive: Dive, environment: str, infos: dict[str, NodeInfo]) -> Iterator[Message]:
+    yield from infos.values()
+    raw = set(dive.nodes("image")) - set(dive.nodes("candidates"))
+    detector = None
+    if raw:
+        from buddyline.tools.detect import DEFAULT_METHOD, DiveDetector
+
+        detector = DiveDetector(DEFAULT_METHOD, environment, dive.infos() | infos)
+    topics = ("info", "candidates", "attitude", "depth", *(("image",) if raw else ()))
+    for envelope in dive.messages(*topics):
+        message = envelope.message
+        if isinstance(message, CompressedImage):
+            found = detector.candidates(envelope) if detector is not None and envelope.node in raw else None
+            if found is not None:
+                yield found.message
+        elif not (isinstance(message, NodeInfo) and message.node in infos):
+            yield message
+
+
+def _pair(present: list[str], wanted: Pair | None) -> Pair:
+    if wanted is not None:
+        missing = [node for node in wanted if node not in present]
+        if missing:
+            raise BuddylineError(f"no candidates of node {missing[0]}; nodes: {', '.join(present) or 'none'}")
+        return wanted
+    if len(present) != 2:
+        raise BuddylineError(f"candidates of nodes {', '.join(present) or 'none'}: choose a pair")
+    return present[0], present[1]
