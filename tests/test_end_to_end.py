@@ -99,7 +99,7 @@ def test_demo_that_is_gone_leaves_nothing_running(number):
         assert len(children) == 4
         demo.send(number)
         assert demo.wait(timeout=10.0) in (0, -signal.SIGKILL)
-        assert wait_until_gone(children, 5.0)
+        assert wait_until_gone(children, 30.0)
     finally:
         demo.end()
 

@@ -90,7 +90,7 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
     result, endpoint = Result(), free_endpoint()
     with ExitStack() as stack:
 
-        def start(name: str, ready: str, *words: str, module: str = "tools") -> None:
+        def start(name: str, ready: str, *words: str, module: str = "buddyline") -> None:
             process = stack.enter_context(Process(*words, module=module))
             processes[name] = process
             process.wait_for(ready, timeout=60.0)

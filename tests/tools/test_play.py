@@ -125,6 +125,9 @@ def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
         solver = LateSolver(listener, wait_s=1.5)
         player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), threading.Event())
         player.declare(dive.keys)
+        # Until it is told that a solver is alive, playback waits for nobody.
+        while not player._follower._solvers:
+            time.sleep(0.01)
         for envelope in dive.messages():
             player.send(envelope)
     assert len(solver.ahead_ns) > 140
