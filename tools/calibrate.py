@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import msgspec
-import numpy as np
-from buddyline.protocol.clock import SystemClock
-from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CameraModel, NodeInfo, Vector3
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.dives import load_info
-from buddyline.tools.newfile import write_new
+
+if TYPE_CHECKING:
+    import numpy as np
+    from buddyline.protocol.messages import NodeInfo
+    from buddyline.tools.calibration.board import Board
 
 log = logging.getLogger(__name__)
 
@@ -24,21 +23,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="WHAT")
 
-    board = kinds.add_parser("board", help="write the calibration board as a PDF to print")
-    board.add_argument("-o", "--output", required=True, metavar="BOARD.pdf")
-    _board_arguments(board)
-    board.set_defaults(calibrate=_board)
+    def add(name: str, text: str, runs: Callable[[argparse.Namespace], int | None]) -> argparse.ArgumentParser:
+        kind = kinds.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        kind.set_defaults(calibrate=runs)
+        if runs in (_board, _camera):
+            kind.add_argument("--columns", type=int, default=9, help="squares across; default 9")
+            kind.add_argument("--rows", type=int, default=6, help="squares up; default 6")
+            kind.add_argument("--square-mm", type=float, default=30.0, help="side of a square, as measured; default 30")
+        if runs in (_camera, _lights, _magnetometer):
+            kind.add_argument(
+                "--picture",
+                default=f"calibrate-{name}.png",
+                metavar="OUT.png",
+                help="shows the fit; default: %(default)s",
+            )
+        return kind
 
-    camera = kinds.add_parser("camera", help="intrinsics, out of pictures of the board taken in water")
+    board = add("board", "write the calibration board as a PDF to print", _board)
+    board.add_argument("-o", "--output", required=True, metavar="BOARD.pdf")
+
+    camera = add("camera", "find the camera's intrinsics from pictures of the board, taken in water", _camera)
     camera.add_argument(
         "pictures", nargs="+", metavar="PICTURES", help="folders, pictures, or a dive log with pictures"
     )
-    camera.add_argument("--node", help="whose pictures of a log of several nodes")
-    _board_arguments(camera)
-    _result_arguments(camera, "camera")
-    camera.set_defaults(calibrate=_camera)
+    camera.add_argument("--node", help="whose pictures, of a log of several nodes")
+    camera.add_argument("--info", metavar="FILE", help="the node's description: its log, or JSON")
+    camera.add_argument("--new-info", metavar="OUT.json", help="write it anew with this result, for solve --info")
 
-    lights = kinds.add_parser("lights", help="positions of both nodes' lights, out of a solved dive at taped distances")
+    lights = add("lights", "find the positions of both nodes' lights from a solved dive at taped distances", _lights)
     lights.add_argument("dives", nargs="+", metavar="SOLVED.mcap", help="what `buddyline solve` wrote")
     lights.add_argument(
         "--tape",
@@ -49,24 +61,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("BEGIN_S", "END_S", "METRES"),
         help="while both nodes rested, this far from camera to camera; once for each place",
     )
+    lights.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair, of a dive of several")
     lights.add_argument("--pixel-sigma", type=float, default=0.5, metavar="PX", help="of a light's mean; default 0.5")
     lights.add_argument("--tape-sigma-mm", type=float, default=5.0, metavar="MM", help="of a distance; default 5")
     lights.add_argument("--ruler-sigma-mm", type=float, default=10.0, metavar="MM", help="of the entered positions")
-    _result_arguments(lights, "lights", pair=True)
-    lights.set_defaults(calibrate=_lights)
+    lights.add_argument(
+        "--new-info",
+        nargs=2,
+        metavar=("A.json", "B.json"),
+        help="write both nodes' descriptions anew, for solve --info",
+    )
 
-    magnetometer = kinds.add_parser("magnetometer", help="hard and soft iron, out of a log of the rig turned every way")
+    magnetometer = add("magnetometer", "find hard and soft iron from a log of the rig turned every way", _magnetometer)
     magnetometer.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="a log with the node's inertial samples")
-    magnetometer.add_argument("--node", help="whose samples of a log of several nodes")
+    magnetometer.add_argument("--node", help="whose samples, of a log of several nodes")
     magnetometer.add_argument(
         "--position", nargs=2, type=float, metavar=("LAT", "LON"), help="where it was taken: sets the field's strength"
     )
-    magnetometer.add_argument("--picture", default="calibrate-magnetometer.png", metavar="OUT.png")
-    magnetometer.set_defaults(calibrate=_magnetometer)
 
-    clock = kinds.add_parser("clock", help="offset and drift between two nodes' clocks, before and after a dive")
+    clock = add("clock", "find offset and drift between the nodes' clocks, before and after a dive", _clock)
     clock.add_argument(
-        "dives", nargs="*", metavar="DIVE.mcap", help="a dive's logs, both nodes'; default: the nodes that run now"
+        "dives", nargs="*", metavar="DIVE.mcap", help="a dive's logs, every node's; default: the nodes that run now"
     )
     clock.add_argument("--seconds", type=float, default=10.0, metavar="S", help="listen for this long; default 10")
     clock.add_argument(
@@ -74,7 +89,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     clock.add_argument("--json", action="store_true", help="print everything as JSON")
     add_client_arguments(clock)
-    clock.set_defaults(calibrate=_clock)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,59 +97,40 @@ def run(args: argparse.Namespace) -> int:
     return status or 0
 
 
-def _board_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--columns", type=int, default=9, help="squares across; default 9")
-    parser.add_argument("--rows", type=int, default=6, help="squares up; default 6")
-    parser.add_argument("--square-mm", type=float, default=30.0, help="side of a square, as measured; default 30")
+def _the_board(args: argparse.Namespace) -> Board:
+    from buddyline.tools.calibration.board import Board
 
-
-def _result_arguments(parser: argparse.ArgumentParser, kind: str, pair: bool = False) -> None:
-    parser.add_argument("--picture", default=f"calibrate-{kind}.png", metavar="OUT.png")
-    if pair:
-        parser.add_argument(
-            "--new-info",
-            nargs=2,
-            metavar=("A.json", "B.json"),
-            help="write both nodes' descriptions anew, for solve --info",
-        )
-    else:
-        parser.add_argument("--info", metavar="FILE", help="the node's description: a log of it, or JSON")
-        parser.add_argument("--new-info", metavar="OUT.json", help="write it anew with this result, for solve --info")
+    return Board(args.columns, args.rows, args.square_mm / 1e3)
 
 
 def _board(args: argparse.Namespace) -> None:
-    from buddyline.tools.calibration.board import Board
-
-    board = Board(args.columns, args.rows, args.square_mm / 1e3)
+    board = _the_board(args)
     board.write_pdf(Path(args.output))
     log.info("%s: %s", args.output, board.caption)
 
 
 def _camera(args: argparse.Namespace) -> None:
-    from buddyline.tools.calibration.board import Board
     from buddyline.tools.calibration.camera import CornerFinder, calibrate, distinct, draw
     from buddyline.tools.calibration.inputs import pictures
     from buddyline.tools.calibration.pictures import write_picture
+    from buddyline.tools.dives import load_info
+    from msgspec.structs import replace
 
     if bool(args.info) != bool(args.new_info):
         raise BuddylineError("--info and --new-info go together")
-    board = Board(args.columns, args.rows, args.square_mm / 1e3)
+    board = _the_board(args)
     finder = CornerFinder(board)
     seen = [finder.find(name, picture) for name, picture in pictures(args.pictures, args.node)]
     views = [view for view in seen if view is not None]
     if finder.size is None:
         raise BuddylineError(f"{', '.join(args.pictures)}: holds no pictures")
+    width_px, height_px = finder.size
     log.info("board found in %d of %d pictures", len(views), len(seen))
-    found = calibrate(distinct(views, finder.size[0]), finder.size, board)
+    found = calibrate(distinct(views, width_px), finder.size, board)
     write_picture(Path(args.picture), draw(found))
     log.info(
-        "reprojection error %.2f px, %.0f %% covered, %d views, focal length %.1f +- %.1f px; see %s",
-        found.rms_px,
-        100 * found.coverage,
-        found.views,
-        found.camera.fx_px,
-        found.sigma_px[0],
-        args.picture,
+        f"reprojection error {found.rms_px:.2f} px, {found.coverage:.0%} covered, {found.views} views, focal length "
+        f"{found.camera.fx_px:.1f} +- {found.sigma_px[0]:.1f} px; see {args.picture}"
     )
     for name in found.dropped:
         log.info("left out, it does not fit the others: %s", name)
@@ -144,42 +139,55 @@ def _camera(args: argparse.Namespace) -> None:
         if (info.width_px, info.height_px) != found.size:
             raise BuddylineError(
                 f"{args.info}: describes {info.width_px}x{info.height_px} pixels, the pictures have "
-                f"{found.size[0]}x{found.size[1]}: calibrate in the mode that dives"
+                f"{width_px}x{height_px}: calibrate in the mode that dives"
             )
-        _write_info(args.new_info, msgspec.structs.replace(info, camera=found.camera))
-    _print(_camera_table(found.camera, found.size))
+        _write_info(args.new_info, replace(info, camera=found.camera))
+    camera = found.camera
+    _print(
+        [
+            f"# for pictures of {width_px}x{height_px} pixels, in the water that the board was in",
+            "[calibration.camera]",
+            f'model = "{camera.model}"',
+            *(f"{name} = {getattr(camera, name):.3f}" for name in ("fx_px", "fy_px", "cx_px", "cy_px")),
+            f"distortion = {_numbers(camera.distortion, '.6f')}",
+        ]
+    )
 
 
 def _lights(args: argparse.Namespace) -> None:
+    import numpy as np
     from buddyline.solver_service.results import rig_of
-    from buddyline.tools.calibration.inputs import stations
+    from buddyline.tools.calibration.inputs import places
     from buddyline.tools.calibration.lights import Noise, fit
     from buddyline.tools.calibration.pictures import draw_lights, write_picture
+    from msgspec.structs import replace
 
-    places, infos = stations(args.dives, [tuple(tape) for tape in args.tape])
+    taped, infos = places(args.dives, [tuple(tape) for tape in args.tape], args.nodes)
     rigs = rig_of(infos[0]), rig_of(infos[1])
     noise = Noise(args.pixel_sigma, args.tape_sigma_mm / 1e3, args.ruler_sigma_mm / 1e3)
-    found = fit(places, (rigs[0].camera, rigs[1].camera), (rigs[0].lights_m, rigs[1].lights_m), noise)
-    write_picture(Path(args.picture), draw_lights(found, places))
+    found = fit(taped, (rigs[0].camera, rigs[1].camera), (rigs[0].lights_m, rigs[1].lights_m), noise)
+    write_picture(Path(args.picture), draw_lights(found, taped))
     log.info("chi2 %.2f, tape within %.1f mm; see %s", found.chi2, 1e3 * np.abs(found.tape_gaps_m).max(), args.picture)
-    results = ((found.lights_a_m, found.sigma_a_m), (found.lights_b_m, found.sigma_b_m))
-    for i, (info, (lights_m, sigma_m)) in enumerate(zip(infos, results, strict=True)):
-        left, right = _vector(lights_m[0]), _vector(lights_m[1])
+    for i, info in enumerate(infos):
+        left, right = found.lights_m[i].round(5).tolist()
+        sigmas = [_numbers(1e3 * sigma_m, ".1f")[1:-1] for sigma_m in found.sigma_m[i]]
+        length_m = np.linalg.norm(found.lights_m[i, 1] - found.lights_m[i, 0])
         _print(
             [
-                f"# node {info.node}: bar {np.linalg.norm(lights_m[1] - lights_m[0]):.4f} m "
-                f"+- {found.bar_sigma_m[i] * 1e3:.1f} mm",
+                f"# node {info.node}: bar {length_m:.4f} m +- {found.bar_sigma_m[i] * 1e3:.1f} mm",
                 "[calibration]",
-                f"light_left_m = {list(left)}   # +- {_millimetres(sigma_m[0])} mm",
-                f"light_right_m = {list(right)}   # +- {_millimetres(sigma_m[1])} mm",
+                f"light_left_m = {left}   # +- {sigmas[0]} mm",
+                f"light_right_m = {right}   # +- {sigmas[1]} mm",
             ]
         )
         if args.new_info:
-            _write_info(args.new_info[i], msgspec.structs.replace(info, light_left_m=left, light_right_m=right))
+            _write_info(args.new_info[i], replace(info, light_left_m=tuple(left), light_right_m=tuple(right)))
 
 
 def _magnetometer(args: argparse.Namespace) -> None:
+    import numpy as np
     from buddyline.node.geomagnetism import earth_field
+    from buddyline.protocol.clock import SystemClock
     from buddyline.tools.calibration.ellipsoid import fit
     from buddyline.tools.calibration.inputs import inertial
     from buddyline.tools.calibration.pictures import draw_magnetometer, write_picture
@@ -192,22 +200,17 @@ def _magnetometer(args: argparse.Namespace) -> None:
     found = fit(mags_t, accels_mps2, norm_t)
     write_picture(Path(args.picture), draw_magnetometer(found))
     log.info(
-        "%d readings, %.0f %% of directions, field within %.1f %%, headings within %.2f deg; see %s",
-        len(found.errors),
-        100 * found.coverage,
-        100 * found.residual,
-        np.degrees(found.heading_sigma_rad),
-        args.picture,
+        f"{len(found.errors)} readings, {found.coverage:.0%} of directions, field within {found.residual:.1%}, "
+        f"headings within {np.degrees(found.heading_sigma_rad):.2f} deg; see {args.picture}"
     )
     if not found.turned:
         log.warning("too few readings at rest: the accelerometer's axes were not matched; turn the rig slowly")
-    rows = ", ".join("[" + ", ".join(f"{value:.6f}" for value in row) + "]" for row in found.matrix.tolist())
     _print(
         [
             f"# node {node}, {found.norm_t * 1e6:.1f} uT",
             "[sensors]",
-            "magnetometer_offset_t = [" + ", ".join(f"{value:.4e}" for value in found.offset_t.tolist()) + "]",
-            f"magnetometer_matrix = [{rows}]",
+            f"magnetometer_offset_t = {_numbers(found.offset_t, '.4e')}",
+            f"magnetometer_matrix = [{', '.join(_numbers(row, '.6f') for row in found.matrix)}]",
         ]
     )
 
@@ -224,29 +227,14 @@ def _clock(args: argparse.Namespace) -> int:
     return 0 if args.dives else int(any(one.problem() for one in found))
 
 
-def _camera_table(camera: CameraModel, size: tuple[int, int]) -> list[str]:
-    return [
-        f"# for pictures of {size[0]}x{size[1]} pixels, in the water that the board was in",
-        "[calibration.camera]",
-        f'model = "{camera.model}"',
-        f"fx_px = {camera.fx_px:.3f}",
-        f"fy_px = {camera.fy_px:.3f}",
-        f"cx_px = {camera.cx_px:.3f}",
-        f"cy_px = {camera.cy_px:.3f}",
-        "distortion = [" + ", ".join(f"{value:.6f}" for value in camera.distortion) + "]",
-    ]
-
-
-def _vector(values: np.ndarray) -> Vector3:
-    x, y, z = (round(float(value), 5) for value in values)
-    return x, y, z
-
-
-def _millimetres(sigma_m: np.ndarray) -> str:
-    return ", ".join(f"{1e3 * float(value):.1f}" for value in sigma_m)
+def _numbers(values: Iterable[float] | np.ndarray, form: str) -> str:
+    return f"[{', '.join(format(float(value), form) for value in values)}]"
 
 
 def _write_info(path: str, info: NodeInfo) -> None:
+    from buddyline.protocol.codec import encode
+    from buddyline.tools.newfile import write_new
+
     write_new(path, encode(info))
     log.info("%s: for solve --info %s=%s", path, info.node, path)
 

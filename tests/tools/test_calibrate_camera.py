@@ -17,7 +17,8 @@ from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.tools import calibrate
 from buddyline.tools.calibration import camera
 from buddyline.tools.calibration.board import Board
-from buddyline.tools.calibration.camera import CornerFinder, PoorCalibration, View, coverage, distinct, draw
+from buddyline.tools.calibration.camera import CornerFinder, View, coverage, distinct, draw
+from buddyline.tools.calibration.leastsquares import PoorCalibration
 
 from tests.tools import boards
 

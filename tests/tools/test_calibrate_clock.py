@@ -13,7 +13,7 @@ from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import ClockBeacon, HeardClock, NodeStatus
 from buddyline.protocol.topics import CLOCK
 from buddyline.tools.calibration import clock_report
-from buddyline.tools.calibration.clock import Legs, drift_between, estimate, steps, windows
+from buddyline.tools.calibration.clock import OneWayTimes, drift_between, estimate, steps, windows
 from buddyline.tools.calibration.clock_report import Heard, as_json, as_text, reports
 from buddyline.tools.cli import main
 from buddyline.tools.client import ClientConfig
@@ -49,7 +49,7 @@ def beacons(
 
 
 def exchanges_of(said):
-    legs = Legs()
+    legs = OneWayTimes()
     for beacon in said:
         legs.add(beacon)
     assert legs.pairs() == [("a", "b")]
@@ -68,7 +68,7 @@ def test_a_link_without_jitter_gives_the_offset_and_the_drift_exactly():
 
 @pytest.mark.parametrize("offset_s", [-0.04, 86400.0 * 400])
 def test_swapped_nodes_give_the_opposite_however_far_apart_the_clocks_are(offset_s):
-    legs = Legs()
+    legs = OneWayTimes()
     for beacon in beacons(offset_s=offset_s):
         legs.add(beacon)
     there, back = estimate(legs.exchanges("a", "b")), estimate(legs.exchanges("b", "a"))
@@ -134,7 +134,7 @@ def test_one_lucky_exchange_does_not_make_the_drift_certain():
 
 
 def test_one_way_alone_tells_nothing():
-    legs = Legs()
+    legs = OneWayTimes()
     for beacon in beacons():
         if beacon.node == "a":
             legs.add(beacon)

@@ -17,7 +17,8 @@ from buddyline.protocol.topics import CANDIDATES, INFO, POSE
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import quaternion_of, rotation_exp
 from buddyline.tools import calibrate
-from buddyline.tools.calibration.lights import Noise, PoorLights, Station, fit
+from buddyline.tools.calibration.leastsquares import PoorCalibration
+from buddyline.tools.calibration.lights import Noise, TapedPlace, fit
 
 FOCAL_PX = 1000.0
 CAMERA = Camera("pinhole", 1640, 1232, FOCAL_PX, FOCAL_PX, 819.5, 615.5, (0.0,) * 5)
@@ -39,7 +40,7 @@ def world(n: int = 12, seed: int = 0, pixel_px: float = 0.3, tape_m: float = 0.0
         t = rng.uniform(1.2, 4.0) * along / np.linalg.norm(along)
         R = rotation_exp(rng.uniform(-0.3, 0.3, 3)) @ np.diag([-1.0, 1.0, -1.0])
         stations.append(
-            Station(
+            TapedPlace(
                 f"place {i}",
                 project(lights_b @ R.T + t) + rng.normal(0, pixel_px, (2, 2)),
                 project((lights_a - t) @ R) + rng.normal(0, pixel_px, (2, 2)),
@@ -58,8 +59,8 @@ def bar(lights: np.ndarray) -> float:
 def test_without_noise_the_bars_are_exact():
     stations, lights_a, lights_b = world(20, pixel_px=0.0, tape_m=0.0)
     found = fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), Noise(0.02, 0.0002, 0.05))
-    assert bar(found.lights_a_m) == pytest.approx(bar(lights_a), abs=2e-4)
-    assert bar(found.lights_b_m) == pytest.approx(bar(lights_b), abs=2e-4)
+    assert bar(found.lights_m[0]) == pytest.approx(bar(lights_a), abs=2e-4)
+    assert bar(found.lights_m[1]) == pytest.approx(bar(lights_b), abs=2e-4)
     assert found.chi2 < 0.3
 
 
@@ -70,7 +71,9 @@ def test_errors_are_what_the_sigmas_say():
         stations, *truth = world(seed=seed)
         found = fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), NOISE)
         assert found.chi2 < 2.0
-        for lights, fitted, sigma_m in zip(truth, (found.lights_a_m, found.lights_b_m), found.bar_sigma_m, strict=True):
+        for lights, fitted, sigma_m in zip(
+            truth, (found.lights_m[0], found.lights_m[1]), found.bar_sigma_m, strict=True
+        ):
             off = bar(fitted) - bar(lights)
             scores.append(off / sigma_m)
             after.append(off)
@@ -82,21 +85,21 @@ def test_errors_are_what_the_sigmas_say():
 
 def test_too_few_places_are_refused():
     stations, *_ = world(4)
-    with pytest.raises(PoorLights, match="5 are needed"):
+    with pytest.raises(PoorCalibration, match="5 are needed"):
         fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), NOISE)
 
 
 def test_a_wrong_distance_is_refused_and_named():
     stations, *_ = world()
     wrong = stations[7]
-    stations[7] = Station(*(getattr(wrong, f) for f in ("name", "pixels_a", "pixels_b", "t_a_b_m", "R_a_b")), 3.9)
-    with pytest.raises(PoorLights, match=r"contradict.*place 7"):
+    stations[7] = TapedPlace(*(getattr(wrong, f) for f in ("name", "pixels_a", "pixels_b", "t_a_b_m", "R_a_b")), 3.9)
+    with pytest.raises(PoorCalibration, match=r"contradict.*place 7"):
         fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), NOISE)
 
 
 def test_distances_too_coarse_are_refused():
     stations, *_ = world(6)
-    with pytest.raises(PoorLights, match="tape their distances better"):
+    with pytest.raises(PoorCalibration, match="tape their distances better"):
         fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), Noise(0.5, 0.05, 0.01))
 
 

@@ -17,7 +17,8 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu
 from buddyline.protocol.topics import IMU
 from buddyline.tools import calibrate
-from buddyline.tools.calibration.ellipsoid import CoverageError, coverage, fit
+from buddyline.tools.calibration.ellipsoid import coverage, fit
+from buddyline.tools.calibration.leastsquares import PoorCalibration
 
 FIELD_T = 48e-6
 DIP_RAD = np.radians(62.0)
@@ -85,13 +86,13 @@ def test_strength_follows_the_given_field():
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 10.0, 20.0, 40.0])
 def test_thin_coverage_is_refused(tilt_deg):
-    with pytest.raises(CoverageError, match="turn"):
+    with pytest.raises(PoorCalibration, match="turn"):
         fit(*turned_rig(tilt_deg))
 
 
 def test_a_rig_at_rest_is_refused():
     readings, accels = turned_rig()
-    with pytest.raises(CoverageError, match="turn the rig"):
+    with pytest.raises(PoorCalibration, match="turn the rig"):
         fit(readings[:1] + np.random.default_rng(1).normal(0, 0.3e-6, (500, 3)), accels[:500])
 
 
@@ -102,7 +103,7 @@ def test_a_passing_car_is_left_out_and_a_parking_place_is_refused():
     found = fit(passing, accels, norm_t=FIELD_T)
     assert np.abs(heading_errors_deg(found.offset_t, found.matrix)).max() < 0.6
     parking = readings + 12e-6 * np.sin(np.arange(len(readings)) / 40)[:, None] * [1.0, 0.5, -0.5]
-    with pytest.raises(CoverageError, match="steel"):
+    with pytest.raises(PoorCalibration, match="steel"):
         fit(parking, accels)
 
 
@@ -153,7 +154,7 @@ def test_command_prints_what_the_node_takes(logged, tmp_path, capsys):
 
 def test_command_refuses_a_rig_that_was_hardly_tilted(logged, tmp_path):
     log = logged(*turned_rig(20.0, n=1500))
-    with pytest.raises(CoverageError):
+    with pytest.raises(PoorCalibration):
         calibrate.run(arguments("magnetometer", log, "--picture", str(tmp_path / "m.png")))
     assert not (tmp_path / "m.png").exists()
 

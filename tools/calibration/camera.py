@@ -8,12 +8,11 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel
 from buddyline.tools.calibration.board import Board
+from buddyline.tools.calibration.leastsquares import Floats, PoorCalibration, require
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 LEAST_CORNERS: Final = 8
@@ -26,10 +25,6 @@ MOST_RMS_PX: Final = 1.0
 LEAST_TILT_RAD: Final = np.radians(7.0)
 MOST_FOCAL_SIGMA: Final = 0.005
 OUTLIER_VIEWS: Final = 2.5
-
-
-class PoorCalibration(BuddylineError):  # noqa: N818
-    """Pictures that do not tell the camera; the text says what to do."""
 
 
 @dataclass(frozen=True)
@@ -117,35 +112,44 @@ def _moved_px(one: View, other: View) -> float:
 
 def calibrate(views: list[View], size: tuple[int, int], board: Board) -> CameraFit:
     """Fit a pinhole with OpenCV's k1 k2 p1 p2 k3; raise PoorCalibration where the views do not tell it."""
-    if len(views) < LEAST_VIEWS:
-        raise PoorCalibration(
+    require(
+        (
+            len(views) >= LEAST_VIEWS,
             f"the board is found in {len(views)} different views, {LEAST_VIEWS} are needed: "
-            "move and tilt it between pictures, with all of it sharp and lit"
+            "move and tilt it between pictures, with all of it sharp and lit",
         )
+    )
     corners = np.asarray(board.charuco().getChessboardCorners(), np.float32)
     dropped: list[str] = []
     while True:
-        solution = _solve(views, size, corners)
-        per_view = solution.per_view_px
-        worst = int(per_view.argmax())
-        if per_view[worst] < OUTLIER_VIEWS * np.median(per_view) or len(views) <= LEAST_VIEWS:
+        found, per_view_px = _solve(views, size, corners, tuple(dropped))
+        worst = int(per_view_px.argmax())
+        if per_view_px[worst] < OUTLIER_VIEWS * np.median(per_view_px) or len(views) <= LEAST_VIEWS:
             break
         dropped.append(views[worst].name)
         views = views[:worst] + views[worst + 1 :]
-    points = np.vstack([view.points_px for view in views])
-    found = CameraFit(
-        camera=solution.camera,
-        size=size,
-        rms_px=solution.rms_px,
-        sigma_px=solution.sigma_px,
-        coverage=coverage(points, size),
-        tilt_rad=solution.tilt_rad,
-        views=len(views),
-        points_px=points,
-        residuals_px=solution.residuals_px,
-        dropped=tuple(dropped),
+    focal_share = max(found.sigma_px[0] / found.camera.fx_px, found.sigma_px[1] / found.camera.fy_px)
+    require(
+        (
+            found.rms_px <= MOST_RMS_PX,
+            f"reprojection error {found.rms_px:.2f} px, {MOST_RMS_PX:.1f} px at most: "
+            "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?",
+        ),
+        (
+            found.coverage >= LEAST_COVERAGE,
+            f"corners in {found.coverage:.0%} of the picture, {LEAST_COVERAGE:.0%} are needed: "
+            "bring the board into all edges and corners",
+        ),
+        (
+            bool(found.tilt_rad >= LEAST_TILT_RAD),
+            f"the board was tilted by {np.degrees(found.tilt_rad):.0f} deg, {np.degrees(LEAST_TILT_RAD):.0f} deg at "
+            "least: tilt the board more, both ways",
+        ),
+        (
+            focal_share <= MOST_FOCAL_SIGMA,
+            f"focal length known to {focal_share:.1%} only, {MOST_FOCAL_SIGMA:.1%} at most: tilt the board more",
+        ),
     )
-    _check(found)
     return found
 
 
@@ -164,17 +168,10 @@ def cells(points_px: Floats, size: tuple[int, int]) -> NDArray[np.int64]:
     return counts
 
 
-@dataclass(frozen=True)
-class _Solution:
-    camera: CameraModel
-    rms_px: float
-    sigma_px: tuple[float, float, float, float]
-    tilt_rad: float
-    per_view_px: Floats
-    residuals_px: Floats
-
-
-def _solve(views: list[View], size: tuple[int, int], corners: NDArray[np.float32]) -> _Solution:
+def _solve(
+    views: list[View], size: tuple[int, int], corners: NDArray[np.float32], dropped: tuple[str, ...]
+) -> tuple[CameraFit, Floats]:
+    """Return the fit of these views and each view's reprojection error (n,), px."""
     objects = [corners[view.ids] for view in views]
     images = [view.points_px.astype(np.float32) for view in views]
     try:
@@ -187,22 +184,29 @@ def _solve(views: list[View], size: tuple[int, int], corners: NDArray[np.float32
         image - cv2.projectPoints(points, turn, shift, K, distortion)[0].reshape(-1, 2)
         for points, image, turn, shift in zip(objects, images, turns, shifts, strict=True)
     ]
-    sigma = np.asarray(deviations, np.float64).reshape(-1)
-    return _Solution(
-        CameraModel(
+    fx_px, fy_px, cx_px, cy_px = (float(K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    points = np.vstack([view.points_px for view in views])
+    sigmas = np.asarray(deviations, np.float64).ravel().tolist()
+    found = CameraFit(
+        camera=CameraModel(
             model="pinhole",
-            fx_px=float(K[0, 0]),
-            fy_px=float(K[1, 1]),
-            cx_px=float(K[0, 2]),
-            cy_px=float(K[1, 2]),
-            distortion=[float(v) for v in np.asarray(distortion).reshape(-1)[:5]],
+            fx_px=fx_px,
+            fy_px=fy_px,
+            cx_px=cx_px,
+            cy_px=cy_px,
+            distortion=np.asarray(distortion, np.float64).ravel()[:5].tolist(),
         ),
-        float(rms),
-        (float(sigma[0]), float(sigma[1]), float(sigma[2]), float(sigma[3])),
-        _tilt(turns),
-        np.asarray(per_view, np.float64).reshape(-1),
-        np.vstack(residuals).astype(np.float64),
+        size=size,
+        rms_px=float(rms),
+        sigma_px=(sigmas[0], sigmas[1], sigmas[2], sigmas[3]),
+        coverage=coverage(points, size),
+        tilt_rad=_tilt(turns),
+        views=len(views),
+        points_px=points,
+        residuals_px=np.vstack(residuals).astype(np.float64),
+        dropped=dropped,
     )
+    return found, np.asarray(per_view, np.float64).ravel()
 
 
 def _tilt(turns: Any) -> float:
@@ -211,41 +215,11 @@ def _tilt(turns: Any) -> float:
     return float(np.sqrt(max(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0], 0.0)))
 
 
-def _check(found: CameraFit) -> None:
-    if found.rms_px > MOST_RMS_PX:
-        raise PoorCalibration(
-            f"reprojection error {found.rms_px:.2f} px, {MOST_RMS_PX:.1f} px at most: "
-            "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?"
-        )
-    if found.coverage < LEAST_COVERAGE:
-        raise PoorCalibration(
-            f"corners in {found.coverage:.0%} of the picture, {LEAST_COVERAGE:.0%} are needed: "
-            "bring the board into all edges and corners"
-        )
-    if found.tilt_rad < LEAST_TILT_RAD:
-        raise PoorCalibration(
-            f"the board was tilted by {np.degrees(found.tilt_rad):.0f} deg, {np.degrees(LEAST_TILT_RAD):.0f} deg at "
-            "least: tilt the board more, both ways"
-        )
-    share = max(found.sigma_px[0] / found.camera.fx_px, found.sigma_px[1] / found.camera.fy_px)
-    if share > MOST_FOCAL_SIGMA:
-        raise PoorCalibration(
-            f"focal length known to {share:.1%} only, {MOST_FOCAL_SIGMA:.1%} at most: tilt the board more"
-        )
-
-
 def draw(found: CameraFit, enlarged: float = 20.0) -> Image:
     """Return a picture of the corners used, each with its residual enlarged; cells without any are dark."""
-    width, height = found.size
-    picture = np.full((height, width, 3), 255, np.uint8)
-    counts = cells(found.points_px, found.size)
-    rows, columns = counts.shape
-    for row in range(rows):
-        for column in range(columns):
-            x0, x1 = column * width // columns, (column + 1) * width // columns
-            y0, y1 = row * height // rows, (row + 1) * height // rows
-            if counts[row, column] == 0:
-                picture[y0:y1, x0:x1] = 150
+    empty = (cells(found.points_px, found.size) == 0).astype(np.uint8)
+    shade = 255 - 105 * cv2.resize(empty, found.size, interpolation=cv2.INTER_NEAREST)
+    picture = np.repeat(np.asarray(shade, np.uint8)[..., None], 3, axis=2)
     for point, residual in zip(found.points_px, found.residuals_px, strict=True):
         begin = (round(float(point[0])), round(float(point[1])))
         end = tuple(round(float(v)) for v in point + enlarged * residual)
@@ -255,5 +229,5 @@ def draw(found: CameraFit, enlarged: float = 20.0) -> Image:
         f"rms {found.rms_px:.2f} px (lines x{enlarged:g}), {found.views} views, {found.coverage:.0%} covered, "
         f"f {found.camera.fx_px:.1f} +- {found.sigma_px[0]:.1f}"
     )
-    cv2.putText(picture, text, (8, height - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(picture, text, (8, found.size[1] - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
     return picture

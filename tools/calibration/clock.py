@@ -66,7 +66,7 @@ class ClockOffset:
     exchanges: int
 
 
-class Legs:
+class OneWayTimes:
     """Ways from node to node as their beacons tell them, each once."""
 
     def __init__(self) -> None:

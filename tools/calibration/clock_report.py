@@ -16,9 +16,10 @@ from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
 from buddyline.protocol.topics import CLOCK, NODE_STATUS
-from buddyline.tools.calibration.clock import ClockOffset, Legs, drift_between, estimate, steps, windows
+from buddyline.tools.calibration.clock import ClockOffset, OneWayTimes, drift_between, estimate, steps, windows
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.dives import Dive
+from buddyline.tools.live import open_bus_within
 from buddyline.tools.progress import Progress
 from msgspec import UNSET
 
@@ -34,14 +35,14 @@ LIMIT_S: Final = 2e-3
 class Heard:
     """What two nodes said of their clocks. statuses: the first and the last of each node that has chrony's figures."""
 
-    legs: Legs = field(default_factory=Legs)
+    ways: OneWayTimes = field(default_factory=OneWayTimes)
     statuses: dict[str, tuple[NodeStatus, NodeStatus]] = field(default_factory=dict)
     last_s: dict[str, float] = field(default_factory=dict)
 
     def add(self, message: Message, now_s: float = 0.0) -> None:
         """Take a beacon or a status; others are passed over."""
         if isinstance(message, ClockBeacon):
-            self.legs.add(message)
+            self.ways.add(message)
             self.last_s[message.node] = now_s
         elif isinstance(message, NodeStatus) and message.clock_source is not UNSET:
             first, _ = self.statuses.get(message.node, (message, message))
@@ -50,20 +51,7 @@ class Heard:
 
 def listen(config: ClientConfig, seconds: float, connect_within_s: float = HUB_WITHIN_S) -> Heard:
     """Hear the bus for this long; raise BuddylineError where there is no hub, or a node falls silent meanwhile."""
-    from buddyline.protocol.zenoh_bus import connect
-
-    stop = threading.Event()
-    giving_up = threading.Timer(connect_within_s, stop.set)
-    giving_up.start()
-    try:
-        bus = connect(
-            config.connect, namespace=config.namespace or None, stop=stop, on_wait=lambda _: None, tls=config.tls
-        )
-    finally:
-        giving_up.cancel()
-    if bus is None:
-        raise BuddylineError(f"no hub at {config.connect}: start it with `buddyline hub`, or give --connect")
-    with bus:
+    with open_bus_within(config, connect_within_s) as bus:
         return hear(bus, seconds)
 
 
@@ -127,10 +115,10 @@ class Report:
 
 def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
     """Compare the clocks of each pair; raise BuddylineError where there is nothing to compare."""
-    pairs = heard.legs.pairs() if nodes is None else [(nodes[0], nodes[1])]
+    pairs = heard.ways.pairs() if nodes is None else [(nodes[0], nodes[1])]
     found = []
     for a, b in pairs:
-        exchanges = heard.legs.exchanges(a, b)
+        exchanges = heard.ways.exchanges(a, b)
         offsets = [estimate(part) for part in windows(exchanges)]
         if offsets:
             found.append(Report(a, b, offsets, [int(exchanges.stamp_ns[i]) for i in steps(exchanges)]))
@@ -168,21 +156,21 @@ def as_text(found: Iterable[Report], heard: Heard) -> str:
     lines = []
     for one in found:
         first, last = one.offsets[0], one.offsets[-1]
-        name = f"{one.node_b} minus {one.node_a}"
-        lines.append(f"{name}: {_offset(last)}" if first is last else f"{name}, before: {_offset(first)}")
+        said = [f": {_offset(last)}"]
         if first is not last:
             drift, sigma = drift_between(first, last)
-            lines.append(f"{name}, after:  {_offset(last)}")
             middle_s = (first.offset_s + last.offset_s) / 2
             passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
-            lines.append(
-                f"{name}: {1e6 * drift:+.3f} ppm +- {1e6 * sigma:.3f} over {passed_s:.0f} s;"
-                f" solve with --clock-offset {middle_s:.5f}, right within {1e3 * abs(last.offset_s - middle_s):.2f} ms"
-            )
+            said = [
+                f", before: {_offset(first)}",
+                f", after:  {_offset(last)}",
+                f": {1e6 * drift:+.3f} ppm +- {1e6 * sigma:.3f} over {passed_s:.0f} s;"
+                f" solve with --clock-offset {middle_s:.5f}, right within {1e3 * abs(last.offset_s - middle_s):.2f} ms",
+            ]
         elif last.drift is not None and last.drift_sigma is not None:
-            lines.append(f"{name}: {1e6 * last.drift:+.1f} ppm +- {1e6 * last.drift_sigma:.1f}")
-        if one.problem():
-            lines.append(f"{name}: {one.problem()}")
+            said.append(f": {1e6 * last.drift:+.1f} ppm +- {1e6 * last.drift_sigma:.1f}")
+        said += [f": {problem}"] if (problem := one.problem()) else []
+        lines += [f"{one.node_b} minus {one.node_a}{text}" for text in said]
     for node, both in sorted(heard.statuses.items()):
         lines += [f"{node}: {text}" for text in dict.fromkeys(_chrony_text(status) for status in both)]
     if not heard.statuses:
@@ -190,11 +178,14 @@ def as_text(found: Iterable[Report], heard: Heard) -> str:
     return "\n".join(lines)
 
 
+def _at(stamp_ns: int) -> str:
+    return time.strftime("at %H:%M:%S UTC", time.gmtime(stamp_ns / S_NS))
+
+
 def _offset(offset: ClockOffset) -> str:
-    at = time.strftime("%H:%M:%S", time.gmtime(offset.stamp_ns / S_NS))
     return (
         f"{1e3 * offset.offset_s:+.3f} ms (1 sd {1e3 * offset.sigma_s:.3f}, at most {1e3 * offset.bound_s:.3f} from "
-        f"unequal ways) at {at} UTC, {offset.exchanges} exchanges"
+        f"unequal ways) {_at(offset.stamp_ns)}, {offset.exchanges} exchanges"
     )
 
 
@@ -204,14 +195,12 @@ def _chrony(status: NodeStatus) -> dict[str, Any]:
 
 
 def _chrony_text(status: NodeStatus) -> str:
-    at = time.strftime("%H:%M:%S", time.gmtime(status.stamp_ns / S_NS))
+    at = _at(status.stamp_ns)
     if not status.clock_source:
-        return f"chrony is not synchronised at {at} UTC"
+        return f"chrony is not synchronised {at}"
     if status.clock_offset_s is UNSET:
-        return f"chrony serves this clock as it stands, at {at} UTC"
-    figures = [f"off by {1e3 * status.clock_offset_s:+.3f} ms"]
-    if status.clock_rms_s is not UNSET:
-        figures.append(f"RMS {1e3 * status.clock_rms_s:.3f} ms")
-    if status.clock_bound_s is not UNSET:
-        figures.append(f"at most {1e3 * status.clock_bound_s:.3f} ms")
-    return f"chrony follows {status.clock_source}: {', '.join(figures)}, at {at} UTC"
+        return f"chrony serves this clock as it stands, {at}"
+    figures = f"off by {1e3 * status.clock_offset_s:+.3f} ms"
+    for words, value_s in (("RMS", status.clock_rms_s), ("at most", status.clock_bound_s)):
+        figures += "" if value_s is UNSET else f", {words} {1e3 * value_s:.3f} ms"
+    return f"chrony follows {status.clock_source}: {figures}, {at}"

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.calibration.leastsquares import Floats, PoorCalibration, gauss_newton, jacobian, require
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-
 APART_RAD: Final = np.radians(4.0)
-ROUNDS: Final = 15
 OUTLIER_SIGMAS: Final = 4.0
 GRAVITY_MPS2: Final = 9.80665
 STILL_MPS2: Final = 0.5
@@ -27,10 +24,7 @@ MOST_RESIDUAL: Final = 0.04
 MOST_HEADING_SIGMA_RAD: Final = np.radians(1.0)
 CELLS: Final = 72
 CELL_RAD: Final = np.radians(20.0)
-
-
-class CoverageError(BuddylineError):
-    """Readings that do not tell the ellipsoid; the text says what to do."""
+NO_ELLIPSOID: Final = "the readings tell no ellipsoid: turn the rig through all directions, upside down as well"
 
 
 @dataclass(frozen=True)
@@ -70,28 +64,28 @@ def fit(readings_t: Floats, accels_mps2: Floats, norm_t: float | None = None) ->
     """Fit (n, 3) readings in T, with the accelerometer's (n, 3) of the same moments.
 
     norm_t: strength of the Earth's field where it is known; None keeps the readings' mean scale.
-    Raises CoverageError where the readings do not tell the ellipsoid, or not well enough.
+    Raises PoorCalibration where the readings do not tell the ellipsoid, or not well enough.
     """
     kept = spread_out(readings_t)
     readings_t, accels_mps2 = readings_t[kept], accels_mps2[kept]
-    if len(readings_t) < LEAST_READINGS:
-        raise CoverageError(
-            f"only {len(readings_t)} readings a few degrees apart, {LEAST_READINGS} are needed: "
-            "turn the rig slowly through all directions"
-        )
+    few = f"only {len(readings_t)} readings a few degrees apart, {LEAST_READINGS} are needed"
+    require((len(readings_t) >= LEAST_READINGS, f"{few}: turn the rig slowly through all directions"))
     unit_t = float(np.linalg.norm(readings_t - readings_t.mean(axis=0), axis=1).mean()) or 1.0
     x = readings_t / unit_t
     used = np.ones(len(x), dtype=bool)
     for _ in range(3):
-        offset, shape = _refined(x[used], *_algebraic(x[used]))
-        errors = np.linalg.norm((x - offset) @ shape.T, axis=1) - 1.0
+        state, J = _refined(x[used])
+        offset, shape = _offset_and_shape(state)
+        errors = _errors(x, state)
         spread = 1.4826 * np.median(np.abs(errors[used])) + 1e-9
         used = np.abs(errors) < OUTLIER_SIGMAS * spread
         if used.sum() < LEAST_READINGS:
-            raise CoverageError("the readings lie on no ellipsoid: iron moved beside the rig, or the field is not one")
+            raise PoorCalibration(
+                "the readings lie on no ellipsoid: iron moved beside the rig, or the field is not one"
+            )
     field = (x[used] - offset) @ shape.T
     residual = float(np.sqrt((errors[used] ** 2).mean()))
-    covariance = _covariance(x[used], offset, shape, residual)
+    covariance = np.asarray(np.linalg.pinv(J.T @ J) * max(residual, 1e-6) ** 2, dtype=np.float64)
     turn = _turn(field, accels_mps2[used])
     if turn is not None:
         shape, field = turn @ shape, field @ turn.T
@@ -103,31 +97,29 @@ def fit(readings_t: Floats, accels_mps2: Floats, norm_t: float | None = None) ->
         norm_t=scale_t,
         residual=residual,
         coverage=coverage(directions),
-        heading_sigma_rad=_heading_sigma(directions, accels_mps2[used], offset, shape, covariance),
+        heading_sigma_rad=_heading_sigma(directions, accels_mps2[used], state, covariance),
         directions=directions,
         errors=errors[used],
         turned=turn is not None,
     )
-    _check(found)
-    return found
-
-
-def _check(found: EllipsoidFit) -> None:
-    if found.coverage < LEAST_COVERAGE:
-        raise CoverageError(
+    require(
+        (
+            found.coverage >= LEAST_COVERAGE,
             f"only {found.coverage:.0%} of all directions were seen, {LEAST_COVERAGE:.0%} are needed: "
-            "turn the rig on its sides and upside down as well"
-        )
-    if found.residual > MOST_RESIDUAL:
-        raise CoverageError(
+            "turn the rig on its sides and upside down as well",
+        ),
+        (
+            found.residual <= MOST_RESIDUAL,
             f"the field's strength varies by {found.residual:.1%}, {MOST_RESIDUAL:.0%} at most: "
-            "turn the rig away from steel, cars and buildings, with everything on it fixed"
-        )
-    if found.heading_sigma_rad > MOST_HEADING_SIGMA_RAD:
-        raise CoverageError(
+            "turn the rig away from steel, cars and buildings, with everything on it fixed",
+        ),
+        (
+            found.heading_sigma_rad <= MOST_HEADING_SIGMA_RAD,
             f"headings would be known to {np.degrees(found.heading_sigma_rad):.1f} deg only, "
-            f"{np.degrees(MOST_HEADING_SIGMA_RAD):.0f} deg at most: turn for longer, through all directions"
-        )
+            f"{np.degrees(MOST_HEADING_SIGMA_RAD):.0f} deg at most: turn for longer, through all directions",
+        ),
+    )
+    return found
 
 
 def coverage(directions: Floats) -> float:
@@ -140,57 +132,40 @@ def coverage(directions: Floats) -> float:
     return float((nearest > np.cos(CELL_RAD)).mean())
 
 
-def _algebraic(x: Floats) -> tuple[Floats, Floats]:
-    """Return a first centre (3,) and shape (3, 3) by linear least squares of the quadric."""
+def _offset_and_shape(state: Floats) -> tuple[Floats, Floats]:
+    """Return the centre (3,) and the symmetric shape (3, 3) of a state (9,): centre, then xx xy xz yy yz zz."""
+    xx, xy, xz, yy, yz, zz = state[3:]
+    return state[:3], np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _errors(x: Floats, state: Floats) -> Floats:
+    """Return how far readings (n, 3), made a sphere, are from a radius of 1."""
+    offset, shape = _offset_and_shape(state)
+    return np.asarray(np.linalg.norm((x - offset) @ shape, axis=1) - 1.0)
+
+
+def _algebraic(x: Floats) -> Floats:
+    """Return a first state (9,) by linear least squares of the quadric."""
     a, b, c = x.T
-    design = np.column_stack([a * a, b * b, c * c, 2 * a * b, 2 * a * c, 2 * b * c, 2 * a, 2 * b, 2 * c])
+    design = np.column_stack([a * a, 2 * a * b, 2 * a * c, b * b, 2 * b * c, c * c, 2 * a, 2 * b, 2 * c])
     solution = np.linalg.lstsq(design, np.ones(len(x)), rcond=None)[0]
-    A = np.array(
-        [
-            [solution[0], solution[3], solution[4]],
-            [solution[3], solution[1], solution[5]],
-            [solution[4], solution[5], solution[2]],
-        ]
-    )
+    _, A = _offset_and_shape(np.concatenate((np.zeros(3), solution[:6])))
     try:
-        offset: Floats = -np.linalg.solve(A, solution[6:])
+        offset = -np.linalg.solve(A, solution[6:])
     except np.linalg.LinAlgError:
-        raise CoverageError("the readings lie in a plane: turn the rig upside down as well") from None
-    size = 1.0 + offset @ A @ offset
+        raise PoorCalibration("the readings lie in a plane: turn the rig upside down as well") from None
+    size = float(1.0 + offset @ A @ offset)
     values, axes = np.linalg.eigh(A / size) if abs(size) > 1e-12 else (np.full(3, -1.0), np.eye(3))
-    if (values <= 0).any():
-        raise CoverageError("the readings tell no ellipsoid: turn the rig through all directions, upside down as well")
-    return offset, (axes * np.sqrt(values)) @ axes.T
+    require((bool((values > 0).all()), NO_ELLIPSOID))
+    return np.concatenate((offset, ((axes * np.sqrt(values)) @ axes.T)[np.triu_indices(3)]))
 
 
-def _jacobian(x: Floats, offset: Floats, shape: Floats) -> tuple[Floats, Floats]:
-    """Return the errors of the radius (n,) and their derivatives (n, 9): offset, then xx yy zz xy xz yz."""
-    arm = x - offset
-    y = arm @ shape.T
-    radius = np.linalg.norm(y, axis=1)
-    u = y / radius[:, None]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    by_shape = [u[:, i] * arm[:, j] + (u[:, j] * arm[:, i] if i != j else 0.0) for i, j in pairs]
-    return radius - 1.0, np.column_stack([-(u @ shape), *by_shape])
-
-
-def _refined(x: Floats, offset: Floats, shape: Floats) -> tuple[Floats, Floats]:
-    for _ in range(ROUNDS):
-        errors, J = _jacobian(x, offset, shape)
-        step = np.linalg.lstsq(J, -errors, rcond=None)[0]
-        offset = offset + step[:3]
-        dxx, dyy, dzz, dxy, dxz, dyz = step[3:]
-        shape = shape + np.array([[dxx, dxy, dxz], [dxy, dyy, dyz], [dxz, dyz, dzz]])
-        if np.abs(step).max() < 1e-10:
-            break
-    if not np.isfinite(shape).all() or (np.linalg.eigvalsh(shape) <= 0).any():
-        raise CoverageError("the readings tell no ellipsoid: turn the rig through all directions, upside down as well")
-    return offset, shape
-
-
-def _covariance(x: Floats, offset: Floats, shape: Floats, residual: float) -> Floats:
-    _, J = _jacobian(x, offset, shape)
-    return np.asarray(np.linalg.pinv(J.T @ J) * max(residual, 1e-6) ** 2, dtype=np.float64)
+def _refined(x: Floats) -> tuple[Floats, Floats]:
+    """Return the state (9,) that fits readings (n, 3) best, and the errors' Jacobian (n, 9) there."""
+    state, J = gauss_newton(lambda state: _errors(x, state), _algebraic(x))
+    _, shape = _offset_and_shape(state)
+    require((bool(np.isfinite(shape).all() and (np.linalg.eigvalsh(shape) > 0).all()), NO_ELLIPSOID))
+    return state, J
 
 
 def _turn(field: Floats, accels_mps2: Floats) -> Floats | None:
@@ -210,16 +185,21 @@ def _turn(field: Floats, accels_mps2: Floats) -> Floats | None:
     return np.asarray(q * np.sign(np.diag(q)), dtype=np.float64)
 
 
-def _heading_sigma(directions: Floats, accels_mps2: Floats, offset: Floats, shape: Floats, covariance: Floats) -> float:
-    """Return the heading's 1 sd out of the fit's own covariance, of a level rig, for the worst heading."""
+def _heading_sigma(directions: Floats, accels_mps2: Floats, state: Floats, covariance: Floats) -> float:
+    """Return the heading's 1 sd by the fit's own covariance (9, 9), of a level rig, for the worst heading."""
     up = accels_mps2 / np.maximum(np.linalg.norm(accels_mps2, axis=1, keepdims=True), 1e-9)
     sine = float(np.clip(np.median(-(directions * up).sum(axis=1)), -0.99, 0.99))
     cosine = np.sqrt(1 - sine * sine)
     heading = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    u = np.column_stack([cosine * np.cos(heading), -cosine * np.sin(heading), np.full(24, sine)])
-    arm = np.linalg.solve(shape, u.T).T
+    field = np.column_stack([cosine * np.cos(heading), -cosine * np.sin(heading), np.full(24, sine)])
     sides = np.column_stack([np.sin(heading), np.cos(heading), np.zeros(24)])
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    by_shape = [sides[:, i] * arm[:, j] + (sides[:, j] * arm[:, i] if i != j else 0.0) for i, j in pairs]
-    J = np.column_stack([-(sides @ shape), *by_shape]) / cosine
+    offset, shape = _offset_and_shape(state)
+    readings = np.linalg.solve(shape, field.T).T + offset
+
+    def turned(other: Floats) -> Floats:
+        """Return by how much another state turns the headings, rad."""
+        offset, shape = _offset_and_shape(other)
+        return np.asarray((sides * ((readings - offset) @ shape)).sum(axis=1) / cosine)
+
+    J = jacobian(turned, state)
     return float(np.sqrt(np.einsum("ni,ij,nj->n", J, covariance, J).max()))

@@ -12,12 +12,11 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.rotation import matrix_of
-from buddyline.tools.calibration.lights import Station
+from buddyline.tools.calibration.leastsquares import Floats
+from buddyline.tools.calibration.lights import TapedPlace
 from buddyline.tools.dives import Dive
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
 
 REST_PX: Final = 2.0
 LEAST_FIXES: Final = 5
@@ -69,36 +68,43 @@ def _one_node(dive: Dive, node: str | None, topic: str) -> str:
     raise BuddylineError(f"{dive.name}: {topic} of nodes {', '.join(present) or 'none'}; choose one with --node")
 
 
-def stations(
-    paths: list[str], tapes: list[tuple[float, float, float]]
-) -> tuple[list[Station], tuple[NodeInfo, NodeInfo]]:
-    """Return a place for each tape (begin s, end s, distance m) of a solved dive, and both nodes' calibrations."""
+def places(
+    paths: list[str], tapes: list[tuple[float, float, float]], nodes: list[str] | None
+) -> tuple[list[TapedPlace], tuple[NodeInfo, NodeInfo]]:
+    """Return a place for each tape (begin s, end s, distance m) of a solved dive, and both nodes' calibrations.
+
+    nodes: the pair; None where the dive has one.
+    """
     with Dive(paths) as dive:
         infos = dive.infos()
+        pairs = [ids for ids in dive.ids("pose") if nodes is None or set(ids) == set(nodes)]
+        if len(pairs) != 1:
+            known = ", ".join(" ".join(ids) for ids in dive.ids("pose"))
+            if not known:
+                raise BuddylineError(f"{dive.name}: holds no poses; solve it first: buddyline solve ... -o solved.mcap")
+            raise BuddylineError(f"{dive.name}: poses of the pairs {known}; choose one with --nodes A B")
+        pair = pairs[0]
         frames: dict[tuple[str, int], Candidates] = {}
         poses: list[tuple[float, RelativePose]] = []
         for envelope in dive.messages("candidates", "pose"):
             message = envelope.message
             if isinstance(message, Candidates):
                 frames[message.node, message.trigger] = message
-            elif isinstance(message, RelativePose):
+            elif isinstance(message, RelativePose) and envelope.ids == pair:
                 poses.append(((message.stamp_ns - dive.start_ns) / S_NS, message))
-        if not poses:
-            raise BuddylineError(f"{dive.name}: holds no poses; solve it first: buddyline solve ... -o solved.mcap")
-    pair = poses[0][1].node_a, poses[0][1].node_b
     missing = [node for node in pair if node not in infos]
     if missing:
         raise BuddylineError(f"no calibration of node {missing[0]} in the log")
     found = [
-        _station(f"{begin:g}-{end:g} s", [pose for t, pose in poses if begin <= t <= end], frames, distance_m)
+        _place(f"{begin:g}-{end:g} s", [pose for t, pose in poses if begin <= t <= end], frames, distance_m)
         for begin, end, distance_m in tapes
     ]
     return found, (infos[pair[0]], infos[pair[1]])
 
 
-def _station(
+def _place(
     name: str, poses: list[RelativePose], frames: dict[tuple[str, int], Candidates], distance_m: float
-) -> Station:
+) -> TapedPlace:
     seen = []
     for pose in poses:
         a, b = frames.get((pose.node_a, pose.trigger)), frames.get((pose.node_b, pose.trigger))
@@ -114,6 +120,6 @@ def _station(
         raise BuddylineError(f"{name}: the lights moved by {moved_px:.1f} px; both nodes must be at rest")
     middle = np.median(pixels, axis=0)
     pose = poses[len(poses) // 2]
-    return Station(
+    return TapedPlace(
         name, middle[:2], middle[2:], np.array(pose.t_a_b_m), matrix_of(np.array(pose.q_a_b_xyzw)), distance_m
     )

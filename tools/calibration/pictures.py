@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.calibration.ellipsoid import EllipsoidFit
-from buddyline.tools.calibration.lights import LightsFit, Station
+from buddyline.tools.calibration.lights import LightsFit, TapedPlace
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
@@ -60,26 +60,26 @@ def draw_magnetometer(found: EllipsoidFit) -> Image:
     return picture
 
 
-def draw_lights(found: LightsFit, stations: list[Station]) -> Image:
+def draw_lights(found: LightsFit, places: list[TapedPlace]) -> Image:
     """Return each place's pixel residual (blue) and tape gap (red) as bars."""
     width, left = 760, 200
-    picture = np.full((ROW_PX * (len(stations) + 2), width, 3), 255, np.uint8)
+    picture = np.full((ROW_PX * (len(places) + 2), width, 3), 255, np.uint8)
     _text(picture, "pixels rms (blue, full: 2 px)   tape gap (red, full: 20 mm)", (10, 20))
-    for i, station in enumerate(stations):
+    for i, place in enumerate(places):
         y = ROW_PX * (i + 1)
         pixel_px, gap_m = float(found.pixel_rms_px[i]), float(found.tape_gaps_m[i])
-        _text(picture, f"{station.name}: {station.distance_m:.3f} m", (10, y + 18))
+        _text(picture, f"{place.name}: {place.distance_m:.3f} m", (10, y + 18))
         room = width - left - 130
         for row, share, colour in ((4, pixel_px / 2, BLUE), (16, abs(gap_m) / 0.02, RED)):
             end = left + round(room * min(share, 1.0))
             cv2.rectangle(picture, (left, y + row), (end, y + row + 8), colour, cv2.FILLED)
         _text(picture, f"{pixel_px:.2f} px {gap_m * 1e3:+.1f} mm", (width - 125, y + 18))
-    a_mm, b_mm = (1e3 * np.linalg.norm(lights[1] - lights[0]) for lights in (found.lights_a_m, found.lights_b_m))
+    a_mm, b_mm = (1e3 * np.linalg.norm(found.lights_m[:, 1] - found.lights_m[:, 0], axis=1)).tolist()
     _text(
         picture,
         f"bars {a_mm:.1f} +- {found.bar_sigma_m[0] * 1e3:.1f} mm, "
         f"{b_mm:.1f} +- {found.bar_sigma_m[1] * 1e3:.1f} mm, chi2 {found.chi2:.2f}",
-        (10, ROW_PX * (len(stations) + 1) + 18),
+        (10, ROW_PX * (len(places) + 1) + 18),
     )
     return picture
 
