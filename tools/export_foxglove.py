@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import CHUNK_NS
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
@@ -27,6 +28,7 @@ from buddyline.protocol.messages import (
 from buddyline.protocol.topics import parse_key
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from buddyline.tools.dives import Dive
+from buddyline.tools.newfile import new_file
 
 WORLD: Final = "world"
 TRANSFORMS: Final = "/tf"
@@ -201,16 +203,10 @@ def export_foxglove(dive: Dive, output: Path) -> int:
     from mcap.writer import CompressionType, Writer
 
     translation = Translation(fox)
-    try:
-        file = open(output, "xb")
-    except FileExistsError:
-        raise BuddylineError(f"{output}: exists; name another or remove it first") from None
-    except OSError as error:
-        raise BuddylineError(f"{output}: cannot be written: {error.strerror}") from error
-    count = 0
+    count = cut_ns = 0
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}
-    with file:
+    with new_file(output) as part, open(part, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="", library="buddyline")
         for topic, stamp_ns, message in _translated(dive, translation):
@@ -219,6 +215,9 @@ def export_foxglove(dive: Dive, output: Path) -> int:
                 if schema.name not in schemas:
                     schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[topic] = writer.register_channel(topic, "protobuf", schemas[schema.name])
+            if stamp_ns - cut_ns >= CHUNK_NS:
+                writer.flush()
+                cut_ns = stamp_ns
             writer.add_message(channels[topic], stamp_ns, message.encode(), stamp_ns, count & 0xFFFFFFFF)
             count += 1
         writer.finish()

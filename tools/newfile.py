@@ -28,19 +28,35 @@ def check_new(path: Path | str, hint: str = REMOVE_IT) -> Path:
     return Path(path)
 
 
-def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> None:
-    """Write a new file; raise BuddylineError where one exists, or where the place cannot be written.
+@contextmanager
+def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
+    """Give the place beside a new file to write to, and name it when it is whole.
 
-    hint: what to do about a file that exists.
+    Raises BuddylineError where a file is there (hint: what to do about it), or where the place cannot be written.
     """
     target = check_new(path, hint)
-    part = _part_of(target)
+    part = target.with_name(f"{target.name}.part")
+    check_new(part, "a command still writes it, or was killed; remove it in that case")
     try:
-        with open(part, "xb") as file, _named_when_whole(part, target, hint):
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
+        yield part
+        try:
+            os.link(part, target)
+        except FileExistsError:
+            check_new(target, hint)
+        except OSError:
+            # A file system without hard links (a memory stick's).
+            check_new(target, hint)
+            part.rename(target)
     except OSError as error:
         raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> None:
+    """Write a new file; raise BuddylineError as new_file does."""
+    with new_file(path, hint) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_output(target: str, content: str | bytes) -> None:
@@ -55,38 +71,13 @@ def write_output(target: str, content: str | bytes) -> None:
 
 @contextmanager
 def new_dive_log(path: Path | str, metadata: dict[str, str] | None = None) -> Iterator[DiveLogWriter]:
-    """Write a new dive log; raise BuddylineError where one exists, or where the place cannot be written."""
+    """Write a new dive log; raise BuddylineError as new_file does."""
     from buddyline.protocol.divelog import DiveLogWriter
 
-    target = check_new(path)
-    part = _part_of(target)
-    writer = DiveLogWriter(part, metadata=metadata)
-    with _named_when_whole(part, target):
+    with new_file(path) as part:
+        writer = DiveLogWriter(part, metadata=metadata)
         try:
             yield writer
             writer.close()
-        except OSError as error:
-            raise BuddylineError(f"{path}: cannot be written: {error.strerror}") from error
         finally:
             writer.abandon()
-
-
-def _part_of(target: Path) -> Path:
-    part = target.with_name(f"{target.name}.part")
-    return check_new(part, "a command still writes it, or ended without a word; in that case remove it")
-
-
-@contextmanager
-def _named_when_whole(part: Path, target: Path, hint: str = REMOVE_IT) -> Iterator[None]:
-    try:
-        yield
-        try:
-            os.link(part, target)
-        except FileExistsError:
-            raise BuddylineError(f"{target}: exists; {hint}") from None
-        except OSError:
-            # A file system without hard links (a memory stick's).
-            check_new(target, hint)
-            part.rename(target)
-    finally:
-        part.unlink(missing_ok=True)
