@@ -12,33 +12,33 @@ import signal
 import statistics
 import sys
 
+from buddyline.tools.measure.tables import markdown_head, markdown_row
+
 from tests.faults.observer import Tally
 from tests.faults.scenarios import SCENARIOS, Report
 
-HEADER = (
-    "| fault | times | published | received | lost | duplicated | out of order | triggers | without outcome "
-    "| outcome twice | poses | recovery median s | worst s |"
+HEAD = (
+    "fault",
+    "times",
+    "published",
+    "received",
+    "lost",
+    "duplicated",
+    "out of order",
+    "triggers",
+    "without outcome",
+    "outcome twice",
+    "poses",
+    "recovery median s",
+    "worst s",
 )
 
 
 def row(report: Report) -> str:
     tally = report.tally
-    cells = [
-        report.fault,
-        len(report.recover_s),
-        tally.published,
-        tally.received,
-        tally.lost,
-        tally.duplicated,
-        tally.disordered,
-        tally.triggers,
-        tally.without_outcome,
-        tally.outcomes_doubled,
-        tally.reasons["pose"],
-        f"{statistics.median(report.recover_s):.2f}",
-        f"{max(report.recover_s):.2f}",
-    ]
-    return "| " + " | ".join(map(str, cells)) + " |"
+    counts = [getattr(tally, field.name) for field in dataclasses.fields(tally) if field.name != "reasons"]
+    recovered = [f"{statistics.median(report.recover_s):.2f}", f"{max(report.recover_s):.2f}"]
+    return markdown_row([report.fault, len(report.recover_s), *counts, tally.reasons["pose"], *recovered])
 
 
 def main() -> int:
@@ -51,8 +51,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     reports = []
     if not args.json:
-        print(HEADER)
-        print("|" + " --- |" * HEADER[1:].count("|"))
+        print(markdown_head(HEAD))
     for name in args.faults or SCENARIOS:
         report = SCENARIOS[name](args.times)
         reports.append(report)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from buddyline.protocol.bus import Bus, Received
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogReader
-from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
-from buddyline.protocol.topics import CANDIDATES, POSE, REJECTED, parse_key
-from buddyline.protocol.zenoh_bus import connect
+from buddyline.protocol.envelope import Envelope, Refusals
+from buddyline.protocol.messages import Candidates, Rejected, RelativePose
+from buddyline.protocol.topics import CANDIDATES, POSE, REJECTED
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.live import follow, open_bus_within
 
 # What a node exposed in the last moment before it was stopped may not have left it.
 END_NS = S_NS
+CONNECT_S = 20.0
 
 Frame = tuple[str, str, int]  # node, boot, seq
 Outcome = Rejected | RelativePose
@@ -50,27 +51,24 @@ class Observer:
     """A client of the bus that keeps every frame and every outcome it receives."""
 
     def __init__(self, endpoint: str) -> None:
-        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
-        assert bus is not None
-        self.bus: Bus = bus
+        self.bus = open_bus_within(ClientConfig(connect=endpoint), CONNECT_S)
+        self.refusals = Refusals("observer")
         self.frames: list[tuple[Candidates, int]] = []
         self.outcomes: list[tuple[Outcome, int]] = []
         self._changed = threading.Condition()
         for topic in (CANDIDATES, POSE, REJECTED):
-            bus.subscribe(topic.key_any(), self._receive, capacity=100_000)
+            follow(self.bus, topic.key_any(), self.refusals, self._take, capacity=100_000)
 
     def close(self) -> None:
         self.bus.close()
 
-    def _receive(self, received: Received) -> None:
-        parsed = parse_key(received.key)
-        assert parsed is not None
-        message = decode(received.payload, parsed[0].schema)
+    def _take(self, envelope: Envelope) -> None:
+        message = envelope.message
         with self._changed:
             if isinstance(message, Candidates):
-                self.frames.append((message, received.receive_ns))
+                self.frames.append((message, envelope.time_ns))
             elif isinstance(message, Rejected | RelativePose):
-                self.outcomes.append((message, received.receive_ns))
+                self.outcomes.append((message, envelope.time_ns))
             self._changed.notify_all()
 
     def wait_for_match(self, since_ns: int, timeout_s: float) -> int:
@@ -107,7 +105,7 @@ class Observer:
         first: dict[tuple[str, str], int] = {}
         for node, boot, seq in frames:
             first[node, boot] = min(seq, first.get((node, boot), seq))
-        messages = [m for path in logs for m in _messages(path) if isinstance(m, Candidates)]
+        messages = [m for path in logs for m in _frames(path)]
         ends_ns: dict[str, int] = {}
         for m in messages:
             ends_ns[m.node] = max(m.stamp_ns - END_NS, ends_ns.get(m.node, 0))
@@ -146,16 +144,7 @@ def _disordered(frames: list[Frame]) -> int:
     return count
 
 
-def _messages(path: Path) -> list[Message]:
+def _frames(path: Path) -> list[Candidates]:
     with DiveLogReader(path) as reader:
-        decoded = [record.open().message for record in reader.records(lambda key: key.endswith("/candidates"))]
-    return [message for message in decoded if message is not None]
-
-
-def until(condition: Callable[[], bool], timeout_s: float) -> None:
-    """Wait for what no event announces."""
-    ends_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > ends_s:
-            raise TimeoutError
-        time.sleep(0.01)
+        opened = [record.open().message for record in reader.records(lambda key: key.endswith("/candidates"))]
+    return [message for message in opened if isinstance(message, Candidates)]

@@ -75,18 +75,22 @@ def hub(times: int) -> Report:
     return kill_and_return("hub", times, seed=1)
 
 
-def frozen_hub(times: int) -> Report:
-    """The hub stands still for longer than its clients' patience, then goes on as if nothing had been."""
-    report = Report(f"hub stopped for {FREEZE_S:g} s")
+def freeze_and_return(name: str, seconds: float, report: Report, times: int) -> Report:
+    """A process stands still, and goes on as if nothing had been."""
     with running() as system:
         for _ in range(times):
             time.sleep(1.0)
-            system.freeze("hub")
-            time.sleep(FREEZE_S)
-            system.thaw("hub")
+            system.freeze(name)
+            time.sleep(seconds)
+            system.thaw(name)
             measure(system, report, time.time_ns())
         report.tally = system.finish()
     return report
+
+
+def frozen_hub(times: int) -> Report:
+    """The hub stands still for longer than its clients' patience."""
+    return freeze_and_return("hub", FREEZE_S, Report(f"hub stopped for {FREEZE_S:g} s"), times)
 
 
 def node(times: int) -> Report:
@@ -125,16 +129,7 @@ def frozen_viewer(times: int) -> Report:
 
 def frozen_node(times: int) -> Report:
     """A node's process is stopped for 15 s, as a link that is cut: its lease runs out and it comes back."""
-    report = Report(f"node stopped for {CUT_S:g} s")
-    with running() as system:
-        for _ in range(times):
-            time.sleep(1.0)
-            system.freeze("b")
-            time.sleep(CUT_S)
-            system.thaw("b")
-            measure(system, report, time.time_ns())
-        report.tally = system.finish()
-    return report
+    return freeze_and_return("b", CUT_S, Report(f"node stopped for {CUT_S:g} s"), times)
 
 
 def cut_link(times: int) -> Report:

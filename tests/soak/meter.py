@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from array import array
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.codec import decode, payload_stamp_ns
 from buddyline.protocol.divelog import DiveLogReader
-from buddyline.protocol.messages import Candidates, RelativePose
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, NODE_STATUS, POSE, REJECTED, Topic, parse_key
-from buddyline.protocol.zenoh_bus import connect
+from buddyline.protocol.envelope import Envelope, Refusals
+from buddyline.protocol.messages import Candidates, Rejected, RelativePose
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, NODE_STATUS, POSE, REJECTED, parse_key
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.live import follow, open_bus_within
 
 COUNTED = (CANDIDATES, ATTITUDE, IMU, DEPTH, NODE_STATUS, POSE, REJECTED)
-PAGE = os.sysconf("SC_PAGE_SIZE")
-TICKS = os.sysconf("SC_CLK_TCK")
+CONNECT_S = 20.0
 
 
 @dataclass
@@ -55,41 +53,38 @@ class Streams:
         self.outcomes = array("q")
         self.triggers = array("q")
 
-    def take(self, key: str, topic: Topic, payload: bytes) -> None:
-        stamp_ns, seq = payload_stamp_ns(payload) or 0, None
-        if topic is CANDIDATES:
-            frame = decode(payload, Candidates)
-            seq = frame.seq
-            self.triggers.append(frame.trigger)
-        elif topic in (POSE, REJECTED):
-            self.outcomes.append(decode(payload, topic.schema).trigger)
-        self.by_key.setdefault(key, Stream()).take(stamp_ns, seq)
+    def take(self, envelope: Envelope) -> None:
+        message, seq = envelope.message, None
+        if isinstance(message, Candidates):
+            seq = message.seq
+            self.triggers.append(message.trigger)
+        elif isinstance(message, RelativePose | Rejected):
+            self.outcomes.append(message.trigger)
+        self.by_key.setdefault(envelope.key, Stream()).take(int(getattr(message, "stamp_ns")), seq)  # noqa: B009
 
 
 class Viewer:
     """A client of the bus that counts all that it is sent; latencies: from exposure to pose, this minute's."""
 
     def __init__(self, endpoint: str) -> None:
-        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
-        assert bus is not None
-        self.bus = bus
+        self.bus = open_bus_within(ClientConfig(connect=endpoint), CONNECT_S)
         self.streams = Streams()
+        self.refusals = Refusals("viewer")
         self._latencies_ms: list[float] = []
         self._lock = threading.Lock()
-        self._subscriptions = [bus.subscribe(topic.key_any(), self._receive, capacity=65536) for topic in COUNTED]
+        self._subscriptions = [
+            follow(self.bus, topic.key_any(), self.refusals, self._take, capacity=65536) for topic in COUNTED
+        ]
 
     @property
     def missed(self) -> int:
         return sum(subscription.missed + subscription.dropped for subscription in self._subscriptions)
 
-    def _receive(self, received: Received) -> None:
-        parsed = parse_key(received.key)
-        assert parsed is not None
+    def _take(self, envelope: Envelope) -> None:
         with self._lock:
-            self.streams.take(received.key, parsed[0], received.payload)
-            if parsed[0] is POSE:
-                pose = decode(received.payload, RelativePose)
-                self._latencies_ms.append((received.receive_ns - pose.stamp_ns) / S_NS * 1e3)
+            self.streams.take(envelope)
+            if isinstance(envelope.message, RelativePose):
+                self._latencies_ms.append((envelope.time_ns - envelope.message.stamp_ns) / S_NS * 1e3)
 
     def counts(self) -> Counter[str]:
         with self._lock:
@@ -105,12 +100,9 @@ class Viewer:
 def streams_of(log: Path) -> Streams:
     """Return what a log holds, in the order in which it was written."""
     streams = Streams()
-    topics = {topic.name for topic in COUNTED}
     with DiveLogReader(log) as reader:
-        for record in reader.records(lambda key: (p := parse_key(key)) is not None and p[0].name in topics):
-            parsed = parse_key(record.key)
-            assert parsed is not None
-            streams.take(record.key, parsed[0], record.payload)
+        for record in reader.records(lambda key: (p := parse_key(key)) is not None and p[0] in COUNTED):
+            streams.take(record.open())
     return streams
 
 
@@ -121,22 +113,3 @@ def stamps_of(log: Path) -> dict[str, array[int]]:
         for record in reader.records():
             stamps.setdefault(record.key, array("q")).append(record.publish_time_ns)
     return {key: array("q", sorted(found)) for key, found in stamps.items()}
-
-
-@dataclass(frozen=True)
-class Load:
-    """What a process takes: resident memory, open files, processor time since its start."""
-
-    rss_mb: float
-    fds: int
-    cpu_s: float
-
-
-def load_of(pid: int) -> Load:
-    process = Path(f"/proc/{pid}")
-    fields = (process / "stat").read_text().rpartition(")")[2].split()
-    return Load(
-        rss_mb=int((process / "statm").read_text().split()[1]) * PAGE / 1e6,
-        fds=len(os.listdir(process / "fd")),
-        cpu_s=(int(fields[11]) + int(fields[12])) / TICKS,
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import time
 from bisect import bisect_left, bisect_right
 from collections import Counter
@@ -14,9 +13,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from buddyline.protocol.clock import S_NS
+from buddyline.tools.measure.children import free_port
+from buddyline.tools.measure.load import Load, load_of
 
 from tests.processes import Process, free_endpoint
-from tests.soak.meter import Load, Stream, Streams, Viewer, load_of, stamps_of, streams_of
+from tests.soak.meter import Stream, Streams, Viewer, stamps_of, streams_of
 
 RATE_HZ = 30.0
 # The first frames wait for those of the node that starts last.
@@ -27,9 +28,9 @@ END_NS = 2 * S_NS
 # Once the publishers' caches, which hold a minute or more, and the solver's memory of the clocks' offset are full. What
 # grows then is each log's index, which is written at its end, and the monitor's picture of the dive.
 SETTLED_S = 600.0
-MAX_GROWTH_MB = 4.0
-MAX_GROWTH_MB_PER_H = 10.0
-MAX_MORE_FDS = 4
+MAX_GROWTH_MIB = 4.0
+MAX_GROWTH_MIB_PER_H = 10.0
+MAX_MORE_FILES = 4
 # Of the p99 of a minute's latencies: the median of the last third over that of the first.
 MAX_P99_RATIO, MAX_P99_MORE_MS = 1.5, 10.0
 
@@ -53,7 +54,7 @@ environment = "basin"
 
 @dataclass
 class Minute:
-    """A line of the report. rates_hz: by topic, of all nodes. pace_ms: what tests/soak/pace.py took, median and p99."""
+    """A line of the report. rates_hz: by topic, of all nodes. pace_ms: of tools/measure/pace.py, median and p99."""
 
     at_s: float
     rates_hz: dict[str, float]
@@ -107,7 +108,7 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
             config = directory / f"{node}.toml"
             config.write_text(NODE.format(node=node, endpoint=endpoint, rate_hz=RATE_HZ, directory=directory))
             start(f"node {node}", "connected", "--config", str(config), module="tests.soak.node")
-        pace = stack.enter_context(Process(module="tests.soak.pace"))
+        pace = stack.enter_context(Process(module="buddyline.tools.measure.pace"))
         _measure(result, processes, viewer, pace, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("node a", "node b")}
         # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
@@ -118,15 +119,10 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
         result.failures += [f"{name}: exit status {status}" for name, status in statuses.items() if status]
         for name, process in processes.items():
             result.failures += [f"{name}: {line}" for line in process.lines if line.startswith(("E ", "Traceback"))]
+    result.failures += viewer.refusals.lines()
     _compare(result, directory, viewer.streams)
     _judge_loads(result)
     return result
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _measure(
@@ -206,11 +202,11 @@ def _judge_loads(result: Result) -> None:
     first, last = settled[0], settled[-1]
     hours = (last.at_s - first.at_s) / 3600
     for name, load in last.loads.items():
-        grown_mb, more_fds = load.rss_mb - first.loads[name].rss_mb, load.fds - first.loads[name].fds
-        if last.at_s > SETTLED_S and grown_mb > MAX_GROWTH_MB + MAX_GROWTH_MB_PER_H * hours:
-            result.failures.append(f"{name}: grew by {grown_mb:.1f} MB in {hours:.2f} h")
-        if more_fds > MAX_MORE_FDS:
-            result.failures.append(f"{name}: {more_fds} more open files")
+        grown_mib, more_files = load.rss_mib - first.loads[name].rss_mib, load.files - first.loads[name].files
+        if last.at_s > SETTLED_S and grown_mib > MAX_GROWTH_MIB + MAX_GROWTH_MIB_PER_H * hours:
+            result.failures.append(f"{name}: grew by {grown_mib:.1f} MiB in {hours:.2f} h")
+        if more_files > MAX_MORE_FILES:
+            result.failures.append(f"{name}: {more_files} more open files")
     third = len(settled) // 3
     if third >= 2:
         early, late = (median([m.p99_ms for m in part]) for part in (settled[:third], settled[-third:]))

@@ -32,7 +32,7 @@ def test_errors_stand_over_the_bound_and_choices_beside_the_range_gap(capsys, mo
         assert 0.5 < row["over_bound"]["refined"][0] < 1.6
         assert row["over_bound"]["paper_literal"][0] > row["over_bound"]["refined"][0]
     assert figures["choices"][0]["sensors"] >= 0.8
-    assert "RMSE over the bound" in accuracy.table(**figures)
+    assert "RMSE over the bound" in accuracy.table(figures)
 
 
 def test_simulated_lights_fall_where_they_are_said_to():

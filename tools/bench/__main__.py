@@ -1,4 +1,7 @@
-"""`python -m buddyline.tools.bench BENCHMARK`: one each, imported when it is called."""
+"""`python -m buddyline.tools.bench BENCHMARK`: one each, imported when it is called.
+
+A benchmark is a module with add_arguments(parser), measure(args) and table(figures).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,9 @@ from importlib import import_module
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.measure.tables import write
 
+PROGRAM: Final = "python -m buddyline.tools.bench"
 BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
     "accuracy": "the solver: errors over the Cramer-Rao bound, and the right lights among false ones",
@@ -20,22 +25,27 @@ BENCHMARKS: Final = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one benchmark; return the exit status."""
+    """Run one benchmark, print its figures; return the exit status."""
     listing = "\n".join(f"  {name:8} {does}" for name, does in BENCHMARKS.items())
     parser = argparse.ArgumentParser(
-        prog="python -m buddyline.tools.bench",
+        prog=PROGRAM,
         description=f"benchmarks:\n{listing}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("benchmark", choices=list(BENCHMARKS), metavar="BENCHMARK")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="its own; see BENCHMARK --help")
-    args = parser.parse_args(argv)
-    run = import_module(f"buddyline.tools.bench.{args.benchmark}").main
+    chosen = parser.parse_args(argv)
+    benchmark = import_module(f"buddyline.tools.bench.{chosen.benchmark}")
+    own = argparse.ArgumentParser(prog=f"{PROGRAM} {chosen.benchmark}", description=benchmark.__doc__)
+    benchmark.add_arguments(own)
+    own.add_argument("--json", action="store_true", help="print the figures as JSON")
+    args = own.parse_args(chosen.arguments)
     try:
-        return int(run(args.arguments))
+        write(benchmark.measure(args), benchmark.table, as_json=args.json)
     except BuddylineError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
+    return 0
 
 
 if __name__ == "__main__":

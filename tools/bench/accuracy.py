@@ -10,18 +10,19 @@ ranges agree best), by pictures alone, and with attitude and depth; then wrong p
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.geometry.closed_form import closed_form
-from buddyline.solver_service.geometry.rotation import matrix_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
 from buddyline.solver_service.geometry.trigger import Fix, Settings
-from buddyline.tools.bench.triggers import CAMERA, RIG, Trigger, images, simulate
+from buddyline.tools.bench.triggers import CAMERA, INFO, RIG, Trigger, simulate
+from buddyline.tools.bound import pose_bounds
+from buddyline.tools.evaluation.poses import WRONG_SHARE
+from buddyline.tools.measure.tables import cells_of, text_table
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -32,26 +33,21 @@ PNP: Final = {"solvePnP": cv2.SOLVEPNP_ITERATIVE, "SQPnP": cv2.SOLVEPNP_SQPNP}
 METHODS: Final = ("refined", "exact", "paper", "paper_midpoint", "paper_literal")
 BANDS_M: Final = ((1.5, 4.0), (4.0, 10.0), (10.0, 20.0))
 FALSE: Final = (1, 2, 4, 8, 16)
-WRONG: Final = 0.1
-STEP: Final = 1e-6
 
 
-def main(argv: list[str]) -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench accuracy", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the benchmark's arguments."""
     parser.add_argument("--triggers", type=int, default=200, metavar="N", help="of each kind")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+
+
+def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
+    """Return the errors over the bound by range and noise, and the choices by range and false candidates."""
     if args.triggers < 1:
         raise BuddylineError("--triggers: at least 1")
-    errors = [over_bound(range_m, sigma_px, args.triggers) for range_m in RANGES_M for sigma_px in SIGMAS_PX]
-    choices = [choice(band_m, false, args.triggers) for band_m in BANDS_M for false in FALSE]
-    if args.json:
-        json.dump({"errors": errors, "choices": choices}, sys.stdout, indent=1)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write(table(errors, choices))
-    return 0
+    return {
+        "errors": [over_bound(range_m, sigma_px, args.triggers) for range_m in RANGES_M for sigma_px in SIGMAS_PX],
+        "choices": [choice(band_m, false, args.triggers) for band_m in BANDS_M for false in FALSE],
+    }
 
 
 def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
@@ -60,7 +56,8 @@ def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
     bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in (*METHODS, *PNP)}, []
     for _ in range(count):
         trigger = simulate(rng, (range_m, range_m), sigma_px=sigma_px)
-        bound += limit(trigger, sigma_px)
+        covariance = pose_bounds(trigger.t_a_b_m[None], quaternion_of(trigger.R_a_b)[None], INFO, INFO, sigma_px)[0]
+        bound += np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
         for method in METHODS:
             settings = Settings(method=method, min_probability=0.0, range_min_m=0.5, range_max_m=60.0)
             fix = trigger.solve(settings, sensors=False)
@@ -103,17 +100,6 @@ def one_view(trigger: Trigger, sigma_px: float, rng: np.random.Generator) -> dic
     return poses
 
 
-def limit(trigger: Trigger, sigma_px: float) -> tuple[float, float]:
-    """Return the bound's traces: position, m^2, and rotation, rad^2."""
-    columns = []
-    for step in STEP * np.eye(6):
-        ends = [images(trigger.t_a_b_m + s[:3], rotation_exp(s[3:]) @ trigger.R_a_b) for s in (step, -step)]
-        columns.append((ends[0] - ends[1]).ravel() / (2.0 * STEP))
-    J = np.array(columns).T
-    covariance = sigma_px**2 * np.linalg.inv(J.T @ J)
-    return float(np.trace(covariance[:3, :3])), float(np.trace(covariance[3:, 3:]))
-
-
 def choice(band_m: tuple[float, float], false: int, count: int) -> dict[str, Any]:
     """Return the shares of right choices, and of wrong poses among all poses."""
     rng = np.random.default_rng(false)
@@ -127,7 +113,7 @@ def choice(band_m: tuple[float, float], false: int, count: int) -> dict[str, Any
             if isinstance(fix, Fix):
                 off = float(np.linalg.norm(fix.t_a_b_m - trigger.t_a_b_m) / np.linalg.norm(trigger.t_a_b_m))
                 counts[0] += trigger.right(fix)
-                counts[1] += off > WRONG
+                counts[1] += off > WRONG_SHARE
                 counts[2] += 1
     for name, (right, wrong, poses) in tally.items():
         row[name] = right / count
@@ -154,25 +140,27 @@ def trigger_by_range_gap(trigger: Trigger) -> bool:
     return chosen == [trigger.pair_a, trigger.pair_b]
 
 
-def table(errors: list[dict[str, Any]], choices: list[dict[str, Any]]) -> str:
+def table(figures: dict[str, list[dict[str, Any]]]) -> str:
     """Return both tables for a person."""
-    lines = [
-        "RMSE over the bound, position / rotation",
-        "range sigma    bound          " + "  ".join((*METHODS, *PNP)) + "  NEES",
+    errors = {
+        "range": "{range_m:.1f} m",
+        "sigma": "{sigma_px:.1f} px",
+        "bound": "{bound_mm:.1f} mm {bound_deg:.3f} deg",
+        **{name: f"{{over_bound[{name}][0]:.3f}}/{{over_bound[{name}][1]:.3f}}" for name in (*METHODS, *PNP)},
+        "NEES": "{nees:.3f}",
+    }
+    choices = {
+        "range": "{range_m[0]:.1f}-{range_m[1]:.1f} m",
+        "false": "{false}",
+        "range gap alone": "{range_gap_alone:.3f}",
+        "pictures (wrong)": "{pictures:.3f} ({pictures_wrong:.4f})",
+        "with sensors (wrong)": "{sensors:.3f} ({sensors_wrong:.4f})",
+    }
+    scaled = [
+        row | {"bound_mm": 1e3 * row["bound_m"], "bound_deg": math.degrees(row["bound_rad"])}
+        for row in figures["errors"]
     ]
-    for row in errors:
-        ratios = "  ".join(f"{position:.3f}/{rotation:.3f}" for position, rotation in row["over_bound"].values())
-        bound = f"{1e3 * row['bound_m']:6.1f} mm {math.degrees(row['bound_rad']):.3f} deg"
-        lines.append(f"{row['range_m']:4.1f}m {row['sigma_px']:.1f}px  {bound}  {ratios}  {row['nees']:.3f}")
-    lines += [
-        "",
-        "right lights, and wrong poses of all poses",
-        "range      false  range gap alone  pictures       with sensors",
-    ]
-    for row in choices:
-        low, high = row["range_m"]
-        lines.append(
-            f"{low:4.1f}-{high:4.1f} m  {row['false']:3d}     {row['range_gap_alone']:.3f}       "
-            f"{row['pictures']:.3f} {row['pictures_wrong']:.4f}   {row['sensors']:.3f} {row['sensors_wrong']:.4f}"
-        )
-    return "\n".join(lines) + "\n"
+    return (
+        f"RMSE over the bound, position / rotation\n{text_table(cells_of(scaled, errors))}\n\n"
+        f"right lights, and wrong poses of all poses\n{text_table(cells_of(figures['choices'], choices))}"
+    )

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import socket
 import statistics
 import subprocess
 import sys
@@ -21,16 +19,20 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.bus import Bus
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
 from buddyline.protocol.topics import CANDIDATES, IMAGE, POSE
+from buddyline.tools.client import ClientConfig
+from buddyline.tools.live import follow, open_bus_within
+from buddyline.tools.measure.children import Child, free_endpoint, free_port
+from buddyline.tools.measure.tables import cells_of, text_table
 
 RATE_HZ: Final = 30
 DIVE_S: Final = 120
@@ -46,86 +48,51 @@ SOLVED: Final = "the solver finds the pose"
 CHROMIUM_FLAGS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-def main(argv: list[str]) -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench monitor", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the benchmark's arguments."""
     parser.add_argument("--minutes", type=float, default=2.0, help="when CPU and memory are read again; default: 2")
     parser.add_argument("--viewers", type=int, nargs="+", default=[1, 3], metavar="N", help="default: 1 3")
     parser.add_argument("--rounds", type=int, default=4, help="of latency with and without; default: 4")
     parser.add_argument("--round-s", type=float, default=15.0, help="default: 15")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the page's weight, the latency by turns with and without a monitor, and what monitors take."""
     if args.minutes < 1 or min(args.viewers) < 1 or args.rounds < 0:
         raise BuddylineError("--minutes: 1 or more; --viewers: 1 or more; --rounds: 0 or more")
-    with tempfile.TemporaryDirectory() as directory, ExitStack() as stack:
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
-        bus = stack.enter_context(playing(Path(directory), endpoint))
-        latencies = measure_latency(bus, endpoint, args.rounds, args.round_s)
-        figures = {
+    endpoint = free_endpoint()
+    with tempfile.TemporaryDirectory() as directory, playing(Path(directory), endpoint) as bus:
+        return {
+            "latency": measure_latency(bus, endpoint, args.rounds, args.round_s),
             "page": measure_page(endpoint),
-            "latency": latencies,
             "servers": measure_servers(endpoint, args.viewers, args.minutes),
         }
-    print(json.dumps(figures) if args.json else "\n".join(table(figures)))
-    return 0
-
-
-def free_port() -> int:
-    """Return a port of loopback that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@contextmanager
-def running(*words: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a `buddyline` command until left."""
-    with tempfile.TemporaryFile() as said:
-        child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "buddyline", *words], stdin=subprocess.DEVNULL, stdout=said, stderr=said
-        )
-        try:
-            yield child
-        finally:
-            early = child.poll()
-            child.terminate()
-            try:
-                child.wait(10)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait(10)
-            if early is not None:
-                said.seek(0)
-                last = said.read().decode(errors="replace").splitlines()[-5:]
-                print(f"buddyline {words[0]} ended with {early}: {' | '.join(last)}", file=sys.stderr)
 
 
 @contextmanager
 def playing(directory: Path, endpoint: str) -> Iterator[Bus]:
     """Run hub, solver and a dive over and over, with previews; give a bus to listen on once poses come."""
-    from buddyline.protocol.zenoh_bus import connect
-
     dive = str(directory / "dive.mcap")
     made = [sys.executable, "-P", "-m", "buddyline", "simulate", dive, "--rate", str(RATE_HZ), "--seconds", str(DIVE_S)]
     subprocess.run([*made, "--undisturbed", "--range-max", "8"], check=True, capture_output=True)
-    stop = threading.Event()
-    with running("hub", "--listen", endpoint), running("solver", "--connect", endpoint):
-        bus = connect(endpoint, namespace=None, stop=stop, on_wait=lambda _: None)
-        if bus is None:
-            raise BuddylineError("no hub came up")
-        with bus, running("play", dive, "--loop", "--connect", endpoint):
-            previews = threading.Thread(target=_previews, args=(bus, stop))
-            previews.start()
-            try:
-                came = threading.Event()
-                watching = bus.subscribe(POSE.key_any(), lambda _: came.set(), history=False)
-                if not came.wait(READY_S):
-                    raise BuddylineError(f"no pose within {READY_S:g} s")
-                watching.close()
-                yield bus
-            finally:
-                stop.set()
-                previews.join(10)
+    stop, came = threading.Event(), threading.Event()
+    with (
+        Child("hub", "--listen", endpoint),
+        Child("solver", "--connect", endpoint),
+        open_bus_within(ClientConfig(connect=endpoint), READY_S) as bus,
+        Child("play", dive, "--loop", "--connect", endpoint),
+    ):
+        previews = threading.Thread(target=_previews, args=(bus, stop))
+        previews.start()
+        try:
+            watching = bus.subscribe(POSE.key_any(), lambda _: came.set(), history=False)
+            if not came.wait(READY_S):
+                raise BuddylineError(f"no pose within {READY_S:g} s")
+            watching.close()
+            yield bus
+        finally:
+            stop.set()
+            previews.join(10)
 
 
 def _previews(bus: Bus, stop: threading.Event) -> None:
@@ -142,32 +109,26 @@ def _previews(bus: Bus, stop: threading.Event) -> None:
             publisher.put(CompressedImage(timestamp=stamp, frame_id=f"{node}_camera", data=data, format="jpeg"))
 
 
-@dataclass
-class Listener:
-    """How long each pose takes to come after the later of its two candidates, s, as a third party hears both."""
+class Latencies:
+    """How long each pose takes to come after the later of its two candidates, as a third party hears both."""
 
-    _frames_ns: dict[int, dict[str, int]] = field(default_factory=dict)
-    _poses_ns: dict[int, int] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self._frames_ns: dict[int, list[int]] = {}
+        self._poses_ns: dict[int, int] = {}
 
-    def candidates(self, received: Received) -> None:
-        """Take a frame's candidates."""
-        message = received.open().message
-        if isinstance(message, Candidates):
-            self._frames_ns.setdefault(message.trigger, {})[message.node] = received.receive_ns
+    def take(self, envelope: Envelope) -> None:
+        """Take a frame's candidates or a pose."""
+        if isinstance(envelope.message, Candidates):
+            self._frames_ns.setdefault(envelope.message.trigger, []).append(envelope.time_ns)
+        elif isinstance(envelope.message, RelativePose):
+            self._poses_ns[envelope.message.trigger] = envelope.time_ns
 
-    def pose(self, received: Received) -> None:
-        """Take a pose."""
-        message = received.open().message
-        if isinstance(message, RelativePose):
-            self._poses_ns[message.trigger] = received.receive_ns
-
-    @property
-    def latencies_s(self) -> list[float]:
-        """All so far. Threads take frames and poses in any order, so they are matched here."""
+    def seconds(self) -> list[float]:
+        """Return all so far. Threads take frames and poses in any order, so they are matched here."""
         return [
-            (pose_ns - max(frames_ns.values())) / 1e9
+            (pose_ns - max(frames_ns)) / 1e9
             for trigger, pose_ns in self._poses_ns.items()
-            if len(frames_ns := self._frames_ns.get(trigger, {})) == 2
+            if len(frames_ns := self._frames_ns.get(trigger, [])) == 2
         ]
 
 
@@ -181,15 +142,15 @@ def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dic
                     address = stack.enter_context(monitor(endpoint))[1]
                     stack.enter_context(viewer(address))
                 time.sleep(SETTLE_S)
-                listener = Listener()
+                latencies, refusals = Latencies(), Refusals("bench")
                 subscriptions = [
-                    bus.subscribe(CANDIDATES.key_any(), listener.candidates, history=False),
-                    bus.subscribe(POSE.key_any(), listener.pose, history=False),
+                    follow(bus, topic.key_any(), refusals, latencies.take, history=False)
+                    for topic in (CANDIDATES, POSE)
                 ]
                 time.sleep(round_s)
                 for subscription in subscriptions:
                     subscription.close()
-            latencies_s = listener.latencies_s
+            latencies_s = latencies.seconds()
             if not latencies_s:
                 raise BuddylineError("no poses came")
             result[f"{name}_s"].append(statistics.median(latencies_s))
@@ -198,22 +159,22 @@ def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dic
 
 
 @contextmanager
-def monitor(endpoint: str) -> Iterator[tuple[int, str]]:
-    """Run a monitor; give its process id and the page's address once that answers."""
+def monitor(endpoint: str) -> Iterator[tuple[Child, str]]:
+    """Run a monitor; give it and the page's address once that answers."""
     port = free_port()
-    with running("monitor", "--connect", endpoint, "--port", str(port)) as child:
-        address = f"127.0.0.1:{port}"
-        deadline_s = time.monotonic() + READY_S
+    address = f"127.0.0.1:{port}"
+    with Child("monitor", "--connect", endpoint, "--port", str(port)) as child:
+        ends_s = time.monotonic() + READY_S
         while True:
             try:
                 urllib.request.urlopen(f"http://{address}", timeout=5).close()
             except OSError as error:
-                if time.monotonic() > deadline_s or child.poll() is not None:
-                    raise BuddylineError("the monitor's page does not come up") from error
+                if (death := child.death()) or time.monotonic() > ends_s:
+                    raise BuddylineError(death or "the monitor's page does not come up") from error
                 time.sleep(0.1)
             else:
                 break
-        yield child.pid, address
+        yield child, address
 
 
 @contextmanager
@@ -258,44 +219,25 @@ def measure_servers(endpoint: str, viewers: list[int], minutes: float) -> list[d
     with ExitStack() as stack:
         started = []
         for count in viewers:
-            pid, address = stack.enter_context(monitor(endpoint))
-            started.append((count, pid, [stack.enter_context(viewer(address)) for _ in range(count)]))
+            child, address = stack.enter_context(monitor(endpoint))
+            started.append((count, child, [stack.enter_context(viewer(address)) for _ in range(count)]))
         began_s = time.monotonic()
         for at_s in sorted({60.0, minutes * 60}):
             time.sleep(max(began_s + at_s - WINDOW_S - time.monotonic(), 0))
-            before = [(_cpu_s(pid), sum(one[0] for one in taken), time.monotonic()) for _, pid, taken in started]
+            before = [(child.load(), sum(one[0] for one in taken), time.monotonic()) for _, child, taken in started]
             time.sleep(max(began_s + at_s - time.monotonic(), 1.0))
-            for (count, pid, taken), (cpu_s, taken_before, then_s) in zip(started, before, strict=True):
-                span_s = time.monotonic() - then_s
+            for (count, child, taken), (early, taken_before, then_s) in zip(started, before, strict=True):
+                late, span_s = child.load(), time.monotonic() - then_s
                 row = {
                     "viewers": count,
                     "minutes": at_s / 60,
-                    "cpu_share": (_cpu_s(pid) - cpu_s) / span_s,
-                    "rss_mib": _rss_mib(pid),
+                    "cpu_share": (late.cpu_s - early.cpu_s) / span_s,
+                    "rss_mib": late.rss_mib,
                     "to_each_kbyte_s": (sum(one[0] for one in taken) - taken_before) / count / span_s / 1e3,
                 }
                 rows.append(row)
                 print(json.dumps(row), file=sys.stderr, flush=True)
     return rows
-
-
-def _cpu_s(pid: int) -> float:
-    fields = _proc(pid, "stat").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-
-def _rss_mib(pid: int) -> float:
-    rows = [row for row in _proc(pid, "status").splitlines() if row.startswith("VmRSS:")]
-    if not rows:
-        raise BuddylineError(f"process {pid} has ended")
-    return int(rows[0].split()[1]) / 1024
-
-
-def _proc(pid: int, name: str) -> str:
-    try:
-        return Path(f"/proc/{pid}/{name}").read_text()
-    except OSError as error:
-        raise BuddylineError(f"process {pid} cannot be measured: {error.strerror}") from error
 
 
 def measure_page(endpoint: str) -> dict[str, float]:
@@ -339,25 +281,25 @@ def _first_scene_s(address: str) -> float | None:
             browser.close()
 
 
-def table(figures: dict[str, Any]) -> list[str]:
-    """Return the figures as lines."""
+def table(figures: dict[str, Any]) -> str:
+    """Return the figures for a person."""
     page, latency = figures["page"], figures["latency"]
-    rows = [f"page {page['page_kbyte']:.0f} KB as served; first two seconds {page['first_two_seconds_kbyte']:.0f} KB"]
+    lines = [f"page {page['page_kbyte']:.0f} KB as served; first two seconds {page['first_two_seconds_kbyte']:.0f} KB"]
     if "first_scene_s" in page:
-        rows.append(f"first scene after {page['first_scene_s']:.1f} s (Chromium, drawing in software)")
+        lines.append(f"first scene after {page['first_scene_s']:.1f} s (Chromium, drawing in software)")
     if latency["with_s"]:
         ratios = [a / b for a, b in zip(latency["with_s"], latency["without_s"], strict=True)]
-        rows.append(
-            f"candidates to pose, median: {1e3 * statistics.median(latency['without_s']):.2f} ms without, "
-            f"{1e3 * statistics.median(latency['with_s']):.2f} ms with; ratio {statistics.median(ratios):.2f} "
-            f"({min(ratios):.2f}-{max(ratios):.2f} in {len(ratios)} rounds); "
-            f"p99 {1e3 * statistics.median(latency['without_p99_s']):.1f} and "
-            f"{1e3 * statistics.median(latency['with_p99_s']):.1f} ms"
+        ms = {name: 1e3 * statistics.median(values) for name, values in latency.items()}
+        lines.append(
+            f"candidates to pose, median: {ms['without_s']:.2f} ms without, {ms['with_s']:.2f} ms with; "
+            f"ratio {statistics.median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f} in {len(ratios)} rounds); "
+            f"p99 {ms['without_p99_s']:.1f} and {ms['with_p99_s']:.1f} ms"
         )
-    rows.append(f"{'viewers':>8}{'minutes':>9}{'CPU, % of a core':>18}{'RSS, MiB':>10}{'KB/s to each':>14}")
-    for row in figures["servers"]:
-        rows.append(
-            f"{row['viewers']:8}{row['minutes']:9.0f}{100 * row['cpu_share']:18.1f}{row['rss_mib']:10.0f}"
-            f"{row['to_each_kbyte_s']:14.0f}"
-        )
-    return rows
+    columns = {
+        "viewers": "{viewers}",
+        "minutes": "{minutes:.0f}",
+        "CPU, of a core": "{cpu_share:.1%}",
+        "RSS, MiB": "{rss_mib:.0f}",
+        "KB/s to each": "{to_each_kbyte_s:.0f}",
+    }
+    return "\n".join([*lines, text_table(cells_of(figures["servers"], columns))])

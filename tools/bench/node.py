@@ -10,12 +10,7 @@ pipeline come on top.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
-import resource
-import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -43,6 +38,8 @@ from buddyline.node.service import NodeService
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, Message, NodeInfo
+from buddyline.tools.measure.children import Child, free_endpoint
+from buddyline.tools.measure.load import load_of
 from numpy.typing import NDArray
 
 PICTURES: Final = 24
@@ -53,80 +50,57 @@ FORCE_MPS2: Final = np.array([0.0, 0.0, -9.81])
 FIELD_T: Final = np.array([2.2e-5, 0.0, 4.4e-5])
 
 
-def main(argv: list[str]) -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench node", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the benchmark's arguments."""
     parser.add_argument("--environment", default="cavern")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="default: 60, after 5 to warm up")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="default: 10")
     parser.add_argument("--width", type=int, default=1640, metavar="PX", help="default: 1640, by 1232")
     parser.add_argument("--images", type=float, default=2.0, metavar="HZ", help="recorded pictures; default: 2")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """Run one node for so long; return its figures."""
     if args.seconds < 2 or args.rate <= 0 or args.width < 64:
         raise BuddylineError("--seconds: at least 2; --rate: above 0; --width: at least 64")
-    figures = measure(args.environment, args.seconds, args.rate, args.width, args.images)
-    if args.json:
-        json.dump(figures, sys.stdout, indent=1)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write(table(figures))
-    return 0
-
-
-def measure(environment: str, seconds: float, rate_hz: float, width_px: int, images_hz: float) -> dict[str, Any]:
-    """Run one node for so long; return its figures."""
-    endpoint = _free_endpoint()
-    height_px = round(width_px * 1232 / 1640)
     config = NodeConfig(
         node="a",
-        connect=endpoint,
-        rate_hz=rate_hz,
-        camera=CameraConfig(name="bench", width_px=width_px, height_px=height_px),
+        connect=free_endpoint(),
+        rate_hz=args.rate,
+        camera=CameraConfig(name="bench", width_px=args.width, height_px=round(args.width * 1232 / 1640)),
         sensors=SensorsConfig(name="bench"),
-        simulation=SimulationConfig(environment=environment),
+        simulation=SimulationConfig(environment=args.environment),
     )
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, Child("hub", "--listen", config.connect):
         pictures, info = _prepared(config, Path(folder) / "pictures.npy")
-        config = _on_this_disk(config, info, Path(folder) / "dives", images_hz)
-        camera = PreparedCamera(pictures, config.trigger_period_ns)
-        service = MeasuredNode(config, camera)
-        hub = subprocess.Popen(
-            [sys.executable, "-P", "-m", "buddyline", "hub", "--listen", endpoint],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        config = _on_this_disk(config, info, Path(folder) / "dives", args.images)
+        service = MeasuredNode(config, PreparedCamera(pictures, config.trigger_period_ns))
         try:
             service.open()
             service.start()
-            figures = _watch(service, seconds)
+            figures = _watch(service, args.seconds)
         finally:
             status = service.close()
-            hub.terminate()
-            hub.wait()
         if status:
             raise BuddylineError(f"the node ended with status {status}")
-        log_bytes = service.recorder.path.stat().st_size
-        figures["log_kb_per_s"] = log_bytes / 1e3 / (seconds + WARM_UP_S)
-        return figures | {"environment": environment, "width_px": width_px, "rate_hz": rate_hz, "images_hz": images_hz}
+        figures["log_kb_per_s"] = service.recorder.path.stat().st_size / 1e3 / (args.seconds + WARM_UP_S)
+    asked = {"width_px": args.width, "rate_hz": args.rate, "images_hz": args.images}
+    return figures | {"environment": args.environment, **asked}
 
 
 def table(figures: dict[str, Any]) -> str:
     """Return the figures for a person."""
     rss = ", ".join(f"{mib:.1f} MiB after {minutes:g} min" for minutes, mib in figures["rss_mib"])
-    lines = [
-        f"{figures['environment']}, {figures['width_px']} px wide, {figures['rate_hz']:g} Hz, "
-        f"{figures['images_hz']:g} pictures a second recorded; {figures['frames']} frames",
-        f"capture to candidates published   median {figures['median_ms']:.1f} ms, p99 {figures['p99_ms']:.1f} ms, "
-        f"most {figures['most_ms']:.1f} ms",
-        f"processor, of one core            {100 * figures['cpu']:.1f} %",
-        f"memory (RSS)                      {rss}",
-        f"log without pictures              {figures['log_kb_per_s']:.1f} kB/s",
-        "rates, Hz                         "
-        + ", ".join(f"{name} {rate:.1f}" for name, rate in sorted(figures["rates_hz"].items())),
-        f"dropped                           {figures['dropped']}",
-    ]
-    return "\n".join(lines) + "\n"
+    rates = ", ".join(f"{name} {rate:.1f}" for name, rate in sorted(figures["rates_hz"].items()))
+    return (
+        "{environment}, {width_px} px wide, {rate_hz:g} Hz, {images_hz:g} pictures a second recorded; {frames} frames\n"
+        "capture to candidates published   median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms, most {most_ms:.1f} ms\n"
+        "processor, of one core            {cpu:.1%}\n"
+        f"memory (RSS)                      {rss}\n"
+        "log without pictures              {log_kb_per_s:.1f} kB/s\n"
+        f"rates, Hz                         {rates}\n"
+        "dropped                           {dropped}"
+    ).format(**figures)
 
 
 class PreparedCamera:
@@ -142,9 +116,8 @@ class PreparedCamera:
         self._period_ns = period_ns
         self._number = 0
 
-    def info(self) -> NodeInfo | None:
-        """Return None: the calibration stands in the configuration."""
-        return None
+    def info(self) -> None:
+        """The calibration stands in the configuration."""
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
         """Wait for the next instant."""
@@ -227,15 +200,16 @@ def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
             raise BuddylineError("the node did not come to its hub")
     service.stop.wait(WARM_UP_S)
     first, sent = len(service.times_s), service.outlet.sent.copy()
-    began_s, used_s = time.monotonic(), _used_s()
+    began_s, began = time.monotonic(), load_of()
     rss_mib: list[tuple[float, float]] = []
     while (passed_s := time.monotonic() - began_s) < seconds:
         if passed_s >= 60.0 and not rss_mib:
-            rss_mib.append((1.0, _rss_mib()))
+            rss_mib.append((1.0, load_of().rss_mib))
         if service.stop.wait(min(1.0, seconds - passed_s)):
             raise BuddylineError("the node ended")
-    cpu = (_used_s() - used_s) / passed_s
-    rss_mib.append((round(passed_s / 60.0, 1), _rss_mib()))
+    ended = load_of()
+    cpu = (ended.cpu_s - began.cpu_s) / passed_s
+    rss_mib.append((round(passed_s / 60.0, 1), ended.rss_mib))
     times_ms = 1e3 * np.array(service.times_s[first:])
     if not len(times_ms):
         raise BuddylineError("not one frame came through")
@@ -280,19 +254,3 @@ def _on_this_disk(config: NodeConfig, info: NodeInfo, directory: Path, images_hz
     )
     record = RecordConfig(directory=str(directory), images_hz=images_hz)
     return replace(config, calibration=calibration, record=record)
-
-
-def _free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def _used_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
-
-
-def _rss_mib() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20

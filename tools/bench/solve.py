@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import json
 import math
 import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from shutil import which
 from typing import Any, Final
@@ -24,7 +22,9 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.geometry.closed_form import eq1_range_m
 from buddyline.solver_service.geometry.trigger import Fix, Settings
-from buddyline.tools.bench.triggers import Trigger, simulate
+from buddyline.tools.bench.triggers import simulate
+from buddyline.tools.measure.tables import cells_of, text_table
+from buddyline.tools.measure.turns import fastest_s
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -46,81 +46,61 @@ void eq1(long n, const double *alpha, const double *beta, double d, double *l)
 EVALUATIONS: Final = 200_000
 
 
-def main(argv: list[str]) -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(prog="python -m buddyline.tools.bench solve", description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the benchmark's arguments."""
     parser.add_argument("--candidates", type=int, nargs="+", default=list(COUNTS), metavar="N", help="a side")
     parser.add_argument("--repeats", type=int, default=15, help="of each trigger; the fastest counts")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args(argv)
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """Return all figures, times as the median over triggers of the fastest repeat."""
     if min(args.candidates) < 2 or max(args.candidates) > 64 or args.repeats < 1:
         raise BuddylineError("--candidates: 2 to 64, as a message holds; --repeats: at least 1")
-    figures = measure(sorted(set(args.candidates)), args.repeats)
-    if args.json:
-        json.dump(figures, sys.stdout, indent=1)
-        sys.stdout.write("\n")
-    else:
-        sys.stdout.write(table(figures))
-    return 0
-
-
-def measure(counts: list[int], repeats: int) -> dict[str, Any]:
-    """Return all figures, times as the median over triggers of the fastest repeat."""
-    rows = []
-    for count in counts:
-        row: dict[str, Any] = {"candidates": count, "hypotheses": (count * (count - 1)) ** 2}
-        for name, sensors in (("alone_ms", False), ("sensors_ms", True)):
-            rng = np.random.default_rng(count)
-            triggers = [simulate(rng, RANGE_M, count - 2) for _ in range(TRIGGERS)]
-            times, right = zip(*(timed(trigger, sensors, repeats) for trigger in triggers), strict=True)
-            row[name] = 1e3 * float(np.median(times))
-            row[name.replace("_ms", "_solved")] = sum(right) / TRIGGERS
-        row["ns_per_hypothesis"] = 1e6 * row["sensors_ms"] / row["hypotheses"]
-        row["ns_per_combination"] = 4.0 * row["ns_per_hypothesis"]
-        rows.append(row)
-    figures: dict[str, Any] = {"solver": rows, "eq1_numpy_ns": eq1_numpy_ns(repeats), "eq1_c_ns": eq1_c_ns(repeats)}
+    rows = [solved(count, args.repeats) for count in sorted(set(args.candidates))]
+    figures = {"solver": rows, "eq1_numpy_ns": eq1_numpy_ns(args.repeats), "eq1_c_ns": eq1_c_ns(args.repeats)}
     by_count = {row["candidates"]: row["sensors_ms"] for row in rows}
     if {16, 64} <= by_count.keys():
         figures["growth_16_to_64"] = math.log(by_count[64] / by_count[16]) / math.log(4.0)
     return figures
 
 
+def solved(count: int, repeats: int) -> dict[str, Any]:
+    """Return the row of triggers with so many candidates a side."""
+    row: dict[str, Any] = {"candidates": count, "hypotheses": (count * (count - 1)) ** 2}
+    for name, sensors in (("alone", False), ("sensors", True)):
+        rng = np.random.default_rng(count)
+        triggers = [simulate(rng, RANGE_M, count - 2) for _ in range(TRIGGERS)]
+        works = [partial(trigger.solve, SETTINGS, sensors=sensors) for trigger in triggers]
+        row[f"{name}_ms"] = 1e3 * float(np.median([fastest_s(work, repeats) for work in works]))
+        row[f"{name}_solved"] = sum(isinstance(work(), Fix) for work in works) / TRIGGERS
+    row["ns_per_hypothesis"] = 1e6 * row["sensors_ms"] / row["hypotheses"]
+    row["ns_per_combination"] = 4.0 * row["ns_per_hypothesis"]
+    return row
+
+
 def table(figures: dict[str, Any]) -> str:
     """Return the figures for a person."""
-    lines = ["candidates  hypotheses   ms alone (solved)   ms with sensors (solved)   ns/hypothesis  ns/combination"]
-    lines += [
-        f"{row['candidates']:10d}  {row['hypotheses']:10d}  {row['alone_ms']:8.3f} ({row['alone_solved']:4.0%})"
-        f"      {row['sensors_ms']:8.3f} ({row['sensors_solved']:4.0%})         {row['ns_per_hypothesis']:10.1f}"
-        f"      {row['ns_per_combination']:10.1f}"
-        for row in figures["solver"]
-    ]
+    columns = {
+        "candidates": "{candidates}",
+        "hypotheses": "{hypotheses}",
+        "ms alone (solved)": "{alone_ms:.3f} ({alone_solved:4.0%})",
+        "ms with sensors (solved)": "{sensors_ms:.3f} ({sensors_solved:4.0%})",
+        "ns/hypothesis": "{ns_per_hypothesis:.1f}",
+        "ns/combination": "{ns_per_combination:.1f}",
+    }
+    lines = [text_table(cells_of(figures["solver"], columns))]
     if "growth_16_to_64" in figures:
         lines.append(f"growth from 16 to 64 candidates a side: their number to the {figures['growth_16_to_64']:.2f}")
     c = figures["eq1_c_ns"]
     lines.append(
         f"Eq. 1 alone: {figures['eq1_numpy_ns']:.1f} ns in numpy, {f'{c:.1f} ns in C' if c else 'no gcc for C'}"
     )
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
-def timed(trigger: Trigger, sensors: bool, repeats: int) -> tuple[float, bool]:
-    """Return the fastest of some repeats, and whether there was a pose."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        found = trigger.solve(SETTINGS, sensors=sensors)
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), isinstance(found, Fix)
-
-
-def fastest_ns(evaluate: Callable[[], object], repeats: int) -> float:
+def eq1_ns(evaluate: Callable[[], object], repeats: int) -> float:
     """Return the fastest time of one of EVALUATIONS."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        evaluate()
-        seconds.append(time.perf_counter() - start)
-    return 1e9 * min(seconds) / EVALUATIONS
+    return 1e9 * fastest_s(evaluate, repeats) / EVALUATIONS
 
 
 def angles() -> tuple[Floats, Floats]:
@@ -133,7 +113,7 @@ def eq1_numpy_ns(repeats: int) -> float:
     """Time one Eq. 1, from its angles, in numpy."""
     alpha, beta = angles()
     length_m = np.array(0.88)
-    return fastest_ns(lambda: eq1_range_m(np.cos(alpha), np.sin(alpha), np.sin(beta), length_m), repeats)
+    return eq1_ns(lambda: eq1_range_m(np.cos(alpha), np.sin(alpha), np.sin(beta), length_m), repeats)
 
 
 def eq1_c_ns(repeats: int) -> float | None:
@@ -154,4 +134,4 @@ def eq1_c_ns(repeats: int) -> float | None:
     evaluate.restype = None
     (alpha, beta), out = angles(), np.empty(EVALUATIONS)
     a, b, c = (array.ctypes.data_as(pointer) for array in (alpha, beta, out))
-    return fastest_ns(lambda: evaluate(EVALUATIONS, a, b, 0.88, c), repeats)
+    return eq1_ns(lambda: evaluate(EVALUATIONS, a, b, 0.88, c), repeats)

@@ -7,14 +7,28 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.solver_service.geometry.rotation import quaternion_of
-from buddyline.solver_service.geometry.trigger import Camera, Fix, NoFix, Rig, Sensed, Settings, View, solve_trigger
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, Sensed, Settings, View, solve_trigger
+from buddyline.solver_service.results import rig_of
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-CAMERA: Final = Camera("pinhole", 1640, 1232, 1800.0, 1800.0, 819.5, 615.5)
-RIG: Final = Rig(CAMERA, np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]]))
+INFO: Final = NodeInfo(
+    node="x",
+    stamp_ns=0,
+    width_px=1640,
+    height_px=1232,
+    camera=CameraModel(model="pinhole", fx_px=1800.0, fy_px=1800.0, cx_px=819.5, cy_px=615.5, distortion=[0.0] * 5),
+    light_left_m=(-0.44, 0.0, 0.0),
+    light_right_m=(0.44, 0.0, 0.0),
+    sigma_px=1.0,
+    trigger_period_ns=S_NS,
+)
+RIG: Final = rig_of(INFO)
+CAMERA: Final = RIG.camera
 # As in the design's table: roll and pitch 1.4 degrees, yaw 5 and depth 3 cm between the two, 1 sd.
 TILT_SIGMA_RAD: Final = math.radians(1.0)
 HEADING_SIGMA_RAD: Final = math.radians(3.5)
