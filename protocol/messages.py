@@ -436,6 +436,7 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 
     latency: from the middle of exposure to the pose, over the last second's poses (live dives only).
     clock_skew_s: B's clock minus A's as the dive itself tells it, left out until it does.
+    unused: nodes that the solver hears and is not told to use, left out where there are none.
     """
 
     node_a: NodeId
@@ -455,3 +456,4 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     latency_p99_s: float | UnsetType = UNSET
     clock_skew_s: float | UnsetType = UNSET
     problem: str = ""
+    unused: list[NodeId] | UnsetType = UNSET

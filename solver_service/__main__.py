@@ -13,18 +13,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--config", metavar="FILE.toml", help="the solver's configuration (all of it has defaults)")
     parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, tcp/host:7447, in place of the configured one")
+    parser.add_argument("--nodes", metavar="A,B,...", help="solve the pairs of these alone, in place of the configured")
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the solver until it is stopped; return the exit status."""
     import msgspec
-    from buddyline.solver_service.config import load_solver_config
+    from buddyline.solver_service.config import load_solver_config, node_ids
     from buddyline.solver_service.service import SolverService
 
     config = load_solver_config(args.config)
     if args.connect:
         config = msgspec.structs.replace(config, connect=args.connect)
+    if args.nodes:
+        config = msgspec.structs.replace(config, nodes=node_ids([args.nodes]), pairs=[])
     service = SolverService(config, args.config or "defaults")
     service.handle_signals()
     service.start()
@@ -35,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 def main() -> int:
     """Run as a program of its own."""
     parser = argparse.ArgumentParser(
-        prog="solver_service", description="Buddyline's solver: candidates of two nodes in, relative poses out."
+        prog="solver_service", description="Buddyline's solver: candidates of the nodes in, relative poses out."
     )
     add_arguments(parser)
     start_logging()

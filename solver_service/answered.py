@@ -1,4 +1,4 @@
-"""What a solver before this one has answered, so that one that is started again says nothing twice."""
+"""What a solver before this one answered, so that one that is started again says nothing twice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Rejected, RelativePose
+from buddyline.protocol.messages import Message, Rejected, RelativePose
 
 Outcome = RelativePose | Rejected
 
@@ -19,11 +19,47 @@ LIVE_WITHIN_NS: Final = 600 * S_NS
 
 
 class Answered:
+    """The outcomes of all pairs: those that were said are withheld; `said`: each pair's last ones."""
+
+    def __init__(self, said: Iterable[Outcome] = ()) -> None:
+        self._said: dict[tuple[str, str], list[Outcome]] = {}
+        self._pairs: dict[tuple[str, str], AnsweredPair] = {}
+        for outcome in said:
+            self._said.setdefault((outcome.node_a, outcome.node_b), []).append(outcome)
+
+    def unsaid(self, messages: Iterable[Message]) -> list[Message]:
+        """Return those messages that are no outcome, or were not said before."""
+        return [
+            message
+            for message in messages
+            if not isinstance(message, Outcome) or self.pair((message.node_a, message.node_b)).is_due(message)
+        ]
+
+    def is_over(self, pairs: Iterable[tuple[str, str]], stamp_ns: int, now_ns: int) -> bool:
+        """Whether a frame out of a cache need not be solved: of a dive that goes on now, and answered long before.
+
+        pairs: of the frame's node.
+        """
+        known = [self.pair(nodes).is_over(stamp_ns, now_ns) for nodes in pairs]
+        return bool(known) and all(known)
+
+    def saw_new_frame(self, pairs: Iterable[tuple[str, str]], trigger: int) -> list[Message]:
+        """Take note of a frame that was not there when this solver joined; return what is due after all."""
+        return [outcome for nodes in pairs for outcome in self.pair(nodes).saw_new_frame(trigger)]
+
+    def pair(self, nodes: tuple[str, str]) -> AnsweredPair:
+        """Return what was said of a pair."""
+        if nodes not in self._pairs:
+            self._pairs[nodes] = AnsweredPair(self._said.pop(nodes, ()))
+        return self._pairs[nodes]
+
+
+class AnsweredPair:
     """Triggers up to one were answered; what the nodes' caches hold of them is solved again and not said again.
 
-    Solved again it is, as far as later poses are judged by earlier ones. A frame that is new cannot have been
-    answered: where its trigger was, it is another dive, or a clock was set back, and what was withheld so far is due
-    after all.
+    It is solved again as far as later poses are judged by earlier ones. A frame that is new cannot have been answered:
+    where its trigger was, it is of another dive, or a clock was set back, and what was withheld so far is due after
+    all.
     """
 
     def __init__(self, said: Iterable[Outcome] = ()) -> None:
@@ -33,24 +69,21 @@ class Answered:
         self._up_to_ns = max((one.stamp_ns for one in in_order), default=0)
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
 
-    def unsaid(self, outcomes: Iterable[Outcome]) -> list[Outcome]:
-        """Return those outcomes that have not been said before."""
-        due = []
-        for outcome in outcomes:
-            if self._up_to is not None and outcome.trigger <= self._up_to:
-                self._withheld.append(outcome)
-            else:
-                self._withheld.clear()
-                due.append(outcome)
-        return due
+    def is_due(self, outcome: Outcome) -> bool:
+        """Whether an outcome was not said before; else it is withheld."""
+        if self._up_to is not None and outcome.trigger <= self._up_to:
+            self._withheld.append(outcome)
+            return False
+        self._withheld.clear()
+        return True
 
     def is_over(self, stamp_ns: int, now_ns: int) -> bool:
-        """Whether a frame out of a cache need not be solved: of a dive that goes on now, and answered long before."""
+        """Whether the dive goes on now, and was answered well beyond stamp_ns."""
         live = self._up_to is not None and abs(now_ns - self._up_to_ns) < LIVE_WITHIN_NS
         return live and stamp_ns < self._up_to_ns - WARM_UP_NS
 
     def saw_new_frame(self, trigger: int) -> list[Outcome]:
-        """Take note of a frame that was not there when this solver joined; return what is due after all."""
+        """Take note of a frame that is new; return what is due after all."""
         if self._up_to is None or trigger > self._up_to:
             return []
         due = list(self._withheld)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.messages import NodeId
 from buddyline.protocol.security import SOLVER, Tls, check_identity
+from buddyline.protocol.topics import check_node_id
 from buddyline.solver_service.geometry.observation import Method, Settings
 from msgspec import Meta, field
 from msgspec.structs import replace
@@ -46,12 +48,13 @@ class SolveConfig(Config, frozen=True, kw_only=True):
 
 
 class SolverConfig(Config, frozen=True, kw_only=True):
-    """A whole solver. nodes: the pair [a, b]; empty: the first two that appear, in alphabetical order.
+    """A whole solver. nodes: solve every pair of these; pairs: solve these, A first. Neither: every pair that appears.
 
     status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py).
     """
 
     nodes: list[NodeId] = field(default_factory=list)
+    pairs: list[tuple[NodeId, NodeId]] = field(default_factory=list)
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
     tls: Tls | None = None
@@ -59,9 +62,26 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     solve: SolveConfig = field(default_factory=SolveConfig)
 
     def __post_init__(self) -> None:
-        """Check the pair."""
-        if len(self.nodes) not in (0, 2) or len(set(self.nodes)) != len(self.nodes):
-            raise ValueError(f"nodes: two different ids, or none, not {self.nodes}")
+        """Check nodes and pairs."""
+        if len(self.nodes) == 1 or len(set(self.nodes)) != len(self.nodes):
+            raise ValueError(f"nodes: two or more different ids, or none, not {self.nodes}")
+        if self.nodes and self.pairs:
+            raise ValueError("nodes, pairs: give one of them")
+        if any(a == b for a, b in self.pairs) or len({frozenset(pair) for pair in self.pairs}) != len(self.pairs):
+            raise ValueError(f"pairs: each of two different ids, and once, not {[list(pair) for pair in self.pairs]}")
+
+    @property
+    def chosen(self) -> list[tuple[str, str]] | None:
+        """The pairs to solve; None: all that appear."""
+        return self.pairs or list(combinations(self.nodes, 2)) or None
+
+
+def node_ids(words: list[str]) -> list[str]:
+    """Return the ids of `--nodes A B` or `--nodes A,B`; raise ConfigError where they are not two or more."""
+    ids = [check_node_id(node) for word in words for node in word.split(",")]
+    if len(ids) < 2 or len(set(ids)) != len(ids):
+        raise ConfigError(f"--nodes {' '.join(words)}: give two or more different ids")
+    return ids
 
 
 def load_solver_config(path: Path | str | None) -> SolverConfig:

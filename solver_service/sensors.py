@@ -5,16 +5,16 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, Literal, TypeVar
 
 import numpy as np
 from buddyline.protocol.clock import MS_NS, S_NS
-from buddyline.protocol.messages import Attitude, Depth
+from buddyline.protocol.messages import Attitude, Depth, Imu
 from numpy.typing import NDArray
 
-# Samples further back than this come of a clock that has been set.
+# Samples further back than this come from a clock that was set.
 HORIZON_NS: Final = 20 * S_NS
-# After an outage a node's samples wait for the other node's frames: as far as the nodes' caches reach.
+# After an outage a node's samples wait for the other node's frames, as far back as the nodes' caches reach.
 KEPT_NS: Final = 60 * S_NS
 MAX_SAMPLES: Final = 8192
 SENSOR_WAIT_NS: Final = 3 * S_NS
@@ -35,25 +35,47 @@ DEPTH_DRIFT_MPS: Final = 0.1
 S = TypeVar("S", Attitude, Depth)
 
 
+class BackwardJump:
+    """Tells samples of a clock that was set back from samples that are merely late."""
+
+    def __init__(self) -> None:
+        self._stamps: deque[int] = deque(maxlen=5)
+
+    def judge(self, stamp_ns: int, newest_ns: int | None) -> Literal["take", "drop", "restart"]:
+        """Say what to do with a sample; newest_ns: of those that are kept."""
+        if newest_ns is not None and stamp_ns < newest_ns - HORIZON_NS:
+            # A clock that jumped back is believed once it goes on from there.
+            self._stamps.append(stamp_ns)
+            if len(self._stamps) < 5:
+                return "drop"
+            self._stamps.clear()
+            return "restart"
+        if not self._stamps or stamp_ns > self._stamps[-1] + HORIZON_NS:
+            self._stamps.clear()
+        return "take"
+
+
 class SampleStream(Generic[S]):
-    """Samples of one sensor by time, bounded; `lag_ns`: how far before a frame its samples may end."""
+    """Samples of one sensor by time, bounded; `lag_ns`: how far before a frame its samples may end.
+
+    missing_ns: for how long, in receive time, frames have come without samples of their time.
+    """
 
     def __init__(self, lag_ns: int) -> None:
+        self.missing_ns = 0
         self._lag_ns = lag_ns
         self._stamps: list[int] = []
         self._samples: list[S] = []
-        self._recent_back: deque[int] = deque(maxlen=5)
+        self._jump = BackwardJump()
 
     def add(self, sample: S) -> None:
         """Take one sample, in any order."""
-        if self._stamps and sample.stamp_ns < self._stamps[-1] - HORIZON_NS:
-            # A clock that jumped back is believed once it goes on from there.
-            self._recent_back.append(sample.stamp_ns)
-            if len(self._recent_back) < 5:
-                return
-            self.clear()
-        elif not self._recent_back or sample.stamp_ns > self._recent_back[-1] + HORIZON_NS:
-            self._recent_back.clear()
+        verdict = self._jump.judge(sample.stamp_ns, self._stamps[-1] if self._stamps else None)
+        if verdict == "drop":
+            return
+        if verdict == "restart":
+            self._stamps.clear()
+            self._samples.clear()
         at = bisect.bisect_left(self._stamps, sample.stamp_ns)
         if at < len(self._stamps) and self._stamps[at] == sample.stamp_ns:
             return
@@ -63,22 +85,16 @@ class SampleStream(Generic[S]):
             keep = max(bisect.bisect_left(self._stamps, self._stamps[-1] - KEPT_NS), len(self._stamps) - MAX_SAMPLES)
             del self._stamps[:keep], self._samples[:keep]
 
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._stamps.clear()
-        self._samples.clear()
-        self._recent_back.clear()
-
-    def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int, held_up: bool) -> bool:
+    def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int, *, live: bool) -> bool:
         """Whether what matters for a frame at stamp_ns is here, or is not going to come.
 
-        first_frame_ns, newest_frame_ns: the node's frames so far; a sensor that stays behind them for three
-        seconds of the dive is not waited for any longer. held_up: whether its samples may still be on their way; then
-        one that has sent any is.
+        A sensor that is missing for three seconds has stopped: in receive time where the dive is live, since a
+        backlog comes in a burst, else in the dive's own time. first_frame_ns, newest_frame_ns: the node's frames so
+        far.
         """
         newest_ns = self._stamps[-1] if self._stamps else first_frame_ns
-        stopped = newest_frame_ns - newest_ns > SENSOR_WAIT_NS and not (held_up and self._stamps)
-        return stopped or newest_ns >= stamp_ns - self._lag_ns
+        missing_ns = self.missing_ns if live else newest_frame_ns - newest_ns
+        return missing_ns > SENSOR_WAIT_NS or newest_ns >= stamp_ns - self._lag_ns
 
     def around(self, stamp_ns: int) -> tuple[S | None, S | None]:
         """Return the samples at or before, and after, stamp_ns."""
@@ -90,6 +106,52 @@ class SampleStream(Generic[S]):
     def between(self, start_ns: int, end_ns: int) -> list[S]:
         """Return the samples from start_ns to end_ns, both included."""
         return self._samples[bisect.bisect_left(self._stamps, start_ns) : bisect.bisect_right(self._stamps, end_ns)]
+
+
+class ImuWindow:
+    """The last minute of a node's inertial samples in order of their stamps, as arrays; bounded."""
+
+    def __init__(self) -> None:
+        self._stamps = np.empty(2 * MAX_SAMPLES, dtype=np.int64)
+        self._values = np.empty((2 * MAX_SAMPLES, 6))
+        self._start = self._end = 0
+        self._jump = BackwardJump()
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return self._end - self._start
+
+    def add(self, sample: Imu) -> None:
+        """Take one sample, in any order."""
+        newest_ns = int(self._stamps[self._end - 1]) if len(self) else None
+        verdict = self._jump.judge(sample.stamp_ns, newest_ns)
+        if verdict == "drop":
+            return
+        if verdict == "restart":
+            self._start = self._end = 0
+        if self._end == len(self._stamps):
+            self._stamps[: len(self)] = self._stamps[self._start : self._end].copy()
+            self._values[: len(self)] = self._values[self._start : self._end].copy()
+            self._start, self._end = 0, len(self)
+        at = self._end
+        if newest_ns is not None and verdict == "take" and sample.stamp_ns <= newest_ns:
+            at = self._place(sample.stamp_ns)
+            if self._stamps[at] == sample.stamp_ns:
+                return
+            self._stamps[at + 1 : self._end + 1] = self._stamps[at : self._end].copy()
+            self._values[at + 1 : self._end + 1] = self._values[at : self._end].copy()
+        self._stamps[at] = sample.stamp_ns
+        self._values[at] = (*sample.accel_mps2, *sample.gyro_radps)
+        self._end += 1
+        self._start = max(self._start, self._end - MAX_SAMPLES, self._place(int(self._stamps[self._end - 1]) - KEPT_NS))
+
+    def between(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return stamps (N,) and accelerometer m/s^2 with gyroscope rad/s (N, 6), from start_ns to end_ns, both in."""
+        first, last = self._place(start_ns), self._place(end_ns, "right")
+        return self._stamps[first:last].copy(), self._values[first:last].copy()
+
+    def _place(self, stamp_ns: int, side: Literal["left", "right"] = "left") -> int:
+        return self._start + int(np.searchsorted(self._stamps[self._start : self._end], stamp_ns, side))
 
 
 def attitude_at(

@@ -1,27 +1,31 @@
-"""What one node has sent, in the order of its own time: frames, calibration, attitude, depth."""
+"""One node's side of the dive: a bounded window of frames, samples and calibrations in its own time.
+
+Many pairs read a node's stream, and none takes anything out of it.
+"""
 
 from __future__ import annotations
 
 import bisect
-from collections import OrderedDict
+from collections import OrderedDict, deque
+from collections.abc import Iterable
 from enum import Enum
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo
+from buddyline.protocol.messages import Attitude, Candidates, Depth, Imu, NodeInfo
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.results import rig_of
-from buddyline.solver_service.sensors import DEPTH_LAG_NS, SampleStream
+from buddyline.solver_service.sensors import DEPTH_LAG_NS, KEPT_NS, SENSOR_WAIT_NS, ImuWindow, SampleStream
+from msgspec import UNSET
+from msgspec.structs import replace
 
-# A frame further than this from the node's others is not of the same time line ...
+# A frame further than this from the node's newest one is on another time line ...
 FAR_NS: Final = 5 * S_NS
-# ... until so many in a row agree that the clock has been set.
+# ... until this many frames in a row agree that the clock was set.
 FRAMES_TO_BELIEVE: Final = 5
-# A frame of a live dive, which is one of so near the receiver's own time, has been held up where it comes so much later
-# after the last one than it was made; but a link that lets frames through by fits and starts is no outage each time.
-LIVE_WITHIN_NS: Final = 60 * S_NS
-HELD_UP_NS: Final = 1 * S_NS
-HELD_UP_AGAIN_NS: Final = 5 * S_NS
+# Progress counts at most this much a frame: a gap in the dive is no time in which anything could have come.
+LONGEST_STEP_NS: Final = 1 * S_NS
+MAX_FRAME_BYTES: Final = 4 << 20
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
 
@@ -36,26 +40,78 @@ class Arrival(Enum):
     CLOCK_SET = "clock_set"
 
 
+def size_bytes(frame: Candidates) -> int:
+    """Estimate the memory that a frame takes."""
+    return 512 + len(frame.boot) + 320 * len(frame.blobs)
+
+
+class FrameWindow:
+    """A node's frames in order of their stamps; past a minute or MAX_FRAME_BYTES the oldest go, and are counted."""
+
+    def __init__(self) -> None:
+        self.evicted = 0
+        self.bytes = 0
+        self._stamps: list[int] = []
+        self._frames: list[tuple[Candidates, int | None]] = []
+
+    def __len__(self) -> int:
+        """Count the frames."""
+        return len(self._frames)
+
+    def add(self, frame: Candidates, receive_ns: int | None) -> None:
+        """Take a frame, in any order."""
+        at = bisect.bisect_right(self._stamps, frame.stamp_ns)
+        self._stamps.insert(at, frame.stamp_ns)
+        self._frames.insert(at, (frame, receive_ns))
+        self.bytes += size_bytes(frame)
+        while self.bytes > MAX_FRAME_BYTES or self._stamps[0] < self._stamps[-1] - KEPT_NS:
+            self.bytes -= size_bytes(self._frames[0][0])
+            del self._stamps[0], self._frames[0]
+            self.evicted += 1
+
+    def between(self, start_ns: int, end_ns: int) -> list[Candidates]:
+        """Return the frames from start_ns to end_ns, both included."""
+        first, last = bisect.bisect_left(self._stamps, start_ns), bisect.bisect_right(self._stamps, end_ns)
+        return [frame for frame, _ in self._frames[first:last]]
+
+    def received_since(self, receive_ns: int | None) -> list[Candidates]:
+        """Return the frames that came at receive_ns or later; all where either time is not known."""
+        return [frame for frame, came_ns in self._frames if receive_ns is None or (came_ns or receive_ns) >= receive_ns]
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self._stamps.clear()
+        self._frames.clear()
+        self.bytes = 0
+
+
 class NodeStream:
-    """One node's side of the match; bounded. held_up_ns: when the first frame after an outage has come."""
+    """What one node has sent. All windows are bounded.
+
+    received: frames so far. first_ns, newest_ns: stamps of this time line's first and newest frame. elapsed_ns: how
+    far the frames have come, without the gaps between them: the clock of a dive that is read from a log.
+    """
 
     def __init__(self, node: str) -> None:
         self.node = node
-        self.frames: dict[int, Candidates] = {}
+        self.frames = FrameWindow()
         self.attitude: SampleStream[Attitude] = SampleStream(lag_ns=0)
         self.depth: SampleStream[Depth] = SampleStream(lag_ns=DEPTH_LAG_NS)
+        self.imu = ImuWindow()
         self.received = 0
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
-        self.held_up_ns = -HELD_UP_AGAIN_NS
-        self._newest_came_ns: tuple[int, int] | None = None
+        self.elapsed_ns = 0
+        self._newest_receive_ns: int | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
-        self._sequence: OrderedDict[int, tuple[str, int, int]] = OrderedDict()  # trigger: boot, seq, stamp
+        self._sequence: OrderedDict[int, tuple[int, int, int]] = OrderedDict()  # trigger: hash of boot, seq, stamp
         self._newest_trigger = -1
-        self._far: list[int] = []
+        self._far: deque[int] = deque(maxlen=FRAMES_TO_BELIEVE)
 
     def add_info(self, info: NodeInfo) -> None:
         """Take a calibration; it holds from its stamp on."""
+        # What the solver does not need may be of any length.
+        info = replace(info, software="", config_sha256="", tags=UNSET)
         at = bisect.bisect_left(self._calibrations, info.stamp_ns, key=_since)
         if at < len(self._calibrations) and _since(self._calibrations[at]) == info.stamp_ns:
             self._calibrations[at] = (info, rig_of(info))
@@ -63,63 +119,46 @@ class NodeStream:
             self._calibrations.insert(at, (info, rig_of(info)))
             del self._calibrations[:-MAX_INFOS]
 
-    def calibration_at(self, stamp_ns: int) -> tuple[NodeInfo, Rig] | None:
+    def calibration(self, stamp_ns: int) -> tuple[NodeInfo, Rig] | None:
         """Return the calibration in force at stamp_ns (before the first one: the first)."""
         at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
         return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
-    def add_frame(self, frame: Candidates, other_newest_ns: int | None) -> Arrival:
-        """Take a frame, or say why not; other_newest_ns: how far the other node has come, which vouches for a gap."""
+    def add_sample(self, sample: Attitude | Depth | Imu) -> None:
+        """Take a sample of one of the sensors."""
+        if isinstance(sample, Imu):
+            self.imu.add(sample)
+            return
+        sensor: SampleStream[Attitude] | SampleStream[Depth]
+        if isinstance(sample, Attitude):
+            sensor = self.attitude
+            self.attitude.add(sample)
+        else:
+            sensor = self.depth
+            self.depth.add(sample)
+        if self.newest_ns is None or sample.stamp_ns >= self.newest_ns - SENSOR_WAIT_NS:
+            sensor.missing_ns = 0
+
+    def add_frame(self, frame: Candidates, others_ns: Iterable[int], receive_ns: int | None) -> Arrival:
+        """Take a frame, or say why not.
+
+        others_ns: newest stamps of the other nodes; one that is near a frame confirms it after a gap.
+        """
         self.received += 1
-        verdict = self._place_in_time(frame.stamp_ns, other_newest_ns)
+        verdict = self._place_in_time(frame.stamp_ns, others_ns)
         if verdict is Arrival.FAR:
             return verdict
+        identity = hash(frame.boot), frame.seq, frame.stamp_ns
         seen = self._sequence.get(frame.trigger)
-        if seen is not None and verdict is not Arrival.CLOCK_SET:
-            if seen == (frame.boot, frame.seq, frame.stamp_ns):
-                return Arrival.DUPLICATE
-            return Arrival.CONFLICT
-        self._sequence[frame.trigger] = (frame.boot, frame.seq, frame.stamp_ns)
+        if seen is not None:
+            return Arrival.DUPLICATE if seen == identity else Arrival.CONFLICT
+        self._sequence[frame.trigger] = identity
         self._newest_trigger = max(self._newest_trigger, frame.trigger)
         if len(self._sequence) > MAX_SEQUENCE_MEMORY:
             self._sequence.popitem(last=False)
-        self.frames[frame.trigger] = frame
+        self.frames.add(frame, receive_ns)
+        self._count_missing(receive_ns)
         return verdict
-
-    def saw_frame_come(self, stamp_ns: int, came_ns: int) -> None:
-        """Compare when a frame was made and when it has come with the newest before; an old one again says nothing."""
-        made_before_ns, came_before_ns = self._newest_came_ns or (stamp_ns - 1, came_ns)
-        if stamp_ns <= made_before_ns:
-            return
-        held_up_ns = came_ns - came_before_ns - (stamp_ns - made_before_ns)
-        again = 0 <= came_ns - self.held_up_ns < HELD_UP_AGAIN_NS
-        if held_up_ns > HELD_UP_NS and abs(came_ns - stamp_ns) < LIVE_WITHIN_NS and not again:
-            self.held_up_ns = came_ns
-        self._newest_came_ns = stamp_ns, came_ns
-
-    def _place_in_time(self, stamp_ns: int, other_newest_ns: int | None) -> Arrival:
-        if self.newest_ns is None:
-            self.first_ns = self.newest_ns = stamp_ns
-            return Arrival.FRESH
-        resumed = (
-            stamp_ns > self.newest_ns and other_newest_ns is not None and abs(stamp_ns - other_newest_ns) <= FAR_NS
-        )
-        if resumed or abs(stamp_ns - self.newest_ns) <= FAR_NS:
-            self._far.clear()
-            self.newest_ns = max(self.newest_ns, stamp_ns)
-            return Arrival.FRESH
-        if self._far and abs(stamp_ns - self._far[-1]) > FAR_NS:
-            self._far.clear()
-        self._far.append(stamp_ns)
-        if len(self._far) < FRAMES_TO_BELIEVE:
-            return Arrival.FAR
-        self._far.clear()
-        self.frames.clear()
-        self._sequence.clear()
-        self._newest_came_ns = None
-        self._newest_trigger = -1
-        self.first_ns = self.newest_ns = stamp_ns
-        return Arrival.CLOCK_SET
 
     def has_passed(self, trigger: int) -> bool:
         """Whether this node sent no frame for trigger: its neighbours are here, with nothing between them."""
@@ -137,15 +176,45 @@ class NodeStream:
         boot_1, seq_1, _ = self._sequence[after]
         return boot_0 == boot_1 and seq_1 == seq_0 + 1
 
-    def sensors_cover(self, stamp_ns: int, held_up: bool) -> bool:
-        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come.
-
-        held_up: whether they may still be on their way, so that their absence says nothing.
-        """
+    def sensors_cover(self, stamp_ns: int, *, live: bool) -> bool:
+        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come."""
         if self.first_ns is None or self.newest_ns is None:
             return True
         first_ns, newest_ns = self.first_ns, self.newest_ns
-        return all(sensor.covers(stamp_ns, first_ns, newest_ns, held_up) for sensor in (self.attitude, self.depth))
+        return all(sensor.covers(stamp_ns, first_ns, newest_ns, live=live) for sensor in (self.attitude, self.depth))
+
+    def _place_in_time(self, stamp_ns: int, others_ns: Iterable[int]) -> Arrival:
+        if self.newest_ns is None:
+            self.first_ns = self.newest_ns = stamp_ns
+            return Arrival.FRESH
+        step_ns = stamp_ns - self.newest_ns
+        resumed = step_ns > 0 and any(abs(stamp_ns - other_ns) <= FAR_NS for other_ns in others_ns)
+        if resumed or abs(step_ns) <= FAR_NS:
+            self._far.clear()
+            self.elapsed_ns += min(max(step_ns, 0), LONGEST_STEP_NS)
+            self.newest_ns = max(self.newest_ns, stamp_ns)
+            return Arrival.FRESH
+        if self._far and abs(stamp_ns - self._far[-1]) > FAR_NS:
+            self._far.clear()
+        self._far.append(stamp_ns)
+        if len(self._far) < FRAMES_TO_BELIEVE:
+            return Arrival.FAR
+        self._far.clear()
+        self.frames.clear()
+        self._sequence.clear()
+        self._newest_trigger = -1
+        self.first_ns = self.newest_ns = stamp_ns
+        return Arrival.CLOCK_SET
+
+    def _count_missing(self, receive_ns: int | None) -> None:
+        """Count how long frames have come without the samples of a sensor."""
+        if receive_ns is None:
+            return
+        if self._newest_receive_ns is not None:
+            step_ns = min(max(receive_ns - self._newest_receive_ns, 0), LONGEST_STEP_NS)
+            self.attitude.missing_ns += step_ns
+            self.depth.missing_ns += step_ns
+        self._newest_receive_ns = receive_ns
 
 
 def _since(calibration: tuple[NodeInfo, Rig]) -> int:

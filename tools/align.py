@@ -10,7 +10,7 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
+from buddyline.solver_service.alignment import ClockOffset
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.dives import Dive
@@ -62,12 +62,12 @@ def run(args: argparse.Namespace) -> int:
 def _pass(
     dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
 ) -> ClockOffset | None:
-    alignment = ClockAlignment()
     settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
-    core = SolverCore(*pair, settings, round(offset_s * S_NS), alignment)
+    core = SolverCore(settings, [pair], {pair[1]: round(offset_s * S_NS)}, align=True)
     for envelope in messages_of(dive, args, dive.infos(), *pair, doing=f"align, pass {number}"):
         core.handle(envelope.message)
     core.flush()
     if not core.counts["solved"]:
         raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
-    return alignment.estimate()
+    alignment = core.pairs[pair].alignment
+    return None if alignment is None else alignment.estimate()

@@ -44,7 +44,7 @@ def solve_messages(
         if node not in known:
             raise BuddylineError(f"no NodeInfo of node {node}")
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
-    core = SolverCore(*chosen, settings, round(clock_offset_s * S_NS))
+    core = SolverCore(settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)})
     outcomes = [outcome for message in taken for outcome in core.handle(message)] + core.flush()
     return Solved(
         chosen,

@@ -6,22 +6,27 @@ import argparse
 import json
 import logging
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import combinations, islice
 from pathlib import Path
+from typing import Final
 
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo
 from buddyline.protocol.topics import check_node_id
-from buddyline.solver_service.config import CHECKS, METHODS, SolveConfig
+from buddyline.solver_service.config import CHECKS, METHODS, SolveConfig, node_ids
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 
 log = logging.getLogger(__name__)
 
+# How many messages are matched before what they match is solved, all at once.
+TOGETHER: Final = 256
 # What the output carries beside the poses, so that it can be evaluated and solved again on its own.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
@@ -34,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--checks", default=",".join(CHECKS), help=f"comma-separated, of {', '.join(CHECKS)} (default: all)"
     )
-    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
+    parser.add_argument(
+        "--nodes", nargs="+", metavar="NODE", help="solve every pair of these, A B or a,b,c; default: all in the logs"
+    )
     parser.add_argument(
         "--info",
         action="append",
@@ -61,33 +68,35 @@ def run(args: argparse.Namespace) -> int:
     )
     replaced = replacements(args.info)
     with Dive(args.dives) as dive:
-        node_a, node_b = pair_of(dive, args.nodes)
-        infos = dive.infos() | replaced
-        for node in (node_a, node_b):
-            if node not in infos:
-                raise BuddylineError(f"{dive.name}: no NodeInfo of node {node}; give one with --info {node}=FILE")
-        core = SolverCore(node_a, node_b, settings, round(args.clock_offset * 1e9))
+        nodes, infos = nodes_of(dive, args.nodes), dive.infos() | replaced
+        nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
+        if args.clock_offset and len(nodes) > 2:
+            raise ConfigError(f"--clock-offset {args.clock_offset:g}: is of one pair; choose it with --nodes A B")
+        core = SolverCore(settings, list(combinations(nodes, 2)), {nodes[1]: round(args.clock_offset * 1e9)})
         began_s = time.monotonic()
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
-            for envelope in messages_of(dive, args, infos, node_a, node_b, doing="solve"):
-                message = envelope.message
-                if isinstance(message, NodeInfo) and message.node in replaced:
-                    continue
-                writer.write(envelope.key, envelope.payload, envelope.time_ns)
-                _write(writer, core.handle(message))
+            envelopes = messages_of(dive, args, infos, *nodes, doing="solve")
+            while together := list(islice(envelopes, TOGETHER)):
+                sound = [envelope for envelope in together if not _is_replaced(envelope.message, replaced)]
+                for envelope in sound:
+                    writer.write(envelope.key, envelope.payload, envelope.time_ns)
+                _write(writer, core.handle_many(envelope.message for envelope in sound))
             _write(writer, core.flush())
         bad = dive.refused
     _summarize(args, core, bad, time.monotonic() - began_s)
-    resolved = sum(core.counts.values())
-    if resolved == 0:
-        log.error("no trigger was resolved: the dive holds no candidates of %s or %s", node_a, node_b)
-    elif core.matched == 0:
-        log.error("nodes %s and %s have no trigger in common: are the logs of the same dive?", node_a, node_b)
+    if not core.counts.total():
+        log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))
+    elif not core.matched:
+        log.error("nodes %s have no trigger in common: are the logs of the same dive?", " and ".join(nodes))
     return 0 if core.matched else 1
+
+
+def _is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:
+    return isinstance(message, NodeInfo) and message.node in replaced
 
 
 def replacements(given: list[str]) -> dict[str, NodeInfo]:
@@ -104,29 +113,47 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
     return replaced
 
 
-def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
-    """Return the pair to solve: the given one, or the dive's two nodes; raise where there is none."""
+def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:
+    """Return the nodes to solve: the given ones, or all of the dive; raise where there are not two."""
     present = dive.nodes("candidates", "image")
     if given:
-        missing = [node for node in given if node not in present]
+        nodes = node_ids(given)
+        missing = [node for node in nodes if node not in present]
         if missing:
             raise BuddylineError(
                 f"{dive.name}: holds nothing of node {missing[0]}; it has {', '.join(present) or 'none'}"
             )
-        return given[0], given[1]
+        return nodes
     if len(present) < 2:
         have = f"only of node {present[0]}" if present else "of no node"
         raise BuddylineError(f"{dive.name}: candidates or pictures {have}; give the logs of both nodes")
-    if len(present) > 2:
-        raise BuddylineError(f"{dive.name}: nodes {', '.join(present)}; choose a pair with --nodes A B")
-    return present[0], present[1]
+    return present
+
+
+def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
+    """Return the one pair that a command takes: the given one, or the dive's two nodes; raise where there is none."""
+    nodes = nodes_of(dive, given)
+    if len(nodes) > 2:
+        raise BuddylineError(f"{dive.name}: nodes {', '.join(nodes)}; choose a pair with --nodes A B")
+    return nodes[0], nodes[1]
+
+
+def _with_info(dive: Dive, nodes: list[str], infos: Mapping[str, NodeInfo], *, given: bool) -> list[str]:
+    """Leave out the nodes without a calibration; raise where they were asked for, or fewer than two are left."""
+    known = [node for node in nodes if node in infos]
+    unknown = [node for node in nodes if node not in infos]
+    if unknown and (given or len(known) < 2):
+        raise BuddylineError(f"{dive.name}: no NodeInfo of node {unknown[0]}; give one with --info {unknown[0]}=FILE")
+    for node in unknown:
+        log.warning("%s: no NodeInfo of node %s: it is left out; give one with --info %s=FILE", dive.name, node, node)
+    return known
 
 
 def messages_of(
-    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *pair: str, doing: str
+    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *nodes: str, doing: str
 ) -> Iterator[Envelope]:
     """Yield what the solver and the output need; the pictures of a node without candidates are detected."""
-    raw = [node for node in pair if node not in dive.nodes("candidates")]
+    raw = [node for node in nodes if node not in dive.nodes("candidates")]
     detector = None
     if raw:
         from buddyline.tools.detect import DiveDetector
@@ -134,7 +161,7 @@ def messages_of(
         detector = DiveDetector(args.detector, args.environment, infos)
     topics = (*COPIED, "image") if raw else COPIED
     for envelope in dive.messages(*topics, doing=doing):
-        if len(envelope.ids) == 1 and envelope.node not in pair:
+        if len(envelope.ids) == 1 and envelope.node not in nodes:
             continue
         if not isinstance(envelope.message, CompressedImage):
             yield envelope
@@ -144,34 +171,47 @@ def messages_of(
                 yield found
 
 
-def _write(writer: DiveLogWriter, results: list[RelativePose | Rejected]) -> None:
+def _write(writer: DiveLogWriter, results: Iterable[Message]) -> None:
     for result in results:
         writer.write_message(result)
 
 
 def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: float) -> None:
-    resolved = sum(core.counts.values())
-    rejected = {reason: count for reason, count in sorted(core.counts.items()) if reason != "solved"}
     if args.json:
-        print(
-            json.dumps(
-                {
-                    "node_a": core.node_a,
-                    "node_b": core.node_b,
-                    "triggers": resolved,
-                    "matched": core.matched,
-                    "solved": core.counts["solved"],
-                    "rejected": rejected,
-                    "bad_messages": bad,
-                    "seconds": took_s,
-                    "output": str(Path(args.output)),
-                }
-            )
-        )
+        pairs = [
+            {
+                "node_a": pair.nodes[0],
+                "node_b": pair.nodes[1],
+                "triggers": pair.counts.total(),
+                "matched": pair.matcher.matched,
+                "solved": pair.counts["solved"],
+                "rejected": _rejected(pair.counts),
+            }
+            for pair in core.pairs.values()
+        ]
+        totals = pairs[0] if len(pairs) == 1 else _totals(core)
+        run = {"pairs": pairs, "bad_messages": bad, "seconds": took_s, "output": str(Path(args.output))}
+        print(json.dumps(totals | run))
         return
-    print(f"{args.output}: {core.counts['solved']} poses of {resolved} triggers, nodes {core.node_a} and {core.node_b}")
-    for reason, count in rejected.items():
-        print(f"  {count:6d} {reason}")
+    for pair in core.pairs.values():
+        solved, triggers = pair.counts["solved"], pair.counts.total()
+        print(f"{args.output}: {solved} poses of {triggers} triggers, nodes {pair.nodes[0]} and {pair.nodes[1]}")
+        for reason, count in _rejected(pair.counts).items():
+            print(f"  {count:6d} {reason}")
     if bad:
         print(f"  {bad:6d} messages that could not be used")
-    print(f"  {took_s:.1f} s, {resolved / max(took_s, 1e-9):.0f} triggers/s")
+    print(f"  {took_s:.1f} s, {core.counts.total() / max(took_s, 1e-9):.0f} triggers/s")
+
+
+def _totals(core: SolverCore) -> dict[str, object]:
+    counts = core.counts
+    return {
+        "triggers": counts.total(),
+        "matched": core.matched,
+        "solved": counts["solved"],
+        "rejected": _rejected(counts),
+    }
+
+
+def _rejected(counts: Counter[str]) -> dict[str, int]:
+    return {reason: count for reason, count in sorted(counts.items()) if reason != "solved"}

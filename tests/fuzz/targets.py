@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from buddyline.node.config import NodeConfig
 from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import decode, encode, payload_stamp_ns
 from buddyline.protocol.config import Config, ConfigError, parse_config
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
@@ -299,7 +300,7 @@ class Capture:
 
 def fuzz_solver(data: st.DataObject) -> None:
     """The solver takes it all, and ends each trigger once."""
-    service = SolverService(SolverConfig(nodes=["a", "b"]))
+    service = SolverService(SolverConfig(nodes=["a", "b"]), clock=ManualClock(STAMP_NS))
     bus = Capture()
     service.attach(bus)
     sent = set()
@@ -310,9 +311,7 @@ def fuzz_solver(data: st.DataObject) -> None:
             service.receive(Received(key, payload, STAMP_NS, ""))
             with contextlib.suppress(MessageError):
                 sent.add(decode(payload, Candidates).trigger)
-        core = service._core
-        assert core is not None
-        service._publish(core.flush())
+        service._publish(service.core.flush())
     ended = Counter(result.trigger for result in bus.published if isinstance(result, RelativePose | Rejected))
     assert set(ended) <= sent
     assert all(count == 1 for count in ended.values()), ended

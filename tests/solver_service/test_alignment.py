@@ -109,14 +109,13 @@ def test_too_few_fixes_tell_nothing():
 
 def test_a_dive_with_a_clock_that_is_off():
     messages, _ = dive_messages(seconds=15, seed=1, clock_offset_ns=50_000_000, range_max_m=3.0)
-    alignment = ClockAlignment()
-    core = SolverCore("a", "b", Settings(skew_sigma_s=0.05), alignment=alignment)
+    core = SolverCore(Settings(skew_sigma_s=0.05), [("a", "b")], align=True)
     for message in messages:
         core.handle(message)
     core.flush()
-    found = alignment.estimate()
+    found = core.pairs["a", "b"].alignment.estimate()
     assert abs(found.offset_s - 0.05) < 4 * found.sigma_s + 0.005
-    corrected = SolverCore("a", "b", Settings(), clock_offset_ns=50_000_000)
+    corrected = SolverCore(Settings(), [("a", "b")], {"b": 50_000_000})
     results = [result for message in messages for result in corrected.handle(message)]
     assert corrected.counts["solved"] >= core.counts["solved"] * 0.9
     # B's pictures were taken 50 ms before A's, and are now known to have been.

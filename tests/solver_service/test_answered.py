@@ -9,9 +9,12 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import key_of, parse_key
-from buddyline.solver_service.answered import Answered
+from buddyline.solver_service.answered import Answered, AnsweredPair
 from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.service import SolverService
+from msgspec.structs import replace
 
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
@@ -24,46 +27,62 @@ def triggers(outcomes):
     return [one.trigger for one in outcomes]
 
 
+def unsaid(answered, ks):
+    return [k for k in ks if answered.is_due(outcome(k))]
+
+
 def test_the_first_solver_says_everything():
-    answered = Answered()
-    assert triggers(answered.unsaid([outcome(k) for k in range(5)])) == list(range(5))
+    answered = AnsweredPair()
+    assert unsaid(answered, range(5)) == list(range(5))
     assert answered.saw_new_frame(0) == []
 
 
 def test_what_was_said_is_not_said_again_and_what_was_not_is():
-    answered = Answered([outcome(3), outcome(7)])
-    assert triggers(answered.unsaid([outcome(k) for k in range(12)])) == [8, 9, 10, 11]
+    answered = AnsweredPair([outcome(3), outcome(7)])
+    assert unsaid(answered, range(12)) == [8, 9, 10, 11]
     assert answered.saw_new_frame(12) == []
-    assert triggers(answered.unsaid([outcome(5, "late"), outcome(12)])) == [12]
+    assert unsaid(answered, [5, 12]) == [12]
 
 
 def test_a_late_rejection_out_of_a_clock_that_is_ahead_says_nothing_of_the_others():
-    answered = Answered([outcome(7), outcome(10**6, "late")])
-    assert triggers(answered.unsaid([outcome(k) for k in range(10)])) == [8, 9]
+    answered = AnsweredPair([outcome(7), outcome(10**6, "late")])
+    assert unsaid(answered, range(10)) == [8, 9]
 
 
 def test_another_dive_is_no_answered_one():
     """Its frames came before the solver did, and those that come now have triggers that were answered."""
-    answered = Answered([outcome(100)])
-    assert answered.unsaid([outcome(1), outcome(2)]) == []
+    answered = AnsweredPair([outcome(100)])
+    assert unsaid(answered, [1, 2]) == []
     assert triggers(answered.saw_new_frame(3)) == [1, 2]
-    assert triggers(answered.unsaid([outcome(3)])) == [3]
+    assert unsaid(answered, [3]) == [3]
 
 
 def test_what_was_said_for_certain_stays_so_when_another_dive_begins():
-    answered = Answered([outcome(7)])
-    assert triggers(answered.unsaid([outcome(6), outcome(8)])) == [8]
+    answered = AnsweredPair([outcome(7)])
+    assert unsaid(answered, [6, 8]) == [8]
     assert answered.saw_new_frame(2) == []
-    assert triggers(answered.unsaid([outcome(2)])) == [2]
+    assert unsaid(answered, [2]) == [2]
+
+
+def test_pairs_are_answered_each_for_itself():
+    answered = Answered([outcome(7)])
+    other = Rejected(node_a="a", node_b="c", stamp_ns=5, trigger=5, reason="unmatched")
+    status = SolverCore(Settings(), [("a", "b")]).report(0, 0, 0, [])
+    assert answered.unsaid([outcome(5), other, *status, outcome(8)]) == [other, *status, outcome(8)]
+    # A frame of a is over only where all of its pairs have had it.
+    now_ns = 10**18
+    answered = Answered([replace(outcome(7), stamp_ns=now_ns)])
+    assert answered.is_over([("a", "b")], now_ns - 60 * S_NS, now_ns)
+    assert not answered.is_over([("a", "b"), ("a", "c")], now_ns - 60 * S_NS, now_ns)
 
 
 def test_of_a_live_dive_only_the_last_moments_are_solved_again():
     now_ns = 10**18
     said = Rejected(node_a="a", node_b="b", stamp_ns=now_ns - 20 * S_NS, trigger=7, reason="ambiguous")
     for age_s, over in ((60, True), (31, True), (29, False), (20, False), (1, False)):
-        assert Answered([said]).is_over(now_ns - age_s * S_NS, now_ns) is over
-        assert not Answered([said]).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
-        assert not Answered().is_over(now_ns - age_s * S_NS, now_ns)
+        assert AnsweredPair([said]).is_over(now_ns - age_s * S_NS, now_ns) is over
+        assert not AnsweredPair([said]).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
+        assert not AnsweredPair().is_over(now_ns - age_s * S_NS, now_ns)
 
 
 @pytest.mark.parametrize("live", [True, False], ids=["live", "stored"])
@@ -77,16 +96,19 @@ def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
         publishers = {key: nodes.publisher(parse_key(key)[0], *parse_key(key)[1]) for key in map(key_of, messages)}
         viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
 
-        def publish(part):
+        def publish(part, service=None):
             for message in part:
                 clock.set_ns(max(clock.now_ns() + 1, message.stamp_ns))
                 publishers[key_of(message)].put(message)
+                if service is not None and isinstance(message, Candidates):
+                    # Time must not run ahead of the solver.
+                    stream = service.core.streams[message.node]
+                    until(lambda stream=stream, ns=message.stamp_ns: (stream.newest_ns or 0) >= ns)
 
         def solver(bus, part):
             service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
             service.attach(bus)
-            publish(part)
-            until(lambda: (service._core.newest_ns[part[-1].node == "b"] or 0) >= part[-1].stamp_ns)
+            publish(part, service)
             return service
 
         with network.connect() as bus:
@@ -95,10 +117,10 @@ def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
         with network.connect() as bus:
             service = solver(bus, messages[back_at:])
             with service._lock:
-                service._publish(service._core.flush())
+                service._publish(service.core.flush())
             # Of a dive of now, what was answered long ago is not even looked at.
             frames = sum(isinstance(message, Candidates) for message in messages)
-            assert (sum(service._core.received) < frames) is live
+            assert (sum(stream.received for stream in service.core.streams.values()) < frames) is live
         until(lambda: any(payload_trigger(one) == messages[-1].trigger for one in outcomes))
     counts = Counter(payload_trigger(one) for one in outcomes)
     assert set(counts) == {message.trigger for message in messages if isinstance(message, Candidates)}

@@ -8,14 +8,24 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
-from buddyline.solver_service.core import MAX_PENDING, SolverCore
+from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.matcher import MAX_PENDING
 
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 
+def core_of(*pair):
+    return SolverCore(Settings(), [pair or ("a", "b")])
+
+
+def matcher_of(core):
+    (pair,) = core.pairs.values()
+    return pair.matcher
+
+
 def solve(messages, node_a="a", node_b="b"):
-    core = SolverCore(node_a, node_b, Settings())
+    core = core_of(node_a, node_b)
     results = [result for message in messages for result in core.handle(message)]
     return results + core.flush(), core
 
@@ -78,7 +88,7 @@ def test_frames_out_of_order_are_matched(dive):
         swapped[one], swapped[other] = swapped[other], swapped[one]
     results, core = solve(swapped)
     assert_each_ends_once(results, messages)
-    assert core.late == 0
+    assert matcher_of(core).late == 0
     assert results == expected
 
 
@@ -88,7 +98,7 @@ def test_duplicates_change_nothing(dive):
     doubled = [copy for message in messages for copy in (message, message)]
     results, core = solve(doubled)
     assert results == expected
-    assert core.duplicates + core.late == len(triggers_of(messages)) * 2
+    assert matcher_of(core).duplicates + matcher_of(core).late == len(triggers_of(messages)) * 2
 
 
 def test_lost_frames_are_unmatched_without_waiting(dive):
@@ -106,7 +116,7 @@ def test_camera_that_skipped_a_trigger_is_known_at_once(dive):
     messages, _ = dive
     frames = [m for m in messages if isinstance(m, Candidates)]
     gone = sorted(triggers_of(frames))[10]
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     seq = 0
     for message in messages:
         sent = message
@@ -127,13 +137,13 @@ def test_late_frame_ends_once_and_is_counted(dive):
     rest = [m for m in messages if m is not late]
     results, core = solve([*rest[: len(rest) // 2 + 300], late, *rest[len(rest) // 2 + 300 :]])
     assert_each_ends_once(results, messages)
-    assert core.late == 1
+    assert matcher_of(core).late == 1
 
 
 def test_one_node_alone_expires_and_memory_is_bounded(dive):
     messages, _ = dive
     alone = [m for m in messages if m.node == "a"]
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     results = []
     for message in alone:
         results += core.handle(message)
@@ -157,7 +167,7 @@ def test_after_an_outage_what_comes_last_is_waited_for(last):
     """Five seconds of frames arrive at once, without the other node's or their attitudes: the poses are the same."""
     messages, _ = dive_messages(seconds=11.0)
     expected, _ = solve(messages)
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     results = []
     for message in sorted(messages, key=lambda message: held_up(message, last)):
         results += core.handle(message, held_up(message, last))
@@ -168,7 +178,7 @@ def test_of_a_stored_dive_nothing_is_held_up(dive):
     """A dive may be played faster than it was made, and stand still in between."""
     frames = [m for m in dive[0] if m.node == "a" and isinstance(m, Candidates)]
     later_ns = 86_400 * S_NS
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     core.handle(frames[0], frames[0].stamp_ns + later_ns)
     for frame in frames[1:]:
         core.handle(frame, frames[0].stamp_ns + later_ns + 5 * S_NS)
@@ -178,7 +188,7 @@ def test_of_a_stored_dive_nothing_is_held_up(dive):
 def test_old_frames_again_and_again_hold_nothing_up():
     """With a sensor that has stopped: it is given up after three seconds, and then no frame waits."""
     messages, _ = dive_messages(seconds=9.0)
-    core, frames = SolverCore("a", "b", Settings()), []
+    core, frames = core_of(), []
     for message in messages:
         if isinstance(message, Depth) and message.stamp_ns > START_NS + S_NS:
             continue
@@ -186,14 +196,14 @@ def test_old_frames_again_and_again_hold_nothing_up():
         if isinstance(message, Candidates):
             frames.append(message)
             core.handle(frames[-50:][0], message.stamp_ns)
-            behind_ns = message.stamp_ns - core._newest_resolved * PERIOD_NS
+            behind_ns = message.stamp_ns - matcher_of(core)._newest_resolved * PERIOD_NS
             assert message.stamp_ns < START_NS + 5 * S_NS or behind_ns < 500 * MS_NS
 
 
 def test_a_link_by_fits_and_starts_keeps_nobody_waiting_for_long():
     """A's frames come 1.3 s late at most, all 1.3 s together; b has gone."""
     messages, _ = dive_messages(seconds=30.0, sensors=False)
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     waited_s = []
     for message in messages:
         if message.node == "a" and isinstance(message, Candidates):
@@ -205,7 +215,7 @@ def test_a_link_by_fits_and_starts_keeps_nobody_waiting_for_long():
 
 def test_a_live_frame_waits_two_seconds_for_a_silent_node(dive):
     messages, _ = dive
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     core.handle(next(m for m in messages if m.node == "b" and isinstance(m, NodeInfo)), START_NS)
     for message in messages:
         if message.node == "a":
@@ -291,13 +301,13 @@ def test_other_nodes_are_not_used(dive):
     expected, _ = solve(messages)
     results, core = solve([*messages[:100], *stranger, *messages[100:]])
     assert results == expected
-    assert core.foreign == 10
+    assert core.unused == {"c": 10}
 
 
 def test_pending_is_bounded_against_a_flood(dive):
     messages, _ = dive
     frame = next(m for m in messages if isinstance(m, Candidates))
-    core = SolverCore("a", "b", Settings())
+    core = core_of()
     for k in range(2 * MAX_PENDING):
         core.handle(msgspec.structs.replace(frame, trigger=frame.trigger + k, seq=2 * k, blobs=[]))
     assert core.pending <= MAX_PENDING
@@ -305,7 +315,7 @@ def test_pending_is_bounded_against_a_flood(dive):
 
 def test_same_id_twice_is_refused():
     with pytest.raises(ValueError, match="same id"):
-        SolverCore("a", "a", Settings())
+        core_of("a", "a")
 
 
 def test_without_sensors_it_still_solves():

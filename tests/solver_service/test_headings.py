@@ -6,13 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 from buddyline.protocol.messages import Attitude, Candidates, RelativePose
-from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.evidence import heading_offset
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
-from buddyline.solver_service.service import SolverService
 
 from tests.solver_service.scenes import IDEAL, random_scene, rotation
 
@@ -92,13 +90,12 @@ def test_with_a_compass_far_off_three_lights_still_give_poses(dive):
 
 def test_the_solver_says_that_compasses_disagree(dive):
     messages, _ = dive
-    service = SolverService(SolverConfig(), "defaults")
     problems = []
     for said in (messages, [turned(message) for message in messages]):
-        core = SolverCore("a", "b", Settings())
+        core = SolverCore(Settings(), [("a", "b")])
         for message in said:
             core.handle(message)
-        problems.append(service.status(core).problem)
+        problems.append(core.report(0, 0, 0, [])[0].problem)
     assert "compasses" not in problems[0]
     assert "compasses of a and b disagree by 8" in problems[1]
 
@@ -112,7 +109,7 @@ def turned(message):
 
 
 def solved(messages):
-    core = SolverCore("a", "b", Settings())
+    core = SolverCore(Settings(), [("a", "b")])
     return [result for message in messages for result in core.handle(message)] + core.flush()
 
 

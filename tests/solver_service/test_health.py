@@ -9,62 +9,63 @@ from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import NodeInfo
 from buddyline.protocol.topics import INFO, SOLVER_STATUS
 from buddyline.solver_service.config import SolverConfig
-from buddyline.solver_service.health import NodeHealth
+from buddyline.solver_service.health import Health
 from buddyline.solver_service.service import SolverService
 
 from tests.solver_service.conftest import dive_messages
 
 S_NS = 1_000_000_000
+AB = ("a", "b")
 
 
 @pytest.fixture
 def health():
-    health = NodeHealth("a", "b")
+    health = Health()
     for node in ("a", "b"):
         health.saw_process(f"node/{node}", True)
         health.saw_period(node, S_NS // 10)
-        health.saw_frame(node, 100 * S_NS, now_s=50.0)
-    assert health.problems(50.5) == []
+        health.saw_frame(node, 100 * S_NS, now_ns=50 * S_NS)
+    assert health.problems(AB, 50500 * S_NS // 1000) == []
     return health
 
 
 def test_nothing_has_come_yet():
-    assert NodeHealth("a", "b").problems(0.0) == ["no frame of node a yet", "no frame of node b yet"]
+    assert Health().problems(AB, 0) == ["no frame of node a yet", "no frame of node b yet"]
 
 
 def test_a_node_that_is_gone_is_named_until_it_is_back(health):
     health.saw_process("node/b", False)
     health.saw_process("node/c", False)
     health.saw_process("b", False)
-    assert health.problems(50.5) == ["node b is gone: its process ended, or its link"]
+    assert health.problems(AB, 50500 * S_NS // 1000) == ["node b is gone: its process ended, or its link"]
     health.saw_process("node/b", True)
-    assert health.problems(50.5) == []
+    assert health.problems(AB, 50500 * S_NS // 1000) == []
 
 
 def test_a_silent_node_is_named_within_two_seconds_with_the_status_interval(health):
-    health.saw_frame("a", 101 * S_NS, now_s=51.0)
-    assert health.problems(51.01) == ["no frame of node b for 1 s"]
+    health.saw_frame("a", 101 * S_NS, now_ns=51 * S_NS)
+    assert health.problems(AB, 51010 * S_NS // 1000) == ["no frame of node b for 1 s"]
 
 
 def test_a_node_with_rare_triggers_is_not_called_silent_between_them(health):
     health.saw_period("b", 2 * S_NS)
-    health.saw_frame("a", 103 * S_NS, now_s=55.0)
-    assert "no frame" not in "".join(health.problems(55.5))
-    assert health.problems(56.5) == ["no frame of node a for 2 s", "no frame of node b for 6 s"]
+    health.saw_frame("a", 103 * S_NS, now_ns=55 * S_NS)
+    assert "no frame" not in "".join(health.problems(AB, 55500 * S_NS // 1000))
+    assert health.problems(AB, 56500 * S_NS // 1000) == ["no frame of node a for 2 s", "no frame of node b for 6 s"]
 
 
 @pytest.mark.parametrize(("ahead_s", "first", "second"), [(3600, "b", "a"), (-3600, "a", "b"), (1.5, "b", "a")])
 def test_clocks_that_disagree_are_named_with_their_difference(health, ahead_s, first, second):
-    health.saw_frame("a", 101 * S_NS, now_s=51.0)
-    health.saw_frame("b", 101 * S_NS + round(ahead_s * S_NS), now_s=51.0)
-    (said,) = health.problems(51.2)
+    health.saw_frame("a", 101 * S_NS, now_ns=51 * S_NS)
+    health.saw_frame("b", 101 * S_NS + round(ahead_s * S_NS), now_ns=51 * S_NS)
+    (said,) = health.problems(AB, 51200 * S_NS // 1000)
     assert said.startswith(f"frames of {first} are {abs(ahead_s):.1f} s ahead of those of {second}")
 
 
 def test_the_latency_of_a_link_is_no_disagreement(health):
-    health.saw_frame("a", 101 * S_NS, now_s=51.0)
-    health.saw_frame("b", 100 * S_NS + S_NS // 5, now_s=51.0)
-    assert health.problems(51.2) == []
+    health.saw_frame("a", 101 * S_NS, now_ns=51 * S_NS)
+    health.saw_frame("b", 100 * S_NS + S_NS // 5, now_ns=51 * S_NS)
+    assert health.problems(AB, 51200 * S_NS // 1000) == []
 
 
 def test_the_solver_says_at_once_that_a_nodes_process_is_gone():
@@ -86,12 +87,12 @@ def test_the_solver_says_at_once_that_a_nodes_process_is_gone():
         viewer.subscribe(SOLVER_STATUS.key("a", "b"), hear)
         node.declare_alive("node/b")
         service.attach(own)
-        own.watch_alive(service._watch)
+        own.watch_alive(service.watch)
         for message in messages:
             if isinstance(message, NodeInfo):
                 node.publisher(INFO, message.node).put_bytes(encode(message))
         deadline_s = time.monotonic() + 10.0
-        while service._core is None and time.monotonic() < deadline_s:
+        while not service.core.pairs and time.monotonic() < deadline_s:
             service.stop.wait(0.01)
         node.close()
         with said:

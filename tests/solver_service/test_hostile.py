@@ -4,10 +4,12 @@ import tracemalloc
 
 import pytest
 from buddyline.protocol.bus import Received
+from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import MAX_MESSAGE_BYTES, encode
-from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.topics import key_of
 from buddyline.solver_service.config import SolverConfig
+from buddyline.solver_service.core import MAX_NODES
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
 
@@ -27,7 +29,8 @@ class Solver:
 
     def __init__(self):
         self.bus = Capture()
-        self.service = SolverService(SolverConfig(nodes=["a", "b"]))
+        # Its clock stands still: nothing here may depend on how long a test takes.
+        self.service = SolverService(SolverConfig(nodes=["a", "b"]), clock=ManualClock())
         self.service.attach(self.bus)
 
     def take(self, message, key=None):
@@ -35,11 +38,12 @@ class Solver:
         self.service.receive(Received(key or key_of(message), payload, 0, ""))
 
     def results(self):
-        self.service._publish(self.service._core.flush())
+        self.service._publish(self.service.core.flush())
         return [m for m in self.bus.published if isinstance(m, RelativePose | Rejected)]
 
     def status(self):
-        return self.service.status(self.service._core)
+        self.service.report()
+        return next(m for m in reversed(self.bus.published) if isinstance(m, SolverStatus))
 
 
 def solved(messages):
@@ -212,7 +216,8 @@ def test_a_stream_of_unknown_nodes_is_bounded_and_takes_no_ones_place(messages, 
     for message in messages:
         solver.take(message)
     assert [encode(result) for result in solver.results()] == healthy
-    assert solver.service._core.foreign == 2000
+    assert sum(solver.service.core.unused.values()) == MAX_NODES
+    assert len(solver.status().unused) == MAX_NODES
     assert solver.status().problem == ""
 
 

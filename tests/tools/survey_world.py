@@ -204,7 +204,7 @@ def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s
     """
     flaws = flaws or Flaws()
     nodes = [_Node(rng, 0, flaws), _Node(rng, 1, flaws)]
-    core = SolverCore("a", "b", SolveConfig().settings("test"))
+    core = SolverCore(SolveConfig().settings("test"), [("a", "b")])
     out = []
 
     def take(*messages):

@@ -40,7 +40,7 @@ def equation_1() -> float:
 
 def trigger(found: Path) -> dict[str, float]:
     """Return the time of whole triggers, matching and messages included, by the candidates of a log, ms."""
-    core = SolverCore("a", "b", SolveConfig().settings("experiments"))
+    core = SolverCore(SolveConfig().settings("experiments"), [("a", "b")])
     taken_ms = []
     with Dive([found]) as dive:
         for envelope in dive.messages("info", "attitude", "depth", "candidates"):

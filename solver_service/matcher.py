@@ -1,0 +1,260 @@
+"""Frames of two nodes, brought together by their triggers: each trigger is matched once, or has a reason why not.
+
+A trigger waits for what may still come. What is read from a log, or played from one, waits in the dive's own time;
+what is live waits in receive time, since a backlog arrives in a burst after an outage.
+"""
+
+from __future__ import annotations
+
+import bisect
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from typing import Final
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Candidates, Reason
+from buddyline.solver_service.pair import Matched
+from buddyline.solver_service.results import sensed_of
+from buddyline.solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream, size_bytes
+
+# How far a node's frames go on, in the dive's own time, before one that is missing is given up.
+MATCH_WINDOW_NS: Final = 1 * S_NS
+# How long a frame waits where the other node is silent altogether.
+SILENCE_WINDOW_NS: Final = 2 * S_NS
+# How long a trigger waits for anything at all, a sensor that has stopped for instance.
+LONGEST_WAIT_NS: Final = 3 * S_NS
+MAX_PENDING: Final = 512
+MAX_PENDING_BYTES: Final = 4 << 20
+MAX_RESOLVED_MEMORY: Final = 4096
+
+TWO_FRAMES: Final = "two different frames claim this trigger: two nodes of one id?"
+
+
+@dataclass(frozen=True)
+class Unmatched:
+    """A trigger that cannot be solved, and why; stamp_ns: of its frame."""
+
+    trigger: int
+    stamp_ns: int
+    reason: Reason
+    detail: str
+
+
+@dataclass(eq=False, slots=True)
+class _Waiting:
+    """A trigger's frames, of a and b, and when the first came.
+
+    receive_ns: None where it is read from a log; then elapsed_ns counts, how far both nodes' frames had come. live:
+    whether receive time tells how old it is.
+    """
+
+    trigger: int
+    frames: list[Candidates | None]
+    receive_ns: int | None
+    elapsed_ns: tuple[int, int]
+    live: bool
+    conflict: bool = False
+
+
+class PairMatcher:
+    """Matches the frames of nodes a and b. Deterministic; time is an argument.
+
+    late: frames that came after their trigger was resolved. duplicates: frames that came twice. matched: triggers
+    with a frame and a calibration from both.
+    """
+
+    def __init__(self, stream_a: NodeStream, stream_b: NodeStream) -> None:
+        self.streams = stream_a, stream_b
+        self.matched = 0
+        self.late = 0
+        self.duplicates = 0
+        self.pending_bytes = 0
+        self._waiting: dict[int, _Waiting] = {}
+        self._order: list[int] = []
+        self._arrivals: deque[_Waiting] = deque()
+        self._resolved: OrderedDict[int, None] = OrderedDict()
+        self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
+        self._newest_resolved = -1
+        self._now_ns: int | None = None
+
+    @property
+    def pending(self) -> int:
+        """Triggers that wait for something."""
+        return len(self._order)
+
+    def take(
+        self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool
+    ) -> list[Matched | Unmatched]:
+        """Take a frame that its node's stream has judged; return what is resolved by that alone.
+
+        After a CLOCK_SET, what was learned from earlier triggers is void: see `restart`.
+        """
+        if receive_ns is not None:
+            self._now_ns = receive_ns
+        trigger = frame.trigger
+        if arrival is Arrival.DUPLICATE:
+            self.duplicates += 1
+            return []
+        if arrival is Arrival.FAR:
+            self.late += 1
+            self._far.append(trigger)
+            if trigger in self._resolved:
+                return []
+            newest_ns = self.streams[self._side(frame)].newest_ns or 0
+            seconds = (frame.stamp_ns - newest_ns) / S_NS
+            detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
+            return [self._give_up(frame, "late", detail)]
+        if trigger in self._resolved:
+            self.late += 1
+            return []
+        waiting = self._waiting.get(trigger)
+        if arrival is Arrival.CONFLICT:
+            if waiting is None:
+                return [self._give_up(frame, "duplicate", TWO_FRAMES)]
+            waiting.conflict = True
+            return []
+        if trigger < self._newest_resolved:
+            self.late += 1
+            return [self._give_up(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
+        if waiting is None:
+            elapsed_ns = self.streams[0].elapsed_ns, self.streams[1].elapsed_ns
+            waiting = _Waiting(trigger, [None, None], receive_ns, elapsed_ns, live)
+            if len(self._arrivals) > 2 * MAX_PENDING:
+                self._arrivals = deque(one for one in self._arrivals if self._waiting.get(one.trigger) is one)
+            self._arrivals.append(waiting)
+            self._waiting[trigger] = waiting
+            bisect.insort(self._order, trigger)
+        waiting.frames[self._side(frame)] = frame
+        self.pending_bytes += size_bytes(frame)
+        return []
+
+    def restart(self, node: str) -> list[Matched | Unmatched]:
+        """Begin a new time line of a node whose clock was set; return what waited with a frame of the old one.
+
+        The same triggers may come again, as in a dive played twice; but not those that told of the new time.
+        """
+        side = 0 if self.streams[0].node == node else 1
+        results = [
+            result
+            for trigger in list(self._order)
+            if self._waiting[trigger].frames[side] is not None
+            and (result := self._resolve_one(self._waiting[trigger], at_once=True)) is not None
+        ]
+        self._resolved = OrderedDict.fromkeys(self._far)
+        self._newest_resolved = -1
+        return results
+
+    def resolve(self, receive_ns: int | None, *, everything: bool = False) -> list[Matched | Unmatched]:
+        """Resolve, in the order of the triggers, all that waits for nothing more; everything: whatever it waits for."""
+        if receive_ns is not None:
+            self._now_ns = receive_ns
+        if not self._order:
+            return []
+        overdue = self._newest_overdue()
+        results: list[Matched | Unmatched] = []
+        while self._order:
+            trigger = self._order[0]
+            crowded = len(self._order) > MAX_PENDING or self.pending_bytes > MAX_PENDING_BYTES
+            at_once = everything or crowded or trigger <= overdue
+            result = self._resolve_one(self._waiting[trigger], at_once=at_once)
+            if result is None:
+                break
+            results.append(result)
+        return results
+
+    def _side(self, frame: Candidates) -> int:
+        return 0 if frame.node == self.streams[0].node else 1
+
+    def _newest_overdue(self) -> int:
+        """Return the last trigger that has waited for too long; none before it waits any longer either."""
+        overdue = -1
+        while self._arrivals:
+            first = self._arrivals[0]
+            if self._waiting.get(first.trigger) is first:
+                if not self._has_waited(first):
+                    break
+                overdue = max(overdue, first.trigger)
+            self._arrivals.popleft()
+        return overdue
+
+    def _has_waited(self, waiting: _Waiting) -> bool:
+        if waiting.receive_ns is not None and self._now_ns is not None:
+            if self._now_ns - waiting.receive_ns > LONGEST_WAIT_NS:
+                return True
+            if waiting.live:
+                return False
+        since = zip(self.streams, waiting.elapsed_ns, strict=True)
+        return any(stream.elapsed_ns - began_ns > LONGEST_WAIT_NS for stream, began_ns in since)
+
+    def _resolve_one(self, waiting: _Waiting, *, at_once: bool) -> Matched | Unmatched | None:
+        """Resolve one trigger; None where it still waits for something that may come."""
+        frame_a, frame_b = waiting.frames
+        frame = frame_a or frame_b
+        if frame is None:
+            return None
+        stream_a, stream_b = self.streams
+        if waiting.conflict:
+            return self._give_up(frame, "duplicate", TWO_FRAMES)
+        if frame_a is None or frame_b is None:
+            other = stream_b if frame_b is None else stream_a
+            if not (at_once or other.has_passed(waiting.trigger) or self._expired(waiting, frame, other)):
+                return None
+            return self._give_up(frame, "unmatched", f"no frame of {other.node} for this trigger")
+        expired = at_once or self._expired(waiting, frame_a, stream_b) or self._expired(waiting, frame_b, stream_a)
+        known_a, known_b = stream_a.calibration(frame_a.stamp_ns), stream_b.calibration(frame_b.stamp_ns)
+        if known_a is None or known_b is None:
+            if not expired:
+                return None
+            pairs = ((stream_a.node, known_a), (stream_b.node, known_b))
+            missing = " and ".join(node for node, known in pairs if known is None)
+            return self._give_up(frame_a, "no_info", f"no NodeInfo of {missing}")
+        covered = stream_a.sensors_cover(frame_a.stamp_ns, live=waiting.live) and stream_b.sensors_cover(
+            frame_b.stamp_ns, live=waiting.live
+        )
+        if not (covered or at_once):
+            return None
+        self.matched += 1
+        for one, (info, _) in ((frame_a, known_a), (frame_b, known_b)):
+            if (one.width_px, one.height_px) != (info.width_px, info.height_px):
+                sizes = f"{one.width_px}x{one.height_px} px, its calibration {info.width_px}x{info.height_px}"
+                return self._give_up(one, "no_info", f"frame of {one.node} is {sizes}")
+        self._finish(waiting.trigger)
+        self._newest_resolved = max(self._newest_resolved, waiting.trigger)
+        return Matched(
+            trigger=waiting.trigger,
+            stamp_ns=(frame_a.stamp_ns + frame_b.stamp_ns) // 2,
+            frame_a=frame_a,
+            frame_b=frame_b,
+            info_a=known_a[0],
+            info_b=known_b[0],
+            rig_a=known_a[1],
+            rig_b=known_b[1],
+            sensed_a=sensed_of(stream_a.attitude, stream_a.depth, frame_a.stamp_ns),
+            sensed_b=sensed_of(stream_b.attitude, stream_b.depth, frame_b.stamp_ns),
+        )
+
+    def _expired(self, waiting: _Waiting, frame: Candidates, other: NodeStream) -> bool:
+        """Whether the other node's frame for the trigger of this one can be given up."""
+        # A node whose clock is far from this frame says nothing about what of it may still come.
+        if other.newest_ns is not None and MATCH_WINDOW_NS < other.newest_ns - frame.stamp_ns <= FAR_NS:
+            return True
+        if waiting.live and waiting.receive_ns is not None and self._now_ns is not None:
+            return self._now_ns - waiting.receive_ns > SILENCE_WINDOW_NS
+        own_ns = self.streams[self._side(frame)].newest_ns or 0
+        return own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
+
+    def _give_up(self, frame: Candidates, reason: Reason, detail: str) -> Unmatched:
+        self._finish(frame.trigger)
+        if reason != "late":
+            self._newest_resolved = max(self._newest_resolved, frame.trigger)
+        return Unmatched(frame.trigger, frame.stamp_ns, reason, detail)
+
+    def _finish(self, trigger: int) -> None:
+        waiting = self._waiting.pop(trigger, None)
+        if waiting is not None:
+            del self._order[bisect.bisect_left(self._order, trigger)]
+            self.pending_bytes -= sum(size_bytes(frame) for frame in waiting.frames if frame is not None)
+            waiting.frames = [None, None]
+        self._resolved[trigger] = None
+        if len(self._resolved) > MAX_RESOLVED_MEMORY:
+            self._resolved.popitem(last=False)

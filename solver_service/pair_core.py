@@ -1,0 +1,151 @@
+"""One pair's work from matched frames to messages: outcomes and status."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import Counter, deque
+from typing import Final, TypeAlias
+
+from buddyline.protocol import __version__
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
+from buddyline.protocol.messages import Candidates, Message, Rejected, SolverStatus
+from buddyline.protocol.topics import POSE, REJECTED, SOLVER_STATUS
+from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
+from buddyline.solver_service.geometry.trigger import NoFix, Settings
+from buddyline.solver_service.matcher import PairMatcher, Unmatched
+from buddyline.solver_service.pair import Matched, PairSolver
+from buddyline.solver_service.results import relative_pose
+from buddyline.solver_service.streams import Arrival, NodeStream
+from msgspec import UNSET
+
+PairId: TypeAlias = tuple[str, str]
+
+# What a pair publishes.
+PUBLISHED: Final = (POSE, REJECTED, SOLVER_STATUS)
+# The clocks' offset is reported once the dive tells it this well.
+REPORTED_OFFSET_SIGMA_S: Final = 0.003
+ALIGN_EVERY_NS: Final = 10 * S_NS
+
+
+class PairCore:
+    """One pair: its matcher, its solver, and what became of its triggers.
+
+    counts: "solved" and the reasons. latencies_s: from the middle of exposure to publication, since the last report.
+    A track of the pair belongs here: both streams hold frames and samples in the order of their stamps, also those
+    without a match, and `settle` makes the fixes; what it returns is published by its own topic and key.
+    """
+
+    def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: Settings, *, align: bool) -> None:
+        self.nodes: PairId = (stream_a.node, stream_b.node)
+        self.streams = stream_a, stream_b
+        self.matcher = PairMatcher(stream_a, stream_b)
+        self.alignment = ClockAlignment() if align else None
+        self.solver = PairSolver(settings, self.alignment)
+        self.counts: Counter[str] = Counter()
+        self.latencies_s: deque[float] = deque(maxlen=2000)
+        self._offset: ClockOffset | None = None
+        self._aligned_ns: int | None = None
+        self._unsettled: list[Matched | Unmatched] = []
+        self._settled: list[Message] = []
+
+    def take(self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool) -> None:
+        """Take a frame of one of the two nodes."""
+        if arrival is Arrival.CLOCK_SET:
+            self._unsettled += self.matcher.restart(frame.node)
+            self._solve()
+            self.solver.forget()
+        self._unsettled += self.matcher.take(frame, arrival, receive_ns, live=live)
+
+    def resolve(self, receive_ns: int | None, *, everything: bool = False) -> None:
+        """Match what waits for nothing more."""
+        self._unsettled += self.matcher.resolve(receive_ns, everything=everything)
+
+    def settle(self) -> list[Message]:
+        """Solve what is matched, all at once; return the outcomes in the order of the triggers."""
+        self._solve()
+        settled, self._settled = self._settled, []
+        return settled
+
+    def _solve(self) -> None:
+        if not self._unsettled:
+            return
+        found = iter(self.solver.solve([one for one in self._unsettled if isinstance(one, Matched)]))
+        for one in self._unsettled:
+            if isinstance(one, Unmatched):
+                self._reject(one)
+                continue
+            fix = next(found)
+            if isinstance(fix, NoFix):
+                self._reject(Unmatched(one.trigger, one.stamp_ns, fix.reason, fix.detail))
+            else:
+                self.counts["solved"] += 1
+                self._settled.append(relative_pose(one.frame_a, one.frame_b, one.rig_a, one.sensed_a, fix))
+        self._unsettled.clear()
+
+    def _reject(self, one: Unmatched) -> None:
+        self.counts[one.reason] += 1
+        node_a, node_b = self.nodes
+        self._settled.append(
+            Rejected(
+                node_a=node_a,
+                node_b=node_b,
+                stamp_ns=one.stamp_ns,
+                trigger=one.trigger,
+                reason=one.reason,
+                detail=one.detail,
+            )
+        )
+
+    def report(
+        self, stamp_ns: int, now_ns: int, problems: list[str], bad_messages: int, unused: list[str]
+    ) -> SolverStatus:
+        """Return the pair's status at stamp_ns; now_ns: steady receive time, problems: what else is wrong."""
+        (node_a, node_b), (stream_a, stream_b) = self.nodes, self.streams
+        latencies_s = sorted(self.latencies_s)
+        self.latencies_s.clear()
+        p99 = min(len(latencies_s) * 99 // 100, len(latencies_s) - 1)
+        offset = self._estimate_offset(now_ns)
+        return SolverStatus(
+            node_a=node_a,
+            node_b=node_b,
+            stamp_ns=stamp_ns,
+            software=f"buddyline {__version__}",
+            received_a=stream_a.received,
+            received_b=stream_b.received,
+            matched=self.matcher.matched,
+            solved=self.counts["solved"],
+            rejected={reason: count for reason, count in sorted(self.counts.items()) if reason != "solved"},
+            late=self.matcher.late,
+            duplicates=self.matcher.duplicates,
+            bad_messages=bad_messages,
+            pending=self.matcher.pending,
+            latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
+            latency_p99_s=latencies_s[p99] if latencies_s else UNSET,
+            clock_skew_s=UNSET if offset is None else offset.offset_s,
+            problem="; ".join(problems + self._disagreements(offset)),
+            unused=unused or UNSET,
+        )
+
+    def _estimate_offset(self, now_ns: int) -> ClockOffset | None:
+        if self.alignment is not None and (self._aligned_ns is None or now_ns - self._aligned_ns > ALIGN_EVERY_NS):
+            found = self.alignment.estimate()
+            self._offset = found if found is not None and found.sigma_s < REPORTED_OFFSET_SIGMA_S else None
+            self._aligned_ns = now_ns
+        return self._offset
+
+    def _disagreements(self, offset: ClockOffset | None) -> list[str]:
+        """Say what the poses tell against the two nodes' clocks and compasses."""
+        found = []
+        node_a, node_b = self.nodes
+        if offset is not None and abs(offset.offset_s) > max(CLOCKS_APART_S, 4 * offset.sigma_s):
+            found.append(f"clock of {node_b} is {offset.offset_s * 1e3:+.1f} ms from that of {node_a}")
+        heading = self.solver.heading(max(stream.newest_ns or 0 for stream in self.streams))
+        if heading is not None and abs(heading.offset_rad) > HEADINGS_APART_RAD:
+            apart_deg = math.degrees(abs(heading.offset_rad))
+            found.append(
+                f"compasses of {node_a} and {node_b} disagree by {apart_deg:.0f} deg: "
+                "is one near steel, or not calibrated?"
+            )
+        return found
