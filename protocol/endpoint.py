@@ -1,32 +1,16 @@
-"""Where the hub is, and the settings that keep everyone else from opening a socket of their own."""
+"""Where the hub is: `tcp/<host>:<port>`, or `tls/...`."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from buddyline.protocol.codec import MAX_MESSAGE_BYTES
 from buddyline.protocol.errors import BuddylineError
-
-if TYPE_CHECKING:
-    from buddyline.protocol.security import Tls
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
 _ENDPOINT = re.compile(r"(?:tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]{1,5})\Z")
-
-# The lease is how long a link that fell silent is held for alive. A hub that accepts and then does not answer is
-# given up within open_timeout, or a client would be deaf for ten seconds after it thawed.
-_COMMON: Final = {
-    "scouting/multicast/enabled": False,
-    "scouting/gossip/enabled": False,
-    "scouting/delay": 0,
-    "transport/link/tx/lease": 3000,
-    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES + 65536,
-    "transport/unicast/open_timeout": 2000,
-    "transport/shared_memory/enabled": False,
-}
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
@@ -39,18 +23,6 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
     return match.group(1).strip("[]"), int(match.group(2))
 
 
-def check_endpoint(endpoint: str, tls: Tls | None = None) -> str:
-    """Return endpoint; raise BuddylineError where it is none, or where it and the [tls] table do not agree."""
-    host_and_port(endpoint)
-    if endpoint.startswith("tls/") and tls is None:
-        raise BuddylineError(f"{endpoint}: needs a [tls] table in the configuration (`buddyline keys` makes it)")
-    if endpoint.startswith("tcp/") and tls is not None:
-        raise BuddylineError(
-            f"{endpoint}: is without TLS and the configuration has a [tls] table; write tls/... or leave it out"
-        )
-    return endpoint
-
-
 def is_loopback(endpoint: str) -> bool:
     """Whether endpoint is reached from this machine alone, as far as its name tells."""
     host, _ = host_and_port(endpoint)
@@ -58,42 +30,3 @@ def is_loopback(endpoint: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
-
-
-def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object] | None = None) -> dict[str, object]:
-    """Return the Zenoh settings of the one process that listens; access: `protocol.access.access_rules`."""
-    settings = {
-        "mode": "router",
-        "listen/endpoints": [check_endpoint(endpoint, tls)],
-        "connect/endpoints": [],
-        **_COMMON,
-        **_tls_settings(tls, "listen"),
-    }
-    return settings if access is None else {**settings, "access_control": access}
-
-
-def client_settings(endpoint: str, namespace: str | None, tls: Tls | None = None) -> dict[str, object]:
-    """Return the Zenoh settings of a client: it connects to endpoint, again and again, and listens nowhere."""
-    settings = {
-        "mode": "client",
-        "listen/endpoints": [],
-        "connect/endpoints": [check_endpoint(endpoint, tls)],
-        "connect/timeout_ms": 0,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5},
-        **_COMMON,
-        **_tls_settings(tls, "connect"),
-    }
-    return settings if namespace is None else {**settings, "namespace": namespace}
-
-
-def _tls_settings(tls: Tls | None, side: str) -> dict[str, object]:
-    if tls is None:
-        return {}
-    return {
-        "transport/link/tls/root_ca_certificate": tls.ca,
-        f"transport/link/tls/{side}_certificate": tls.certificate,
-        f"transport/link/tls/{side}_private_key": tls.key,
-        "transport/link/tls/enable_mtls": True,
-        # The hub is known by its authority and its certificate's purpose: tethers change their addresses.
-        "transport/link/tls/verify_name_on_connect": False,
-    }

@@ -22,11 +22,12 @@ from buddyline.protocol.bus import (
 )
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap
-from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, client_settings
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
 from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
 from buddyline.protocol.zenoh_bus.session import BulkLink, config_of, open_client
+from buddyline.protocol.zenoh_bus.settings import client_settings
 from buddyline.protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
 from buddyline.protocol.zenoh_bus.watchdog import Watchdog
 

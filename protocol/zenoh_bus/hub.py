@@ -7,11 +7,12 @@ from types import TracebackType
 from typing import Final, Self
 
 import zenoh
-from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, hub_settings
+from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import TOPICS
 from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.settings import hub_settings
 
 # Whoever invents keys, or sends what is no pose, must not fill the hub's memory.
 MAX_RETAINED: Final = 256

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import zenoh
-from buddyline.protocol.endpoint import client_settings
 from buddyline.protocol.security import RefusedError, Tls, refusal
+from buddyline.protocol.zenoh_bus.settings import client_settings
 
 RETRY_S: Final = 0.25
 
 
 def config_of(settings: Mapping[str, object]) -> zenoh.Config:
-    """Return Zenoh's form of protocol.endpoint's settings."""
+    """Return Zenoh's form of the settings (zenoh_bus.settings)."""
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
