@@ -142,8 +142,7 @@ class Refusals:
         """Return a line for each key: how many of its messages were refused, and why the first."""
         with self._lock:
             return [
-                f"{key}: {refused.count} messages refused, the first: {refused.first}"
-                for key, refused in self.by_key.items()
+                f"{key}: {refused.count} refused, the first: {refused.first}" for key, refused in self.by_key.items()
             ]
 
 

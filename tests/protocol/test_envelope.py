@@ -70,8 +70,7 @@ def test_refusals_are_counted_by_key_with_the_first_reason_and_said_ever_less_of
     assert len(caplog.records) == 7  # the 1st, 2nd, 4th ... 64th
     assert "bad message on buddyline/node/b/depth" in caplog.text
     assert refusals.lines() == [
-        "buddyline/node/b/depth: 100 messages refused, the first: "
-        "buddyline.Depth: node 'a' on key buddyline/node/b/depth"
+        "buddyline/node/b/depth: 100 refused, the first: buddyline.Depth: node 'a' on key buddyline/node/b/depth"
     ]
 
 

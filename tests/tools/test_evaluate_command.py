@@ -135,7 +135,7 @@ def test_bad_messages_and_damage_are_told_and_do_no_harm(tmp_path, capsys):
         writer.write("buddyline/pair/a/b/note", b"{}", FIRST)
         writer.flush()
         writer.write("buddyline/pair/a/b/pose", b'{"node_a": 7}', FIRST)
-    assert "o.mcap: buddyline/pair/a/b/pose: 1 messages refused" in damaged(tmp_path / "o.mcap")
+    assert "o.mcap: buddyline/pair/a/b/pose: 1 refused" in damaged(tmp_path / "o.mcap")
     whole = (tmp_path / "o.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) - 60])
     assert "cut.mcap: breaks off" in damaged(tmp_path / "cut.mcap")
