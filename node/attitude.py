@@ -87,7 +87,7 @@ def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[f
     return c * nx - s * ny, c * ny + s * nx, c * nz + s * nw, c * nw - s * nz
 
 
-class _Rest:
+class _RestWatch:
     """Watches for a time at rest, which tells the gyroscope's bias."""
 
     def __init__(self) -> None:
@@ -138,7 +138,7 @@ class VqfAttitude:
         self._calibration = calibration
         self._declination_rad = field.declination_rad if field else declination_rad
         self._heading = HeadingFilter(field, not calibration.is_none)
-        self._rest: _Rest | None = _Rest()
+        self._rest: _RestWatch | None = _RestWatch()
         self._vqf: Any = None
         self._bias_radps = np.zeros(3)
         self._last_ns = 0

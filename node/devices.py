@@ -31,7 +31,7 @@ class Frame:
     row_time_ns: int = 0
 
 
-class Camera(Protocol):
+class CameraDevice(Protocol):
     """Gives one frame per trigger; used by one thread.
 
     row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" where all
@@ -107,9 +107,9 @@ def load(registry: Mapping[str, str], what: str, name: str) -> Callable[..., Any
         raise BuddylineError(f"{what} {name!r} needs the package {error.name}: pip install 'buddyline[pi]'") from error
 
 
-def open_camera(config: NodeConfig, clock: Clock) -> Camera:
+def open_camera(config: NodeConfig, clock: Clock) -> CameraDevice:
     """Open the configured camera."""
-    camera: Camera = load(CAMERAS, "camera", config.camera.name)(config, clock)
+    camera: CameraDevice = load(CAMERAS, "camera", config.camera.name)(config, clock)
     return camera
 
 

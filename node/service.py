@@ -20,7 +20,7 @@ from buddyline.node.clock_sync import ClockSync
 from buddyline.node.clock_watch import ClockWatch
 from buddyline.node.config import NodeConfig
 from buddyline.node.detect import make_detector
-from buddyline.node.devices import Camera, Frame, Source, open_camera, open_sensors
+from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
@@ -58,7 +58,7 @@ class NodeService(Service):
         self,
         config: NodeConfig,
         clock: Clock | None = None,
-        camera: Callable[[NodeConfig, Clock], Camera] = open_camera,
+        camera: Callable[[NodeConfig, Clock], CameraDevice] = open_camera,
         sensors: Callable[[NodeConfig, Clock], list[Source]] = open_sensors,
     ) -> None:
         super().__init__(f"node {config.node}", StatusFile.of(f"node-{config.node}", config.status_file))
@@ -87,7 +87,7 @@ class NodeService(Service):
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError where one cannot be had."""
-        self.camera: Camera = self._open_camera(self.config, self.clock)
+        self.camera: CameraDevice = self._open_camera(self.config, self.clock)
         self.sources: list[Source] = self._open_sensors(self.config, self.clock)
         info = self._info()
         self.pipeline = Pipeline(

@@ -8,7 +8,7 @@ import sys
 from dataclasses import asdict, fields
 
 import cv2
-from buddyline.node.sim.dive import Plan, messages
+from buddyline.node.sim.dive import DivePlan, messages
 from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
@@ -21,7 +21,7 @@ ASPECT = 616 / 820
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    scenario, plan = Scenario(), Plan()
+    scenario, plan = Scenario(), DivePlan()
     parser.add_argument("output", metavar="OUT.mcap", help="the dive log to write; must not exist")
     parser.add_argument("--environment", choices=ENVIRONMENTS, default=scenario.environment, help="default: cavern")
     parser.add_argument("--seconds", type=float, default=plan.seconds, help="default: %(default)s")
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
         inertial=args.inertial,
     )
-    plan = Plan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
+    plan = DivePlan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
     with (
         new_dive_log(args.output, metadata) as writer,

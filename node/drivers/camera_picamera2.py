@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from buddyline.node.config import CameraConfig, NodeConfig
 from buddyline.node.devices import Frame
-from buddyline.node.drivers.health import Health
+from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.readout import GLOBAL_SHUTTERS, Readout, boottime_ns, line_time_ns, wall_offset_ns
 from buddyline.node.drivers.samples import DeviceError
 from buddyline.node.trigger import FrameChooser, PhaseLock, frames_per_trigger
@@ -64,7 +64,7 @@ class Picamera2Camera:
         self._frame_period_ns = trigger_period_ns // self._frames
         self._clock = clock
         self._boottime = boottime
-        self._health = Health("camera")
+        self._health = DeviceHealth("camera")
         self._camera: Any = None
         self._open()
 

@@ -12,7 +12,7 @@ import numpy as np
 from buddyline.node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
 from buddyline.node.config import NodeConfig
 from buddyline.node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
-from buddyline.node.drivers.health import Health
+from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_imu
 from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
@@ -65,8 +65,8 @@ class ImuSource:
         self._clock = clock
         self._device: ImuDevice | None = None
         self._turn = Metronome(IMU_PERIOD_NS, clock)
-        self._health = Health(self.name)
-        self._compass = Health("compass")
+        self._health = DeviceHealth(self.name)
+        self._compass = DeviceHealth("compass")
 
     @property
     def problem(self) -> str:
@@ -144,7 +144,7 @@ class DepthSource:
         self._zero = SurfaceZero(load_zero(zero_path, clock.now_ns()))
         self._clock = clock
         self._device: DepthDevice | None = None
-        self._health = Health(self.name)
+        self._health = DeviceHealth(self.name)
 
     @property
     def problem(self) -> str:

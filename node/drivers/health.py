@@ -7,7 +7,7 @@ import logging
 log = logging.getLogger(__name__)
 
 
-class Health:
+class DeviceHealth:
     """What is wrong with one device. problem: "" where all is well."""
 
     def __init__(self, name: str) -> None:

@@ -21,7 +21,7 @@ FROZEN_READINGS: Final = 10
 MAG_RETRY_NS: Final = S_NS
 
 
-class Motion(Protocol):
+class MotionSensor(Protocol):
     """What gives acceleration and angular rate, in its own frame."""
 
     def start(self) -> None:
@@ -73,7 +73,7 @@ class ChipImu:
     def __init__(
         self,
         name: str,
-        motion: Motion,
+        motion: MotionSensor,
         magnetometer: Magnetometer | None,
         R_body_chip: NDArray[np.float64],
         clock: Clock,

@@ -76,7 +76,7 @@ def decode_model(words: Sequence[int]) -> Model:
 
 
 @dataclass(frozen=True, slots=True)
-class Terms:
+class FirstOrder:
     """First-order terms: difference to the reference temperature, 0.01 degC, offset, sensitivity."""
 
     dt: int
@@ -85,19 +85,19 @@ class Terms:
     sens: int
 
 
-def first_order_30ba(c: Sequence[int], d2: int) -> Terms:
+def first_order_30ba(c: Sequence[int], d2: int) -> FirstOrder:
     """Return the first-order terms of C1..C6 and the raw temperature."""
     dt = d2 - (c[4] << 8)
-    return Terms(dt, 2000 + (dt * c[5] >> 23), (c[1] << 16) + (c[3] * dt >> 7), (c[0] << 15) + (c[2] * dt >> 8))
+    return FirstOrder(dt, 2000 + (dt * c[5] >> 23), (c[1] << 16) + (c[3] * dt >> 7), (c[0] << 15) + (c[2] * dt >> 8))
 
 
-def first_order_02ba(c: Sequence[int], d2: int) -> Terms:
+def first_order_02ba(c: Sequence[int], d2: int) -> FirstOrder:
     """Return the first-order terms of C1..C6 and the raw temperature."""
     dt = d2 - (c[4] << 8)
-    return Terms(dt, 2000 + (dt * c[5] >> 23), (c[1] << 17) + (c[3] * dt >> 6), (c[0] << 16) + (c[2] * dt >> 7))
+    return FirstOrder(dt, 2000 + (dt * c[5] >> 23), (c[1] << 17) + (c[3] * dt >> 6), (c[0] << 16) + (c[2] * dt >> 7))
 
 
-def second_order_30ba(terms: Terms) -> tuple[int, int, int]:
+def second_order_30ba(terms: FirstOrder) -> tuple[int, int, int]:
     """Return Ti, OFFi and SENSi."""
     dt, t = terms.dt, terms.temp - 2000
     if t >= 0:
@@ -110,7 +110,7 @@ def second_order_30ba(terms: Terms) -> tuple[int, int, int]:
     return ti, offi, sensi
 
 
-def second_order_02ba(terms: Terms) -> tuple[int, int, int]:
+def second_order_02ba(terms: FirstOrder) -> tuple[int, int, int]:
     """Return Ti, OFFi and SENSi."""
     dt, t = terms.dt, terms.temp - 2000
     if t >= 0:

@@ -7,11 +7,11 @@ import math
 import numpy as np
 from buddyline.node.sim.glow import stands_out
 from buddyline.node.sim.randomness import generator
-from buddyline.node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, View
+from buddyline.node.sim.scene import LAMP_RADIUS_M, Lamp, Scene, SceneView
 from buddyline.protocol.messages import MAX_BLOBS, Blob
 
 
-def visible(scene: Scene, index: int, view: View, lamp: Lamp) -> bool:
+def visible(scene: Scene, index: int, view: SceneView, lamp: Lamp) -> bool:
     """Tell whether a lamp is in the picture, nothing stands before it, and it is bright enough to be seen."""
     u, v = lamp.pixel
     scenario, camera = scene.scenario, scene.rigs[index].camera
@@ -19,7 +19,7 @@ def visible(scene: Scene, index: int, view: View, lamp: Lamp) -> bool:
     return bool(inside) and not view.hidden(lamp.pixel) and stands_out(lamp, scenario.water, camera.fx_px)
 
 
-def blobs(scene: Scene, index: int, view: View, stamp_ns: int) -> tuple[list[Blob], int]:
+def blobs(scene: Scene, index: int, view: SceneView, stamp_ns: int) -> tuple[list[Blob], int]:
     """Return the candidates of one picture in no order, and how many of them were too many for a message.
 
     Lights in view are seen with noise sigma_px, some grossly off, some missed; other lamps and reflections are

@@ -28,7 +28,7 @@ Entry: TypeAlias = tuple[int, str, Message]
 
 
 @dataclass(frozen=True)
-class Plan:
+class DivePlan:
     """What of a dive is logged. images: pictures in place of synthetic candidates.
 
     exposure_sigma_ns: how far exposures stray from their trigger, 1 sd. lost_share: of the frames.
@@ -56,7 +56,7 @@ class Plan:
         return round(S_NS / self.rate_hz)
 
 
-def messages(world: World, plan: Plan) -> Iterator[Entry]:
+def messages(world: World, plan: DivePlan) -> Iterator[Entry]:
     """Yield all messages of a dive in order of time; the same world and plan give the same dive."""
     start_ns = world.scenario.start_ns
     end_ns = start_ns + math.ceil(plan.seconds * S_NS)
@@ -79,13 +79,13 @@ def _samples(sample: Callable[[str, int], Message], node: str, key: str, stamps_
         yield stamp_ns, key, sample(node, stamp_ns)
 
 
-def _triggers(world: World, plan: Plan, end_ns: int) -> Iterator[int]:
+def _triggers(world: World, plan: DivePlan, end_ns: int) -> Iterator[int]:
     """Yield the indices of the triggers of a dive; none so early that its exposure might precede the start."""
     lead_ns = 5 * plan.exposure_sigma_ns + MS_NS
     yield from range(-(-(world.scenario.start_ns + lead_ns) // plan.period_ns), -(-end_ns // plan.period_ns))
 
 
-def _truth(world: World, plan: Plan, end_ns: int) -> Iterator[Entry]:
+def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
     """Yield the truth at the nominal instant of every trigger, whether or not its frames were lost."""
     nodes = (world.scenario.node_a, world.scenario.node_b)
     key = topics.TRUTH.key(*nodes)
@@ -96,7 +96,7 @@ def _truth(world: World, plan: Plan, end_ns: int) -> Iterator[Entry]:
             yield stamp_ns, topics.NET_TRUTH.key(NET, node), world.node_truth(node, stamp_ns, NET)
 
 
-def _frames(world: World, plan: Plan, node: str, end_ns: int) -> Iterator[Entry]:
+def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[Entry]:
     """Yield each frame that was not lost, as picture or candidates, and where its lights truly are."""
     index, seq = world.scenario.index(node), 0
     light_truth = topics.LIGHT_TRUTH.key(node)

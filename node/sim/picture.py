@@ -8,7 +8,7 @@ from buddyline.node.sim import tags
 from buddyline.node.sim.glow import GlowRenderer
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import Scenario
-from buddyline.node.sim.scene import Lamp, Passer, Scene, View
+from buddyline.node.sim.scene import Lamp, Passer, Scene, SceneView
 from buddyline.node.sim.scenery import Scenery
 from buddyline.node.sim.snow import Snow
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ class Painter:
         self._noise = _noise_tile(scenario, index)
         self._full: Image = np.empty((scenario.height_px, scenario.width_px, 3), np.float32)
 
-    def paint(self, view: View, t_s: float, frame: int) -> NDArray[np.uint8]:
+    def paint(self, view: SceneView, t_s: float, frame: int) -> NDArray[np.uint8]:
         """Return the picture, (H, W, 3) uint8, blue green red. frame: names the frame's own noise."""
         rng = generator(self._seed, "frame", self._index, frame)
         lamps = [lamp for lamp in (*view.lights, *view.others) if self._matters(lamp)]

@@ -19,7 +19,7 @@ SPILL: Final = 0.015
 
 
 @dataclass(frozen=True)
-class Rig:
+class SimulatedRig:
     """One node as built. lights_m, aims: (2, 3), left and right, in its camera frame; aims are unit vectors.
 
     beams_rad, intensities: (2,), of the lamps: 1 sd of the beam, and how bright on its axis.
@@ -33,7 +33,7 @@ class Rig:
     depth_port_m: Vector
 
 
-def build(scenario: Scenario, index: int) -> Rig:
+def build(scenario: Scenario, index: int) -> SimulatedRig:
     """Return the rig of A (0) or B (1): lamps toed out by 3 to 8 degrees, a few millimetres off the bar."""
     rng = generator(scenario.seed, "rig", index)
     half_m = scenario.baseline_m(index) / 2
@@ -45,7 +45,7 @@ def build(scenario: Scenario, index: int) -> Rig:
     beams_rad = np.radians(rng.uniform(9, 16, 2))
     intensities = rng.uniform(0.7, 1.4, 2)
     port_m = np.array([0.0, 0.06, -0.12]) if scenario.rig_sigma_m > 0 else np.zeros(3)
-    return Rig(scenario.camera(index), lights_m, aims, beams_rad, intensities, port_m)
+    return SimulatedRig(scenario.camera(index), lights_m, aims, beams_rad, intensities, port_m)
 
 
 def beam(cos_off_axis: Vector, beam_rad: float) -> Vector:

@@ -10,11 +10,11 @@ import numpy as np
 from buddyline.node.sim import tags
 from buddyline.node.sim.camera import project
 from buddyline.node.sim.randomness import Sway, generator
-from buddyline.node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, Rig, beam, build
+from buddyline.node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, SimulatedRig, beam, build
 from buddyline.node.sim.rotation import Matrix, Vector
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.tags import SeenTag
-from buddyline.node.sim.trajectory import Motion, Placement
+from buddyline.node.sim.trajectory import PairMotion, Placement
 
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0
@@ -22,7 +22,7 @@ PASSING_SHARE = 0.6
 
 
 @dataclass(frozen=True)
-class Source:
+class LightSource:
     """A lamp in the water, in NED. intensity: on its axis; beam_rad: 1 sd of its beam.
 
     stretch: how much ripples draw its image out, up and down (a reflection), 1 for none.
@@ -37,7 +37,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A Source before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture."""
+    """A LightSource before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture."""
 
     position_m: Vector
     aim: Vector
@@ -73,7 +73,7 @@ class Passer:
 
 
 @dataclass(frozen=True)
-class View:
+class SceneView:
     """All that one camera sees at one time. lights: the other node's, left and right."""
 
     placement: Placement
@@ -97,15 +97,15 @@ class Scene:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.motion = Motion(scenario)
-        self.rigs: tuple[Rig, Rig] = (build(scenario, 0), build(scenario, 1))
+        self.motion = PairMotion(scenario)
+        self.rigs: tuple[SimulatedRig, SimulatedRig] = (build(scenario, 0), build(scenario, 1))
         rng = generator(scenario.seed, "divers")
         self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
         # Pictures, candidates and truth of a frame all ask for the same view.
         self.view = lru_cache(maxsize=4)(self._view)
         self._ripple = [[Sway(rng, 0.4, 3.0) for _ in range(2)] for _ in range(2)]
 
-    def _view(self, index: int, t_s: float) -> View:
+    def _view(self, index: int, t_s: float) -> SceneView:
         """Return what A (0) or B (1) sees at t_s, with every lamp where its row of the picture has it."""
         placement = self.motion.placement(index, t_s)
         lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))
@@ -115,7 +115,7 @@ class Scene:
             sources += [self._reflection(1 - index, side, t_s) for side in (LEFT, RIGHT)]
         others = tuple(self._seen(index, placement, source) for source in sources)
         seen_tags = self._tags(index, placement, t_s) if self.scenario.tags else ()
-        return View(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights), seen_tags)
+        return SceneView(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights), seen_tags)
 
     def _light(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
         lamp = self._seen(index, placement, self._source(1 - index, side, t_s))
@@ -131,18 +131,18 @@ class Scene:
         """Return when a row is exposed, against the middle row."""
         return (v_px - (self.scenario.height_px - 1) / 2) * self.scenario.row_time_ns * 1e-9
 
-    def _source(self, index: int, side: int, t_s: float) -> Source:
+    def _source(self, index: int, side: int, t_s: float) -> LightSource:
         """Return a node's own light."""
         placement, rig = self.motion.placement(index, t_s), self.rigs[index]
         R_ned_camera = placement.R_ned_body @ R_BODY_CAMERA
-        return Source(
+        return LightSource(
             placement.position_ned_m + R_ned_camera @ rig.lights_m[side],
             R_ned_camera @ rig.aims[side],
             float(rig.intensities[side]),
             float(rig.beams_rad[side]),
         )
 
-    def _reflection(self, index: int, side: int, t_s: float) -> Source:
+    def _reflection(self, index: int, side: int, t_s: float) -> LightSource:
         """Return a light's mirror image in the surface; ripples move it and draw it out."""
         source = self._source(index, side, t_s)
         mirror = np.array([1.0, 1.0, -1.0])
@@ -155,7 +155,7 @@ class Scene:
             stretch=3.0,
         )
 
-    def _seen(self, index: int, placement: Placement, source: Source) -> Lamp:
+    def _seen(self, index: int, placement: Placement, source: LightSource) -> Lamp:
         """Return a lamp as A (0) or B (1) sees it."""
         R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
         position_m = R_camera_ned @ (source.position_ned_m - placement.position_ned_m)
@@ -244,7 +244,7 @@ class _Diver:
         self._ways = [Sway(rng, 12.0, 40.0) for _ in range(3)]
         self._aims = [Sway(rng, 6.0, 25.0) for _ in range(2)]
 
-    def source(self, nodes: tuple[Placement, Placement], t_s: float) -> Source:
+    def source(self, nodes: tuple[Placement, Placement], t_s: float) -> LightSource:
         """Return the lamp."""
         start_m, end_m = (node.position_ned_m for node in nodes)
         line_m = end_m - start_m
@@ -255,4 +255,4 @@ class _Diver:
         azimuth = math.pi * 2 * self._aims[0](t_s)
         tilt = 0.6 * self._aims[1](t_s)
         aim = np.array([math.cos(azimuth) * math.cos(tilt), math.sin(azimuth) * math.cos(tilt), math.sin(tilt)])
-        return Source(position_m, aim, self._intensity, self._beam_rad)
+        return LightSource(position_m, aim, self._intensity, self._beam_rad)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import Scenario
-from buddyline.node.sim.scene import View
+from buddyline.node.sim.scene import SceneView
 from buddyline.protocol.messages import CameraModel
 from numpy.typing import NDArray
 
@@ -54,7 +54,7 @@ class Scenery:
         self._speck: Image = np.array((0.8, 1.0, 0.9), np.float32)
         self.passer_radiance: Image = 0.5 * self._ambient
 
-    def paint(self, view: View, t_s: float, coarse: Image, full: Image) -> None:
+    def paint(self, view: SceneView, t_s: float, coarse: Image, full: Image) -> None:
         """Paint the background over full, (H, W, 3), and the glow that stands in coarse, (h, w, 3), onto it."""
         if not self._sunlit:
             coarse += DARK_WATER
@@ -86,7 +86,7 @@ class Scenery:
         self._add_body(view)
         cv2.resize(middle, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
 
-    def _add_body(self, view: View) -> None:
+    def _add_body(self, view: SceneView) -> None:
         """Add the other node's bar and housing to the middle picture, before sunlit water."""
         left, right = view.lights
         if min(left.position_m[2], right.position_m[2]) < 0.3 or np.isnan([left.pixel, right.pixel]).any():

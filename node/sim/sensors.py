@@ -24,7 +24,7 @@ SLOW_SHARE: Final = 0.8
 """Share of an attitude error's variance that wanders slowly; the rest is new in every sample."""
 
 
-class Sensors:
+class SensorModel:
     """The sensors of one node. Times in seconds since the start; stamps name the samples' own noise."""
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import Scenario
-from buddyline.node.sim.scene import View
+from buddyline.node.sim.scene import SceneView
 from buddyline.protocol.messages import CameraModel
 from numpy.typing import NDArray
 
@@ -28,7 +28,7 @@ class Snow:
         self._shine = rng.lognormal(-1.0, 0.8, count)
         self._camera = camera
 
-    def add(self, full: Image, view: View, t_s: float) -> None:
+    def add(self, full: Image, view: SceneView, t_s: float) -> None:
         """Add the particles in view to the full picture."""
         camera = self._camera
         position_m = view.placement.position_ned_m

@@ -27,7 +27,7 @@ class Placement:
     position_ned_m: Vector
 
 
-class Motion:
+class PairMotion:
     """The two nodes' motion: A rests and sways, B backs off and circles before it.
 
     The angles are shares of the room that the bar leaves in the picture at the present range, so that the lights

@@ -17,7 +17,7 @@ from buddyline.node.sim.rig import LEFT, Q_BODY_CAMERA, R_BODY_CAMERA, RIGHT
 from buddyline.node.sim.rotation import Matrix, Vector
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.scene import Lamp, Scene
-from buddyline.node.sim.sensors import Sensors
+from buddyline.node.sim.sensors import SensorModel
 from buddyline.node.sim.tags import Tag
 from buddyline.protocol.messages import (
     ArTag,
@@ -45,7 +45,7 @@ class World:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self._scene = Scene(scenario)
-        self._sensors = [Sensors(scenario, self._scene, i) for i in range(2)]
+        self._sensors = [SensorModel(scenario, self._scene, i) for i in range(2)]
         self._painters: dict[int, Painter] = {}
 
     def info(self, node: str, stamp_ns: int, trigger_period_ns: int) -> NodeInfo:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-from buddyline.node.sim.dive import Plan, messages
+from buddyline.node.sim.dive import DivePlan, messages
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
@@ -22,7 +22,7 @@ def _dive(plan, **scenario):
 
 
 def test_a_dive_holds_every_topic_at_its_rate_in_order_of_time():
-    entries = _dive(Plan(seconds=4, rate_hz=5, imu=True, lost_share=0.0))
+    entries = _dive(DivePlan(seconds=4, rate_hz=5, imu=True, lost_share=0.0))
     counts = Counter(key for _, key, _ in entries)
     assert counts.pop("buddyline/pair/a/b/truth") == 19
     assert [counts.pop(f"buddyline/net/main/truth/{node}") for node in "ab"] == [19, 19]
@@ -40,8 +40,8 @@ def test_a_dive_holds_every_topic_at_its_rate_in_order_of_time():
 
 
 def test_triggers_are_those_of_the_contract_and_exposures_stray():
-    period_ns = Plan(rate_hz=8).period_ns
-    entries = _dive(Plan(seconds=10, rate_hz=8, lost_share=0.1))
+    period_ns = DivePlan(rate_hz=8).period_ns
+    entries = _dive(DivePlan(seconds=10, rate_hz=8, lost_share=0.1))
     frames = [m for _, _, m in entries if isinstance(m, Candidates) and m.node == "a"]
     truths = {m.trigger: m for _, _, m in entries if isinstance(m, Truth)}
     lights = [m for _, _, m in entries if isinstance(m, LightTruth) and m.node == "a"]
@@ -55,13 +55,15 @@ def test_triggers_are_those_of_the_contract_and_exposures_stray():
 
 
 def test_the_same_seed_is_the_same_dive_to_the_last_bit():
-    one, two = (_dive(Plan(seconds=2)) for _ in range(2))
+    one, two = (_dive(DivePlan(seconds=2)) for _ in range(2))
     assert [encode(m) for _, _, m in one] == [encode(m) for _, _, m in two]
 
 
 def test_a_dive_with_images_holds_what_the_camera_saw():
     scenario = {"environment": "lake", "width_px": 410, "height_px": 308}
-    pictures = [m for _, _, m in _dive(Plan(seconds=0.5, images=True), **scenario) if isinstance(m, CompressedImage)]
+    pictures = [
+        m for _, _, m in _dive(DivePlan(seconds=0.5, images=True), **scenario) if isinstance(m, CompressedImage)
+    ]
     assert {m.frame_id for m in pictures} == {"a_camera", "b_camera"}
     world = World(Scenario(seed=3, start_ns=START_NS, **scenario))
     image = cv2.imdecode(np.frombuffer(pictures[0].data, np.uint8), cv2.IMREAD_COLOR)
@@ -75,4 +77,4 @@ def test_a_dive_with_images_holds_what_the_camera_saw():
 )
 def test_what_cannot_be_logged_is_refused_by_name(wrong, named):
     with pytest.raises(BuddylineError, match=named):
-        Plan(**wrong)
+        DivePlan(**wrong)

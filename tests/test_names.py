@@ -1,0 +1,47 @@
+"""A type name stands for one thing in the whole project."""
+
+import ast
+from collections import defaultdict
+
+from tests.imports import modules
+from tests.processes import REPOSITORY
+
+# Still to be renamed. This list only ever gets shorter.
+KNOWN_DOUBLES = frozenset(
+    {"Candidates", "ClockOffset", "Detection", "Frame", "Line", "Plan", "Publisher", "Reading", "Shot", "Sighting"}
+    | {"Track", "Translation", "View"}
+)
+
+
+def classes(root):
+    """Return the modules that define a class, by its name without a leading underscore."""
+    found = defaultdict(set)
+    for module, path in modules(root).items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                found[node.name.lstrip("_")].add(module)
+    return found
+
+
+def doubles(root):
+    """Return the names that two modules give to a class."""
+    return {name: sorted(where) for name, where in classes(root).items() if len(where) > 1}
+
+
+def test_no_class_name_stands_for_two_things():
+    found = {name: where for name, where in doubles(REPOSITORY).items() if name not in KNOWN_DOUBLES}
+    assert found == {}, "choose another name: one class name, one thing"
+
+
+def test_known_doubles_are_still_there():
+    assert doubles(REPOSITORY).keys() >= KNOWN_DOUBLES, "take the renamed ones from KNOWN_DOUBLES"
+
+
+def test_a_double_is_found(tmp_path):
+    for folder, text in (
+        ("node", "class Light:\n    pass\n"),
+        ("tools", "def f():\n    class _Light:\n        pass\n"),
+    ):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "lamp.py").write_text(text)
+    assert doubles(tmp_path) == {"Light": ["buddyline.node.lamp", "buddyline.tools.lamp"]}
