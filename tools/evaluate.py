@@ -8,9 +8,10 @@ import logging
 from pathlib import Path
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.evaluation.logs import load_for_evaluation, parse_pair
+from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.report import as_dict, as_text
 from buddyline.tools.evaluation.result import evaluate
+from buddyline.tools.pairs import add_pair_argument
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "logs", nargs="+", metavar="OUT.mcap", help="the solved log; further logs, where it lacks candidates or truth"
     )
     parser.add_argument("--truth", action="append", default=[], metavar="T.mcap", help="the log with the truth")
-    parser.add_argument("--pair", type=parse_pair, metavar="A/B", help="where the logs hold more than one pair")
+    add_pair_argument(parser, "the only one")
     parser.add_argument("--json", action="store_true", help="print one JSON object: metres, radians, seconds")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots (PNG); needs the extra `plots`")
 

@@ -14,8 +14,9 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Truth
-from buddyline.tools.evaluation.logs import load, parse_pair
+from buddyline.tools.evaluation.logs import load
 from buddyline.tools.newfile import check_new, write_new
+from buddyline.tools.pairs import add_pair_argument
 from msgspec import UNSET
 
 FORMATS: Final = ("tum", "csv", "foxglove")
@@ -44,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses in place of the solved ones (tum)")
     parser.add_argument("--rejected", action="store_true", help="rows for triggers without a pose, too (csv)")
-    parser.add_argument("--pair", type=parse_pair, metavar="A/B", help="where the logs hold more than one pair")
+    add_pair_argument(parser, "the only one")
 
 
 def run(args: argparse.Namespace) -> int:

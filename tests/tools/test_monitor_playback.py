@@ -5,6 +5,7 @@ from __future__ import annotations
 import html.parser
 import json
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,10 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
-from buddyline.tools.monitor.playback import LEAD_NS, Playback, survey
+from buddyline.tools.monitor.playback import LEAD_NS, Playback, cover
 from buddyline.tools.monitor.report import report_html
 from buddyline.tools.monitor.summary import summarize
+from buddyline.tools.pairs import solved_pair
 from mcap.reader import make_reader
 
 from tests.tools.evaluated import INFOS, frame, info, pose, rejection, truth, write_log
@@ -43,7 +45,8 @@ def dive(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 class TestPlayback:
     def test_playing_on_gives_what_was_known_then(self, dive: str) -> None:
-        with Playback([dive]) as playback:
+        with Dive([dive]) as opened:
+            playback = Playback(opened)
             for k in range(0, 60, 7):
                 playback.advance(at(k))
             playback.advance(at(59))
@@ -53,7 +56,8 @@ class TestPlayback:
             assert playback.picture.nodes["b"].depth == expected.nodes["b"].depth
 
     def test_a_jump_ends_where_playing_on_would(self, dive: str) -> None:
-        with Playback([dive]) as played, Playback([dive]) as jumped:
+        with Dive([dive]) as one, Dive([dive]) as other:
+            played, jumped = Playback(one), Playback(other)
             played.advance(at(450))
             jumped.seek(at(500))
             jumped.seek(at(450))
@@ -64,7 +68,8 @@ class TestPlayback:
             assert list(jumped.picture.points) == [p for p in played.picture.points if p.at_ns >= begin_ns]
 
     def test_a_jump_past_the_ends_stays_inside(self, dive: str) -> None:
-        with Playback([dive]) as playback:
+        with Dive([dive]) as opened:
+            playback = Playback(opened)
             playback.seek(0)
             assert playback.position_ns == playback.start_ns
             playback.seek(2**62)
@@ -73,14 +78,13 @@ class TestPlayback:
     def test_a_log_without_messages_is_refused(self, tmp_path: Path) -> None:
         with DiveLogWriter(tmp_path / "empty.mcap"):
             pass
-        with pytest.raises(BuddylineError, match="no message"):
-            Playback([str(tmp_path / "empty.mcap")])
+        with Dive([tmp_path / "empty.mcap"]) as opened, pytest.raises(BuddylineError, match="no message"):
+            Playback(opened)
 
     def test_the_survey_finds_the_stretch_without_poses(self, dive: str) -> None:
         coverage = Coverage(at(0), at(TICKS - 1))
         assert not coverage.complete
-        for _ in survey([dive], coverage):
-            pass
+        cover(coverage, [dive], ("a", "b"), threading.Event())
         assert coverage.complete
         ((begin_ns, end_ns, reasons),) = coverage.without()
         assert reasons == {"ambiguous": 30}
@@ -117,10 +121,10 @@ class TestReadingFromATime:
 class TestReport:
     def test_the_page_is_whole_and_asks_nothing_of_any_network(self, dive: str) -> None:
         with Dive([dive]) as opened:
-            page = report_html(opened)
+            page = report_html(opened, solved_pair(opened, None))
         outside = _Addresses()
         outside.feed(page)
-        assert [address for address in outside.found if not address.startswith("data:")] == []
+        assert [address for address in outside.found if not address.startswith(("data:", "#"))] == []
         assert "default-src 'none'" in page
         assert not re.search(r"https?://", page)
         for text in ("570 (95%)", "for 3.0 s: more than one arrangement fits (30)", "light spacing", "3.00 to 3.00 m"):
@@ -128,7 +132,7 @@ class TestReport:
 
     def test_the_replay_has_the_poses(self, dive: str) -> None:
         with Dive([dive]) as opened:
-            page = report_html(opened)
+            page = report_html(opened, solved_pair(opened, None))
         frames = json.loads(re.search(r"FRAMES=(\[.*?\]);\n", page).group(1))  # type: ignore[union-attr]
         times = np.array([keyframe[0] for keyframe in frames])
         np.testing.assert_allclose(frames[0][1], (3.0, 0.0, 0.0), atol=1e-4)
@@ -138,25 +142,38 @@ class TestReport:
     def test_figures_against_truth(self, tmp_path: Path) -> None:
         messages = [*INFOS.values(), *(pose(k, (0.0, 0.0, 3.02)) for k in range(5)), *(truth(k) for k in range(5))]
         with Dive([write_log(tmp_path / "t.mcap", *messages)]) as opened:
-            errors_m = summarize(opened).errors_m
-        np.testing.assert_allclose(errors_m, [[0.02, 0.02]] * 5, atol=1e-9)
+            errors = summarize(opened, ("a", "b")).errors()
+        np.testing.assert_allclose([errors.translation_m, errors.range_m], [[0.02] * 5] * 2, atol=1e-9)
 
     def test_pictures_are_shown_with_what_became_of_them(self, dive: str) -> None:
         with Dive([dive]) as opened:
-            shots = summarize(opened).shots
+            shots = summarize(opened, ("a", "b")).shots
         assert list(shots) == ["a"]
         assert shots["a"].words.startswith("Pose at 3.00 m")
+
+    def test_of_several_pairs_the_chosen_one_is_told_and_the_others_named(self, tmp_path: Path) -> None:
+        others = [pose(k, (0.0, 0.0, 7.0), node_b="c") for k in range(9)]
+        path = write_log(tmp_path / "three.mcap", *INFOS.values(), info("c"), *map(pose, range(5)), *others)
+        with Dive([path]) as opened:
+            first = report_html(opened, solved_pair(opened, None))
+            chosen = report_html(opened, solved_pair(opened, ("c", "a")))
+            with pytest.raises(BuddylineError, match="nothing of pair b/c; pairs: a/b, a/c"):
+                solved_pair(opened, ("b", "c"))
+        assert "3.00 to 3.00 m" in first
+        assert "poses of other pairs are not told: a and c" in first
+        assert "7.00 to 7.00 m" in chosen
+        assert "poses of other pairs are not told: a and b" in chosen
 
     def test_a_log_without_poses_is_reported_and_says_so(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "raw.mcap", *INFOS.values(), *(frame("a", k) for k in range(20)))
         with Dive([path]) as opened:
-            page = report_html(opened)
+            page = report_html(opened, solved_pair(opened, None))
         assert "this log holds no pose; solve it first" in page
 
     def test_names_in_a_log_cannot_become_markup(self, tmp_path: Path) -> None:
         bad = info("a", software="</script><img src=http://x>")
         with Dive([write_log(tmp_path / "x.mcap", bad, pose(0))]) as opened:
-            page = report_html(opened)
+            page = report_html(opened, solved_pair(opened, None))
         assert "<img src=http" not in page
 
 

@@ -27,24 +27,16 @@ from buddyline.protocol.topics import (
     REJECTED,
     TRUTH,
     Topic,
-    parse_key,
 )
 from buddyline.tools.dives import Dive, open_each
-from buddyline.tools.evaluation.recorded import Pair, Recorded
+from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.truth import inverted
+from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.
 _TAGS: Final = (ARTAG,)
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH)
-
-
-def parse_pair(text: str) -> Pair:
-    """Return the two node ids of `A/B`; raise BuddylineError otherwise."""
-    parsed = parse_key(f"buddyline/pair/{text}/pose")
-    if parsed is None:
-        raise BuddylineError(f"--pair {text}: give A/B, two node ids")
-    return parsed[1][0], parsed[1][1]
 
 
 def _names(dives: Sequence[Dive]) -> str:
@@ -65,13 +57,9 @@ def _choose_pair(dives: Sequence[Dive], wanted: Pair | None) -> Pair:
         nodes = [ids[0] for ids in _ids(dives, CANDIDATES)]
         pairs = [(nodes[0], nodes[-1])] if nodes else []
     if wanted is not None:
-        if wanted not in pairs and wanted[::-1] not in pairs:
-            have = ", ".join("/".join(pair) for pair in pairs) or "none"
-            raise BuddylineError(f"{_names(dives)}: nothing of pair {'/'.join(wanted)}; pairs: {have}")
-        return wanted if wanted in pairs else (wanted[1], wanted[0])
+        return wanted_pair(wanted, pairs, _names(dives))
     if len(pairs) > 1:
-        listed = ", ".join("/".join(pair) for pair in pairs)
-        raise BuddylineError(f"{_names(dives)}: holds pairs {listed}; choose one with --pair A/B")
+        raise BuddylineError(f"{_names(dives)}: holds pairs {pair_words(pairs)}; choose one with --pair A/B")
     if not pairs:
         raise BuddylineError(f"{_names(dives)}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     return pairs[0]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from buddyline.protocol.messages import Attitude, Candidates, LightTruth, NodeInfo, Rejected, RelativePose, Truth
-
-Pair = tuple[str, str]
+from buddyline.tools.pairs import Pair
 
 
 @dataclass

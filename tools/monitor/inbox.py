@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.envelope import Refusals
@@ -35,15 +34,6 @@ QUEUED: Final = 2048
 NEWEST_ONLY: Final = frozenset({ATTITUDE.name, DEPTH.name, IMAGE.name, NODE_STATUS.name, SOLVER_STATUS.name, INFO.name})
 
 
-@dataclass(frozen=True)
-class Presence:
-    """Someone came onto the bus or left it."""
-
-    name: str
-    alive: bool
-    at_ns: int
-
-
 class Inbox:
     """What has come off the bus and is not yet in the picture; safe to fill from several threads."""
 
@@ -52,7 +42,7 @@ class Inbox:
         self.refusals = Refusals("monitor")
         self._clock = clock
         self._lock = threading.Lock()
-        self._queue: deque[Received | Presence] = deque()
+        self._queue: deque[Received | tuple[str, bool, int]] = deque()
         self._newest: dict[str, Received] = {}
 
     def subscribe(self, bus: Bus) -> None:
@@ -79,9 +69,9 @@ class Inbox:
     def presence(self, name: str, alive: bool) -> None:
         """Keep that someone came or left; only for the bus."""
         with self._lock:
-            self._put(Presence(name, alive, self._clock.now_ns()))
+            self._put((name, alive, self._clock.now_ns()))
 
-    def _put(self, item: Received | Presence) -> None:
+    def _put(self, item: Received | tuple[str, bool, int]) -> None:
         self._queue.append(item)
         if len(self._queue) > QUEUED:
             self._queue.popleft()
@@ -97,10 +87,8 @@ class Inbox:
             self._newest.clear()
             self._queue.clear()
         for item in items:
-            if isinstance(item, Presence):
-                picture.alive(item.name, item.alive, item.at_ns)
-                continue
-            envelope = self.refusals.open(item)
-            if envelope is not None:
+            if isinstance(item, tuple):
+                picture.alive(*item)
+            elif envelope := self.refusals.open(item):
                 picture.take(envelope.message, envelope.node, envelope.time_ns)
         return len(items)

@@ -7,33 +7,30 @@ import logging
 import webbrowser
 from typing import TYPE_CHECKING, Final
 
-from buddyline.protocol.clock import Clock, SystemClock
-from buddyline.protocol.service import Service
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.live import LiveClient
-from buddyline.tools.monitor.inbox import Inbox
-from buddyline.tools.monitor.page import DEFAULT_HOST, DEFAULT_PORT, Page, open_server
-from buddyline.tools.monitor.picture import PairPicture
+from buddyline.tools.pairs import add_pair_argument
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
+    from buddyline.tools.monitor.page import Page
+    from buddyline.tools.monitor.picture import PairPicture
 
 log = logging.getLogger(__name__)
 
-TICK_S: Final = 0.1
-TEXTS_EVERY: Final = 3
-PLOTS_EVERY: Final = 10
+DEFAULT_HOST: Final = "127.0.0.1"
+DEFAULT_PORT: Final = 8080
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add_client_arguments(parser)
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
+    add_pair_argument(parser, "the first that the solver speaks of")
     add_page_arguments(parser)
 
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare where the page is served."""
+    """Declare how long and where the page is served."""
+    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
     parser.add_argument(
         "--host",
         default=DEFAULT_HOST,
@@ -45,6 +42,8 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 
 def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
     """Serve the page, and say where."""
+    from buddyline.tools.monitor.page import Page, open_server
+
     server = open_server(args.host, args.port, title)
     address = f"http://{'127.0.0.1' if args.host == '0.0.0.0' else args.host}:{server.get_port()}"
     if args.host not in ("127.0.0.1", "localhost", "::1"):
@@ -57,37 +56,26 @@ def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until stopped."""
+    from buddyline.protocol.clock import SystemClock
+    from buddyline.tools.live import LiveClient
+    from buddyline.tools.monitor.inbox import Inbox
+    from buddyline.tools.monitor.picture import PairPicture
+
     client = LiveClient("monitor", client_config(args), args.seconds)
     page = open_page(args, "Buddyline", live=True)
     clock = SystemClock()
-    inbox = Inbox(clock)
-    client.spawn("page", lambda: _draw(client, page, inbox, clock))
+    inbox, picture = Inbox(clock), PairPicture(args.pair)
+
+    def step(_: bool) -> tuple[PairPicture, int, bool]:
+        inbox.empty_into(picture)
+        return picture, clock.now_ns(), False
 
     def follow(bus: Bus) -> None:
         inbox.subscribe(bus)
         client.wait()
 
+    client.spawn("page", lambda: page.draw_until(client.stop, step))
     try:
         return client.run(follow)
     finally:
         page.close()
-
-
-def _draw(service: Service, page: Page, inbox: Inbox, clock: Clock) -> None:
-    picture = PairPicture()
-    tick = 0
-    seen: frozenset[int] = frozenset()
-    while not service.stop.wait(TICK_S):
-        inbox.empty_into(picture)
-        viewers, now_ns = page.viewers(), clock.now_ns()
-        if not viewers:
-            seen = viewers
-            continue
-        # Who has just come sees all of it at once.
-        tick = 0 if viewers - seen else tick + 1
-        seen = viewers
-        page.draw_scene(picture, now_ns)
-        if tick % TEXTS_EVERY == 0:
-            page.draw_texts(picture, now_ns)
-        if tick % PLOTS_EVERY == 0:
-            page.draw_plots(picture, now_ns)

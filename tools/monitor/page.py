@@ -1,9 +1,11 @@
-"""The page itself, drawn by viser: the pair in space, and the panel beside it. The only module that knows viser."""
+"""The page itself, drawn by viser: the pair in space, and the panel beside it. Nothing else imports viser."""
 
 from __future__ import annotations
 
 import io
 import logging
+import threading
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -13,7 +15,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.monitor import panel
-from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, Point
+from buddyline.tools.monitor.picture import KEPT_NS, NodePicture, PairPicture, columns
 from buddyline.tools.monitor.scene import Floats, age_colours, ellipsoid, fields_of_view, fit, holds, wxyz
 
 if TYPE_CHECKING:
@@ -21,20 +23,29 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-DEFAULT_HOST: Final = "127.0.0.1"
-DEFAULT_PORT: Final = 8080
+TICK_S: Final = 0.1
+TEXTS_EVERY: Final = 3
+PLOTS_EVERY: Final = 10
+PLOTTED_S: Final = 120.0
+PLOT_PX: Final = 120
+MISSES: Final = "Triggers without a pose, a second"
+POSE_COLOUR: Final = "#f2a93b"
+NO_POSE_COLOUR: Final = "#e0574f"
 
 A_COLOUR: Final = (235, 235, 240)
 B_COLOUR: Final = (255, 170, 60)
 STALE_COLOUR: Final = (95, 98, 105)
 LEFT_COLOUR: Final = (255, 92, 92)
 RIGHT_COLOUR: Final = (75, 227, 122)
+WHITE: Final = (255, 255, 255)
 NORTH_COLOUR: Final = (230, 80, 80)
 DOWN_COLOUR: Final = (90, 160, 255)
+SURFACE_COLOUR: Final = (70, 150, 190)
 FRUSTUM_M: Final = 0.35
 LIGHT_RADIUS_M: Final = 0.035
-# An eye this far, by its distance, from where the page put it is its owner's; a new place is taken from so far on.
+# A viewer has chosen the view where the eye is further from where the page put it than this share of its distance.
 CHOSEN: Final = 0.02
+# The view follows the pair only where a better eye is further away than this share of its distance.
 WORTH_A_TURN: Final = 0.2
 # Trail segments longer than this in time are not drawn: between the poses nothing is known.
 TRAIL_BREAK_NS: Final = 3 * S_NS // 2
@@ -66,10 +77,13 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
     return server
 
 
+Colour = tuple[int, int, int]
+
+
 class NodeDrawing:
     """One node to scale: camera frustum, bar, both lights, name."""
 
-    def __init__(self, server: viser.ViserServer, path: str, colour: tuple[int, int, int]) -> None:
+    def __init__(self, server: viser.ViserServer, path: str, colour: Colour) -> None:
         self._scene = server.scene
         self._path = path
         self._colour = colour
@@ -79,10 +93,10 @@ class NodeDrawing:
         self._label = self._scene.add_label(f"{path}/name", "", position=(0.0, -0.25, 0.0), visible=False)
         self._stale = False
 
-    def show(self, info: NodeInfo | None, R_s_c: Floats, t_m: Floats, text: str, stale: bool) -> None:
+    def show(self, node: NodePicture | None, R_s_c: Floats, t_m: Floats, text: str, stale: bool) -> None:
         """Draw it at t_m, turned by R_s_c."""
-        if info is not None:
-            self._build(info)
+        if node is not None and node.info is not None:
+            self._build(node.info)
         self._frame.position = t_m
         self._frame.wxyz = wxyz(R_s_c)
         self._frame.visible = self._label.visible = True
@@ -103,34 +117,30 @@ class NodeDrawing:
         self._rig = rig
         fov_rad, aspect = fields_of_view(info)
         lights_m = np.array([info.light_left_m, info.light_right_m])
-        add = self._scene
+        frustum: dict[str, Any] = {"scale": FRUSTUM_M, "thickness": 0.012, "cast_shadow": False}
+        ball: dict[str, Any] = {"subdivisions": 2, "cast_shadow": False, "receive_shadow": False}
         self._parts = [
-            add.add_camera_frustum(
-                f"{self._path}/camera", fov_rad, aspect, scale=FRUSTUM_M, thickness=0.012, cast_shadow=False
-            ),
-            add.add_line_segments(f"{self._path}/bar", lights_m[None].astype(np.float32), self._colour, thickness=0.02),
-            *(
-                add.add_icosphere(
-                    f"{self._path}/{name}",
-                    LIGHT_RADIUS_M,
-                    subdivisions=2,
-                    position=light_m,
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
-                for name, light_m in zip(("left", "right"), lights_m, strict=True)
-            ),
+            self._scene.add_camera_frustum(f"{self._path}/camera", fov_rad, aspect, **frustum),
+            self._scene.add_line_segments(f"{self._path}/bar", _segments(*lights_m), self._colour, thickness=0.02),
+        ] + [
+            self._scene.add_icosphere(f"{self._path}/{name}", LIGHT_RADIUS_M, position=light_m, **ball)
+            for name, light_m in zip(("left", "right"), lights_m, strict=True)
         ]
         self._tint()
 
     def _tint(self) -> None:
-        if not self._parts:
-            return
-        camera, bar, left, right = self._parts
-        camera.color = STALE_COLOUR if self._stale else self._colour
-        bar.colors = np.array(STALE_COLOUR if self._stale else self._colour, np.uint8)
-        left.color = STALE_COLOUR if self._stale else LEFT_COLOUR
-        right.color = STALE_COLOUR if self._stale else RIGHT_COLOUR
+        if self._parts:
+            colours = (self._colour, self._colour, LEFT_COLOUR, RIGHT_COLOUR)
+            camera, bar, *lights = self._parts
+            camera.color, bar_colour, *light_colours = (STALE_COLOUR,) * 4 if self._stale else colours
+            bar.colors = np.array(bar_colour, np.uint8)
+            for light, colour in zip(lights, light_colours, strict=True):
+                light.color = colour
+
+
+def _segments(*points: Any) -> Any:
+    """Return line segments (n / 2, 2, 3) of pairs of points."""
+    return np.array(points, np.float32).reshape(-1, 2, 3)
 
 
 class SceneDrawing:
@@ -141,53 +151,34 @@ class SceneDrawing:
         scene = server.scene
         self._a = NodeDrawing(server, "/a", A_COLOUR)
         self._b = NodeDrawing(server, "/b", B_COLOUR)
-        none = np.zeros((1, 2, 3), np.float32)
-        self._sight = scene.add_line_segments("/sight", none, (255, 255, 255), thickness=0.008)
-        self._plumb = scene.add_line_segments("/plumb", none, DOWN_COLOUR, thickness=0.006)
-        self._trail_key: tuple[int, int] | None = None
+        hidden: dict[str, Any] = {"visible": False}
+        nothing = np.zeros((1, 2, 3), np.float32)
+        self._sight = scene.add_line_segments("/sight", nothing, WHITE, thickness=0.008, **hidden)
+        self._plumb = scene.add_line_segments("/plumb", nothing, DOWN_COLOUR, thickness=0.006, **hidden)
+        no_shadow: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._ellipsoid = scene.add_icosphere(
-            "/uncertainty", 1.0, B_COLOUR, opacity=0.35, subdivisions=3, cast_shadow=False, receive_shadow=False
+            "/uncertainty", 1.0, B_COLOUR, opacity=0.35, subdivisions=3, **no_shadow, **hidden
         )
-        scene.add_grid(
-            "/grid",
-            60.0,
-            60.0,
-            plane="xy",
-            cell_size=1.0,
-            section_size=5.0,
-            cell_color=(62, 78, 92),
-            section_color=(84, 108, 128),
-            shadow_opacity=0.0,
-            fade_distance=60.0,
-        )
+        grid: dict[str, Any] = {"plane": "xy", "section_size": 5.0, "shadow_opacity": 0.0}
+        cells: dict[str, Any] = {"cell_color": (62, 78, 92), "section_color": (84, 108, 128), "fade_distance": 60.0}
+        scene.add_grid("/grid", 60.0, 60.0, cell_size=1.0, **grid, **cells)
+        cells = {"cell_color": SURFACE_COLOUR, "section_color": SURFACE_COLOUR, "plane_color": (60, 150, 200)}
         self._surface = scene.add_grid(
-            "/surface",
-            60.0,
-            60.0,
-            plane="xy",
-            cell_size=5.0,
-            section_size=5.0,
-            cell_color=(70, 150, 190),
-            section_color=(70, 150, 190),
-            plane_color=(60, 150, 200),
-            plane_opacity=0.06,
-            shadow_opacity=0.0,
-            visible=False,
+            "/surface", 60.0, 60.0, cell_size=5.0, plane_opacity=0.06, **grid, **cells, **hidden
         )
-        self._surface_name = scene.add_label("/surface/name", "surface", visible=False)
-        down = np.array([[[0, 0, 0], [0, 0, 1.0]], [[0, 0, 1.0], [0.06, 0, 0.88]], [[0, 0, 1.0], [-0.06, 0, 0.88]]])
-        scene.add_line_segments("/down", down.astype(np.float32), DOWN_COLOUR, thickness=0.012)
+        self._surface_name = scene.add_label("/surface/name", "surface", **hidden)
+        down = _segments((0, 0, 0), (0, 0, 1), (0, 0, 1), (0.06, 0, 0.88), (0, 0, 1), (-0.06, 0, 0.88))
+        scene.add_line_segments("/down", down, DOWN_COLOUR, thickness=0.012)
         scene.add_label("/down/name", "gravity", position=(0.0, 0.0, 1.05))
-        north = np.array([[[0, 0, 0], [1.5, 0, 0]], [[1.5, 0, 0], [1.35, 0.08, 0]], [[1.5, 0, 0], [1.35, -0.08, 0]]])
-        self._north = scene.add_line_segments("/north", north.astype(np.float32), NORTH_COLOUR, thickness=0.012)
+        north = _segments((0, 0, 0), (1.5, 0, 0), (1.5, 0, 0), (1.35, 0.08, 0), (1.5, 0, 0), (1.35, -0.08, 0))
+        self._north = scene.add_line_segments("/north", north, NORTH_COLOUR, thickness=0.012, **hidden)
         scene.add_label("/north/name", "north", position=(1.6, 0.0, 0.0))
+        self._trail_key: tuple[int, int] | None = None
         self._fitted = False
         self._t_m = np.array([3.0, 0.0, 0.0])
-        for handle in (self._sight, self._plumb, self._ellipsoid, self._north):
-            handle.visible = False
         self._eyes: dict[int, tuple[Floats, Floats, bool]] = {}  # eye, target, upright, as the page put them
         server.on_client_connect(self.fit)
-        server.on_client_disconnect(self._forget)
+        server.on_client_disconnect(lambda client: self._eyes.pop(client.client_id, None) and None)
 
     def fit(self, client: viser.ClientHandle) -> None:
         """Turn one viewer's eye so that it sees the pair."""
@@ -198,11 +189,13 @@ class SceneDrawing:
             client.camera.position = eye
             client.camera.look_at = target
 
-    def _forget(self, client: viser.ClientHandle) -> None:
-        self._eyes.pop(client.client_id, None)
+    def fit_all(self) -> None:
+        """Turn every viewer's eye."""
+        for client in list(self._server.get_clients().values()):
+            self.fit(client)
 
     def _follow(self) -> None:
-        """Turn the eyes of those whom the pair has left, and who have not chosen their own view."""
+        """Turn the eyes of viewers out of whose view the pair has moved, unless they have chosen their own view."""
         for client in list(self._server.get_clients().values()):
             put = self._eyes.get(client.client_id)
             if put is None:
@@ -217,37 +210,31 @@ class SceneDrawing:
                 if np.linalg.norm(better - eye) > WORTH_A_TURN * np.linalg.norm(better):
                     self.fit(client)
 
-    def fit_all(self) -> None:
-        """Turn every viewer's eye."""
-        for client in list(self._server.get_clients().values()):
-            self.fit(client)
-
     def draw(self, picture: PairPicture, now_ns: int) -> None:
         """Move everything to where it is now."""
-        name_a, name_b = picture.ends()
+        (name_a, name_b), (node_a, node_b) = picture.ends(), picture.end_nodes()
         frame, pose, stale = picture.frame(), picture.pose, picture.is_stale(now_ns)
-        node_a = picture.nodes.get(name_a) if name_a else None
-        node_b = picture.nodes.get(name_b) if name_b else None
         with self._server.atomic():
             self._north.visible = frame.levelled
-            depth_a_m = node_a.depth.depth_m if node_a is not None and node_a.depth is not None else None
-            level = "" if frame.levelled else ", attitude unknown: drawn level"
             if name_a is not None:
-                text = f"{name_a}{_depth_words(depth_a_m)}{level}"
+                text = f"{name_a}{_depth_words(node_a)}{'' if frame.levelled else ', attitude unknown: drawn level'}"
                 silent = node_a is None or now_ns - node_a.alive_ns() > S_NS
-                self._a.show(node_a.info if node_a else None, frame.R_s_a, np.zeros(3), text, silent)
-            self._surface.visible = self._surface_name.visible = depth_a_m is not None
-            if depth_a_m is not None:
-                self._surface.position = (0.0, 0.0, -depth_a_m)
+                self._a.show(node_a, frame.R_s_a, np.zeros(3), text, silent)
+            depth_m = node_a.depth.depth_m if node_a is not None and node_a.depth is not None else None
+            self._surface.visible = self._surface_name.visible = depth_m is not None
+            if depth_m is not None:
+                self._surface.position = (0.0, 0.0, -depth_m)
             if pose is None or name_b is None:
                 self._b.hide()
                 return
             t_m = np.array(frame.place(pose))
-            depth_b_m = node_b.depth.depth_m if node_b is not None and node_b.depth is not None else None
-            age_ns = picture.pose_age_ns(now_ns) or 0
-            text_b = f"{name_b}{_depth_words(depth_b_m)}{f', STALE {age_ns / S_NS:.0f} s' if stale else ''}"
-            self._b.show(node_b.info if node_b else None, frame.turn_b(pose), t_m, text_b, stale)
-            self._lines(t_m, stale)
+            age_s = (picture.pose_age_ns(now_ns) or 0) / S_NS
+            text = f"{name_b}{_depth_words(node_b)}{f', STALE {age_s:.0f} s' if stale else ''}"
+            self._b.show(node_b, frame.turn_b(pose), t_m, text, stale)
+            self._sight.points = _segments(np.zeros(3), t_m)
+            self._sight.colors = np.array(STALE_COLOUR if stale else WHITE, np.uint8)
+            self._plumb.points = _segments(t_m, (t_m[0], t_m[1], 0.0))
+            self._sight.visible = self._plumb.visible = True
             half_m, R_s_axes = ellipsoid(pose, frame)
             self._ellipsoid.visible = not stale
             self._ellipsoid.position = tuple(t_m.tolist())
@@ -260,21 +247,17 @@ class SceneDrawing:
             self._fitted = True
             self.fit_all()
 
-    def _lines(self, t_m: Floats, stale: bool) -> None:
-        foot_m = np.array([t_m[0], t_m[1], 0.0])
-        self._sight.points = np.array([[np.zeros(3), t_m]], np.float32)
-        self._sight.colors = np.array(STALE_COLOUR if stale else (255, 255, 255), np.uint8)
-        self._plumb.points = np.array([[t_m, foot_m]], np.float32)
-        self._sight.visible = self._plumb.visible = True
-
     def draw_trail(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw where B was, by age; slower than the rest, since all of it is sent anew."""
-        points = list(picture.points)
-        key = (len(points), now_ns // S_NS)
+        """Draw where B was, by age; at most once a second, since all of it is sent anew."""
+        key = (len(picture.points), now_ns // S_NS)
         if key == self._trail_key:
             return
         self._trail_key = key
-        segments = joined(points)
+        segments = [
+            (one, other)
+            for one, other in pairwise(picture.points)
+            if other.at_ns - one.at_ns <= TRAIL_BREAK_NS and one.frame.levelled == other.frame.levelled
+        ]
         if not segments:
             self._server.scene.remove_by_name("/trail")
             return
@@ -285,17 +268,51 @@ class SceneDrawing:
         self._server.scene.add_line_segments("/trail", ends_m, colours, thickness=0.015)
 
 
-def joined(points: list[Point]) -> list[tuple[Point, Point]]:
-    """Return the pairs of successive points between which the trail is drawn."""
-    return [
-        (one, other)
-        for one, other in pairwise(points)
-        if other.at_ns - one.at_ns <= TRAIL_BREAK_NS and one.levelled == other.levelled
-    ]
+def _depth_words(node: NodePicture | None) -> str:
+    return "" if node is None or node.depth is None else f", {node.depth.depth_m:.1f} m deep"
 
 
-def _depth_words(depth_m: float | None) -> str:
-    return "" if depth_m is None else f", {depth_m:.1f} m deep"
+class TimePlots:
+    """The last two minutes of each quantity, and how many triggers of each second ended without a pose."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        self._gui = gui
+        self._folder = gui.add_folder("Last two minutes")
+        self._plots: dict[str, viser.GuiUplotHandle] = {}
+
+    def draw(self, picture: PairPicture, now_ns: int) -> None:
+        """Draw each quantity that is known; a plot is there while it has values."""
+        points = [point for point in picture.points if 0 <= now_ns - point.at_ns <= PLOTTED_S * S_NS]
+        t_s, found = columns(points, now_ns)
+        for title, values in found.items():
+            known = np.isfinite(values)
+            # Points without a line between them: nothing is known where there is no pose.
+            self._show(title, (t_s[known], values[known]), POSE_COLOUR, {"width": 0})
+        missed_s = [(miss.at_ns - now_ns) / S_NS for miss in picture.misses]
+        counts, edges_s = np.histogram(missed_s, int(PLOTTED_S), (-PLOTTED_S, 0.0))
+        if picture.misses:
+            self._show(MISSES, (edges_s[1:], counts.astype(float)), NO_POSE_COLOUR, {})
+        for title, plot in self._plots.items():
+            shown = title in found or (title == MISSES and bool(picture.misses))
+            if plot.visible != shown:
+                plot.visible = shown
+
+    def _show(self, title: str, data: tuple[Floats, Floats], colour: str, style: dict[str, Any]) -> None:
+        if title in self._plots:
+            self._plots[title].data = data
+            return
+        points = {"show": bool(style), "size": 3, "fill": colour, "stroke": colour}
+        series: Any = ({"label": "s before now"}, {"label": title, "stroke": colour, "points": points} | style)
+        with self._folder:
+            self._plots[title] = self._gui.add_uplot(
+                data,
+                series,
+                title=title,
+                scales={"x": {"time": False, "range": (-PLOTTED_S, 0.0)}},
+                axes=({"size": 26}, {}),
+                legend={"show": False},
+                height=PLOT_PX,
+            )
 
 
 class Page:
@@ -307,14 +324,12 @@ class Page:
         gui = server.gui
         self._headline = gui.add_html(panel.block("Starting."))
         self.scene = SceneDrawing(server)
-        self._fit = gui.add_button("Show both nodes")
-        self._fit.on_click(lambda _: self.scene.fit_all())
+        gui.add_button("Show both nodes").on_click(lambda _: self.scene.fit_all())
         with gui.add_folder("What is going on"):
             self._health = gui.add_html("")
         with gui.add_folder("Cameras"):
             self._cameras: list[viser.GuiHtmlHandle] = [gui.add_html("", visible=False) for _ in range(2)]
-        with gui.add_folder("Last two minutes"):
-            self._plots = gui.add_html("")
+        self._plots = TimePlots(gui)
         self._content: dict[int, str] = {}
 
     def close(self) -> None:
@@ -322,31 +337,38 @@ class Page:
         with redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    def viewers(self) -> frozenset[int]:
-        """Return the ids of those who look at the page now."""
-        return frozenset(self.server.get_clients())
+    def draw_until(self, stop: threading.Event, step: Callable[[bool], tuple[PairPicture, int, bool]]) -> None:
+        """Draw what step returns, ten times a second, until stop is set.
 
-    def draw_scene(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw what moves."""
+        step(watched): the picture, its present time (ns), and whether all is to be drawn at once; watched: whether
+        anyone looks at the page.
+        """
+        tick = 0
+        seen: frozenset[int] = frozenset()
+        while not stop.wait(TICK_S):
+            viewers = frozenset(self.server.get_clients())
+            picture, now_ns, jumped = step(bool(viewers))
+            # Who has just come sees all of it at once.
+            tick = 0 if jumped or viewers - seen else tick + 1
+            seen = viewers
+            if viewers:
+                self._draw(picture, now_ns, tick)
+
+    def _draw(self, picture: PairPicture, now_ns: int, tick: int) -> None:
         self.scene.draw(picture, now_ns)
+        if tick % TEXTS_EVERY == 0:
+            self.set_html(self._headline, panel.headline(picture, now_ns, live=self._live))
+            self.set_html(self._health, panel.health(picture, now_ns, live=self._live))
+            for slot, node in zip(self._cameras, picture.end_nodes(), strict=True):
+                slot.visible = node is not None
+                if node is not None:
+                    self.set_html(slot, panel.camera(picture, node, now_ns))
+            self.scene.draw_trail(picture, now_ns)
+        if tick % PLOTS_EVERY == 0:
+            self._plots.draw(picture, now_ns)
 
-    def draw_texts(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw figures, health and pictures, each where it changed; and the trail."""
-        self._set(self._headline, panel.headline(picture, now_ns, live=self._live))
-        self._set(self._health, panel.health(picture, now_ns, live=self._live))
-        for slot, name in zip(self._cameras, picture.ends(), strict=True):
-            node = picture.nodes.get(name) if name is not None else None
-            slot.visible = node is not None
-            if node is not None:
-                self._set(slot, panel.camera(picture, node, now_ns))
-        self.scene.draw_trail(picture, now_ns)
-
-    def draw_plots(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw the plots anew."""
-        self._set(self._plots, panel.plots(picture, now_ns))
-
-    def _set(self, handle: viser.GuiHtmlHandle, content: str) -> None:
-        # What is sent goes to every viewer: the same thing twice would be load for nothing.
+    def set_html(self, handle: viser.GuiHtmlHandle, content: str) -> None:
+        """Show HTML where it differs from what is shown: what is sent goes to every viewer."""
         if self._content.get(id(handle)) != content:
             self._content[id(handle)] = content
             handle.content = content

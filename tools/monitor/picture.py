@@ -1,16 +1,19 @@
 """What is known of a pair at an instant: the state that page, playback and report draw from.
 
 Pure: messages go in with the time at which they came, questions are asked with the present time, and nothing here
-asks a clock. Live, the times are those of this machine, so that nobody else's clock makes a thing look fresh;
-of a stored dive they are its log times.
+asks a clock. Live, the times are receive times, so that no other machine's clock makes a thing look fresh; of a stored
+dive they are log times.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import (
@@ -26,7 +29,9 @@ from buddyline.protocol.messages import (
     SolverStatus,
 )
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMAGE, INFO, NODE_STATUS, POSE, Topic
-from buddyline.tools.monitor.scene import Frame, frame_of
+from buddyline.tools.monitor.scene import Floats, Frame, frame_of
+from buddyline.tools.pairs import Pair
+from msgspec import UNSET, UnsetType
 
 KEPT_NS: Final = 150 * S_NS
 # Poses closer together than this are one point of trail and plots.
@@ -41,14 +46,51 @@ class Point:
     """One pose on trail and plots. at_ns: when it came; t_m: B in the scene, (north, east, down) from A."""
 
     at_ns: int
+    pose: RelativePose
     t_m: tuple[float, float, float]
-    levelled: bool
-    range_m: float
-    azimuth_rad: float | None
-    inclination_rad: float | None
-    range_gap_m: float
-    latency_s: float | None
-    sigma_m: float
+    frame: Frame = field(compare=False)
+
+    @property
+    def latency_s(self) -> float:
+        """From exposure to here; NaN for a log solved offline, whose poses have log times of their own stamps."""
+        latency_ns = self.at_ns - self.pose.stamp_ns
+        return latency_ns / S_NS if 0 < latency_ns < LIVE_WITHIN_NS else math.nan
+
+
+# What is plotted over time: the title, the value of a point (NaN where it is not known).
+QUANTITIES: Final = (
+    ("Range, m", lambda point: point.pose.range_m),
+    ("Azimuth, deg from north, clockwise", lambda point: _degrees(point.pose.azimuth_rad)),
+    ("Inclination, deg, up positive", lambda point: _degrees(point.pose.inclination_rad)),
+    ("Gap between both nodes' ranges, mm", lambda point: point.pose.range_gap_m * 1e3),
+    ("Latency from exposure to here, ms", lambda point: point.latency_s * 1e3),
+)
+
+
+def columns(points: Sequence[Point], zero_ns: int) -> tuple[Floats, dict[str, Floats]]:
+    """Return the points' times from zero_ns (s), and of each quantity that is known its values by title.
+
+    Azimuths are continued past 360 deg, so that no line jumps where north is crossed.
+    """
+    t_s = np.array([(point.at_ns - zero_ns) / S_NS for point in points], float)
+    found = {}
+    for title, value in QUANTITIES:
+        values = np.array([value(point) for point in points], float)
+        known = np.isfinite(values)
+        if title.startswith("Azimuth"):
+            values[known] = np.unwrap(values[known], period=360.0)
+        if known.any():
+            found[title] = values
+    return t_s, found
+
+
+def _degrees(angle_rad: float | UnsetType) -> float:
+    return math.nan if angle_rad is UNSET else math.degrees(angle_rad)
+
+
+def sigma_m(pose: RelativePose) -> float:
+    """Return a position's uncertainty: the root of the sum of its three variances."""
+    return math.sqrt(sum(max(pose.covariance[i], 0.0) for i in (0, 7, 14)))
 
 
 @dataclass(frozen=True)
@@ -57,7 +99,6 @@ class Miss:
 
     at_ns: int
     reason: str
-    detail: str
 
 
 @dataclass
@@ -93,21 +134,47 @@ class NodePicture:
         """Return when the last sign of life came (0: never)."""
         return max((ns for what, ns in self.heard_ns.items() if what != INFO.name), default=0)
 
-    def seen(self, trigger: int) -> Candidates | None:
-        """Return this node's candidates of one trigger, where they are still kept."""
-        return next((frame for frame in reversed(self.candidates) if frame.trigger == trigger), None)
-
-    def seen_at(self, stamp_ns: int) -> Candidates | None:
-        """Return the candidates found in the picture of this stamp, where they are still kept."""
+    def shown(self) -> Candidates | None:
+        """Return the candidates of the newest picture, where they are still kept; without pictures the newest."""
+        if self.image is None:
+            return self.candidates[-1] if self.candidates else None
+        stamp_ns = self.image.stamp_ns
         return next((frame for frame in reversed(self.candidates) if frame.stamp_ns == stamp_ns), None)
+
+    def take(self, message: Message, at_ns: int) -> None:
+        """Take one of the node's messages."""
+        kind = _KINDS.get(type(message))
+        if kind is None:
+            return
+        topic, field_name = kind
+        self.heard_ns[topic.name] = at_ns
+        if isinstance(message, Candidates):
+            self.candidates.append(message)
+            return
+        if isinstance(message, NodeStatus) and _is_new_problem(self.status, message):
+            self.problem_since_ns = at_ns
+        setattr(self, field_name, message)
+
+
+_KINDS: Final[dict[type[Message], tuple[Topic, str]]] = {
+    NodeInfo: (INFO, "info"),
+    Attitude: (ATTITUDE, "attitude"),
+    Depth: (DEPTH, "depth"),
+    NodeStatus: (NODE_STATUS, "status"),
+    CompressedImage: (IMAGE, "image"),
+    Candidates: (CANDIDATES, "candidates"),
+}
 
 
 class PairPicture:
-    """The state of one pair: the first one that a solver speaks of, else the first two nodes by name."""
+    """The state of one pair, and of all nodes.
 
-    def __init__(self) -> None:
+    pair: the one to follow; without, the first that a solver speaks of, and until then the first two nodes by name.
+    """
+
+    def __init__(self, pair: Pair | None = None) -> None:
         self.nodes: dict[str, NodePicture] = {}
-        self.pair: tuple[str, str] | None = None
+        self.pair = pair
         self.pose: RelativePose | None = None
         self.pose_ns: int | None = None
         self.points: deque[Point] = deque()
@@ -121,28 +188,27 @@ class PairPicture:
         self.solver_left_ns: int | None = None
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        self.other_pairs: set[tuple[str, str]] = set()
-        self._frame = Frame.unknown()
+        self.other_pairs: set[Pair] = set()
 
     def take(self, message: Message, node: str | None, at_ns: int) -> None:
         """Take one message that came at at_ns; node: of a picture, whose message does not name it."""
         self.first_ns = at_ns if self.first_ns is None else self.first_ns
         self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
-        if isinstance(message, RelativePose | Rejected | SolverStatus):
-            pair = (message.node_a, message.node_b)
-            if self.pair is None:
-                self.pair = pair
-            if pair != self.pair:
-                self.other_pairs.add(pair)
-                return
-            if isinstance(message, SolverStatus):
-                self._take_solver(message, at_ns)
-            else:
-                self._take_result(message, at_ns)
+        if not isinstance(message, RelativePose | Rejected | SolverStatus):
+            sender = getattr(message, "node", node)
+            if isinstance(sender, str):
+                self.nodes.setdefault(sender, NodePicture(sender)).take(message, at_ns)
             return
-        sender = getattr(message, "node", node)
-        if isinstance(sender, str):
-            self._take_node(self.nodes.setdefault(sender, NodePicture(sender)), message, at_ns)
+        pair = (message.node_a, message.node_b)
+        self.pair = self.pair or pair
+        if pair != self.pair:
+            self.other_pairs.add(pair)
+        elif isinstance(message, SolverStatus):
+            if _is_new_problem(self.solver, message):
+                self.solver_problem_since_ns = at_ns
+            self.solver, self.solver_ns = message, at_ns
+        else:
+            self._take_result(message, at_ns)
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
         """Take what the bus says of who is there: `node/<id>` or `solver/...`."""
@@ -160,46 +226,25 @@ class PairPicture:
         names = [*sorted(self.nodes), None, None]
         return names[0], names[1]
 
+    def end_nodes(self) -> tuple[NodePicture | None, NodePicture | None]:
+        """Return what is known of A and of B."""
+        a, b = (self.nodes.get(name) if name is not None else None for name in self.ends())
+        return a, b
+
     def pose_age_ns(self, now_ns: int) -> int | None:
         """Return how old the newest pose is, None where there is none."""
         return None if self.pose_ns is None else max(now_ns - self.pose_ns, 0)
 
     def is_stale(self, now_ns: int) -> bool:
         """Return whether what the scene shows of B is no longer so."""
-        age_ns, a = self.pose_age_ns(now_ns), self.nodes.get(self.ends()[0] or "")
+        age_ns, a = self.pose_age_ns(now_ns), self.end_nodes()[0]
         stale_ns = round(stale_after_s(POSE) * S_NS) if a is None else a.stale_after_ns(POSE)
         return age_ns is None or age_ns >= stale_ns
 
     def frame(self) -> Frame:
         """Return how A's camera stands in the scene, by A's newest attitude."""
-        return self._frame
-
-    def recent(self, now_ns: int, within_ns: int) -> list[Point]:
-        """Return the poses of the last so many ns, oldest first."""
-        return [point for point in self.points if now_ns - within_ns <= point.at_ns <= now_ns]
-
-    def _take_node(self, node: NodePicture, message: Message, at_ns: int) -> None:
-        kind = _KINDS.get(type(message))
-        if kind is None:
-            return
-        topic, field_name = kind
-        node.heard_ns[topic.name] = at_ns
-        if isinstance(message, Candidates):
-            node.candidates.append(message)
-            return
-        if isinstance(message, NodeStatus):
-            before = node.status.problem if node.status else ""
-            if _subject(message.problem) != _subject(before):
-                node.problem_since_ns = at_ns
-        setattr(node, field_name, message)
-        if isinstance(message, NodeInfo | Attitude) and node.node == self.ends()[0]:
-            self._frame = frame_of(node.info, node.attitude)
-
-    def _take_solver(self, status: SolverStatus, at_ns: int) -> None:
-        before = self.solver.problem if self.solver else ""
-        if _subject(status.problem) != _subject(before):
-            self.solver_problem_since_ns = at_ns
-        self.solver, self.solver_ns = status, at_ns
+        node = self.end_nodes()[0]
+        return Frame.unknown() if node is None else frame_of(node.info, node.attitude)
 
     def _take_result(self, result: RelativePose | Rejected, at_ns: int) -> None:
         self.results[result.trigger] = result
@@ -207,48 +252,22 @@ class PairPicture:
             del self.results[next(iter(self.results))]
         if isinstance(result, Rejected):
             self.rejected[result.reason] += 1
-            self.misses.append(Miss(at_ns, result.reason, result.detail))
+            self.misses.append(Miss(at_ns, result.reason))
             return
         self.solved += 1
         self.pose, self.pose_ns = result, at_ns
         if self.points and 0 <= at_ns - self.points[-1].at_ns < POINT_SPACING_NS:
             return
-        node = self.nodes.get(result.node_a)
-        if node is not None:
-            self._frame = frame_of(node.info, node.attitude)
-        self.points.append(point_of(result, self._frame, at_ns))
+        frame = self.frame()
+        self.points.append(Point(at_ns, result, frame.place(result), frame))
         while self.points and self.points[0].at_ns < at_ns - KEPT_NS:
             self.points.popleft()
 
 
-_KINDS: Final[dict[type[Message], tuple[Topic, str]]] = {
-    NodeInfo: (INFO, "info"),
-    Attitude: (ATTITUDE, "attitude"),
-    Depth: (DEPTH, "depth"),
-    NodeStatus: (NODE_STATUS, "status"),
-    CompressedImage: (IMAGE, "image"),
-    Candidates: (CANDIDATES, "candidates"),
-}
-
-
-def _subject(problem: str) -> str:
-    """Return what a problem is about, without the figures that change from one report to the next."""
-    return "".join(letter for letter in problem if not letter.isdigit())
-
-
-def point_of(pose: RelativePose, frame: Frame, at_ns: int) -> Point:
-    """Return what trail and plots keep of a pose that came at at_ns."""
-    latency_ns = at_ns - pose.stamp_ns
-    variance_m2 = sum(max(pose.covariance[i], 0.0) for i in (0, 7, 14))
-    return Point(
-        at_ns=at_ns,
-        t_m=frame.place(pose),
-        levelled=frame.levelled,
-        range_m=pose.range_m,
-        azimuth_rad=pose.azimuth_rad if isinstance(pose.azimuth_rad, float) else None,
-        inclination_rad=pose.inclination_rad if isinstance(pose.inclination_rad, float) else None,
-        range_gap_m=pose.range_gap_m,
-        # A log that was solved offline has its poses at their own stamps: that is no latency.
-        latency_s=latency_ns / S_NS if 0 < latency_ns < LIVE_WITHIN_NS else None,
-        sigma_m=float(variance_m2**0.5),
+def _is_new_problem(before: NodeStatus | SolverStatus | None, status: NodeStatus | SolverStatus) -> bool:
+    """Return whether a status speaks of another problem; figures in it change from one report to the next."""
+    one, other = (
+        "".join(letter for letter in text if not letter.isdigit())
+        for text in ((before.problem if before else ""), status.problem)
     )
+    return one != other

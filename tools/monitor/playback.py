@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final, Self
+import threading
+from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Rejected
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.picture import PairPicture
+from buddyline.tools.pairs import Pair
 
 SHOWN: Final = (
     *("info", "candidates", "attitude", "depth", "image", "node_status"),
@@ -17,24 +18,23 @@ SHOWN: Final = (
 )
 # Before an instant that was jumped to, this much of the dive is read for trail and plots.
 LEAD_NS: Final = 30 * S_NS
+# After so many outcomes, reading the whole dive lets playback and page go first.
+PACE: Final = 256
 
 
 class Playback:
-    """The logs of one dive, at one instant."""
+    """A dive at one instant; pair: the one that is shown."""
 
-    def __init__(self, paths: list[str]) -> None:
-        self._dive = Dive(paths, one_rig=False)
-        try:
-            self.start_ns, self.end_ns = self._dive.start_ns, self._dive.end_ns
-        except BaseException:
-            self._dive.close()
-            raise
+    def __init__(self, dive: Dive, pair: Pair | None = None) -> None:
+        self._dive = dive
+        self._pair = pair
+        self.start_ns, self.end_ns = dive.start_ns, dive.end_ns
         self.seek(self.start_ns)
 
     def seek(self, to_ns: int) -> None:
         """Go to an instant of log time, forward or back."""
         to_ns = min(max(to_ns, self.start_ns), self.end_ns)
-        self.picture = PairPicture()
+        self.picture = PairPicture(self._pair)
         # The first calibrations, which a jump may pass over.
         for info in self._dive.infos().values():
             self.picture.take(info, None, self.start_ns)
@@ -53,27 +53,17 @@ class Playback:
             self.picture.take(self._next.message, self._next.node, self._next.time_ns)
             self._next = next(self._messages, None)
 
-    def close(self) -> None:
-        """Close the logs."""
-        self._dive.close()
 
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the logs."""
-        self.close()
-
-
-def survey(paths: list[str], coverage: Coverage) -> Iterator[None]:
-    """Fill coverage from the logs, a record at a time; yields so that the reader sets the pace.
+def cover(coverage: Coverage, paths: list[str], pair: Pair | None, stop: threading.Event) -> None:
+    """Count a whole dive's outcomes of one pair (None: of all) into coverage, until stop is set.
 
     Opens the logs anew: it runs beside the playback, which reads elsewhere in the files.
     """
     with Dive(paths, one_rig=False) as dive:
-        for envelope in dive.messages("pose", "rejected"):
+        for count, envelope in enumerate(dive.messages("pose", "rejected")):
             outcome = envelope.message
-            coverage.add(envelope.time_ns, outcome.reason if isinstance(outcome, Rejected) else None)
-            yield
+            if pair is None or envelope.ids == pair:
+                coverage.add(envelope.time_ns, outcome.reason if isinstance(outcome, Rejected) else None)
+            if count % PACE == PACE - 1 and stop.wait(0.001):
+                return
     coverage.complete = True

@@ -6,12 +6,14 @@ import json
 from collections.abc import Sequence
 from typing import Any, Final
 
+import msgspec
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.monitor.picture import PairPicture, Point
 from buddyline.tools.monitor.scene import fields_of_view
-from msgspec import Struct
 
 
-class Keyframe(Struct, frozen=True, array_like=True):
+class Keyframe(msgspec.Struct, frozen=True, array_like=True):
     """One instant of the replay. s: from the start; t: B in the scene (m); a, b: R_s_a and R_s_b, row by row."""
 
     s: float
@@ -19,6 +21,21 @@ class Keyframe(Struct, frozen=True, array_like=True):
     a: list[float]
     b: list[float]
     joined: bool
+
+
+def keyframes(points: Sequence[Point], begin_ns: int, joined_ns: int) -> list[Keyframe]:
+    """Return the replay's instants; joined_ns: points further apart than this are not joined by the trail."""
+    found = []
+    before_ns: int | None = None
+    for point in points:
+        joined = before_ns is not None and point.at_ns - before_ns <= joined_ns
+        R_s_a, R_s_b = point.frame.R_s_a, point.frame.turn_b(point.pose)
+        t, a, b = (
+            [round(x, 4) for x in numbers] for numbers in (point.t_m, R_s_a.ravel().tolist(), R_s_b.ravel().tolist())
+        )
+        found.append(Keyframe(round((point.at_ns - begin_ns) / S_NS, 3), t, a, b, joined))
+        before_ns = point.at_ns
+    return found
 
 
 def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
@@ -33,15 +50,14 @@ def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
     }
 
 
-def replay_html(keyframes: Sequence[Keyframe], names: tuple[str, str], rigs: tuple[Any, Any], *, levelled: bool) -> str:
+def replay_html(frames: Sequence[Keyframe], picture: PairPicture, *, levelled: bool) -> str:
     """Return the replay as an HTML fragment."""
-    import msgspec
-
-    data = {"names": names, "rigs": rigs, "levelled": levelled}
-    frames = msgspec.json.encode(list(keyframes)).decode("ascii")
+    names = [name or default for name, default in zip(picture.ends(), "AB", strict=True)]
+    rigs = [rig_outline(node.info if node else None) for node in picture.end_nodes()]
     # Inside a script only `</` could end it early.
-    head = json.dumps(data).replace("</", "<\\/")
-    return _HTML + f"<script>const PAIR={head},FRAMES={frames};\n{_SCRIPT}</script>"
+    head = json.dumps({"names": names, "rigs": rigs, "levelled": levelled}).replace("</", "<\\/")
+    encoded = msgspec.json.encode(list(frames)).decode("ascii")
+    return _HTML + f"<script>const PAIR={head},FRAMES={encoded};\n{_SCRIPT}</script>"
 
 
 _HTML: Final = """<div class="replay"><canvas id="replay" aria-label="3-D replay of the dive"></canvas>
