@@ -36,7 +36,7 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
         (SOLVER, ["pair/*/*/*"], "solver"),
         (VIEWER, [], "viewer"),
         (SURVEYOR, ["node/*/mark"], "surveyor"),
-        (PLAYER, ["node/*/*", "pair/*/*/truth", "pair/*/*/artag"], "player"),
+        (PLAYER, ["node/*/*", "pair/*/*/truth", "pair/*/*/artag", "net/*/truth/*"], "player"),
     ]:
         own = [f"{root}/@alive/{alive}/**"] + [f"{root}/{key}{end}" for key in keys for end in ("", "/@adv/**")]
         rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))

@@ -39,8 +39,9 @@ class Envelope:
 
     @property
     def node(self) -> str:
-        """The node that sent it; A of a pair."""
-        return self.ids[0]
+        """The node that it is of; A of a pair."""
+        fields = self.topic.id_fields
+        return self.ids[fields.index("node") if "node" in fields else 0]
 
 
 def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:

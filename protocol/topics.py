@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Final, Literal
 
 from buddyline.protocol import messages
@@ -24,19 +24,20 @@ class Topic:
     template: its key, with {node}, {a} and {b}, or {net} and {node}. schema: the message's type; rate_hz: nominal, 0
     where it comes on change. latest_only: late joiners get the newest one (else the cache serves to recover what was
     missed). express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never).
-    retained: the hub keeps the newest of each key, and what was said stays known when who said it is gone.
+    retained: the hub keeps the newest of each key, and what was said stays known when who said it is gone. solved: a
+    solver's result, which is made anew from a stored dive.
     """
 
     name: str
     template: str
     schema: type[Message]
-    schema_name: str
     rate_hz: float
     priority: Priority
     express: bool = False
     latest_only: bool = False
     stale_s: float = 0.0
     retained: bool = False
+    solved: bool = False
 
     def key(self, *ids: str) -> str:
         """Return the Zenoh key and MCAP topic for these ids: a node's, a pair's two, or a net's and a node's."""
@@ -47,7 +48,13 @@ class Topic:
             raise ValueError(f"topic {self.name} takes {len(names)} node ids, got {len(ids)}")
         return self.template.format(**dict(zip(names, ids, strict=True)))
 
-    @property
+    @cached_property
+    def schema_name(self) -> str:
+        """The schema's name in MCAP and in the Zenoh encoding."""
+        home = "foxglove" if self.schema is messages.CompressedImage else "buddyline"
+        return f"{home}.{self.schema.__name__}"
+
+    @cached_property
     def id_fields(self) -> tuple[str, ...]:
         """The message's fields that hold the key's ids, in the key's order."""
         return tuple(_ID_FIELDS[name] for name in _PLACES.findall(self.template))
@@ -62,142 +69,81 @@ class Topic:
         return f"application/json;{self.schema_name}"
 
 
-INFO: Final = Topic(
-    "info",
-    "buddyline/node/{node}/info",
-    messages.NodeInfo,
-    "buddyline.NodeInfo",
-    0.0,
-    "data",
-    latest_only=True,
-)
+INFO: Final = Topic("info", "buddyline/node/{node}/info", messages.NodeInfo, 0.0, "data", latest_only=True)
 CANDIDATES: Final = Topic(
     "candidates",
     "buddyline/node/{node}/candidates",
     messages.Candidates,
-    "buddyline.Candidates",
     10.0,
     "interactive_high",
     express=True,
     stale_s=1.0,
 )
-IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, "buddyline.Imu", 100.0, "data", stale_s=2.0)
+IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0)
 ATTITUDE: Final = Topic(
-    "attitude",
-    "buddyline/node/{node}/attitude",
-    messages.Attitude,
-    "buddyline.Attitude",
-    100.0,
-    "data_high",
-    express=True,
-    stale_s=2.0,
+    "attitude", "buddyline/node/{node}/attitude", messages.Attitude, 100.0, "data_high", express=True, stale_s=2.0
 )
 DEPTH: Final = Topic(
-    "depth",
-    "buddyline/node/{node}/depth",
-    messages.Depth,
-    "buddyline.Depth",
-    20.0,
-    "data_high",
-    express=True,
-    stale_s=2.0,
+    "depth", "buddyline/node/{node}/depth", messages.Depth, 20.0, "data_high", express=True, stale_s=2.0
 )
-IMAGE: Final = Topic(
-    "image",
-    "buddyline/node/{node}/image",
-    messages.CompressedImage,
-    "foxglove.CompressedImage",
-    1.0,
-    "background",
-    stale_s=3.0,
-)
+IMAGE: Final = Topic("image", "buddyline/node/{node}/image", messages.CompressedImage, 1.0, "background", stale_s=3.0)
 NODE_STATUS: Final = Topic(
-    "node_status",
-    "buddyline/node/{node}/status",
-    messages.NodeStatus,
-    "buddyline.NodeStatus",
-    1.0,
-    "data_low",
-    latest_only=True,
-    stale_s=3.0,
+    "node_status", "buddyline/node/{node}/status", messages.NodeStatus, 1.0, "data_low", latest_only=True, stale_s=3.0
 )
 CLOCK: Final = Topic(
-    "clock",
-    "buddyline/node/{node}/clock",
-    messages.ClockBeacon,
-    "buddyline.ClockBeacon",
-    4.0,
-    "interactive_high",
-    express=True,
+    "clock", "buddyline/node/{node}/clock", messages.ClockBeacon, 4.0, "interactive_high", express=True
 )
-LIGHT_TRUTH: Final = Topic(
-    "light_truth",
-    "buddyline/node/{node}/light_truth",
-    messages.LightTruth,
-    "buddyline.LightTruth",
-    10.0,
-    "data_low",
-)
-MARK: Final = Topic("mark", "buddyline/node/{node}/mark", messages.Mark, "buddyline.Mark", 0.0, "data")
+LIGHT_TRUTH: Final = Topic("light_truth", "buddyline/node/{node}/light_truth", messages.LightTruth, 10.0, "data_low")
+MARK: Final = Topic("mark", "buddyline/node/{node}/mark", messages.Mark, 0.0, "data")
 POSE: Final = Topic(
     "pose",
     "buddyline/pair/{a}/{b}/pose",
     messages.RelativePose,
-    "buddyline.RelativePose",
     10.0,
     "interactive_high",
     express=True,
     stale_s=1.0,
     retained=True,
+    solved=True,
 )
 # After POSE, which carries the same schema: topic_of gives the first.
-ARTAG: Final = Topic(
-    "artag", "buddyline/pair/{a}/{b}/artag", messages.RelativePose, "buddyline.RelativePose", 10.0, "data"
-)
+ARTAG: Final = Topic("artag", "buddyline/pair/{a}/{b}/artag", messages.RelativePose, 10.0, "data")
 REJECTED: Final = Topic(
     "rejected",
     "buddyline/pair/{a}/{b}/rejected",
     messages.Rejected,
-    "buddyline.Rejected",
     10.0,
     "interactive_high",
     express=True,
     retained=True,
+    solved=True,
 )
 TRACK: Final = Topic(
     "track",
     "buddyline/pair/{a}/{b}/track",
     messages.Track,
-    "buddyline.Track",
     20.0,
     "interactive_high",
     express=True,
     stale_s=1.0,
     retained=True,
+    solved=True,
 )
 # After TRACK, which carries the same schema: topic_of goes by the message's mode.
 TRACK_LAG: Final = Topic(
-    "track_lag",
-    "buddyline/pair/{a}/{b}/track_lag",
-    messages.Track,
-    "buddyline.Track",
-    20.0,
-    "data",
-    stale_s=3.0,
+    "track_lag", "buddyline/pair/{a}/{b}/track_lag", messages.Track, 20.0, "data", stale_s=3.0, solved=True
 )
-TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, "buddyline.Truth", 10.0, "data_low")
-NET_TRUTH: Final = Topic(
-    "net_truth", "buddyline/net/{net}/truth/{node}", messages.NodePose, "buddyline.NodePose", 10.0, "data_low"
-)
+TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, 10.0, "data_low")
+NET_TRUTH: Final = Topic("net_truth", "buddyline/net/{net}/truth/{node}", messages.NodePose, 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(
     "solver_status",
     "buddyline/pair/{a}/{b}/status",
     messages.SolverStatus,
-    "buddyline.SolverStatus",
     1.0,
     "data_low",
     latest_only=True,
     stale_s=3.0,
+    solved=True,
 )
 
 TOPICS: Final = (

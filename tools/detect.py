@@ -19,7 +19,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import Envelope, envelope_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, NodeInfo
-from buddyline.protocol.topics import IMAGE, TOPICS
+from buddyline.protocol.topics import CANDIDATES, IMAGE, TOPICS
 from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 DEFAULT_METHOD = METHODS[0]
 FOLDER_PERIOD_NS = 100_000_000
 # What was solved or detected before is left out.
-DERIVED_FROM = tuple({topic.name for topic in TOPICS} - {"candidates", "pose", "rejected", "solver_status"})
+DERIVED_FROM = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CANDIDATES)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,7 +20,7 @@ from typing import Final
 import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
-from buddyline.protocol.divelog import DiveLogReader, Record, read_logs
+from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
@@ -167,10 +167,6 @@ class Dive:
                 yield record.open()
             except MessageError as error:
                 reading.refusals.setdefault(reader.path, Refusals()).note(record.key, error)
-
-    def records(self, *topic_names: str) -> Iterator[Record]:
-        """Yield the records of these topics (none named: of all) unopened, by log time, for who copies them."""
-        return read_logs(self.readers, _wanted(topic_names))
 
     def metadata(self) -> dict[str, str]:
         """Return what the logs say about themselves; the first named prevails."""

@@ -42,7 +42,7 @@ R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0
 LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
 
 
-class Translation:
+class FoxgloveTranslation:
     """Turns a dive's messages into Foxglove's, one by one."""
 
     def __init__(self, schemas: Any) -> None:
@@ -202,7 +202,7 @@ def export_foxglove(dive: Dive, output: Path) -> int:
         ) from error
     from mcap.writer import CompressionType, Writer
 
-    translation = Translation(fox)
+    translation = FoxgloveTranslation(fox)
     count = cut_ns = 0
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}
@@ -224,7 +224,7 @@ def export_foxglove(dive: Dive, output: Path) -> int:
     return count
 
 
-def _translated(dive: Dive, translation: Translation) -> Iterator[tuple[str, int, Any]]:
+def _translated(dive: Dive, translation: FoxgloveTranslation) -> Iterator[tuple[str, int, Any]]:
     topics = ("info", "candidates", "attitude", "depth", "image", "pose")
     yield from translation.start(dive.infos(), _base(dive), dive.start_ns)
     for envelope in dive.messages(*topics):

@@ -16,7 +16,7 @@ from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodeInfo
 from buddyline.protocol.security import PLAYER
-from buddyline.protocol.topics import CANDIDATES, IMAGE, INFO, POSE, REJECTED, TOPICS, parse_key
+from buddyline.protocol.topics import CANDIDATES, CLOCK, IMAGE, INFO, POSE, REJECTED, TOPICS, parse_key
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import LiveClient
@@ -29,10 +29,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# Poses and what else a solver made are not sent: a solver on the bus makes them anew. What the clocks were then says
-# nothing of those that are on the bus now.
-NOT_SENT: Final = frozenset({"pose", "rejected", "solver_status", "clock"})
-SENT: Final = tuple({topic.name for topic in TOPICS} - NOT_SENT)
+# A solver on the bus makes its results anew. What the clocks were then says nothing of those that are on the bus now.
+SENT: Final = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CLOCK)
 # Pictures go out as previews: the bus is for what the solver needs.
 IMAGES_HZ: Final = 2.0
 # At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time: less than
@@ -119,7 +117,7 @@ class Player:
         """Declare the publishers of a dive, so that subscribers find them before the first message."""
         for key in keys:
             parsed = parse_key(key)
-            if parsed and parsed[0].name not in NOT_SENT and key not in self._publishers:
+            if parsed and parsed[0].name in SENT and key not in self._publishers:
                 self._publishers[key] = self._bus.publisher(parsed[0], *parsed[1])
 
     def send_infos(self, infos: Iterable[NodeInfo]) -> None:

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from buddyline.protocol import recorder as module
-from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.pictures import PictureLog, with_pictures
 from buddyline.protocol.recorder import Recorder, RecordError
@@ -87,7 +87,7 @@ def test_pictures_stand_beside_the_log_and_are_found_with_it(tmp_path):
     assert with_pictures([tmp_path]) == [tmp_path]
     assert stamps(path, PICTURE) == []
     with Dive([path]) as dive:
-        found = [(r.key, r.log_time_ns) for r in dive.records()]
+        found = [(r.key, r.log_time_ns) for r in read_logs(dive.readers)]
         assert dive.metadata()["node"] == "a"
     assert found == [(DEPTH if i % 2 else PICTURE, i) for i in range(1, 25)]
 
@@ -115,7 +115,7 @@ def test_the_oldest_pictures_go_first_and_only_this_nodes(tmp_path):
         assert (disk / "b-0.pictures" / "000000.mcap").exists()
         assert stamps(path, DEPTH) == list(range(1, sender.count, 2))
         with Dive([path]) as dive:
-            kept = [r.log_time_ns for r in dive.records("image")]
+            kept = [r.log_time_ns for r in read_logs(dive.readers, lambda key: key.endswith("/image"))]
             assert dive.losses == []
         assert kept == list(range(kept[0], sender.count + 1, 2))
         assert kept[0] > 2
@@ -139,7 +139,7 @@ def test_without_pictures_to_delete_no_more_are_recorded_until_there_is_room(tmp
             sender.picture()
         assert stamps(path, DEPTH) == [1, 3]
         with Dive([path]) as dive:
-            assert [r.log_time_ns for r in dive.records("image")] == [4]
+            assert [r.log_time_ns for r in read_logs(dive.readers, lambda key: key.endswith("/image"))] == [4]
 
 
 def test_a_full_disk_is_named_and_nothing_is_lost_once_there_is_room(tmp_path, caplog):

@@ -32,7 +32,7 @@ _NEAR_M: Final = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
+class TagReading:
     """One tag read in one picture. points_m: (4, 3), where the layout has its corners, in the other node's frame.
 
     rays: (4, 2), corners as x/z, y/z; focal_px: (2,); by_a: whether A's camera saw it.
@@ -75,14 +75,14 @@ class _Fit:
 
 def readings_of(
     found: Mapping[int, Sequence[Floats]], layout: Layout, camera: CameraModel, *, by_a: bool
-) -> list[Reading]:
+) -> list[TagReading]:
     """Return what a picture shows of the other node's tags; found: by id, corners (4, 2) px."""
     matrix = np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
     undistort = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
     focal_px = np.array([camera.fx_px, camera.fy_px])
     distortion = np.array(camera.distortion)
     return [
-        Reading(
+        TagReading(
             layout.corners_m[tag_id],
             np.asarray(undistort(corners.reshape(-1, 1, 2), matrix, distortion), dtype=np.float64).reshape(4, 2),
             focal_px,
@@ -93,9 +93,9 @@ def readings_of(
     ]
 
 
-def tag_pose(readings: Sequence[Reading]) -> TagPose | None:
+def tag_pose(readings: Sequence[TagReading]) -> TagPose | None:
     """Return T_a_b from all readings that fit together; None where too few do, or two poses explain them."""
-    best: list[Reading] = []
+    best: list[TagReading] = []
     best_fit: _Fit | None = None
     everything = len({(reading.by_a, id(reading.points_m)) for reading in readings})
     for seed in readings:
@@ -139,7 +139,7 @@ def tag_pose(readings: Sequence[Reading]) -> TagPose | None:
     )
 
 
-def _mean(fit: _Fit, chosen: Sequence[Reading]) -> float:
+def _mean(fit: _Fit, chosen: Sequence[TagReading]) -> float:
     return fit.squares_px2 / (8 * len(chosen))
 
 
@@ -147,15 +147,15 @@ def _angle(p_xyzw: Floats, q_xyzw: Floats) -> float:
     return float(np.linalg.norm(rotation_vector(multiply(p_xyzw, conjugate(q_xyzw)))))
 
 
-def _alone(chosen: Sequence[Reading], joint: _Fit, *, by_a: bool) -> _Fit:
+def _alone(chosen: Sequence[TagReading], joint: _Fit, *, by_a: bool) -> _Fit:
     """Return the pose from one picture's tags, from the joint one on; the joint one where it has none."""
     own = [reading for reading in chosen if reading.by_a is by_a]
     return (_fit((joint.t_m, joint.q_xyzw), own) or joint) if own else joint
 
 
 def _gather(
-    seed: Reading, start: tuple[Floats, Floats], readings: Sequence[Reading]
-) -> tuple[list[Reading], _Fit | None]:
+    seed: TagReading, start: tuple[Floats, Floats], readings: Sequence[TagReading]
+) -> tuple[list[TagReading], _Fit | None]:
     """Return the readings that fit together with this one, and their pose."""
     fit = _fit(start, [seed])
     if fit is None or _mean(fit, [seed]) > _FIT_PX**2:
@@ -172,7 +172,7 @@ def _gather(
     return chosen, fit
 
 
-def _starts(reading: Reading) -> list[tuple[Floats, Floats]]:
+def _starts(reading: TagReading) -> list[tuple[Floats, Floats]]:
     """Return the two poses of a square that a picture leaves about equally likely, as T_a_b."""
     count, turns, shifts, _ = cv2.solvePnPGeneric(
         reading.points_m, reading.rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
@@ -220,7 +220,7 @@ def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[
     return ((image - rays) * focal_px).ravel(), J.reshape(-1, 6)
 
 
-def _fit(start: tuple[Floats, Floats], readings: Sequence[Reading]) -> _Fit | None:
+def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _Fit | None:
     """Return the pose of least squares (Levenberg-Marquardt); None where it is not determined."""
     stack = (
         np.concatenate([reading.points_m for reading in readings]),
