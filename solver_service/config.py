@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated, cast
 
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.messages import NodeId
 from buddyline.protocol.security import SOLVER, Tls, check_identity
 from buddyline.protocol.topics import check_node_id
+from buddyline.solver_service.choices import CHECKS, METHODS
 from buddyline.solver_service.geometry.observation import Method, Settings
 from msgspec import Meta, field
 from msgspec.structs import replace
-
-CHECKS = ("range", "twist", "attitude", "depth")
-METHODS = get_args(Method)
 
 
 class SolveConfig(Config, frozen=True, kw_only=True):

@@ -23,15 +23,6 @@ SKEW_SIGMA_S: Final = 0.05
 PASSES: Final = 4
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
-    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
-    parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
-    parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
-
-
 def run(args: argparse.Namespace) -> int:
     """Estimate the offset; return 1 where the dive does not tell it."""
     with Dive(args.dives) as dive:

@@ -29,21 +29,6 @@ from msgspec import UNSET
 log = logging.getLogger(__name__)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive of pictures: its log, or each node's")
-    parser.add_argument("-o", "--output", required=True, metavar="TAGS.mcap", help="poses from tags, and the truth")
-    parser.add_argument("--nodes", nargs=2, metavar=("A", "B"), help="the pair; default: the dive's two nodes")
-    parser.add_argument(
-        "--tags",
-        action="append",
-        default=[],
-        metavar="NODE=FILE",
-        help="the tags that a node carries, in place of its NodeInfo's: JSON, a list of {id, corners_m, family}",
-    )
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-
-
 @dataclass
 class TagSolver:
     """Finds tags picture by picture, and gives the poses of all triggers when the pictures are through."""

@@ -21,13 +21,6 @@ from buddyline.tools.newfile import new_dive_log
 Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns), sorted, and their payloads' CRC-32
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("topside", metavar="TOPSIDE.mcap", help="what `buddyline record` wrote")
-    parser.add_argument("nodes", nargs="+", metavar="NODE.mcap", help="the nodes' own logs, all of the dive")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.mcap", help="must not exist yet")
-
-
 class Union:
     """Tells which messages of several logs go into their union, each key and stamp once, the first log's first."""
 

@@ -19,12 +19,16 @@ SUMMARY: Final = "Two underwater nodes see each other's lights; Buddyline says w
 
 @dataclass(frozen=True)
 class Command:
-    """A command: the module with add_arguments(parser) and run(args), and what it does in a line."""
+    """A command: the module with add_arguments(parser) and run(args), and what it does in a line.
+
+    slow: the module takes long to import; tools/arguments.py declares its arguments.
+    """
 
     name: str
     module: str
     does: str
     examples: tuple[str, ...] = ()
+    slow: bool = False
 
 
 COMMANDS: Final = (
@@ -74,12 +78,14 @@ COMMANDS: Final = (
         "buddyline.tools.repair",
         "make a proper log out of a damaged one, and say what was lost",
         ("buddyline repair cut.mcap -o whole.mcap",),
+        slow=True,
     ),
     Command(
         "backfill",
         "buddyline.tools.backfill",
         "complete a topside recording out of the nodes' own logs",
         ("buddyline backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
+        slow=True,
     ),
     Command(
         "detect",
@@ -89,24 +95,28 @@ COMMANDS: Final = (
             "buddyline detect photos/ --draw marked/",
             "buddyline detect dive.mcap -o candidates.mcap --environment lake",
         ),
+        slow=True,
     ),
     Command(
         "tune",
         "buddyline.tools.tune",
         "propose a site's detector values, and show the pictures they were judged on",
         ("buddyline tune dive.mcap", "buddyline tune pictures/ --draw judged/"),
+        slow=True,
     ),
     Command(
         "solve",
         "buddyline.tools.solve",
         "solve stored dives offline",
         ("buddyline solve a.mcap b.mcap -o poses.mcap", "buddyline solve dive.mcap -o p.mcap --checks range"),
+        slow=True,
     ),
     Command(
         "align",
         "buddyline.tools.align",
         "find the offset between the two nodes' clocks from a dive in which they moved",
         ("buddyline align a.mcap b.mcap",),
+        slow=True,
     ),
     Command(
         "calibrate",
@@ -125,6 +135,7 @@ COMMANDS: Final = (
         "buddyline.tools.evaluate",
         "measure poses and candidates against truth",
         ("buddyline evaluate poses.mcap --truth dive.truth.mcap",),
+        slow=True,
     ),
     Command(
         "monitor",
@@ -143,30 +154,35 @@ COMMANDS: Final = (
         "buddyline.tools.monitor.report",
         "write a dive's report: one page to keep and to send",
         ("buddyline report poses.mcap -o report.html",),
+        slow=True,
     ),
     Command(
         "ros2",
         "buddyline.tools.ros2",
         "let ROS 2 (rmw_zenoh) see attitudes, depths, poses and transforms",
         ("buddyline ros2", "buddyline ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
+        slow=True,
     ),
     Command(
         "artag",
         "buddyline.tools.artag",
         "poses from AR tags in a dive's pictures, to compare the lights with",
         ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
+        slow=True,
     ),
     Command(
         "experiments",
         "buddyline.tools.experiments.command",
         "the paper's figures and numbers, again, with ours beside them: one report",
         ("buddyline experiments -o report/ --quick", "buddyline experiments -o report/ --tag-video test_vid.mp4"),
+        slow=True,
     ),
     Command(
         "plan",
         "buddyline.tools.plan",
         "how far a pair will measure well, by camera, lights and visibility",
         ("buddyline plan --baseline 0.88 --visibility 6 --camera a.toml",),
+        slow=True,
     ),
     Command(
         "mark",
@@ -188,6 +204,7 @@ COMMANDS: Final = (
         "buddyline.tools.export",
         "write poses for other programs",
         ("buddyline export poses.mcap --format tum -o poses.tum",),
+        slow=True,
     ),
 )
 
@@ -238,20 +255,27 @@ def main(argv: list[str] | None = None) -> int:
         return 0
 
 
-def _run(command: Command, words: list[str]) -> int:
-    from buddyline.protocol.service import start_logging
-
-    module = import_module(command.module)
+def parser_of(command: Command) -> argparse.ArgumentParser:
+    """Return the parser of a command's words, with its help."""
     parser = argparse.ArgumentParser(
         prog=f"buddyline {command.name}",
         description=f"{command.does[0].upper()}{command.does[1:]}.",
         epilog="examples:\n" + "\n".join(f"  {example}" for example in command.examples) if command.examples else None,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    module.add_arguments(parser)
-    args = parser.parse_args(words)
+    if command.slow:
+        getattr(import_module("buddyline.tools.arguments"), command.name)(parser)
+    else:
+        import_module(command.module).add_arguments(parser)
+    return parser
+
+
+def _run(command: Command, words: list[str]) -> int:
+    from buddyline.protocol.service import start_logging
+
+    args = parser_of(command).parse_args(words)
     start_logging()
-    status: int = module.run(args)
+    status: int = import_module(command.module).run(args)
     return status
 
 

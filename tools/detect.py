@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
-from buddyline.node.detect import ENVIRONMENTS, METHODS, Detection, make_detector
+from buddyline.node.detect import METHODS, Detection, make_detector
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.node.pipeline import Pipeline
@@ -32,18 +32,6 @@ DEFAULT_METHOD = METHODS[0]
 FOLDER_PERIOD_NS = 100_000_000
 # What was solved or detected before is left out.
 DERIVED_FROM = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CANDIDATES)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap")
-    parser.add_argument("-o", "--output", metavar="OUT.mcap", help="write a dive log in place of JSON lines")
-    parser.add_argument("--draw", metavar="DIR", help="write the pictures with their candidates marked")
-    parser.add_argument("--environment", default="auto", choices=ENVIRONMENTS, help="default: auto")
-    parser.add_argument(
-        "--method", default=DEFAULT_METHOD, choices=METHODS, help=f"default: {DEFAULT_METHOD}; paper: the paper's"
-    )
-    parser.add_argument("--json", action="store_true", help="JSON lines on stdout (the default without -o)")
 
 
 @dataclass

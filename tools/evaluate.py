@@ -5,26 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-from pathlib import Path
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.report import as_dict, as_text
 from buddyline.tools.evaluation.result import evaluate
-from buddyline.tools.pairs import add_pair_argument
 
 log = logging.getLogger(__name__)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument(
-        "logs", nargs="+", metavar="OUT.mcap", help="the solved log; further logs, where it lacks candidates or truth"
-    )
-    parser.add_argument("--truth", action="append", default=[], metavar="T.mcap", help="the log with the truth")
-    add_pair_argument(parser, "the only one")
-    parser.add_argument("--json", action="store_true", help="print one JSON object: metres, radians, seconds")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots (PNG); needs the extra `plots`")
 
 
 def run(args: argparse.Namespace) -> int:

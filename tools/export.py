@@ -8,7 +8,6 @@ import io
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
@@ -16,10 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Truth
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.newfile import check_new, write_new
-from buddyline.tools.pairs import add_pair_argument
 from msgspec import UNSET
-
-FORMATS: Final = ("tum", "csv", "foxglove")
 
 _SD_FIELDS: Final = ("sd_x_m", "sd_y_m", "sd_z_m", "sd_wx_rad", "sd_wy_rad", "sd_wz_rad")
 _CSV_FIELDS: Final = (
@@ -30,22 +26,6 @@ _CSV_FIELDS: Final = (
     *("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "checks", "skew_ns"),
 )
 _REASON_FIELDS: Final = ("reason", "detail")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("logs", nargs="+", metavar="OUT.mcap", help="the solved log, or one with truth")
-    parser.add_argument(
-        "--format",
-        choices=FORMATS,
-        required=True,
-        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row a pose, units in the header; foxglove: a log "
-        "with pictures, marks and transforms as Foxglove, Lichtblick and rerun draw them",
-    )
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
-    parser.add_argument("--truth", action="store_true", help="the true poses in place of the solved ones (tum)")
-    parser.add_argument("--rejected", action="store_true", help="rows for triggers without a pose, too (csv)")
-    add_pair_argument(parser, "the only one")
 
 
 def run(args: argparse.Namespace) -> int:

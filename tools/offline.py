@@ -9,7 +9,8 @@ from pathlib import Path
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo, Rejected, RelativePose
-from buddyline.solver_service.config import CHECKS, SolveConfig
+from buddyline.solver_service.choices import CHECKS
+from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.columns import Pair, PoseColumns, RejectionColumns, in_order, pose_columns, rejection_columns
 from buddyline.tools.dives import Dive

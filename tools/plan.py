@@ -48,25 +48,6 @@ class Row:
     within: bool
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("--baseline", type=float, default=0.88, metavar="M", help="spacing of the lights (%(default)s)")
-    parser.add_argument(
-        "--visibility", type=float, metavar="M", help="how far a diver sees; default: the water ends nothing"
-    )
-    parser.add_argument(
-        "--camera", metavar="FILE", help="the node's .toml, or NodeInfo as .json or .mcap; default: 820 px, 48.8 deg"
-    )
-    parser.add_argument("--sigma-px", type=float, metavar="PX", help="noise of a light; default: the camera's, or 0.7")
-    parser.add_argument("--compass-deg", type=float, default=2.0, metavar="DEG", help="error of headings (%(default)s)")
-    tolerance = parser.add_argument_group("tolerances, RMS")
-    tolerance.add_argument("--range-tolerance", type=float, default=0.10, metavar="M", help="default: %(default)s")
-    tolerance.add_argument("--position-tolerance", type=float, default=0.10, metavar="M", help="default: %(default)s")
-    tolerance.add_argument("--azimuth-tolerance", type=float, default=3.0, metavar="DEG", help="default: %(default)s")
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw it; needs the extra `plots`")
-    parser.add_argument("--json", action="store_true", help="print one JSON object: metres, radians")
-
-
 def run(args: argparse.Namespace) -> int:
     """Print the plan; return 0."""
     for name in ("baseline", "visibility", "sigma_px", "range_tolerance", "position_tolerance", "azimuth_tolerance"):

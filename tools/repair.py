@@ -18,12 +18,6 @@ from buddyline.tools.newfile import new_dive_log
 SHOWN_GAPS: Final = 20
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("input", metavar="IN.mcap", help="is left as it is")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.mcap", help="must not exist yet")
-
-
 def run(args: argparse.Namespace) -> int:
     """Repair one log; say what was lost."""
     # The walk finds what an index that is itself wrong would hide.

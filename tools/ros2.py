@@ -23,7 +23,7 @@ from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, Rela
 from buddyline.protocol.security import ROS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
-from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
@@ -46,13 +46,6 @@ UNKNOWN_VARIANCE: Final = 1e6
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    add_client_arguments(parser, ROS)
-    parser.add_argument("--domain", type=int, default=0, metavar="ID", help="ROS_DOMAIN_ID; default: 0")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
 
 
 @dataclass(frozen=True)

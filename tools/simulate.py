@@ -7,12 +7,8 @@ import math
 import sys
 from dataclasses import asdict, fields
 
-import cv2
-from buddyline.node.sim.dive import DivePlan, messages
-from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, Scenario
-from buddyline.node.sim.world import World
+from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, DivePlan, Scenario
 from buddyline.protocol.clock import MS_NS, S_NS
-from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
@@ -61,6 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the dive; return 0."""
+    import cv2
+    from buddyline.node.sim.dive import messages
+    from buddyline.node.sim.world import World
+    from buddyline.tools.newfile import new_dive_log
+
     cv2.setNumThreads(1)
     scenario = Scenario(
         environment=args.environment,

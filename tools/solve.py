@@ -18,7 +18,7 @@ from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, Message, NodeInfo
 from buddyline.protocol.topics import check_node_id
-from buddyline.solver_service.config import CHECKS, METHODS, SolveConfig, node_ids
+from buddyline.solver_service.config import SolveConfig, node_ids
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
@@ -29,36 +29,6 @@ log = logging.getLogger(__name__)
 TOGETHER: Final = 256
 # What the output carries beside the poses, so that it can be evaluated and solved again on its own.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
-    parser.add_argument("-o", "--output", required=True, metavar="OUT.mcap", help="poses, rejections, and their inputs")
-    parser.add_argument("--method", choices=METHODS, default="refined", help="default: refined")
-    parser.add_argument(
-        "--checks", default=",".join(CHECKS), help=f"comma-separated, of {', '.join(CHECKS)} (default: all)"
-    )
-    parser.add_argument(
-        "--nodes", nargs="+", metavar="NODE", help="solve every pair of these, A B or a,b,c; default: all in the logs"
-    )
-    parser.add_argument(
-        "--info",
-        action="append",
-        default=[],
-        metavar="NODE=FILE",
-        help="calibration in place of the log's: JSON or log",
-    )
-    parser.add_argument(
-        "--clock-offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="B's clock minus A's, as `buddyline align` tells it",
-    )
-    parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
-    parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
-from buddyline.node.detect import ENVIRONMENTS, METHODS, make_detector, presets
+from buddyline.node.detect import make_detector, presets
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
@@ -74,21 +74,6 @@ class Judged:
     def worth(self) -> float:
         """One figure for both."""
         return self.recall - COST_OF_FALSE * self.false
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap")
-    parser.add_argument(
-        "--truth", metavar="T.mcap", help="where the lights truly are; default: in the dive, if it says"
-    )
-    parser.add_argument("--method", default=METHODS[0], choices=METHODS, help=f"default: {METHODS[0]}")
-    parser.add_argument(
-        "--environment", default=ENVIRONMENTS[1], choices=ENVIRONMENTS[1:], help="the preset to start from"
-    )
-    parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
-    parser.add_argument("--draw", default="tuned", metavar="DIR", help="for the marked pictures; default: tuned")
-    parser.add_argument("--json", action="store_true")
 
 
 def run(args: argparse.Namespace) -> int:

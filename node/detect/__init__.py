@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
+from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.node.detect import paper, source
 from buddyline.node.detect.detection import Detection, Detector, ImageError
 from buddyline.protocol.errors import BuddylineError
 
-METHODS: Final = ("source", "paper")
-ENVIRONMENTS: Final = ("auto", "cavern", "night_reef", "lake", "basin")
+METHODS: Final = DETECTORS
+ENVIRONMENTS: Final = PRESETS
 
 __all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "make_detector", "presets"]
 

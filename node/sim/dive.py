@@ -5,15 +5,14 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import cv2
 from buddyline.node.sim.randomness import generator
+from buddyline.node.sim.scenario import DivePlan
 from buddyline.node.sim.world import World
 from buddyline.protocol import topics
 from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 
 BOOT: Final = "simulated"
@@ -25,35 +24,6 @@ JPEG_QUALITY: Final = 92
 
 Entry: TypeAlias = tuple[int, str, Message]
 """Stamp, key, message."""
-
-
-@dataclass(frozen=True)
-class DivePlan:
-    """What of a dive is logged. images: pictures in place of synthetic candidates.
-
-    exposure_sigma_ns: how far exposures stray from their trigger, 1 sd. lost_share: of the frames.
-    """
-
-    seconds: float = 60.0
-    rate_hz: float = 10.0
-    images: bool = False
-    imu: bool = False
-    exposure_sigma_ns: int = MS_NS
-    lost_share: float = 0.03
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be logged, naming the field."""
-        if not 0 < self.seconds < 1e6:
-            raise BuddylineError(f"seconds: {self.seconds} is not above 0 and below 1e6")
-        if not 0 < self.rate_hz <= 200:
-            raise BuddylineError(f"rate_hz: {self.rate_hz} is not above 0 and at most 200")
-        if not 0 <= self.lost_share <= 1:
-            raise BuddylineError(f"lost_share: {self.lost_share} is not between 0 and 1")
-
-    @property
-    def period_ns(self) -> int:
-        """Time between triggers."""
-        return round(S_NS / self.rate_hz)
 
 
 def messages(world: World, plan: DivePlan) -> Iterator[Entry]:

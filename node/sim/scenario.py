@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args
 
+from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel
 from buddyline.protocol.topics import check_node_id
@@ -181,3 +182,32 @@ _LOWEST: Final = {
     "false_lights": 0,
     "other_lamps": 0,
 }
+
+
+@dataclass(frozen=True)
+class DivePlan:
+    """What of a dive is logged. images: pictures in place of synthetic candidates.
+
+    exposure_sigma_ns: how far exposures stray from their trigger, 1 sd. lost_share: of the frames.
+    """
+
+    seconds: float = 60.0
+    rate_hz: float = 10.0
+    images: bool = False
+    imu: bool = False
+    exposure_sigma_ns: int = MS_NS
+    lost_share: float = 0.03
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be logged, naming the field."""
+        if not 0 < self.seconds < 1e6:
+            raise BuddylineError(f"seconds: {self.seconds} is not above 0 and below 1e6")
+        if not 0 < self.rate_hz <= 200:
+            raise BuddylineError(f"rate_hz: {self.rate_hz} is not above 0 and at most 200")
+        if not 0 <= self.lost_share <= 1:
+            raise BuddylineError(f"lost_share: {self.lost_share} is not between 0 and 1")
+
+    @property
+    def period_ns(self) -> int:
+        """Time between triggers."""
+        return round(S_NS / self.rate_hz)

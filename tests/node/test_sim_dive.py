@@ -6,8 +6,8 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
-from buddyline.node.sim.dive import DivePlan, messages
-from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.dive import messages
+from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode

@@ -164,7 +164,7 @@ def test_importing_the_library_imports_nothing_else():
 
 
 def test_the_checks_are_all_of_the_solvers():
-    from buddyline.solver_service.config import CHECKS
+    from buddyline.solver_service.choices import CHECKS
 
     assert buddyline.ALL_CHECKS == CHECKS
     assert (FOLDER / "cavern.outcomes.jsonl").exists()

@@ -44,24 +44,6 @@ PAIRS_NOTE = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="a new folder for the report")
-    parser.add_argument("--quick", action="store_true", help="short dives: a look, not figures to quote")
-    parser.add_argument(
-        "--readme",
-        type=Path,
-        metavar="README.md",
-        help="write the table at a glance into this file, between its markers",
-    )
-    parser.add_argument(
-        "--tag-video",
-        type=Path,
-        metavar="FILE",
-        help="test_vid.mp4 of github.com/mark-belbin/underwater-apriltags",
-    )
-
-
 def run(args: argparse.Namespace) -> int:
     """Run everything and write the report; return 0."""
     figures.check()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.cli import COMMANDS, parser_of
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.result import Result, evaluate
@@ -52,16 +52,14 @@ FULL: Final = Size(seconds=60.0, rate_hz=2.0, long_seconds=240.0, long_rate_hz=4
 QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.0, tank_step=80)
 
 
-def call(module: str, *words: str) -> None:
+def call(name: str, *words: str) -> None:
     """Run one command of the program, without its summary; raise BuddylineError where it fails."""
-    command = import_module(f"buddyline.tools.{module}")
-    parser = argparse.ArgumentParser(prog=f"buddyline {module}")
-    command.add_arguments(parser)
+    command = next(command for command in COMMANDS if command.name == name)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        status = command.run(parser.parse_args(words))
+        status = import_module(command.module).run(parser_of(command).parse_args(words))
     # Tags that no picture shows are a result, too.
-    if status and module != "artag":
-        raise BuddylineError(f"buddyline {module} {' '.join(words)}: ended with {status}")
+    if status and name != "artag":
+        raise BuddylineError(f"buddyline {name} {' '.join(words)}: ended with {status}")
 
 
 def measured(path: Path) -> Result:

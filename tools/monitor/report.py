@@ -8,7 +8,6 @@ import math
 import time
 from collections import Counter
 from html import escape
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -30,7 +29,7 @@ from buddyline.tools.monitor.picture import sigma_m
 from buddyline.tools.monitor.replay import keyframes, replay_html
 from buddyline.tools.monitor.summary import Summary, summarize
 from buddyline.tools.newfile import check_new, write_new
-from buddyline.tools.pairs import Pair, add_pair_argument, solved_pair
+from buddyline.tools.pairs import Pair, solved_pair
 from msgspec import UNSET
 
 log = logging.getLogger(__name__)
@@ -48,13 +47,6 @@ CSS: Final = (
     ".bar{display:flex;gap:8px;align-items:center;flex-wrap:wrap;margin:6px 0}.bar input{flex:1;min-width:120px}"
     ".bar output{min-width:13em;font-variant-numeric:tabular-nums}@media print{.bar{display:none}}" + STRIP_CSS
 )
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: a solved log, or each node's own")
-    add_pair_argument(parser, "the first in the logs")
-    parser.add_argument("-o", "--output", required=True, type=Path, metavar="report.html")
 
 
 def run(args: argparse.Namespace) -> int:
