@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import base64
 import math
+import threading
 from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
-from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS, ManualClock
-from buddyline.protocol.codec import encode
+from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Message
-from buddyline.protocol.topics import POSE, key_of
+from buddyline.protocol.topics import ATTITUDE, INFO, POSE
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.coverage import Coverage, clock_words
-from buddyline.tools.monitor.inbox import QUEUED, Inbox
+from buddyline.tools.monitor.live import subscribe
 from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, columns
 from buddyline.tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
 from msgspec.structs import replace
 
 from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection
-from tests.tools.watched import at, attitude, feed, image, solver_status, status, watched
+from tests.tools.watched import at, attitude, feed, image, solver_status, status, take, watched
 
 HALF = math.sqrt(0.5)
 
@@ -57,7 +58,7 @@ class TestPicture:
 
     def test_b_is_where_the_solver_says_where_it_knows_north(self) -> None:
         picture = watched(1)
-        picture.take(pose(1, t_ned_m=(1.0, 2.0, 3.0), azimuth_rad=1.1, inclination_rad=-0.9), None, at(5))
+        take(picture, pose(1, t_ned_m=(1.0, 2.0, 3.0), azimuth_rad=1.1, inclination_rad=-0.9), at(5))
         assert picture.points[-1].t_m == (1.0, 2.0, 3.0)
 
     def test_stale_within_a_second(self) -> None:
@@ -69,14 +70,14 @@ class TestPicture:
     def test_trail_keeps_minutes_and_no_more(self) -> None:
         picture = PairPicture()
         for k in range(0, 4000, 2):
-            picture.take(pose(k), None, at(k))
+            take(picture, pose(k), at(k))
         assert picture.points[-1].at_ns - picture.points[0].at_ns <= KEPT_NS
         assert len(picture.points) == KEPT_NS // (2 * (at(1) - at(0))) + 1
         assert len(picture.results) <= 128
 
     def test_another_pair_s_poses_are_named_and_not_shown(self) -> None:
         picture = watched(3)
-        picture.take(pose(3, node_b="c", range_m=99.0), None, at(3))
+        take(picture, pose(3, node_b="c", range_m=99.0), at(3))
         assert picture.pose is not None
         assert picture.pose.range_m == 3.0
         assert "another pair, a and c" in words(picture, at(3))
@@ -84,15 +85,15 @@ class TestPicture:
     def test_the_pair_that_was_chosen_is_shown_whatever_comes_first(self) -> None:
         picture = PairPicture(("a", "c"))
         for k in range(3):
-            picture.take(pose(k), None, at(k))
-            picture.take(pose(k, node_b="c", range_m=9.0), None, at(k))
+            take(picture, pose(k), at(k))
+            take(picture, pose(k, node_b="c", range_m=9.0), at(k))
         assert picture.ends() == ("a", "c")
         assert (picture.pose.range_m if picture.pose else None, picture.solved) == (9.0, 3)
 
     def test_latency_of_a_log_solved_offline_is_unknown(self) -> None:
         picture = PairPicture()
-        picture.take(pose(0), None, at(0))
-        picture.take(pose(10), None, at(10) + S_NS // 20)
+        take(picture, pose(0), at(0))
+        take(picture, pose(10), at(10) + S_NS // 20)
         assert [point.latency_s for point in picture.points] == [pytest.approx(math.nan, nan_ok=True), 0.05]
 
 
@@ -140,7 +141,7 @@ class TestHealth:
     def test_what_a_node_reports_is_passed_on_with_its_beginning(self) -> None:
         picture = watched()
         for k, figure in ((30, "2.1"), (40, "3.1"), (50, "4.1")):
-            picture.take(status("a", at(k), f"camera: nothing for {figure} s"), None, at(k))
+            take(picture, status("a", at(k), f"camera: nothing for {figure} s"), at(k))
             feed(picture, k + 1)
         said = [finding for finding in findings(picture, at(51)) if "reports" in finding.text]
         assert [finding.since_ns for finding in said] == [at(30)]
@@ -150,8 +151,8 @@ class TestHealth:
         picture = watched()
         for k in range(30, 60):
             for message in (frame("a", k), frame("b", k), rejection(k, reason)):
-                picture.take(message, None, at(k))
-            picture.take(solver_status(at(k)), None, at(k))
+                take(picture, message, at(k))
+            take(picture, solver_status(at(k)), at(k))
         said = next(finding for finding in findings(picture, at(60)) if finding.name == "pair")
         assert said.text == f"No pose: {REASONS[reason][0]}."
         assert said.advice == REASONS[reason][1]
@@ -159,52 +160,45 @@ class TestHealth:
     def test_a_log_without_poses_says_how_to_get_them(self) -> None:
         picture = PairPicture()
         for k in range(40):
-            picture.take(frame("a", k), None, at(k))
-            picture.take(frame("b", k), None, at(k))
+            take(picture, frame("a", k), at(k))
+            take(picture, frame("b", k), at(k))
         assert "buddyline solve" in words(picture, at(39), live=False)
 
 
 def _unsolved() -> PairPicture:
     picture = watched(11)
     for k in range(11, 61):
-        picture.take(frame("a", k), None, at(k))
-        picture.take(frame("b", k), None, at(k))
+        take(picture, frame("a", k), at(k))
+        take(picture, frame("b", k), at(k))
     return picture
 
 
-class TestInbox:
-    def received(self, message: Message, receive_ns: int) -> Received:
-        return Received(key_of(message), encode(message), receive_ns, "")
+class TestLive:
+    def test_what_comes_over_the_bus_is_in_the_picture_and_bad_messages_change_nothing(self) -> None:
+        network = LocalNetwork(ManualClock(at(30)))
+        picture, refusals = PairPicture(), Refusals("t")
+        with network.connect() as nodes, network.connect() as topside:
+            nodes.publisher(INFO, "a").put(INFOS["a"])
+            subscribe(topside, refusals, picture, threading.Lock())
+            poses = nodes.publisher(POSE, "a", "b")
+            poses.put(pose(0))
+            poses.put_bytes(b'{"range_m": "far"}')
+            poses.put(pose(1))
+            nodes.publisher(ATTITUDE, "a").put(attitude("a", at(1)))
+            # All subscriptions have handed on what they hold when they are closed.
+            topside.close()
+        assert (picture.pose, picture.solved) == (pose(1), 2)
+        assert picture.nodes["a"].info == INFOS["a"]
+        assert picture.nodes["a"].attitude == attitude("a", at(1))
+        assert refusals.count == 1
 
-    def test_only_the_newest_attitude_is_decoded_and_every_pose(self) -> None:
-        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
-        for k in range(20):
-            inbox.receive(self.received(attitude("a", at(k)), at(k)))
-            inbox.receive(self.received(pose(k), at(k)))
-        assert inbox.empty_into(picture) == 21
-        assert picture.solved == 20
-        assert picture.nodes["a"].attitude == attitude("a", at(19))
-
-    def test_a_flood_drops_the_oldest(self) -> None:
-        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
-        for k in range(QUEUED + 5):
-            inbox.receive(self.received(pose(k), at(k)))
-        assert inbox.empty_into(picture) == QUEUED
-        assert inbox.dropped == 5
-        assert picture.pose == pose(QUEUED + 4)
-
-    def test_a_bad_message_is_counted_and_changes_nothing(self) -> None:
-        inbox, picture = Inbox(ManualClock(at(0))), PairPicture()
-        inbox.receive(Received(POSE.key("a", "b"), b'{"range_m": "far"}', 0, ""))
-        inbox.receive(self.received(pose(1), at(1)))
-        inbox.empty_into(picture)
-        assert inbox.refusals.count == 1
-        assert picture.solved == 1
-
-    def test_who_leaves_is_seen(self) -> None:
-        inbox, picture = Inbox(ManualClock(at(30))), watched()
-        inbox.presence("node/b", False)
-        inbox.empty_into(picture)
+    def test_who_leaves_the_bus_is_seen(self) -> None:
+        network, picture = LocalNetwork(ManualClock(at(30))), watched()
+        with network.connect() as topside:
+            with network.connect() as node:
+                node.declare_alive("node/b")
+                subscribe(topside, Refusals("t"), picture, threading.Lock())
+            topside.close()
         assert picture.nodes["b"].left_ns == at(30)
 
 
@@ -218,15 +212,15 @@ class TestPanel:
 
     def test_words_from_the_bus_cannot_become_markup(self) -> None:
         picture = watched()
-        picture.take(status("a", at(30), "<script>alert(1)</script>"), None, at(30))
-        picture.take(replace_detail("<img src=x>"), None, at(30))
+        take(picture, status("a", at(30), "<script>alert(1)</script>"), at(30))
+        take(picture, replace_detail("<img src=x>"), at(30))
         for drawn in (panel.headline, panel.health):
             assert "<script>alert" not in drawn(picture, at(31))
         assert "<img" not in panel.camera(picture, picture.nodes["a"], at(30))
 
     def test_a_picture_carries_its_own_candidates_not_the_newest(self) -> None:
         picture = watched(5)
-        picture.take(image("a", at(2)), "a", at(4))
+        take(picture, image("a", at(2)), at(4))
         drawn = panel.camera(picture, picture.nodes["a"], at(4))
         assert "data:image/png;base64," in drawn
         assert "Pose at 3.00 m" in drawn
@@ -234,8 +228,8 @@ class TestPanel:
 
     def test_a_rejection_is_said_on_the_picture(self) -> None:
         picture = watched(5)
-        picture.take(frame("a", 5), None, at(5))
-        picture.take(rejection(5), None, at(5))
+        take(picture, frame("a", 5), at(5))
+        take(picture, rejection(5), at(5))
         words = panel.judged_picture(picture, picture.nodes["a"])[1]
         assert "more than one arrangement fits (two, alike)" in words
 
@@ -247,7 +241,7 @@ class TestPanel:
         picture = PairPicture()
         for k in range(0, 40, 2):
             azimuth_rad = math.radians((350 + k) % 360)
-            picture.take(pose(k, azimuth_rad=azimuth_rad, inclination_rad=0.0), None, at(k))
+            take(picture, pose(k, azimuth_rad=azimuth_rad, inclination_rad=0.0), at(k))
         _, found = columns(list(picture.points), at(0))
         (drawn,) = (values for title, values in found.items() if title.startswith("Azimuth"))
         np.testing.assert_allclose(np.diff(drawn), 2.0, atol=1e-9)

@@ -5,6 +5,7 @@ import csv
 import io
 import json
 import re
+import threading
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,9 @@ from buddyline.tools.dashboard import Dashboard
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import follow
 from buddyline.tools.monitor.coverage import Coverage
-from buddyline.tools.monitor.inbox import Inbox
+from buddyline.tools.monitor.live import subscribe
 from buddyline.tools.monitor.picture import PairPicture
-from buddyline.tools.monitor.playback import Playback, survey
+from buddyline.tools.monitor.playback import Playback, cover
 from buddyline.tools.monitor.summary import summarize
 from buddyline.tools.survey.live import LiveAlarms, Watch
 from buddyline.tools.survey.readings import of_logs
@@ -47,16 +48,10 @@ def test_nothing_else_decodes_a_payload():
     assert found == {"protocol/envelope.py"}
 
 
-def inbox_of(bus, took):
-    inbox = Inbox(bus.clock)
-    inbox.subscribe(bus)
+def monitor_of(bus, took):
     picture = PairPicture()
-
-    def taken():
-        inbox.empty_into(picture)
-        return {name: node.depth.depth_m for name, node in picture.nodes.items() if node.depth}
-
-    return taken
+    subscribe(bus, Refusals("t"), picture, threading.Lock())
+    return lambda: {name: node.depth.depth_m for name, node in picture.nodes.items() if node.depth}
 
 
 def follower_of(bus, took):
@@ -75,7 +70,7 @@ def watch_of(bus, took):
     return lambda: depths
 
 
-@pytest.mark.parametrize("client", [inbox_of, follower_of, watch_of])
+@pytest.mark.parametrize("client", [monitor_of, follower_of, watch_of])
 def test_a_depth_on_another_nodes_key_is_believed_by_no_live_client(client):
     network = LocalNetwork()
     with network.connect() as nodes, network.connect() as topside:
@@ -125,12 +120,13 @@ def test_commands_count_and_name_what_is_on_another_nodes_key(misplaced, tmp_pat
 
 
 def test_playback_and_report_believe_no_depth_on_another_nodes_key(misplaced):
-    with Playback([misplaced]) as playback:
+    with Dive([misplaced]) as dive:
+        playback = Playback(dive)
         playback.seek(playback.end_ns)
         assert "b" not in playback.picture.nodes or playback.picture.nodes["b"].depth is None
         assert playback.picture.nodes["a"].depth.depth_m == 1.0
     with Dive([misplaced]) as dive:
-        assert {node: line[0][1] for node, line in summarize(dive).depths.items()} == {"a": 1.0}
+        assert {node: line[0][1] for node, line in summarize(dive, ("a", "b")).depths.items()} == {"a": 1.0}
         assert dive.refused == 3
 
 
@@ -157,16 +153,18 @@ def test_of_two_outcomes_of_a_trigger_evaluate_and_export_take_the_first(doubled
 
 def test_of_two_outcomes_of_a_trigger_report_view_and_survey_take_the_first(doubled, caplog):
     with Dive([doubled]) as dive:
-        summary = summarize(dive)
+        summary = summarize(dive, ("a", "b"))
         assert (summary.picture.solved, summary.picture.rejected.total()) == (3, 1)
-        assert summary.ranges_m == [3.0, 3.0, 3.0]
+        assert [pose.range_m for pose in summary.poses] == [3.0, 3.0, 3.0]
         assert dive.losses == []
     assert "4 second outcomes of triggers of a/b left out" in caplog.text
-    with Playback([doubled]) as playback:
+    with Dive([doubled]) as dive:
+        playback = Playback(dive)
         playback.seek(playback.end_ns)
         assert (playback.picture.solved, playback.picture.rejected.total()) == (3, 1)
         coverage = Coverage(playback.start_ns, playback.end_ns)
-        assert len(list(survey([doubled], coverage))) == 4
+        cover(coverage, [doubled], ("a", "b"), threading.Event())
+        assert (coverage.solved.sum(), coverage.rejected.sum()) == (3, 1)
     (readings,) = of_logs([doubled])
     assert (len(readings.triggers), len(readings.rejected)) == (3, 1)
     assert readings.t_a_b_m[:, 2].tolist() == [3.0, 3.0, 3.0]

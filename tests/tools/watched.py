@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode
+from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.messages import (
     Attitude,
     CompressedImage,
@@ -12,6 +14,7 @@ from buddyline.protocol.messages import (
     NodeStatus,
     SolverStatus,
 )
+from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.picture import PairPicture
 
 from tests.tools.evaluated import FIRST, INFOS, PERIOD_NS, frame, pose
@@ -89,11 +92,16 @@ def tick(k: int, nodes: str = "ab") -> list[Message]:
     return said
 
 
+def take(picture: PairPicture, message: Message, at_ns: int) -> None:
+    """Let the picture take a message that came at this time."""
+    picture.take(open_envelope(key_of(message), encode(message), at_ns))
+
+
 def watched(ticks: int = 30) -> PairPicture:
     """A picture of a healthy pair after so many triggers, each message taken at its own stamp."""
     picture = PairPicture()
     for node in "ab":
-        picture.take(INFOS[node], None, at(0))
+        take(picture, INFOS[node], at(0))
     for k in range(ticks):
         feed(picture, k)
     return picture
@@ -101,4 +109,4 @@ def watched(ticks: int = 30) -> PairPicture:
 
 def feed(picture: PairPicture, k: int, nodes: str = "ab") -> None:
     for message in tick(k, nodes):
-        picture.take(message, None, at(k))
+        take(picture, message, at(k))

@@ -4,14 +4,28 @@ from __future__ import annotations
 
 import argparse
 import logging
+import threading
 import webbrowser
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.topics import (
+    ATTITUDE,
+    CANDIDATES,
+    DEPTH,
+    IMAGE,
+    INFO,
+    NODE_STATUS,
+    POSE,
+    REJECTED,
+    SOLVER_STATUS,
+)
 from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.pairs import add_pair_argument
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
+    from buddyline.protocol.envelope import Envelope, Refusals
     from buddyline.tools.monitor.page import Page
     from buddyline.tools.monitor.picture import PairPicture
 
@@ -19,6 +33,8 @@ log = logging.getLogger(__name__)
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
+STATES: Final = (INFO, NODE_STATUS, SOLVER_STATUS)
+STREAMS: Final = (POSE, REJECTED, CANDIDATES, ATTITUDE, DEPTH)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,25 +73,38 @@ def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
 def run(args: argparse.Namespace) -> int:
     """Serve the page until stopped."""
     from buddyline.protocol.clock import SystemClock
-    from buddyline.tools.live import LiveClient
-    from buddyline.tools.monitor.inbox import Inbox
     from buddyline.tools.monitor.picture import PairPicture
 
     client = LiveClient("monitor", client_config(args), args.seconds)
     page = open_page(args, "Buddyline", live=True)
-    clock = SystemClock()
-    inbox, picture = Inbox(clock), PairPicture(args.pair)
+    clock, picture, lock = SystemClock(), PairPicture(args.pair), threading.Lock()
 
-    def step(_: bool) -> tuple[PairPicture, int, bool]:
-        inbox.empty_into(picture)
-        return picture, clock.now_ns(), False
-
-    def follow(bus: Bus) -> None:
-        inbox.subscribe(bus)
+    def work(bus: Bus) -> None:
+        subscribe(bus, client.refusals, picture, lock)
         client.wait()
 
-    client.spawn("page", lambda: page.draw_until(client.stop, step))
+    client.spawn("page", lambda: page.draw_until(client.stop, lambda _: (picture, clock.now_ns(), False), lock))
     try:
-        return client.run(follow)
+        return client.run(work)
     finally:
         page.close()
+
+
+def subscribe(bus: Bus, refusals: Refusals, picture: PairPicture, lock: threading.Lock) -> None:
+    """Let everything that is shown come into the picture, under the lock.
+
+    Only what describes a state is asked for from before: a history of the rest would load the link that the solver
+    needs. Each subscription's queue drops its oldest, so a slow page slows nobody who publishes.
+    """
+
+    def take(envelope: Envelope) -> None:
+        with lock:
+            picture.take(envelope)
+
+    def alive(name: str, is_alive: bool) -> None:
+        with lock:
+            picture.alive(name, is_alive, bus.clock.now_ns())
+
+    for topics, capacity, history in ((STATES, 64, True), (STREAMS, 1024, False), ((IMAGE,), 4, False)):
+        follow(bus, tuple(topic.key_any() for topic in topics), refusals, take, capacity=capacity, history=history)
+    bus.watch_alive(alive)

@@ -6,7 +6,7 @@ import io
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import AbstractContextManager, redirect_stdout
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
@@ -337,8 +337,13 @@ class Page:
         with redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    def draw_until(self, stop: threading.Event, step: Callable[[bool], tuple[PairPicture, int, bool]]) -> None:
-        """Draw what step returns, ten times a second, until stop is set.
+    def draw_until(
+        self,
+        stop: threading.Event,
+        step: Callable[[bool], tuple[PairPicture, int, bool]],
+        lock: AbstractContextManager[Any],
+    ) -> None:
+        """Draw what step returns, ten times a second, until stop is set; lock: held while the picture is read.
 
         step(watched): the picture, its present time (ns), and whether all is to be drawn at once; watched: whether
         anyone looks at the page.
@@ -347,12 +352,13 @@ class Page:
         seen: frozenset[int] = frozenset()
         while not stop.wait(TICK_S):
             viewers = frozenset(self.server.get_clients())
-            picture, now_ns, jumped = step(bool(viewers))
-            # Who has just come sees all of it at once.
-            tick = 0 if jumped or viewers - seen else tick + 1
-            seen = viewers
-            if viewers:
-                self._draw(picture, now_ns, tick)
+            with lock:
+                picture, now_ns, jumped = step(bool(viewers))
+                # Who has just come sees all of it at once.
+                tick = 0 if jumped or viewers - seen else tick + 1
+                seen = viewers
+                if viewers:
+                    self._draw(picture, now_ns, tick)
 
     def _draw(self, picture: PairPicture, now_ns: int, tick: int) -> None:
         self.scene.draw(picture, now_ns)

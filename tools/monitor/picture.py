@@ -15,21 +15,21 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
     CompressedImage,
     Depth,
-    Message,
     NodeInfo,
     NodeStatus,
     Rejected,
     RelativePose,
     SolverStatus,
 )
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMAGE, INFO, NODE_STATUS, POSE, Topic
-from buddyline.tools.monitor.scene import Floats, Frame, frame_of
+from buddyline.protocol.topics import INFO, POSE, Topic
+from buddyline.tools.monitor.scene import Floats, SceneFrame, frame_of
 from buddyline.tools.pairs import Pair
 from msgspec import UNSET, UnsetType
 
@@ -48,7 +48,7 @@ class Point:
     at_ns: int
     pose: RelativePose
     t_m: tuple[float, float, float]
-    frame: Frame = field(compare=False)
+    frame: SceneFrame = field(compare=False)
 
     @property
     def latency_s(self) -> float:
@@ -103,7 +103,10 @@ class Miss:
 
 @dataclass
 class NodePicture:
-    """What is known of one node. heard_ns: by topic's name, when its newest message came."""
+    """What is known of one node: the newest message of each topic, under the topic's name.
+
+    heard_ns: when it came, by topic's name.
+    """
 
     node: str
     info: NodeInfo | None = None
@@ -141,29 +144,18 @@ class NodePicture:
         stamp_ns = self.image.stamp_ns
         return next((frame for frame in reversed(self.candidates) if frame.stamp_ns == stamp_ns), None)
 
-    def take(self, message: Message, at_ns: int) -> None:
+    def take(self, envelope: Envelope) -> None:
         """Take one of the node's messages."""
-        kind = _KINDS.get(type(message))
-        if kind is None:
+        message, name = envelope.message, envelope.topic.name.removeprefix("node_")
+        if not hasattr(self, name):
             return
-        topic, field_name = kind
-        self.heard_ns[topic.name] = at_ns
+        self.heard_ns[envelope.topic.name] = envelope.time_ns
         if isinstance(message, Candidates):
             self.candidates.append(message)
             return
         if isinstance(message, NodeStatus) and _is_new_problem(self.status, message):
-            self.problem_since_ns = at_ns
-        setattr(self, field_name, message)
-
-
-_KINDS: Final[dict[type[Message], tuple[Topic, str]]] = {
-    NodeInfo: (INFO, "info"),
-    Attitude: (ATTITUDE, "attitude"),
-    Depth: (DEPTH, "depth"),
-    NodeStatus: (NODE_STATUS, "status"),
-    CompressedImage: (IMAGE, "image"),
-    Candidates: (CANDIDATES, "candidates"),
-}
+            self.problem_since_ns = envelope.time_ns
+        setattr(self, name, message)
 
 
 class PairPicture:
@@ -190,16 +182,15 @@ class PairPicture:
         self.last_ns: int | None = None
         self.other_pairs: set[Pair] = set()
 
-    def take(self, message: Message, node: str | None, at_ns: int) -> None:
-        """Take one message that came at at_ns; node: of a picture, whose message does not name it."""
+    def take(self, envelope: Envelope) -> None:
+        """Take one message, which came at its time_ns."""
+        message, at_ns = envelope.message, envelope.time_ns
         self.first_ns = at_ns if self.first_ns is None else self.first_ns
         self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
-        if not isinstance(message, RelativePose | Rejected | SolverStatus):
-            sender = getattr(message, "node", node)
-            if isinstance(sender, str):
-                self.nodes.setdefault(sender, NodePicture(sender)).take(message, at_ns)
+        if len(envelope.ids) == 1:
+            self.nodes.setdefault(envelope.node, NodePicture(envelope.node)).take(envelope)
             return
-        pair = (message.node_a, message.node_b)
+        pair = envelope.node, envelope.ids[1]
         self.pair = self.pair or pair
         if pair != self.pair:
             self.other_pairs.add(pair)
@@ -207,7 +198,7 @@ class PairPicture:
             if _is_new_problem(self.solver, message):
                 self.solver_problem_since_ns = at_ns
             self.solver, self.solver_ns = message, at_ns
-        else:
+        elif isinstance(message, RelativePose | Rejected):
             self._take_result(message, at_ns)
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
@@ -241,10 +232,10 @@ class PairPicture:
         stale_ns = round(stale_after_s(POSE) * S_NS) if a is None else a.stale_after_ns(POSE)
         return age_ns is None or age_ns >= stale_ns
 
-    def frame(self) -> Frame:
+    def frame(self) -> SceneFrame:
         """Return how A's camera stands in the scene, by A's newest attitude."""
         node = self.end_nodes()[0]
-        return Frame.unknown() if node is None else frame_of(node.info, node.attitude)
+        return SceneFrame.unknown() if node is None else frame_of(node.info, node.attitude)
 
     def _take_result(self, result: RelativePose | Rejected, at_ns: int) -> None:
         self.results[result.trigger] = result

@@ -6,7 +6,9 @@ import threading
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.messages import Rejected
+from buddyline.protocol.topics import INFO
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.picture import PairPicture
@@ -36,8 +38,8 @@ class Playback:
         to_ns = min(max(to_ns, self.start_ns), self.end_ns)
         self.picture = PairPicture(self._pair)
         # The first calibrations, which a jump may pass over.
-        for info in self._dive.infos().values():
-            self.picture.take(info, None, self.start_ns)
+        for node, info in self._dive.infos().items():
+            self.picture.take(Envelope(INFO.key(node), INFO, (node,), info, b"", self.start_ns))
         self._messages = self._dive.messages(*SHOWN, since_ns=to_ns - LEAD_NS)
         self._next = next(self._messages, None)
         self.position_ns = to_ns
@@ -50,7 +52,7 @@ class Playback:
 
     def _feed(self) -> None:
         while self._next is not None and self._next.time_ns <= self.position_ns:
-            self.picture.take(self._next.message, self._next.node, self._next.time_ns)
+            self.picture.take(self._next)
             self._next = next(self._messages, None)
 
 

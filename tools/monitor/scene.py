@@ -28,16 +28,16 @@ INSIDE: Final = 0.4
 
 
 @dataclass(frozen=True)
-class Frame:
+class SceneFrame:
     """How A's camera stands: R_s_a maps its frame into the scene's; levelled: by a measured attitude."""
 
     R_s_a: Floats
     levelled: bool
 
     @staticmethod
-    def unknown() -> Frame:
+    def unknown() -> SceneFrame:
         """Return A level and looking north, for want of an attitude."""
-        return Frame(R_LEVEL, False)
+        return SceneFrame(R_LEVEL, False)
 
     def place(self, pose: RelativePose) -> tuple[float, float, float]:
         """Return B's position in the scene (m)."""
@@ -52,15 +52,15 @@ class Frame:
         return R_s_b
 
 
-def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> Frame:
+def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> SceneFrame:
     """Return how a camera stands by its mount and its node's attitude."""
     if info is None or attitude is None:
-        return Frame.unknown()
+        return SceneFrame.unknown()
     R_s_body = matrix_of(np.array(attitude.q_ned_body_xyzw))
-    return Frame(R_s_body @ matrix_of(np.array(info.q_body_camera_xyzw)), True)
+    return SceneFrame(R_s_body @ matrix_of(np.array(info.q_body_camera_xyzw)), True)
 
 
-def ellipsoid(pose: RelativePose, frame: Frame) -> tuple[Floats, Floats]:
+def ellipsoid(pose: RelativePose, frame: SceneFrame) -> tuple[Floats, Floats]:
     """Return the half axes (3,) in m and R_s_axes (3, 3) of the ellipsoid that holds B with 95 %."""
     covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))

@@ -28,7 +28,7 @@ SHOTS_NS: Final = 20 * S_NS
 
 
 @dataclass
-class Shot:
+class JudgedPicture:
     """A picture of one node, marked, and what became of it."""
 
     at_ns: int
@@ -52,7 +52,7 @@ class Summary:
     truths: list[Truth] = field(default_factory=list)
     depths: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
-    shots: dict[str, Shot] = field(default_factory=dict)
+    shots: dict[str, JudgedPicture] = field(default_factory=dict)
     infos: dict[str, list[NodeInfo]] = field(default_factory=dict)
 
     def errors(self) -> PoseErrors:
@@ -71,7 +71,7 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
             if pair in (envelope.ids, envelope.ids[::-1]):
                 summary.truths.append(message if envelope.ids == pair else inverted(message))
             continue
-        summary.picture.take(message, envelope.node, at_ns)
+        summary.picture.take(envelope)
         if isinstance(message, RelativePose | Rejected):
             if envelope.ids == pair:
                 _take_outcome(summary, message, at_ns)
@@ -100,20 +100,20 @@ def _take_outcome(summary: Summary, outcome: RelativePose | Rejected, at_ns: int
         summary.points.append(Point(at_ns, outcome, frame.place(outcome), frame))
 
 
-def _shots(dive: Dive, pair: Pair | None) -> dict[str, Shot]:
+def _shots(dive: Dive, pair: Pair | None) -> dict[str, JudgedPicture]:
     """Return a picture of each node near the middle of the dive, where there are pictures."""
     middle_ns = (dive.start_ns + dive.end_ns) // 2
     picture = PairPicture(pair)
-    shots: dict[str, Shot] = {}
+    shots: dict[str, JudgedPicture] = {}
     nodes = dive.nodes("image")
     if not nodes:
         return shots
     for envelope in dive.messages("image", "candidates", "pose", "rejected", since_ns=middle_ns):
         if envelope.time_ns > middle_ns + SHOTS_NS or all(node in shots for node in nodes):
             break
-        picture.take(envelope.message, envelope.node, envelope.time_ns)
+        picture.take(envelope)
         for name, node in picture.nodes.items():
             frame = node.shown()
             if name not in shots and node.image is not None and frame is not None and frame.trigger in picture.results:
-                shots[name] = Shot(envelope.time_ns, *judged_picture(picture, node))
+                shots[name] = JudgedPicture(envelope.time_ns, *judged_picture(picture, node))
     return shots

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import threading
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol.clock import S_NS
@@ -134,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
             return playback.picture, playback.position_ns, wanted_s is not None
 
         service.spawn("coverage", lambda: cover(coverage, args.dives, pair, service.stop))
-        service.spawn("page", lambda: page.draw_until(service.stop, step))
+        service.spawn("page", lambda: page.draw_until(service.stop, step, nullcontext()))
         service.wait(args.seconds)
         status = service.join()
         page.close()
