@@ -34,7 +34,7 @@ def detect(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `buddyline detect`."""
     parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap")
     parser.add_argument("-o", "--output", metavar="OUT.mcap", help="write a dive log in place of JSON lines")
-    parser.add_argument("--draw", metavar="DIR", help="write the pictures with their candidates marked")
+    parser.add_argument("--draw", metavar="DIR", help="a new folder for the pictures with their candidates marked")
     parser.add_argument("--environment", default="auto", choices=PRESETS, help="default: auto")
     parser.add_argument(
         "--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}; paper: the paper's"
@@ -51,7 +51,9 @@ def tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}")
     parser.add_argument("--environment", default=PRESETS[1], choices=PRESETS[1:], help="the preset to start from")
     parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
-    parser.add_argument("--draw", default="tuned", metavar="DIR", help="for the marked pictures; default: tuned")
+    parser.add_argument(
+        "--draw", default="tuned", metavar="DIR", help="a new folder for marked pictures; default: tuned"
+    )
     parser.add_argument("--json", action="store_true")
 
 

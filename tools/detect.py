@@ -23,7 +23,7 @@ from buddyline.protocol.topics import CANDIDATES, IMAGE, TOPICS
 from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
-from buddyline.tools.newfile import new_dive_log
+from buddyline.tools.newfile import new_dive_log, new_folder, write_picture
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     """Detect in pictures or in a dive."""
     cv2.setNumThreads(1)
     if args.draw:
-        Path(args.draw).mkdir(parents=True, exist_ok=True)
+        new_folder(args.draw)
     dives = [path for path in args.inputs if Path(path).suffix == ".mcap"]
     if dives and len(dives) != len(args.inputs):
         raise BuddylineError("give either pictures or dive logs, not both at once")
@@ -132,7 +132,7 @@ def _detect_pictures(args: argparse.Namespace) -> int:
                 )
             )
             if args.draw:
-                cv2.imwrite(str(Path(args.draw) / f"{file.stem}.png"), mark_candidates(picture, detections))
+                write_picture(Path(args.draw), file.stem, mark_candidates(picture, detections))
     if skipped:
         log.warning("%d of %d pictures skipped", skipped, len(files))
     return 1 if skipped == len(files) else 0
@@ -164,7 +164,7 @@ def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
                     print(found.payload.decode())
                 if isinstance(found.message, Candidates) and args.draw and detector.last:
                     frame, detections = detector.last
-                    name = f"{found.node}_{found.message.trigger}.png"
-                    cv2.imwrite(str(Path(args.draw) / name), mark_candidates(frame.image, detections))
+                    name = f"{found.node}_{found.message.trigger}"
+                    write_picture(Path(args.draw), name, mark_candidates(frame.image, detections))
     print(f"{detector.pictures} pictures, {detector.skipped} skipped", file=sys.stderr)
     return 0

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Final
 from buddyline.protocol.errors import BuddylineError
 
 if TYPE_CHECKING:
+    import numpy as np
     from buddyline.protocol.divelog import DiveLogWriter
+    from numpy.typing import NDArray
 
 REMOVE_IT: Final = "name another or remove it first"
 
@@ -67,6 +69,28 @@ def write_output(target: str, content: str | bytes) -> None:
         return
     sys.stdout.buffer.write(content.encode() if isinstance(content, str) else content)
     sys.stdout.flush()
+
+
+def new_folder(path: Path | str) -> Path:
+    """Make a folder for what a command writes; raise BuddylineError where there is one with something in it."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise BuddylineError(f"{folder}: is not empty; name another folder")
+    except OSError as error:
+        raise BuddylineError(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder
+
+
+def write_picture(folder: Path, name: str, picture: NDArray[np.uint8]) -> None:
+    """Write a new picture as NAME.png, or NAME_2.png and so on where that is taken."""
+    import cv2
+
+    path, number = folder / f"{name}.png", 2
+    while path.exists():
+        path, number = folder / f"{name}_{number}.png", number + 1
+    write_new(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 @contextmanager

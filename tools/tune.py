@@ -26,6 +26,7 @@ from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
 from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
+from buddyline.tools.newfile import new_folder, write_picture
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
@@ -86,8 +87,9 @@ def run(args: argparse.Namespace) -> int:
     if lights == 0:
         raise BuddylineError("no lights in these pictures to tune on; give pictures with the lamps on, or --truth")
     present = dict(presets(args.method)[args.environment])
+    folder = new_folder(args.draw)
     proposed, before, after = propose(args.method, args.environment, present, pictures)
-    folder = _write(args.draw, args.method, args.environment, proposed, pictures)
+    _write(folder, args.method, args.environment, proposed, pictures)
     report = {
         "method": args.method,
         "environment": args.environment,
@@ -229,17 +231,14 @@ def _spread(items: list[Any], limit: int) -> list[Any]:
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, min(limit, len(items)))]
 
 
-def _write(folder: str, method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Path:
+def _write(folder: Path, method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> None:
     """Write every picture with what the proposed values find in it, the lights it was judged by as crosses."""
-    path = Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
     detector = make_detector(method, environment, values)
     for picture in pictures:
         marked = mark_candidates(
             picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px]
         )
-        cv2.imwrite(str(path / f"{Path(picture.name).stem}.png"), marked)
-    return path
+        write_picture(folder, Path(picture.name).stem, marked)
 
 
 def _text(report: Mapping[str, Any], proposed: Values, before: Judged, after: Judged) -> str:

@@ -189,6 +189,24 @@ def test_an_interrupted_command_leaves_nothing_under_the_wanted_name(run, name, 
     assert not list(tmp_path.glob("OUT*"))
 
 
+@pytest.mark.parametrize("command", ["detect", "tune"])
+def test_marked_pictures_take_the_place_of_none(dives, tmp_path, capsys, command):
+    originals = tmp_path / "photos"
+    assert main(["detect", str(dives / "pictures.mcap"), "--draw", str(originals)]) == 0
+    before = {path: path.read_bytes() for path in originals.iterdir()}
+    assert main([command, str(originals), "--draw", str(originals)]) == 2
+    assert f"{originals}: is not empty" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in originals.iterdir()} == before
+
+
+def test_pictures_of_one_name_out_of_two_folders_are_both_marked(dives, tmp_path, capsys):
+    for name in ("one", "two"):
+        assert main(["detect", str(dives / "pictures.mcap"), "--draw", str(tmp_path / name)]) == 0
+    assert main(["detect", str(tmp_path / "one"), str(tmp_path / "two"), "--draw", str(tmp_path / "marked")]) == 0
+    count = len(list((tmp_path / "one").iterdir()))
+    assert len(list((tmp_path / "marked").iterdir())) == 2 * count
+
+
 @pytest.mark.parametrize("name", [name for name, words in COMMANDS.items() if "-o" in words])
 def test_no_output_takes_the_place_of_a_file(run, name, tmp_path):
     target = tmp_path / next(word for word in COMMANDS[name] if word.startswith("OUT"))
