@@ -1,0 +1,66 @@
+"""What depth gauges and attitude messages tell the track: residuals and Jacobians."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
+from buddyline.solver_service.track.state import DEPTH_OFFSET, PHI, R_, SIZE, V_, State
+
+# For how long an attitude filter errs alike: tilt, heading. A message counts dt / (2 T) of an independent one.
+TILT_TIME_S: Final = 10.0
+HEADING_TIME_S: Final = 100.0
+
+
+def attitude_residual(state: State, node: int, R_level_camera: Floats) -> tuple[Floats, Floats]:
+    """Give y (3,) = log(R_measured R^T), level axes, and H (3, SIZE)."""
+    y = rotation_log(R_level_camera @ state.R[node].T)
+    H = np.zeros((3, SIZE))
+    H[:, PHI[node]] = np.eye(3)
+    return y, H
+
+
+def attitude_covariance(R_ned_body: Floats, sigma_rad: Floats, tilt_factor: float, heading_factor: float) -> Floats:
+    """Give the covariance (3, 3) of an attitude's error in level axes, its variances inflated by the factors.
+
+    R = Rz(yaw) Ry(pitch) Rx(roll): an error of roll turns about the body's x axis, of pitch about the level line across
+    the heading, of yaw about the vertical.
+    """
+    forward = R_ned_body[:, 0]
+    across = np.array((-forward[1], forward[0], 0.0))
+    length = float(np.linalg.norm(across))
+    across = across / length if length > 1e-6 else np.array((0.0, 1.0, 0.0))
+    axes = np.stack((forward, across, np.array((0.0, 0.0, 1.0))), axis=1)
+    variances = sigma_rad**2 * np.array((tilt_factor, tilt_factor, heading_factor))
+    # Straight up or down the three axes are two: a little of all keeps it a covariance.
+    covariance: Floats = (axes * variances) @ axes.T + 1e-8 * np.eye(3)
+    return covariance
+
+
+def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) -> tuple[Floats, Floats]:
+    """Give y (1,) and H (1, SIZE) of B's depth minus A's as shown age_s before the state's time.
+
+    ports_m (2, 3): of the ports, camera frames. h = (r + R_B p_B - R_A p_A)_z - v_z age + offset.
+    """
+    arm_a, arm_b = state.R[0] @ ports_m[0], state.R[1] @ ports_m[1]
+    back = state.r_m - age_s * state.v_mps
+    h = back[2] + arm_b[2] - arm_a[2] + state.depth_offset_m
+    H = np.zeros((1, SIZE))
+    H[0, R_.start + 2] = 1.0
+    H[0, V_.start + 2] = -age_s
+    H[0, PHI[0]] = -skew(back)[2] + skew(arm_a)[2]
+    H[0, PHI[1]] = -skew(arm_b)[2]
+    H[0, DEPTH_OFFSET] = 1.0
+    return np.array((shown_m - h,)), H
+
+
+def kalman(P: Floats, H: Floats, y: Floats, noise: Floats) -> tuple[Floats, Floats, float]:
+    """Give the error (SIZE,) to add, the covariance after, and chi^2 of the residual."""
+    across = P @ H.T
+    S = H @ across + noise
+    inverse = np.linalg.inv(S)
+    gain = across @ inverse
+    after = P - gain @ across.T
+    after = 0.5 * (after + after.T)
+    return gain @ y, after, float(y @ inverse @ y)

@@ -1,0 +1,140 @@
+"""A whole dive's track: filter, smooth, decide again what was open, smooth again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.filter import Estimate, Guide, Step, TrackFilter
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.lights import COLUMNS
+from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.smoother import rows_between, smoothed
+from buddyline.solver_service.track.start import constants_of
+from buddyline.solver_service.track.state import CLOCK, PHI, R_, State
+
+_BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
+# A later pass starts as if nothing were known but roughly where: its lights tell the rest.
+BROAD_R_M: Final = 0.5
+BROAD_TURN_RAD: Final = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class NodeRecord:
+    """All that one node recorded on a dive. Inertial columns: stamps (N,), accel and gyro (N, 3), body frame."""
+
+    node: TrackNode
+    frames: Sequence[Frame]
+    imu_stamps_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
+    accel_mps2: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    gyro_radps: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    attitudes: Sequence[AttitudeSeen] = ()
+    depths: Sequence[DepthSeen] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """A dive's track. constants: the last state, which holds what was learned of the units and clocks."""
+
+    rows: list[TrackRow]
+    constants: State | None
+    clock_offset_s: float
+    clock_sigma_s: float
+    problems: list[str]
+
+
+def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int = 0) -> TrackFilter:
+    """Make a filter that keeps its steps and holds a whole dive."""
+    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf)
+    track.clock_ns = clock_ns
+    for node, record in enumerate(records):
+        track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps)
+        for attitude in record.attitudes:
+            track.add_attitude(node, attitude)
+        for depth in record.depths:
+            track.add_depth(node, depth)
+        for frame in record.frames:
+            track.add_frame(node, frame)
+    for fix in fixes:
+        track.add_fix(fix)
+    return track
+
+
+def smooth(
+    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
+) -> Smoothed:
+    """Give the whole dive's track at outputs_ns (A's clock)."""
+    first = filter_of(records, fixes, clock_ns)
+    end_ns = last_ns(records)
+    first.advance(end_ns)
+    parts = parts_of(first)
+    if not parts:
+        return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
+    second = filter_of(records, (), clock_ns)
+    second.restarts = False
+    told = sum(part.told for part in parts)
+    if told > 100:
+        second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
+    for part in parts:
+        results = smoothed(part.steps)
+        guide_by(second, part.steps, results)
+        state = results[0][0]
+        second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state))
+    second.advance(end_ns)
+    return rows_of(second, parts_of(second), outputs_ns)
+
+
+def last_ns(records: tuple[NodeRecord, NodeRecord]) -> int:
+    """Give a stamp well after all that was recorded."""
+    stamps = [0]
+    for record in records:
+        stamps += [frame.stamp_ns for frame in record.frames[-1:]]
+    return max(stamps) + 1_000_000_000
+
+
+def parts_of(track: TrackFilter) -> list[Estimate]:
+    """Give the confirmed tracks of a filter, one after the other in time."""
+    parts = [part for part in track.finished if part.steps]
+    if track.main is not None and track.main.confirmed and track.main.steps:
+        parts.append(track.main)
+    return parts
+
+
+def broad_start(track: TrackFilter, state: State) -> tuple[State, Floats]:
+    """Give a state to start again from, with a covariance that holds nothing of the lights yet."""
+    _, variances = constants_of(track.nodes, state.R, state.r_m)
+    P = np.diag(variances)
+    P[R_, R_] = BROAD_R_M**2 * np.eye(3)
+    level = 0.15**2 * np.eye(3)
+    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
+    P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
+    return state, P
+
+
+def guide_by(track: TrackFilter, steps: Sequence[Step], results: Sequence[tuple[State, Floats]]) -> None:
+    """Tell a filter what a pass knew at each picture."""
+    for step, (state, P) in zip(steps, results, strict=True):
+        for look in step.looks:
+            key = look.sight.t_s, look.sight.node
+            track.guides[key] = Guide(step.t_s, state, P[_BLOCK], step.rates_radps, look.chosen)
+
+
+def rows_of(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:
+    """Smooth each part and give its rows at the asked stamps."""
+    rows: list[TrackRow] = []
+    last: tuple[State, Floats] | None = None
+    stamps = sorted(outputs_ns)
+    times = np.array([track.seconds(0, stamp) for stamp in stamps])
+    for part in parts:
+        results = smoothed(part.steps)
+        last = results[-1]
+        rows += rows_between(part.steps, results, times, stamps)
+    if last is None:
+        return Smoothed([], None, track.clock_ns * 1e-9, math.inf, track.problems)
+    state, P = last
+    clock_s = track.clock_ns * 1e-9 + state.clock_s
+    return Smoothed(rows, state, clock_s, math.sqrt(P[CLOCK, CLOCK]), track.problems)

@@ -1,0 +1,41 @@
+"""The track a second later and better: backward over the last steps."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.smoother import rows_between, smoothed
+
+LAG_S: Final = 1.0
+# A pass backward serves all rows that have come due; so seldom it is cheap.
+EVERY_S: Final = 0.5
+
+
+class TrackLag:
+    """Rows of a filter, LAG_S after their stamps. The filter must keep at least LAG_S + EVERY_S of steps."""
+
+    def __init__(self, track: TrackFilter) -> None:
+        self._track = track
+        self._due: list[int] = []
+        self._done_s = -np.inf
+
+    def ask(self, stamps_ns: list[int]) -> None:
+        """Ask for rows at stamps (A's clock), in order."""
+        self._due += stamps_ns
+
+    def rows(self) -> list[TrackRow]:
+        """Return the rows that have come due; call it after `TrackFilter.advance`, at least every EVERY_S."""
+        main = self._track.main
+        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due:
+            return []
+        ready_s = main.t_s - LAG_S
+        ready = [stamp for stamp in self._due if self._track.seconds(0, stamp) <= ready_s]
+        if not ready or ready_s - self._done_s < EVERY_S:
+            return []
+        self._done_s = ready_s
+        self._due = self._due[len(ready) :]
+        times_s = np.array([self._track.seconds(0, stamp) for stamp in ready])
+        return rows_between(main.steps, smoothed(main.steps), times_s, ready)

@@ -1,0 +1,125 @@
+"""Where the lights of one node stand in the other's picture, and how the state's errors move them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.track.state import CLOCK, NAV, State
+from numpy.typing import NDArray
+
+# The errors that move a light in a picture: NAV of them, and the clock's.
+COLUMNS: Final = np.array((*range(NAV), CLOCK))
+
+
+def light_positions(
+    state: State, observer: int, lights_m: Floats, rates_radps: Floats, dt_s: Floats
+) -> tuple[Floats, Floats]:
+    """Give the other node's lights (L, 3) in the observer's camera frame at times dt_s (K,) after the state's.
+
+    Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates.
+    Seen by A:  X = R_A^T (r + R_B l)
+                dX = R_A^T (dr + dt dv - [R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
+    Seen by B:  X = R_B^T d, d = R_A l - r
+                dX = R_B^T (-dr - dt dv - [d]x (phi_A - phi_B)) - R_B^T R_A (w_A x l) dclock
+    With B's clock ahead by dclock more than believed, what is called B's state at t was true dclock earlier. The
+    displacement that A's own unknown velocity adds is counted to r.
+    """
+    other = 1 - observer
+    moving = bool(dt_s.any())
+    times = dt_s if moving else np.zeros(1)
+    # What the other node has turned on, or has yet to turn, by its own clock.
+    late_s = state.clock_s if observer == 0 else -state.clock_s
+    R_observer = state.R[observer] @ rotation_exp(rates_radps[observer] * times[:, None])
+    R_other = state.R[other] @ rotation_exp(rates_radps[other] * (times + late_s)[:, None])
+    arms = R_other @ lights_m.T  # (T, 3, L)
+    arms = np.swapaxes(arms, 1, 2)  # (T, L, 3)
+    swept = np.swapaxes(R_other @ np.cross(rates_radps[other], lights_m).T, 1, 2)
+    ahead_s = times + late_s if observer == 0 else times
+    r = (state.r_m + ahead_s[:, None] * state.v_mps)[:, None, :]
+    sign = 1.0 if observer == 0 else -1.0
+    d = sign * r + arms
+    toward = np.swapaxes(R_observer, 1, 2)[:, None]  # (T, 1, 3, 3)
+    X = (toward @ d[..., None])[..., 0]
+    D = np.zeros((*X.shape, NAV + 1))
+    D[..., 0:3] = sign * toward
+    D[..., 3:6] = D[..., 0:3] * ahead_s[:, None, None, None]
+    turn = toward @ skew(arms if observer == 0 else d)
+    D[..., 6:9] = turn if observer == 0 else -turn
+    D[..., 9:12] = -D[..., 6:9]
+    clock = state.v_mps + swept if observer == 0 else -swept
+    D[..., NAV] = (toward @ clock[..., None])[..., 0]
+    if not moving:
+        K = len(dt_s)
+        X, D = np.broadcast_to(X, (K, *X.shape[1:])), np.broadcast_to(D, (K, *D.shape[1:]))
+    return X, D
+
+
+def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple[Floats, Floats]:
+    """Give how far each candidate (K) stands off each light (L), in px (K, L, 2), and the light's Jacobian.
+
+    bearings (K, 3), tangents (K, 2, 3): of the candidates, as Camera.rays gives them. The picture near a candidate is
+    its tangent plane: h = T X / (b . X), dh = (T - h b^T) dX / (b . X); y = -h. Infinite behind the camera.
+    """
+    depth = np.einsum("kc,klc->kl", bearings, X)
+    ahead = depth > 1e-3 * np.sqrt((X * X).sum(-1))
+    safe = np.where(ahead, depth, 1.0)
+    h = np.einsum("krc,klc->klr", tangents, X) / safe[..., None]
+    slope = (tangents[:, None] - h[..., None] * bearings[:, None, None, :]) / safe[..., None, None]
+    H = slope @ D
+    y = np.where(ahead[..., None], -h, np.inf)
+    return y, H
+
+
+def in_picture(camera: Camera, X: Floats, margin_px: float = 2.0) -> bool:
+    """Whether a point (3,) of the camera frame is imaged: Newton's method on the inverse model."""
+    if X[2] <= 0.0 and camera.model == "pinhole":
+        return False
+    pixel = np.array((camera.cx_px, camera.cy_px))
+    with np.errstate(all="ignore"):
+        tangent_of_angle = np.hypot(X[0], X[1]) / max(abs(float(X[2])), 1e-9)
+        if camera.model == "pinhole":
+            pixel = pixel + np.array((camera.fx_px, camera.fy_px)) * X[:2] / X[2]
+        else:
+            angle = np.arctan2(np.hypot(X[0], X[1]), X[2])
+            pixel = pixel + camera.fx_px * X[:2] / max(tangent_of_angle * abs(float(X[2])), 1e-9) * angle
+        for _ in range(6 if any(camera.distortion) else 1):
+            bearings, tangents = camera.rays(pixel[None])
+            depth = float(bearings[0] @ X)
+            if not np.isfinite(depth) or depth <= 0.0:
+                return False
+            pixel = pixel + tangents[0] @ X / depth
+    u, v = pixel
+    return bool(
+        -0.5 + margin_px <= u <= camera.width_px - 0.5 - margin_px
+        and -0.5 + margin_px <= v <= camera.height_px - 0.5 - margin_px
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One picture as the track uses it: bearings and tangents of its sound candidates.
+
+    index (K,): their places in the frame. t_s: on A's clock as believed; dt_s (K,).
+    """
+
+    t_s: float
+    node: int
+    index: NDArray[np.intp]
+    bearings: Floats
+    tangents: Floats
+    sigma_px: Floats
+    dt_s: Floats
+
+
+def sight_of(rig: Rig, node: int, t_s: float, pixels: Floats, sigma_px: Floats, dt_s: Floats) -> Sight:
+    """Prepare a picture's candidates; those that the camera model does not reach are left out."""
+    with np.errstate(all="ignore"):
+        bearings, tangents = rig.camera.rays(pixels.reshape(-1, 2))
+    sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
+    keep = np.flatnonzero(sound)
+    return Sight(t_s, node, keep, bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep])

@@ -1,0 +1,130 @@
+"""One node's inertial samples: in order, sound, interpolated to any time."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.strapdown import Bools, Noise
+
+# Further apart, and what lies between two samples is not told.
+GAP_S: Final = 0.06
+STANDARD_GRAVITY: Final = 9.80665
+_NOISE_SPAN_S: Final = 2.0
+# Below these densities what the model leaves out rules: scale, cross-axis, interpolation, shake.
+GYRO_FLOOR: Final = 2e-4
+ACCEL_FLOOR: Final = 4e-3
+
+
+class Samples:
+    """Inertial samples in camera axes, by stamp in s since an epoch.
+
+    `rejected` counts samples that were not finite, or came twice.
+    """
+
+    def __init__(self) -> None:
+        self._t = np.empty(1024)
+        self._values = np.empty((1024, 6))
+        self._count = 0
+        self._noise_s = -np.inf
+        self._noise = Noise(GYRO_FLOOR, ACCEL_FLOOR)
+        self.rejected = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def times_s(self) -> Floats:
+        """The stamps (N,)."""
+        return self._t[: self._count]
+
+    @property
+    def values(self) -> Floats:
+        """Force and rate (N, 6)."""
+        return self._values[: self._count]
+
+    def add(self, times_s: Floats, values: Floats) -> None:
+        """Take samples (N,), (N, 6), in any order; a stamp that is there already is refused."""
+        sound = np.isfinite(times_s) & np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1)
+        self.rejected += int(len(sound) - sound.sum())
+        times_s, values = times_s[sound], values[sound]
+        if not len(times_s):
+            return
+        in_order = bool((np.diff(times_s) > 0.0).all()) and (self._count == 0 or times_s[0] > self._t[self._count - 1])
+        if not in_order:
+            merged = np.concatenate((self.times_s, times_s))
+            every, first = np.unique(merged, return_index=True)
+            self.rejected += len(merged) - len(every)
+            values = np.concatenate((self.values, values))[first]
+            times_s, self._count = every, 0
+        need = self._count + len(times_s)
+        if need > len(self._t):
+            room = max(2 * len(self._t), need)
+            self._t = np.concatenate((self.times_s, np.empty(room - self._count)))
+            self._values = np.concatenate((self.values, np.empty((room - self._count, 6))))
+        self._t[self._count : need] = times_s
+        self._values[self._count : need] = values
+        self._count = need
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop samples older than time_s."""
+        first = int(np.searchsorted(self.times_s, time_s))
+        if first > self._count // 2:
+            kept = self._count - first
+            self._t[:kept], self._values[:kept] = self._t[first : self._count], self._values[first : self._count]
+            self._count = kept
+
+    def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools]:
+        """Give the grid (M,) from start_s to end_s, the values (M, 6) there, and which intervals are told (M - 1,).
+
+        known_s: nothing later than this is looked at, so that more samples do not change the answer.
+        """
+        last = int(np.searchsorted(self.times_s, known_s, side="right"))
+        t, values = self._t[:last], self._values[:last]
+        first, stop = int(np.searchsorted(t, start_s, side="right")), int(np.searchsorted(t, end_s, side="left"))
+        grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
+        if last == 0:
+            return grid, np.zeros((2, 6)), np.zeros(1, dtype=bool)
+        ends = np.array((start_s, end_s))
+        right = np.clip(np.searchsorted(t, ends), 1, max(last - 1, 1))
+        if last == 1:
+            edge = np.stack((values[0], values[0]))
+        else:
+            width = t[right] - t[right - 1]
+            share = np.clip((ends - t[right - 1]) / width, 0.0, 1.0)[:, None]
+            edge = (1.0 - share) * values[right - 1] + share * values[right]
+        at = np.concatenate((edge[:1], values[first:stop], edge[1:]))
+        # An interval is told where the samples on its two sides are near each other.
+        before = t[np.maximum(np.arange(first - 1, stop), 0)]
+        after = t[np.minimum(np.arange(first, stop + 1), last - 1)]
+        late = np.maximum(grid[1:] - t[last - 1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
+        told = (after - before < GAP_S) & (late < 0.5 * GAP_S)
+        return grid, at, told
+
+    def near(self, time_s: float, known_s: float) -> bool:
+        """Whether there is a sample within a second before time_s, nothing later than known_s looked at."""
+        last = int(np.searchsorted(self.times_s, known_s, side="right"))
+        return last > 0 and self._t[last - 1] > time_s - 1.0
+
+    def noise(self, time_s: float) -> Noise:
+        """Give the samples' noise as densities, from their third differences over the last seconds.
+
+        Slow motion has none to speak of; white noise of variance s^2 has 20 s^2.
+        """
+        if time_s - self._noise_s >= 1.0:
+            last = int(np.searchsorted(self.times_s, time_s, side="right"))
+            first = int(np.searchsorted(self.times_s, time_s - _NOISE_SPAN_S))
+            if last - first > 20:
+                self._noise_s = time_s
+                t, values = self._t[first:last], self._values[first:last]
+                step_s = float(np.median(np.diff(t)))
+                # The median of squares, not the mean: a jolt is no noise.
+                white = np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / (0.6745 * np.sqrt(20.0))
+                force, rate = np.sqrt(np.mean(white[:3] ** 2)), np.sqrt(np.mean(white[3:] ** 2))
+                root = np.sqrt(step_s)
+                self._noise = Noise(
+                    gyro_rad=float(np.hypot(rate * root, GYRO_FLOOR)),
+                    accel_mps=float(np.hypot(force * root, ACCEL_FLOOR)),
+                )
+        return self._noise

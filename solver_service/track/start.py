@@ -1,0 +1,106 @@
+"""How a track starts: gravity gives tilt, a fix gives all else."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.anchors import attitude_covariance
+from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
+from buddyline.solver_service.track.state import (
+    ACCEL_BIAS,
+    CLOCK,
+    DELAY,
+    DEPTH_OFFSET,
+    GYRO_BIAS,
+    LEVER,
+    MOUNT,
+    PHI,
+    R_,
+    SIZE,
+    V_,
+    State,
+)
+
+# What is believed before the dive tells more, 1 sd.
+SPEED_MPS: Final = 0.6
+GYRO_BIAS_RADPS: Final = 0.008
+ACCEL_BIAS_MPS2: Final = 0.15
+MOUNT_RAD: Final = math.radians(1.0)
+LEVER_TOLD_M: Final = 0.006
+LEVER_UNTOLD_M: Final = 0.05
+DELAY_TOLD_S: Final = 0.001
+DELAY_UNTOLD_S: Final = 0.004
+CLOCK_S: Final = 0.005
+DEPTH_OFFSET_M: Final = 0.2
+
+
+def constants_of(nodes: tuple[TrackNode, TrackNode], R: Floats, r_m: Floats) -> tuple[State, Floats]:
+    """Give a state at r_m (3,), R (2, 3, 3), at rest, with the constants as told, and the variances (SIZE,) of all
+    but position and attitude."""
+    state = State(
+        r_m=r_m,
+        v_mps=np.zeros(3),
+        R=R,
+        gyro_bias_radps=np.zeros((2, 3)),
+        accel_bias_mps2=np.zeros((2, 3)),
+        mount_rad=np.zeros((2, 3)),
+        lever_m=np.stack([np.zeros(3) if node.imu_m is None else node.imu_m for node in nodes]),
+        delay_s=np.array([(node.imu_delay_ns or 0) * 1e-9 for node in nodes]),
+        clock_s=0.0,
+        depth_offset_m=0.0,
+    )
+    sigma = np.zeros(SIZE)
+    sigma[V_] = SPEED_MPS
+    for i, node in enumerate(nodes):
+        sigma[GYRO_BIAS[i]] = GYRO_BIAS_RADPS
+        sigma[ACCEL_BIAS[i]] = ACCEL_BIAS_MPS2
+        sigma[MOUNT[i]] = MOUNT_RAD
+        sigma[LEVER[i]] = LEVER_UNTOLD_M if node.imu_m is None else LEVER_TOLD_M
+        sigma[DELAY[i]] = DELAY_UNTOLD_S if node.imu_delay_ns is None else DELAY_TOLD_S
+    sigma[CLOCK] = CLOCK_S
+    sigma[DEPTH_OFFSET] = DEPTH_OFFSET_M
+    return state, sigma**2
+
+
+def tilt_of(force_mps2: Floats) -> Floats | None:
+    """Give R_level_camera (3, 3) of a camera at rest by its specific force (3,), heading north; None where it tells
+    nothing."""
+    size = float(np.linalg.norm(force_mps2))
+    if not 5.0 < size < 15.0:
+        return None
+    down = -force_mps2 / size
+    ahead = np.array((0.0, 0.0, 1.0)) if abs(down[2]) < 0.9 else np.array((0.0, -1.0, 0.0))
+    north = ahead - down * float(down @ ahead)
+    north = north / np.linalg.norm(north)
+    return np.stack((north, np.cross(down, north), down))
+
+
+def state_from_fix(
+    nodes: tuple[TrackNode, TrackNode], fix: FixSeen, attitude: AttitudeSeen | None, force_mps2: Floats | None
+) -> tuple[State, Floats] | None:
+    """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
+
+    R_B = R_A R_a_b, r = R_A t. In the state's errors: dr = R_A dt, phi_B = phi_A + R_A w.
+    """
+    if attitude is not None:
+        R_A = attitude.R_ned_body @ nodes[0].rig.R_body_camera
+        level = attitude_covariance(attitude.R_ned_body, attitude.sigma_rad, 1.0, 1.0)
+    else:
+        tilt = None if force_mps2 is None else tilt_of(force_mps2)
+        if tilt is None:
+            return None
+        R_A, level = tilt, np.diag((0.05, 0.05, math.pi)) ** 2
+    state, variances = constants_of(nodes, np.stack((R_A, R_A @ fix.R_a_b)), R_A @ fix.t_a_b_m)
+    P = np.diag(variances)
+    turn = np.kron(np.eye(2), R_A)
+    # A fix's own covariance is the least; what it leaves out (frames apart, calibration) is a little more.
+    from_fix = turn @ fix.covariance @ turn.T + np.diag([1e-4] * 3 + [1e-5] * 3)
+    P[R_, R_] = from_fix[:3, :3]
+    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
+    P[PHI[1], PHI[1]] = level + from_fix[3:, 3:]
+    P[R_, PHI[1]] = from_fix[:3, 3:]
+    P[PHI[1], R_] = from_fix[3:, :3]
+    return state, P

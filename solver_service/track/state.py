@@ -1,0 +1,109 @@
+"""The track's state: what is estimated, and how an error moves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
+
+# The error state. A's part comes first where a quantity belongs to a node.
+R_: Final = slice(0, 3)
+V_: Final = slice(3, 6)
+PHI: Final = (slice(6, 9), slice(9, 12))
+GYRO_BIAS: Final = (slice(12, 15), slice(15, 18))
+ACCEL_BIAS: Final = (slice(18, 21), slice(21, 24))
+MOUNT: Final = (slice(24, 27), slice(27, 30))
+LEVER: Final = (slice(30, 33), slice(33, 36))
+DELAY: Final = (36, 37)
+CLOCK: Final = 38
+DEPTH_OFFSET: Final = 39
+SIZE: Final = 40
+NAV: Final = 12
+"""The first errors, which move; the others are constants or walk slowly."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Where both nodes are, in a level frame (z down; north-east-down where a compass says so), and their constants.
+
+    r_m, v_mps (3,): of B's camera from A's. R (2, 3, 3): each camera to level. gyro_bias_radps, accel_bias_mps2,
+    mount_rad, lever_m (2, 3): in camera axes; mount: the small turn that brings the unit's axes, as stated, to the
+    true ones. delay_s (2,): the unit's stamps minus true time. clock_s: B's clock minus A's. depth_offset_m: what
+    B's gauge shows too much against A's.
+    """
+
+    r_m: Floats
+    v_mps: Floats
+    R: Floats
+    gyro_bias_radps: Floats
+    accel_bias_mps2: Floats
+    mount_rad: Floats
+    lever_m: Floats
+    delay_s: Floats
+    clock_s: float
+    depth_offset_m: float
+
+    def plus(self, error: Floats) -> State:
+        """Return the state that is off this one by an error (SIZE,).
+
+        R_X = exp(phi_X) R_X; r = exp(phi_A) r + dr and v likewise: turning all about the vertical is then an error
+        in phi_A and phi_B alone, whatever r and v are (docs/track.md, consistency).
+        """
+        turn = rotation_exp(np.stack((error[PHI[0]], error[PHI[1]])))
+        return State(
+            r_m=turn[0] @ self.r_m + error[R_],
+            v_mps=turn[0] @ self.v_mps + error[V_],
+            R=orthonormal(turn @ self.R),
+            gyro_bias_radps=self.gyro_bias_radps + error[12:18].reshape(2, 3),
+            accel_bias_mps2=self.accel_bias_mps2 + error[18:24].reshape(2, 3),
+            mount_rad=self.mount_rad + error[24:30].reshape(2, 3),
+            lever_m=self.lever_m + error[30:36].reshape(2, 3),
+            delay_s=self.delay_s + error[36:38],
+            clock_s=self.clock_s + float(error[CLOCK]),
+            depth_offset_m=self.depth_offset_m + float(error[DEPTH_OFFSET]),
+        )
+
+    def minus(self, other: State) -> Floats:
+        """Return the error (SIZE,) by which this state is off another: other.plus(error) is this one."""
+        error = np.empty(SIZE)
+        error[PHI[0]] = phi = rotation_log(self.R[0] @ other.R[0].T)
+        error[PHI[1]] = rotation_log(self.R[1] @ other.R[1].T)
+        turn = rotation_exp(phi)
+        error[R_] = self.r_m - turn @ other.r_m
+        error[V_] = self.v_mps - turn @ other.v_mps
+        error[12:18] = (self.gyro_bias_radps - other.gyro_bias_radps).ravel()
+        error[18:24] = (self.accel_bias_mps2 - other.accel_bias_mps2).ravel()
+        error[24:30] = (self.mount_rad - other.mount_rad).ravel()
+        error[30:36] = (self.lever_m - other.lever_m).ravel()
+        error[36:38] = self.delay_s - other.delay_s
+        error[CLOCK] = self.clock_s - other.clock_s
+        error[DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
+        return error
+
+    def moved(self, r_m: Floats, v_mps: Floats, R: Floats) -> State:
+        """Return the same constants elsewhere."""
+        return replace(self, r_m=r_m, v_mps=v_mps, R=R)
+
+
+def orthonormal(R: Floats) -> Floats:
+    """Return near rotations (..., 3, 3) made exact to second order."""
+    cured: Floats = 0.5 * R @ (3.0 * np.eye(3) - np.swapaxes(R, -1, -2) @ R)
+    return cured
+
+
+def plain_of_invariant(state: State) -> Floats:
+    """Give T (NAV, NAV): errors with plain r_true - r and v_true - v, from the state's own."""
+    T = np.eye(NAV)
+    T[R_, PHI[0]] = -skew(state.r_m)
+    T[V_, PHI[0]] = -skew(state.v_mps)
+    return T
+
+
+def invariant_of_plain(state: State) -> Floats:
+    """Give the inverse of `plain_of_invariant`."""
+    T = np.eye(NAV)
+    T[R_, PHI[0]] = skew(state.r_m)
+    T[V_, PHI[0]] = skew(state.v_mps)
+    return T

@@ -1,0 +1,214 @@
+"""Relative strapdown: both nodes' inertial samples move the state from one time to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, TypeAlias
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.track.state import (
+    ACCEL_BIAS,
+    DELAY,
+    GYRO_BIAS,
+    LEVER,
+    MOUNT,
+    NAV,
+    PHI,
+    R_,
+    SIZE,
+    V_,
+    State,
+    invariant_of_plain,
+    orthonormal,
+    plain_of_invariant,
+)
+from numpy.typing import NDArray
+
+Bools: TypeAlias = NDArray[np.bool_]
+
+# The specific force of a node that does not accelerate, level axes.
+_AT_REST_MPS2: Final = np.array((0.0, 0.0, -9.80665))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Spectral densities of what drives one node: per sqrt(s) of the integral.
+
+    gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
+    gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
+    gyro's bias, and of the attitude filter's own error, which stands in place of the mount.
+    """
+
+    gyro_rad: float
+    accel_mps: float
+    gap_gyro_rad: float = 0.25
+    gap_accel_mps: float = 0.3
+    gap_rate_radps: float = 0.15
+    gap_tilt_rad: float = 0.03
+    gap_heading_rad: float = 0.012
+    gyro_bias_radps: float = 1e-4
+    accel_bias_mps2: float = 1e-3
+
+    def scaled(self, unrest: float) -> Noise:
+        """Return the same with the guessed motion's densities times unrest."""
+        if unrest == 1.0:
+            return self
+        return replace(
+            self,
+            gap_accel_mps=unrest * self.gap_accel_mps,
+            gap_rate_radps=unrest * self.gap_rate_radps,
+            gap_gyro_rad=unrest * self.gap_gyro_rad,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Increment:
+    """What one node's samples say between two times, and how its constants bear on it.
+
+    R: its attitude at the end. dv_mps, dp_m (3,): its velocity gained, and its way gained over moving on unaccelerated
+    (gravity left in: it cancels between the nodes). jacobian (9, SIZE): of attitude (left), dv, dp by the node's own
+    attitude at the start and constants. gap_s: how much of the time no sample covers. rate_radps (3,): the turn rate
+    at the end. without: whether there is no unit at all,
+    so that the gyro's bias is the turn rate, its sign turned.
+    """
+
+    R: Floats
+    dv_mps: Floats
+    dp_m: Floats
+    jacobian: Floats
+    gap_s: float
+    rate_radps: Floats
+    without: bool = False
+
+
+def integrate(
+    state: State, node: int, grid_s: Floats, force_mps2: Floats, rate_radps: Floats, told: Bools
+) -> Increment:
+    """Integrate one node's samples over a grid (M,) with values (M, 3) at its points, in camera axes, uncorrected.
+
+    told (M - 1,): whether the accelerometer covers each interval; where not, the node moves on unaccelerated.
+    """
+    R0 = state.R[node]
+    # Where no sample tells at all, bias and mount stand for other things (process_noise).
+    mount = rotation_exp(state.mount_rad[node]) if told.any() else np.eye(3)
+    w = (rate_radps - state.gyro_bias_radps[node]) @ mount.T
+    f = (force_mps2 - state.accel_bias_mps2[node]) @ mount.T
+    h = np.diff(grid_s)
+    w_mid, f_mid = 0.5 * (w[1:] + w[:-1]), 0.5 * (f[1:] + f[:-1])
+    halves = rotation_exp(0.5 * h[:, None] * w_mid)
+    R, R_mid = R0, np.empty((len(h), 3, 3))
+    for j, half in enumerate(halves):
+        middle = R @ half
+        R_mid[j] = middle
+        R = middle @ half
+    R = orthonormal(R)
+    u = np.where(told[:, None], (R_mid @ f_mid[:, :, None])[:, :, 0], _AT_REST_MPS2)
+    to_end = grid_s[-1] - 0.5 * (grid_s[1:] + grid_s[:-1])
+    weights = np.stack((h, h * to_end))
+    span = float(grid_s[-1] - grid_s[0])
+    # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
+    whole_told = bool(told.all())
+    lever = state.lever_m[node] if whole_told else np.zeros(3)
+    arm0, arm1 = R0 @ np.cross(w[0], lever), R @ np.cross(w[-1], lever)
+    dv, dp = weights @ u
+    dv = dv - (arm1 - arm0)
+    dp = dp - (R @ lever - R0 @ lever - arm0 * span)
+
+    # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
+    R_unmounted = R_mid @ mount
+    bias_steps = -R_unmounted * h[:, None, None]
+    mount_steps = -R_mid @ skew(w_mid) * (h * told)[:, None, None]
+    delay_at = ((R_mid @ w_mid[:, :, None])[:, :, 0] - R0 @ w[0]) * whole_told
+    steps = np.concatenate((bias_steps, mount_steps), axis=2)
+    whole = np.add.accumulate(steps, axis=0)
+    middle_error = whole - 0.5 * steps
+    by_attitude = np.concatenate((middle_error, delay_at[:, :, None]), axis=2)
+    force_error = -skew(u) @ by_attitude
+    force_error[:, :, 3:6] -= R_mid @ skew(f_mid)
+    force_error[:, :, 6] += (R_mid @ ((f[1:] - f[:-1]) / np.maximum(h, 1e-9)[:, None])[:, :, None])[:, :, 0]
+    of_force = weights * told
+    both = np.tensordot(of_force, force_error, axes=(1, 0))
+    by_bias = -np.tensordot(of_force, R_unmounted, axes=(1, 0))
+    turned = of_force @ u
+
+    J = np.zeros((9, SIZE))
+    J[0:3, PHI[node]] = np.eye(3)
+    J[0:3, GYRO_BIAS[node]] = whole[-1, :, :3]
+    J[0:3, MOUNT[node]] = whole[-1, :, 3:6]
+    J[0:3, DELAY[node]] = (R @ w[-1] - R0 @ w[0]) * whole_told
+    for row, block in ((3, 0), (6, 1)):
+        rows = slice(row, row + 3)
+        J[rows, PHI[node]] = -skew(turned[block])
+        J[rows, GYRO_BIAS[node]] = both[block][:, :3]
+        J[rows, MOUNT[node]] = both[block][:, 3:6]
+        J[rows, DELAY[node]] = both[block][:, 6]
+        J[rows, ACCEL_BIAS[node]] = by_bias[block]
+    # The lever arm's part is a difference of end points; of its errors, its own and the attitude's count.
+    if whole_told:
+        J[3:6, LEVER[node]] = -(R @ skew(w[-1]) - R0 @ skew(w[0]))
+        J[6:9, LEVER[node]] = -(R - R0 - R0 @ skew(w[0]) * span)
+    J[3:6, PHI[node]] += skew(arm1 - arm0)
+    J[6:9, PHI[node]] += skew(R @ lever - R0 @ lever - arm0 * span)
+    gap = float(h @ ~told)
+    return Increment(R, dv, dp, J, gap, w[-1])
+
+
+def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -> tuple[State, Floats]:
+    """Move the state by both nodes' increments; return it and the rows (NAV, SIZE) of its transition that are not 1.
+
+    The errors are those of `State.plus`, at both ends.
+    """
+    a, b = parts
+    dv, dp = b.dv_mps - a.dv_mps, b.dp_m - a.dp_m
+    after = state.moved(
+        state.r_m + state.v_mps * span_s + dp,
+        state.v_mps + dv,
+        np.stack((a.R, b.R)),
+    )
+    F = np.zeros((NAV, SIZE))
+    F[R_] = b.jacobian[6:9] - a.jacobian[6:9]
+    F[V_] = b.jacobian[3:6] - a.jacobian[3:6]
+    F[PHI[0]], F[PHI[1]] = a.jacobian[0:3], b.jacobian[0:3]
+    F[R_, R_] = F[V_, V_] = np.eye(3)
+    F[R_, V_] = span_s * np.eye(3)
+    F[:, :NAV] = F[:, :NAV] @ plain_of_invariant(state)
+    return after, invariant_of_plain(after) @ F
+
+
+def process_noise(
+    after: State, parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], span_s: float
+) -> tuple[Floats, Floats]:
+    """Give what a step adds to the covariance: of the moving errors (NAV, NAV), and of each other error (SIZE-NAV,)."""
+    Q = np.zeros((NAV, NAV))
+    walk = np.zeros(SIZE)
+    eye = np.eye(3)
+    force = 0.0
+    for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
+        force += noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * part.gap_s
+        if part.without:
+            turn = noise.gap_rate_radps**2 * span_s**3 / 3.0
+            walk[GYRO_BIAS[node]] = noise.gap_rate_radps**2 * span_s
+            walk[MOUNT[node]] = np.array((noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)) ** 2 * span_s
+        else:
+            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s
+            walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
+        Q[PHI[node], PHI[node]] = turn * eye
+        walk[ACCEL_BIAS[node]] = noise.accel_bias_mps2**2 * span_s
+    Q[V_, V_] = force * eye
+    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * eye
+    Q[R_, R_] = span_s * span_s / 3.0 * force * eye
+    T = invariant_of_plain(after)
+    return T @ Q @ T.T, walk[NAV:]
+
+
+def predicted(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:
+    """Give the covariance (SIZE, SIZE) after a step with the transition's rows F (NAV, SIZE)."""
+    across = F @ P
+    after = P.copy()
+    after[:NAV, :NAV] = across @ F.T + Q
+    after[:NAV, NAV:] = across[:, NAV:]
+    after[NAV:, :NAV] = across[:, NAV:].T
+    index = np.arange(NAV, SIZE)
+    after[index, index] += walk
+    return after

@@ -1,0 +1,196 @@
+"""The track on random dives: accuracy, honesty, causality, and what it does with bad input."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.solver_service.track.dive import filter_of, last_ns, smooth
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.inputs import FixSeen
+from buddyline.solver_service.track.lag import TrackLag
+from buddyline.solver_service.track.output import TrackRow
+
+from tests.solver_service.track.dives import Dive, Setting, fix_errors, make, score
+
+SHORT = Setting(seconds=12.0)
+
+
+@pytest.fixture(scope="module")
+def dive() -> Dive:
+    return make(1, SHORT)
+
+
+def same(one: list[TrackRow], two: list[TrackRow]) -> bool:
+    return len(one) == len(two) and all(
+        a.stamp_ns == b.stamp_ns and np.array_equal(a.t_a_b_m, b.t_a_b_m) and np.array_equal(a.covariance, b.covariance)
+        for a, b in zip(one, two, strict=True)
+    )
+
+
+@pytest.mark.parametrize("poor", [False, True])
+def test_whole_dive_beats_its_fixes_and_is_honest(poor: bool) -> None:
+    dive = make(0, replace(SHORT, seconds=20.0, poor=poor))
+    fixes = fix_errors(dive)
+    judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
+    assert judged.covered >= 0.99
+    assert judged.wrong == 0
+    assert np.median(judged.errors_m) < 0.45 * np.median(fixes)
+    assert np.percentile(judged.errors_m, 95) < 0.35 * np.percentile(fixes, 95)
+    assert 0.4 < judged.nees < 2.0
+
+
+def test_filter_covers_the_dive(dive: Dive) -> None:
+    judged = score(dive, filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns))
+    assert judged.covered >= 0.97
+    assert judged.wrong == 0
+    assert np.percentile(judged.errors_m, 95) < np.percentile(fix_errors(dive), 95)
+    assert 0.4 < judged.nees < 2.0
+
+
+def test_no_row_before_the_first_fix(dive: Dive) -> None:
+    rows = filter_of(dive.records, dive.fixes[5:]).advance(last_ns(dive.records), dive.stamps_ns)
+    assert rows[0].stamp_ns >= dive.fixes[5].stamp_ns
+    assert not filter_of(dive.records, []).advance(last_ns(dive.records), dive.stamps_ns)
+
+
+def fed(dive: Dive, order: random.Random | None, chunk_ns: int, window_ns: int = 400_000_000) -> list[TrackRow]:
+    """Feed a live filter by pieces, each piece in any order."""
+    a, b = dive.records
+    track = TrackFilter(a.node, b.node)
+    calls = []
+    for node, record in enumerate(dive.records):
+        for i, stamp in enumerate(record.imu_stamps_ns.tolist()):
+            one = slice(i, i + 1)
+            data = (node, record.imu_stamps_ns[one], record.accel_mps2[one], record.gyro_radps[one])
+            calls.append((stamp, track.add_imu, data))
+        calls += [(seen.stamp_ns, track.add_attitude, (node, seen)) for seen in record.attitudes]
+        calls += [(seen.stamp_ns, track.add_depth, (node, seen)) for seen in record.depths]
+        calls += [(frame.stamp_ns, track.add_frame, (node, frame)) for frame in record.frames]
+    calls += [(fix.stamp_ns, track.add_fix, (fix,)) for fix in dive.fixes]
+    calls.sort(key=lambda call: call[0])
+    if order:
+        calls.sort(key=lambda call: call[0] + order.randrange(window_ns))
+    rows: list[TrackRow] = []
+    track.seconds(0, dive.stamps_ns[0])
+    next_ns, done = dive.stamps_ns[0], 0
+    for stamp, add, data in calls:
+        while stamp > next_ns + 2 * window_ns:
+            asked = [s for s in dive.stamps_ns if done < s <= next_ns]
+            done = next_ns
+            rows += track.advance(next_ns, asked)
+            next_ns += chunk_ns
+        add(*data)  # type: ignore[operator]
+    end_ns = last_ns(dive.records)
+    return rows + track.advance(end_ns, [s for s in dive.stamps_ns if s > done])
+
+
+def test_live_gives_the_same_in_any_order_and_by_any_steps(dive: Dive) -> None:
+    short = Dive(dive.records, dive.fixes, dive.stamps_ns[:80], dive.t_a_b_m, dive.R_a_b)
+    whole = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), short.stamps_ns)
+    assert same(fed(short, None, 100_000_000), whole)
+    assert same(fed(short, random.Random(3), 70_000_000), whole)
+
+
+def test_lag_is_better_than_the_filter(dive: Dive) -> None:
+    track = filter_of(dive.records, dive.fixes)
+    lag = TrackLag(track)
+    lag.ask(dive.stamps_ns)
+    rows: list[TrackRow] = []
+    for now_ns in range(dive.stamps_ns[0], last_ns(dive.records), 100_000_000):
+        track.advance(now_ns)
+        rows += lag.rows()
+    judged = score(dive, rows)
+    causal = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns)
+    assert judged.rows > 0.8 * len(dive.stamps_ns)
+    assert np.percentile(judged.errors_m, 95) < np.percentile(score(dive, causal).errors_m, 95)
+    assert 0.3 < judged.nees < 2.0
+
+
+def test_without_inertial_units(dive: Dive) -> None:
+    none = np.zeros((0, 3))
+    bare = [
+        replace(record, imu_stamps_ns=np.zeros(0, np.int64), accel_mps2=none, gyro_radps=none)
+        for record in dive.records
+    ]
+    for records in ((bare[0], bare[1]), (dive.records[0], bare[1]), (bare[0], dive.records[1])):
+        judged = score(dive, smooth(records, dive.fixes, dive.stamps_ns).rows)
+        assert judged.covered >= 0.97
+        assert judged.wrong == 0
+        assert judged.nees < 2.5
+
+
+def test_two_seconds_of_darkness() -> None:
+    dive = make(4, replace(SHORT, seconds=16.0, dark_s=(8.0, 10.0), near_m=4.0))
+    judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
+    assert judged.errors_m.max() < 0.06
+
+
+def test_a_wrong_fix_changes_nothing_for_long(dive: Dive) -> None:
+    wrong = [
+        FixSeen(fix.stamp_ns, fix.t_a_b_m + np.array((3.0, 0.0, 2.0)), fix.R_a_b, fix.covariance)
+        if i in (20, 21, 22)
+        else fix
+        for i, fix in enumerate(dive.fixes)
+    ]
+    judged = score(dive, filter_of(dive.records, wrong).advance(last_ns(dive.records), dive.stamps_ns))
+    assert judged.wrong == 0
+    assert judged.covered >= 0.97
+
+
+def test_a_track_that_began_wrong_is_replaced(dive: Dive) -> None:
+    first = dive.fixes[0]
+    wrong = FixSeen(first.stamp_ns, first.t_a_b_m + np.array((3.0, 0.0, 2.0)), first.R_a_b, first.covariance)
+    rows = filter_of(dive.records, [wrong, *dive.fixes[1:]]).advance(last_ns(dive.records), dive.stamps_ns)
+    judged = score(dive, rows)
+    assert judged.wrong == 0
+    assert judged.covered >= 0.9
+
+
+@pytest.mark.parametrize("harm", ["nan", "doubled", "gap", "stops", "no attitude", "no depth"])
+def test_bad_input_costs_little(dive: Dive, harm: str) -> None:
+    a, b = dive.records
+    stamps, accel, gyro = b.imu_stamps_ns.copy(), b.accel_mps2.copy(), b.gyro_radps.copy()
+    keep = np.ones(len(stamps), dtype=bool)
+    if harm == "nan":
+        accel[::7, 1] = np.nan
+        gyro[::11] = np.inf
+    elif harm == "doubled":
+        stamps[1::50] = stamps[:-1:50][: len(stamps[1::50])]
+    elif harm == "gap":
+        keep[300:360] = False
+    elif harm == "stops":
+        keep[600:] = False
+    attitudes = () if harm == "no attitude" else b.attitudes
+    depths = () if harm == "no depth" else b.depths
+    b = replace(
+        b,
+        imu_stamps_ns=stamps[keep],
+        accel_mps2=accel[keep],
+        gyro_radps=gyro[keep],
+        attitudes=attitudes,
+        depths=depths,
+    )
+    judged = score(dive, smooth((a, b), dive.fixes, dive.stamps_ns).rows)
+    assert judged.covered >= 0.95
+    assert judged.wrong == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("poor", [False, True])
+def test_many_dives(poor: bool) -> None:
+    """Twenty dives of 30 s: the means over them, as no single short dive tells."""
+    nees, ratios, wrong = [], [], 0
+    for seed in range(20):
+        dive = make(seed + 50, Setting(poor=poor))
+        judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
+        fixes = fix_errors(dive)
+        nees.append((judged.nees, judged.nees_position, judged.nees_rotation))
+        errors = judged.errors_m
+        ratios.append((np.median(errors) / np.median(fixes), np.percentile(errors, 95) / np.percentile(fixes, 95)))
+        wrong += judged.wrong
+    assert wrong == 0
+    assert ((np.mean(nees, axis=0) > 0.75) & (np.mean(nees, axis=0) < 1.3)).all()
+    assert (np.median(ratios, axis=0) < (0.35, 0.28)).all()

@@ -1,0 +1,189 @@
+"""Every Jacobian of the track against differences of the function that it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.track.anchors import attitude_residual, depth_residual
+from buddyline.solver_service.track.lights import COLUMNS, light_positions, residuals
+from buddyline.solver_service.track.output import at_one_time, pose_of
+from buddyline.solver_service.track.state import (
+    CLOCK,
+    DELAY,
+    DEPTH_OFFSET,
+    NAV,
+    SIZE,
+    State,
+    invariant_of_plain,
+    plain_of_invariant,
+)
+from buddyline.solver_service.track.strapdown import Increment, integrate, propagate
+from numpy.typing import NDArray
+
+STEP = 1e-6
+PINHOLE = Camera("pinhole", 820, 616, 900.0, 905.0, 409.5, 307.5, (-0.2, 0.05, 1e-3, -1e-3, 0.0))
+FISHEYE = Camera("fisheye", 820, 616, 400.0, 402.0, 409.5, 307.5, (0.02, -0.01, 0.002, 0.0))
+LIGHTS_M = np.array(((-0.44, 0.01, 0.02), (0.44, -0.02, 0.01)))
+
+
+def a_state(seed: int) -> State:
+    rng = np.random.default_rng(seed)
+    R_a = rotation_exp(rng.normal(0.0, 0.3, 3)) @ np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    t_a_b = np.array((0.3, -0.2, 4.0)) + rng.normal(0.0, 0.2, 3)
+    R_b = R_a @ rotation_exp(np.array((0.0, np.pi, 0.0))) @ rotation_exp(rng.normal(0.0, 0.1, 3))
+    return State(
+        r_m=R_a @ t_a_b,
+        v_mps=rng.normal(0.0, 0.5, 3),
+        R=np.stack((R_a, R_b)),
+        gyro_bias_radps=rng.normal(0.0, 0.02, (2, 3)),
+        accel_bias_mps2=rng.normal(0.0, 0.2, (2, 3)),
+        mount_rad=rng.normal(0.0, 0.05, (2, 3)),
+        lever_m=rng.normal(0.0, 0.1, (2, 3)),
+        delay_s=rng.normal(0.0, 0.003, 2),
+        clock_s=0.002,
+        depth_offset_m=0.1,
+    )
+
+
+def differences(function: Callable[[Floats], Floats], columns: NDArray[np.int64] | range) -> Floats:
+    """Differentiate function(error (SIZE,)) at zero by the named columns."""
+    out = []
+    for column in columns:
+        error = np.zeros(SIZE)
+        error[column] = STEP
+        out.append((function(error) - function(-error)) / (2.0 * STEP))
+    return np.stack(out, axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plus_and_minus_are_inverse(seed: int) -> None:
+    state = a_state(seed)
+    error = np.random.default_rng(seed + 100).normal(0.0, 0.05, SIZE)
+    assert state.plus(error).minus(state) == pytest.approx(error, abs=1e-5)
+    T, back = plain_of_invariant(state), invariant_of_plain(state)
+    assert np.allclose(T @ back, np.eye(NAV))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plain_errors_follow_from_the_states_own(seed: int) -> None:
+    state = a_state(seed)
+
+    def plain(error: Floats) -> Floats:
+        moved = state.plus(error)
+        return np.concatenate((moved.r_m, moved.v_mps))
+
+    assert np.allclose(differences(plain, range(NAV)), plain_of_invariant(state)[:6], atol=1e-6)
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE])
+@pytest.mark.parametrize("observer", [0, 1])
+@pytest.mark.parametrize("dt_s", [0.0, 0.012])
+def test_lights(camera: Camera, observer: int, dt_s: float) -> None:
+    state = a_state(7)
+    rates = np.array(((0.1, -0.3, 0.2), (-0.4, 0.1, 0.3)))
+    times = np.array((dt_s, -dt_s))
+    X, D = light_positions(state, observer, LIGHTS_M, rates, times)
+    pixels = np.array(((300.0, 250.0), (500.0, 350.0)))
+    bearings, tangents = camera.rays(pixels)
+    y, H = residuals(bearings, tangents, X, D)
+
+    def seen(error: Floats) -> Floats:
+        moved = light_positions(state.plus(error), observer, LIGHTS_M, rates, times)
+        return residuals(bearings, tangents, *moved)[0]
+
+    # The residual is measured minus foretold.
+    numeric = -differences(seen, COLUMNS)
+    scale = float(np.abs(H).max())
+    assert np.allclose(H, numeric, atol=2e-3 * scale if dt_s else 1e-5 * scale)
+    assert y.shape == (2, 2, 2)
+
+
+def test_lights_are_where_the_camera_model_says() -> None:
+    """A candidate exactly where a light stands has no residual."""
+    state = a_state(3)
+    X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), np.zeros(1))
+    pixel = PINHOLE.cx_px + 900.0 * X[0, 0, 0] / X[0, 0, 2], PINHOLE.cy_px + 905.0 * X[0, 0, 1] / X[0, 0, 2]
+    plain = Camera("pinhole", 820, 616, 900.0, 905.0, 409.5, 307.5)
+    y, _ = residuals(*plain.rays(np.array((pixel,))), X, D)
+    assert np.abs(y[0, 0]).max() < 1e-9
+
+
+def samples(seed: int) -> tuple[Floats, Floats, Floats]:
+    """Smooth motion's samples, over a quarter of a second before and after, at 400 Hz."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(-40, 80) / 400.0
+    phase, rate = rng.uniform(0.0, 6.0, (2, 3)), rng.uniform(2.0, 6.0, (2, 3))
+    force = np.array((0.3, -9.7, 0.5)) + 0.8 * np.sin(t[:, None] * rate[0] + phase[0])
+    turn = 0.4 * np.sin(t[:, None] * rate[1] + phase[1])
+    return t, force, turn
+
+
+def increments(state: State) -> tuple[Increment, Increment]:
+    parts = []
+    for node in (0, 1):
+        t, force, turn = samples(node)
+        grid = np.linspace(0.0, 0.1, 41)
+        at = grid + state.delay_s[node]
+        values = [np.stack([np.interp(at, t, of[:, axis]) for axis in range(3)], axis=1) for of in (force, turn)]
+        parts.append(integrate(state, node, grid, values[0], values[1], np.ones(40, dtype=bool)))
+    return parts[0], parts[1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("arm", [False, True])
+def test_transition(seed: int, arm: bool) -> None:
+    state = a_state(seed)
+    if not arm:
+        state = replace(state, lever_m=np.zeros((2, 3)), mount_rad=np.zeros((2, 3)))
+    after, F = propagate(state, increments(state), 0.1)
+
+    def moved(error: Floats) -> Floats:
+        start = state.plus(error)
+        return propagate(start, increments(start), 0.1)[0].minus(after)[:NAV]
+
+    names = np.array([column for column in range(SIZE) if column != CLOCK])
+    gap = np.abs(F[:, names] - differences(moved, names)).max(axis=0)
+    exact = np.isin(names, (*range(NAV), *range(18, 24), *range(30, 36), DEPTH_OFFSET))
+    assert gap[exact].max() < 1e-6
+    # A mount's error is taken as one more small turn, and sums go by the middles of intervals. The lever arm's ends
+    # turn with bias, mount and delay, which is left out: 0.1 m at 0.01 rad/s is 1 mm/s.
+    assert gap[np.isin(names, range(12, 18))].max() < (0.3 if arm else 5e-3)
+    assert gap[np.isin(names, range(24, 30))].max() < (0.3 if arm else 5e-3)
+    assert gap[np.isin(names, DELAY)].max() < (1.0 if arm else 2e-2)
+
+
+def test_anchors() -> None:
+    state = a_state(5)
+    ports = np.array(((0.1, 0.2, -0.1), (-0.1, 0.1, 0.05)))
+    _, H = depth_residual(state, 0.4, 0.03, ports)
+    numeric = -differences(lambda error: depth_residual(state.plus(error), 0.4, 0.03, ports)[0], range(SIZE))
+    assert np.allclose(H, numeric, atol=1e-6)
+    _, H = attitude_residual(state, 1, state.R[1])
+    numeric = -differences(lambda error: attitude_residual(state.plus(error), 1, state.R[1])[0], range(SIZE))
+    assert np.allclose(H, numeric, atol=1e-6)
+
+
+def test_pose_covariance() -> None:
+    """The published covariance is the pose's, by differences of the pose."""
+    state = a_state(2)
+    rate = np.array((0.3, -0.2, 0.4))
+    now = at_one_time(state, rate)
+    t0, R0 = now.R[0].T @ now.r_m, now.R[0].T @ now.R[1]
+
+    def pose(error: Floats) -> Floats:
+        moved = at_one_time(state.plus(error), rate)
+        R = moved.R[0].T @ moved.R[1] @ R0.T
+        w = 0.5 * np.array((R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]))
+        return np.concatenate((moved.R[0].T @ moved.r_m - t0, w, moved.R[0].T @ moved.v_mps))
+
+    J = differences(pose, range(SIZE))
+    P = np.diag(np.linspace(0.1, 1.0, SIZE))
+    _, covariance, _, v_covariance = pose_of(state, P, rate)
+    whole = J @ P @ J.T
+    assert np.allclose(covariance, whole[:6, :6], atol=3e-3)
+    assert np.allclose(v_covariance, whole[6:, 6:], atol=1e-6)
