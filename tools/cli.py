@@ -6,6 +6,7 @@ import argparse
 import difflib
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
@@ -14,198 +15,174 @@ from buddyline.protocol import __version__
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.losses import collected
 
-SUMMARY: Final = "Two underwater nodes see each other's lights; Buddyline says where they are."
+SUMMARY: Final = "Two or more underwater nodes see each other's lights; Buddyline says where they are."
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command: the module with add_arguments(parser) and run(args), and what it does in a line.
+    """A command: what it does in a line, examples, and its module with run(args), below buddyline.
 
-    slow: the module takes long to import; tools/arguments.py declares its arguments.
+    Its arguments are declared in tools/arguments.py, by a function of its name, or by add_arguments(parser) of its
+    module where that imports nothing heavy.
     """
 
     name: str
-    module: str
     does: str
-    examples: tuple[str, ...] = ()
-    slow: bool = False
+    examples: tuple[str, ...]
+    module: str = ""
+
+    @property
+    def path(self) -> str:
+        """The module's full name."""
+        return f"buddyline.{self.module or 'tools.' + self.name.replace('-', '_')}"
+
+    def parser(self) -> argparse.ArgumentParser:
+        """Return the command's parser."""
+        from buddyline.tools import arguments
+
+        parser = argparse.ArgumentParser(
+            prog=f"buddyline {self.name}",
+            description=f"{self.does[0].upper()}{self.does[1:]}.",
+            epilog="\n  ".join(["examples:", *(f"buddyline {example}" for example in self.examples)]),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        declare = getattr(arguments, self.name, None) or import_module(self.path).add_arguments
+        declare(parser)
+        return parser
+
+    def run(self, words: Sequence[str]) -> int:
+        """Run it with the words that follow its name; return the exit status."""
+        args = self.parser().parse_args(words)
+        status: int = import_module(self.path).run(args)
+        return status
 
 
 COMMANDS: Final = (
     Command(
         "demo",
-        "buddyline.tools.demo",
-        "run hub, two simulated nodes and solver on this machine, and watch the poses",
-        ("buddyline demo", "buddyline demo --environment lake --seconds 30"),
+        "run a hub, two simulated nodes and the solver on this machine, and watch the poses",
+        ("demo", "demo --environment lake --seconds 30"),
     ),
-    Command("hub", "buddyline.tools.hub", "run the hub that all others connect to", ("buddyline hub",)),
+    Command("hub", "run the hub that all others connect to", ("hub",)),
     Command(
         "keys",
-        "buddyline.tools.keys",
         "make keys and certificates, so that the hub may listen beyond this machine",
-        ("buddyline keys init --hub 192.168.2.1", "buddyline keys node a", "buddyline keys solver"),
+        ("keys init --hub 192.168.2.1", "keys node a", "keys solver"),
     ),
-    Command(
-        "node",
-        "buddyline.node.__main__",
-        "run one node: camera, sensors, detector, log",
-        ("buddyline node --config a.toml",),
-    ),
+    Command("node", "run one node: camera, sensors, detector, log", ("node --config a.toml",), "node.__main__"),
     Command(
         "install-service",
-        "buddyline.tools.install_service",
         "write the systemd unit of node, hub or solver",
-        ("sudo .venv/bin/buddyline install-service node --config pi.toml", "buddyline install-service hub --print"),
+        ("install-service node --config pi.toml", "install-service hub --print"),
     ),
     Command(
         "doctor",
-        "buddyline.tools.doctor.command",
-        "check what a diver would forget, and say what to do about it",
-        ("buddyline doctor --config a.toml", "buddyline doctor", "buddyline doctor --config a.toml --json"),
+        "check what a diver may have forgotten, and say what to do about it",
+        ("doctor --config a.toml", "doctor", "doctor --config a.toml --json"),
+        "tools.doctor.command",
     ),
-    Command(
-        "solver", "buddyline.solver_service.__main__", "run the solver: candidates in, poses out", ("buddyline solver",)
-    ),
+    Command("solver", "run the solver: candidates in, poses out", ("solver",), "solver_service.__main__"),
     Command(
         "play",
-        "buddyline.tools.play",
         "send stored dives over the bus, as if they happened now",
-        ("buddyline play a.mcap b.mcap", "buddyline play dive.mcap --speed 4 --start 10 --end 60"),
+        ("play a.mcap b.mcap", "play dive.mcap --speed 4 --start 10 --end 60"),
     ),
-    Command("record", "buddyline.tools.record", "record the bus into a dive log", ("buddyline record topside.mcap",)),
+    Command("record", "record the bus into a dive log", ("record topside.mcap",)),
     Command(
-        "repair",
-        "buddyline.tools.repair",
-        "make a proper log out of a damaged one, and say what was lost",
-        ("buddyline repair cut.mcap -o whole.mcap",),
-        slow=True,
+        "repair", "make a proper log from a damaged one, and say what was lost", ("repair cut.mcap -o whole.mcap",)
     ),
     Command(
         "backfill",
-        "buddyline.tools.backfill",
-        "complete a topside recording out of the nodes' own logs",
-        ("buddyline backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
-        slow=True,
+        "complete a topside recording from the nodes' own logs",
+        ("backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
     ),
     Command(
         "detect",
-        "buddyline.tools.detect",
         "find light candidates in stored pictures or a dive's pictures",
-        (
-            "buddyline detect photos/ --draw marked/",
-            "buddyline detect dive.mcap -o candidates.mcap --environment lake",
-        ),
-        slow=True,
+        ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap --environment lake"),
     ),
     Command(
         "tune",
-        "buddyline.tools.tune",
-        "propose a site's detector values, and show the pictures they were judged on",
-        ("buddyline tune dive.mcap", "buddyline tune pictures/ --draw judged/"),
-        slow=True,
+        "propose detector values for a site, and show the pictures they were judged on",
+        ("tune dive.mcap", "tune pictures/ --draw judged/"),
     ),
     Command(
         "solve",
-        "buddyline.tools.solve",
         "solve stored dives offline",
-        ("buddyline solve a.mcap b.mcap -o poses.mcap", "buddyline solve dive.mcap -o p.mcap --checks range"),
-        slow=True,
+        ("solve a.mcap b.mcap -o poses.mcap", "solve dive.mcap -o p.mcap --checks range"),
     ),
     Command(
         "align",
-        "buddyline.tools.align",
-        "find the offset between the two nodes' clocks from a dive in which they moved",
-        ("buddyline align a.mcap b.mcap",),
-        slow=True,
+        "find the offset between two nodes' clocks from a dive in which they moved",
+        ("align a.mcap b.mcap",),
     ),
     Command(
         "calibrate",
-        "buddyline.tools.calibrate",
         "calibrate camera, lights, magnetometer or clocks, and say whether the result is good",
-        ("buddyline calibrate board -o board.pdf", "buddyline calibrate camera pictures/", "buddyline calibrate clock"),
+        ("calibrate board -o board.pdf", "calibrate camera pictures/", "calibrate clock"),
     ),
     Command(
         "simulate",
-        "buddyline.tools.simulate",
         "make a dive with known truth",
-        ("buddyline simulate dive.mcap --environment basin --seconds 60", "buddyline simulate dive.mcap --images"),
+        ("simulate dive.mcap --environment basin --seconds 60", "simulate dive.mcap --images"),
     ),
     Command(
         "evaluate",
-        "buddyline.tools.evaluate",
         "measure poses and candidates against truth",
-        ("buddyline evaluate poses.mcap --truth dive.truth.mcap",),
-        slow=True,
+        ("evaluate poses.mcap --truth dive.truth.mcap",),
     ),
     Command(
         "monitor",
-        "buddyline.tools.monitor.live",
-        "watch a running pair in the browser: scene, cameras, plots, health",
-        ("buddyline monitor", "buddyline monitor --connect tcp/192.168.2.1:7447 --open"),
+        "watch running nodes in the browser: scene, cameras, plots, health",
+        ("monitor", "monitor --connect tcp/192.168.2.1:7447 --open"),
+        "tools.monitor.live",
     ),
     Command(
         "view",
-        "buddyline.tools.monitor.view",
-        "look at a stored dive in the browser, played from anywhere",
-        ("buddyline view poses.mcap", "buddyline view pictures.mcap poses.mcap --start 60"),
+        "look at a stored dive in the browser, from any moment on",
+        ("view poses.mcap", "view pictures.mcap poses.mcap --start 60"),
+        "tools.monitor.view",
     ),
     Command(
         "report",
-        "buddyline.tools.monitor.report",
         "write a dive's report: one page to keep and to send",
-        ("buddyline report poses.mcap -o report.html",),
-        slow=True,
+        ("report poses.mcap -o report.html",),
+        "tools.monitor.report",
     ),
     Command(
         "ros2",
-        "buddyline.tools.ros2",
-        "let ROS 2 (rmw_zenoh) see attitudes, depths, poses and transforms",
-        ("buddyline ros2", "buddyline ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
-        slow=True,
+        "show attitudes, depths, poses and transforms to ROS 2 (rmw_zenoh)",
+        ("ros2", "ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
     ),
     Command(
         "artag",
-        "buddyline.tools.artag",
-        "poses from AR tags in a dive's pictures, to compare the lights with",
-        ("buddyline simulate dive.mcap --images --tags", "buddyline artag dive.mcap -o tags.mcap"),
-        slow=True,
+        "find poses from AR tags in a dive's pictures, to compare the lights with",
+        ("simulate dive.mcap --images --tags", "artag dive.mcap -o tags.mcap"),
     ),
     Command(
         "experiments",
-        "buddyline.tools.experiments.command",
-        "the paper's figures and numbers, again, with ours beside them: one report",
-        ("buddyline experiments -o report/ --quick", "buddyline experiments -o report/ --tag-video test_vid.mp4"),
-        slow=True,
+        "repeat the paper's figures and numbers, with ours beside them, in one report",
+        ("experiments -o report/ --quick", "experiments -o report/ --tag-video test_vid.mp4"),
+        "tools.experiments.command",
     ),
     Command(
         "plan",
-        "buddyline.tools.plan",
-        "how far a pair will measure well, by camera, lights and visibility",
-        ("buddyline plan --baseline 0.88 --visibility 6 --camera a.toml",),
-        slow=True,
+        "say how far two nodes will measure well, by camera, lights and visibility",
+        ("plan --baseline 0.88 --visibility 6 --camera a.toml",),
     ),
     Command(
         "mark",
-        "buddyline.tools.survey.mark",
         "name a station or a point of a running dive",
-        ('buddyline mark T4 --node b --note "flake"',),
+        ('mark T4 --node b --note "flake"',),
+        "tools.survey.mark",
     ),
     Command(
         "survey",
-        "buddyline.tools.survey.command",
-        "legs and stations out of solved dives, adjusted, and files that surveyors use",
-        (
-            "buddyline survey legs cave.toml --dive solved.mcap a.mcap b.mcap",
-            "buddyline survey export cave.toml --format svx",
-        ),
+        "make legs and stations from solved dives, adjust them, and write files for surveyors",
+        ("survey legs cave.toml --dive solved.mcap a.mcap b.mcap", "survey export cave.toml --format svx"),
+        "tools.survey.command",
     ),
-    Command(
-        "export",
-        "buddyline.tools.export",
-        "write poses for other programs",
-        ("buddyline export poses.mcap --format tum -o poses.tum",),
-        slow=True,
-    ),
+    Command("export", "write poses for other programs", ("export poses.mcap --format tum -o poses.tum",)),
 )
 
 
@@ -224,6 +201,10 @@ def main(argv: list[str] | None = None) -> int:
     0 done, 1 a check failed or input was damaged, 2 a known error, 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
+    # A terminal or a pipe that takes no more than ASCII gets "?" for the rest, not a traceback.
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
     if not words or words[0] in ("-h", "--help", "help"):
         print(overview())
         return 0
@@ -236,10 +217,13 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"did you mean `{near[0]}`?" if near else "see `buddyline --help`"
         print(f"buddyline: no command {words[0]!r}; {hint}", file=sys.stderr)
         return 2
+    from buddyline.protocol.service import start_logging
+
+    start_logging()
     try:
         with collected() as lost:
             try:
-                status = _run(command, words[1:])
+                status = command.run(words[1:])
             finally:
                 for line in lost.lines():
                     print(f"buddyline {command.name}: {line}", file=sys.stderr)
@@ -253,30 +237,6 @@ def main(argv: list[str] | None = None) -> int:
         # Whoever read our output has gone: nothing is left to say, and nothing to flush at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-
-
-def parser_of(command: Command) -> argparse.ArgumentParser:
-    """Return the parser of a command's words, with its help."""
-    parser = argparse.ArgumentParser(
-        prog=f"buddyline {command.name}",
-        description=f"{command.does[0].upper()}{command.does[1:]}.",
-        epilog="examples:\n" + "\n".join(f"  {example}" for example in command.examples) if command.examples else None,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    if command.slow:
-        getattr(import_module("buddyline.tools.arguments"), command.name)(parser)
-    else:
-        import_module(command.module).add_arguments(parser)
-    return parser
-
-
-def _run(command: Command, words: list[str]) -> int:
-    from buddyline.protocol.service import start_logging
-
-    args = parser_of(command).parse_args(words)
-    start_logging()
-    status: int = import_module(command.module).run(args)
-    return status
 
 
 if __name__ == "__main__":

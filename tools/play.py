@@ -17,7 +17,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodeInfo
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.topics import CANDIDATES, CLOCK, IMAGE, INFO, POSE, REJECTED, TOPICS, parse_key
-from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.client import client_config
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import LiveClient
 from buddyline.tools.progress import Progress
@@ -42,16 +42,6 @@ AHEAD_OF_SILENT_NS: Final = 2_200_000_000
 SOLVER_SILENT_S: Final = 5.0
 # Calibration goes ahead of the frames, which have a higher priority on the bus.
 INFO_AHEAD_S: Final = 0.3
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: its log, or each node's own")
-    parser.add_argument("--speed", type=float, default=1.0, help="1: as it was (default); 0: as fast as it goes")
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
-    parser.add_argument("--end", type=float, metavar="S", help="seconds from the dive's start")
-    parser.add_argument("--loop", action="store_true", help="again and again, with the times carried on")
-    add_client_arguments(parser, PLAYER)
 
 
 class SolverFollower:

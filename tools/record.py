@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import EVERYTHING
-from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
@@ -18,13 +18,6 @@ if TYPE_CHECKING:
     from buddyline.protocol.envelope import Envelope
 
 log = logging.getLogger(__name__)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
-    parser.add_argument("output", metavar="OUT.mcap")
-    add_client_arguments(parser)
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:

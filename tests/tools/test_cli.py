@@ -1,6 +1,7 @@
 """The program as a person meets it: help, exit status, and errors of one line that say what to do."""
 
 import json
+import os
 import subprocess
 import sys
 from typing import get_args
@@ -198,12 +199,21 @@ print(*sorted(sys.modules))
 def test_help_of_every_command_is_quick_because_it_imports_nothing_heavy():
     # What is imported tells more than a clock on a shared machine.
     out = subprocess.run([sys.executable, "-c", EVERY_HELP], capture_output=True, text=True, check=True).stdout
-    assert {"numpy", "cv2", "zenoh", "matplotlib", "viser"}.isdisjoint(out.split())
+    assert {"numpy", "cv2", "zenoh", "mcap", "matplotlib", "viser"}.isdisjoint(out.split())
     assert "buddyline.tools.arguments" in out
 
 
 def test_choices_are_those_that_the_solver_has():
     assert get_args(Method) == METHODS
+
+
+@pytest.mark.parametrize("words", [["plan"], ["plan", "--help"], ["calibrate", "--help"]])
+def test_a_terminal_that_knows_ascii_alone_is_no_error(words):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        [sys.executable, "-m", "buddyline", *words], capture_output=True, text=True, env=environment, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_exit_status_of_the_real_program(tmp_path):

@@ -6,12 +6,11 @@ import contextlib
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.cli import COMMANDS, parser_of
+from buddyline.tools.cli import COMMANDS
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.result import Result, evaluate
@@ -56,7 +55,7 @@ def call(name: str, *words: str) -> None:
     """Run one command of the program, without its summary; raise BuddylineError where it fails."""
     command = next(command for command in COMMANDS if command.name == name)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        status = import_module(command.module).run(parser_of(command).parse_args(words))
+        status = command.run(words)
     # Tags that no picture shows are a result, too.
     if status and name != "artag":
         raise BuddylineError(f"buddyline {name} {' '.join(words)}: ended with {status}")
