@@ -18,7 +18,7 @@ from buddyline.protocol.topics import ARTAG, check_node_id
 from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized, rotate
-from buddyline.tools.evaluation.truth import Track
+from buddyline.tools.evaluation.truth import PoseHistory
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.solve import COPIED, pair_of
 from buddyline.tools.tags.detection import TagFinder
@@ -61,7 +61,7 @@ class TagSolver:
         trigger = trigger_index(image.stamp_ns, info.trigger_period_ns)
         self._seen.setdefault(trigger, {})[node] = (image.stamp_ns, found)
 
-    def poses(self, attitudes_a: Track) -> list[RelativePose]:
+    def poses(self, attitudes_a: PoseHistory) -> list[RelativePose]:
         """Return the poses of all triggers with tags that tell one, in order of time."""
         poses = []
         for trigger, views in sorted(self._seen.items()):
@@ -83,7 +83,9 @@ class TagSolver:
                 )
         return poses
 
-    def _message(self, trigger: int, stamps_ns: dict[str, int], solved: TagPose, attitudes_a: Track) -> RelativePose:
+    def _message(
+        self, trigger: int, stamps_ns: dict[str, int], solved: TagPose, attitudes_a: PoseHistory
+    ) -> RelativePose:
         # A node whose picture is missing says nothing: the other's stamp stands for both.
         stamp_a_ns = stamps_ns.get(self.node_a, stamps_ns.get(self.node_b, 0))
         stamp_b_ns = stamps_ns.get(self.node_b, stamp_a_ns)
@@ -143,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
                     writer.write(envelope.key, envelope.payload, envelope.time_ns)
                 if isinstance(message, Attitude) and message.node == nodes[0]:
                     attitudes.append(message)
-            poses = solver.poses(Track.of_attitudes(attitudes))
+            poses = solver.poses(PoseHistory.of_attitudes(attitudes))
             for pose in poses:
                 writer.write_message(pose, key=ARTAG.key(*nodes))
     summary = {

@@ -9,7 +9,7 @@ from buddyline.protocol.messages import RelativePose
 from buddyline.tools.bound import pose_bounds
 from buddyline.tools.cli import main
 from buddyline.tools.evaluation.poses import pose_errors
-from buddyline.tools.evaluation.truth import Track, TruthTrack
+from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.experiments import numbers
 
 from tests.tools.evaluated import INFOS, pose, truth
@@ -20,7 +20,7 @@ def _errors(offsets_m, range_m=3.0):
     truths = [truth(k, (0.0, 0.0, range_m)) for k in range(len(offsets_m))]
     poses: list[RelativePose] = [pose(k, (0.0, 0.0, range_m + off)) for k, off in enumerate(offsets_m)]
     track = TruthTrack(truths)
-    return pose_errors(poses, track, lambda _: None, Track.of_attitudes([]), INFOS), track
+    return pose_errors(poses, track, lambda _: None, None, INFOS), track
 
 
 def test_errors_go_into_their_range_bin():

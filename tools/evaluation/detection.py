@@ -19,7 +19,7 @@ _NORMAL_MEDIAN: Final = 0.6745
 
 
 @dataclass(frozen=True)
-class Detection:
+class DetectionFigures:
     """Figures over the pictures of both nodes that have LightTruth.
 
     "Near" is within the tolerance of `lights.tolerance_px` (1 % of the width, at least 3 px).
@@ -53,7 +53,7 @@ def _both_among(near: NDArray[np.bool_]) -> bool:
 
 def detection_figures(
     lights: Mapping[tuple[str, int], TrueLights], blobs: Mapping[tuple[str, int], Blobs]
-) -> Detection | None:
+) -> DetectionFigures | None:
     """Measure candidates against the marked lights; None where there is nothing to measure."""
     marked = {key: true for key, true in lights.items() if true.marked}
     if not any(key in blobs for key in marked):
@@ -84,7 +84,7 @@ def detection_figures(
             normalized.append((seen.pixels[nearest] - true.pixels[side]) / seen.sigma_px[nearest])
     error_px, axes = np.array(errors), np.abs(np.array(normalized).ravel())
     measured = len(marked) - lost
-    return Detection(
+    return DetectionFigures(
         pictures=len(marked),
         lost_pictures=lost,
         visible_lights=visible,

@@ -46,7 +46,7 @@ class Pairing:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class VisibleTrigger:
     """One trigger at which both pictures show both lights; ended: "pose", a rejection's reason, or "no result"."""
 
     range_m: float
@@ -58,7 +58,7 @@ class Sighting:
     ended: str
 
 
-def sightings_of(
+def visible_triggers(
     nodes: tuple[str, str],
     poses: Sequence[RelativePose],
     rejected: Sequence[Rejected],
@@ -66,7 +66,7 @@ def sightings_of(
     blobs: Mapping[tuple[str, int], Blobs],
     ranges_m: Mapping[int, float],
     wrong: Collection[int],
-) -> list[Sighting]:
+) -> list[VisibleTrigger]:
     """Return the triggers at which both pictures show both lights; ranges_m: the true range by trigger.
 
     wrong: the triggers of wrong poses.
@@ -74,7 +74,7 @@ def sightings_of(
     pose_at = {pose.trigger: pose for pose in poses}
     reason_at = {rejection.trigger: rejection.reason for rejection in rejected}
     answered = bool(blobs and (poses or rejected))
-    sightings = []
+    triggers_seen = []
     for trigger in sorted({trigger for _, trigger in lights}):
         views = [(lights.get((node, trigger)), blobs.get((node, trigger))) for node in nodes]
         if not all(true is not None and true.visible.all() for true, _ in views):
@@ -84,8 +84,8 @@ def sightings_of(
             seen is not None and true is not None and bool((seen.distances_px(true) <= seen.tolerance_px).any(0).all())
             for true, seen in views
         ]
-        sightings.append(
-            Sighting(
+        triggers_seen.append(
+            VisibleTrigger(
                 range_m=ranges_m.get(trigger, float("nan")),
                 marked=all(true is not None and true.marked for true, _ in views),
                 detected=all(near) if blobs else None,
@@ -95,26 +95,30 @@ def sightings_of(
                 ended="pose" if pose is not None else reason_at.get(trigger, "no result"),
             )
         )
-    return sightings
+    return triggers_seen
 
 
-def pairing_figures(sightings: Sequence[Sighting]) -> Pairing | None:
+def pairing_figures(triggers_seen: Sequence[VisibleTrigger]) -> Pairing | None:
     """Return the figures of these triggers, None where there are none."""
-    if not sightings:
+    if not triggers_seen:
         return None
-    judged = all(sighting.right is not None for sighting in sightings)
-    searched = all(sighting.detected is not None for sighting in sightings)
-    posed = sum(sighting.ended == "pose" for sighting in sightings)
-    right = sum(bool(sighting.right) for sighting in sightings)
-    partial = sum(sighting.partial for sighting in sightings)
+    judged = all(seen_trigger.right is not None for seen_trigger in triggers_seen)
+    searched = all(seen_trigger.detected is not None for seen_trigger in triggers_seen)
+    posed = sum(seen_trigger.ended == "pose" for seen_trigger in triggers_seen)
+    right = sum(bool(seen_trigger.right) for seen_trigger in triggers_seen)
+    partial = sum(seen_trigger.partial for seen_trigger in triggers_seen)
     return Pairing(
-        marked=all(sighting.marked for sighting in sightings),
-        visible=len(sightings),
+        marked=all(seen_trigger.marked for seen_trigger in triggers_seen),
+        visible=len(triggers_seen),
         right=right if judged else None,
         other_pair=posed - right - partial if judged else None,
         partial=partial if judged else None,
-        wrong=sum(sighting.wrong for sighting in sightings),
-        ended=dict(Counter(sighting.ended for sighting in sightings if sighting.ended != "pose").most_common()),
-        detected=sum(bool(sighting.detected) for sighting in sightings) if searched else None,
-        right_detected=sum(bool(sighting.detected and sighting.right) for sighting in sightings) if judged else None,
+        wrong=sum(seen_trigger.wrong for seen_trigger in triggers_seen),
+        ended=dict(
+            Counter(seen_trigger.ended for seen_trigger in triggers_seen if seen_trigger.ended != "pose").most_common()
+        ),
+        detected=sum(bool(seen_trigger.detected) for seen_trigger in triggers_seen) if searched else None,
+        right_detected=sum(bool(seen_trigger.detected and seen_trigger.right) for seen_trigger in triggers_seen)
+        if judged
+        else None,
     )

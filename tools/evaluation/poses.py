@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import NodeInfo, RelativePose
+from buddyline.protocol.messages import NodeInfo, RelativePose, Track
 from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
-from buddyline.tools.evaluation.truth import Track, TruthTrack
+from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 from msgspec import UNSET
 from numpy.typing import NDArray
 
@@ -70,6 +70,39 @@ def nees(errors: Floats, covariances: Floats) -> Floats:
     return result
 
 
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """How n poses differ from the truth; t_m, true_t_m (n, 3), the others (n,), as in PoseErrors."""
+
+    t_m: Floats
+    true_t_m: Floats
+    true_range_m: Floats
+    translation_m: Floats
+    rotation_rad: Floats
+    nees6: Floats
+    nees3: Floats
+
+
+def differences(found: Sequence[tuple[RelativePose | Track, tuple[Floats, Floats]]]) -> Differences:
+    """Compare poses, or samples of a track, with their truth: t_a_b_m and q_a_b_xyzw."""
+    poses = [pose for pose, _ in found]
+    t_m = np.array([pose.t_a_b_m for pose in poses]).reshape(-1, 3)
+    q = normalized(np.array([pose.q_a_b_xyzw for pose in poses]).reshape(-1, 4))
+    covariances = np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6)
+    true_t_m = np.array([known[0] for _, known in found]).reshape(-1, 3)
+    true_q = np.array([known[1] for _, known in found]).reshape(-1, 4)
+    offset_m, w_rad = true_t_m - t_m, rotation_vector(multiply(true_q, conjugate(q)))
+    return Differences(
+        t_m=t_m,
+        true_t_m=true_t_m,
+        true_range_m=np.linalg.norm(true_t_m, axis=1),
+        translation_m=np.linalg.norm(offset_m, axis=1),
+        rotation_rad=np.linalg.norm(w_rad, axis=1),
+        nees6=nees(np.concatenate([offset_m, w_rad], axis=1), covariances),
+        nees3=nees(offset_m, covariances[:, :3, :3]),
+    )
+
+
 def _angle_between(one: Floats, other: Floats) -> Floats:
     angle: Floats = np.arctan2(np.linalg.norm(np.cross(one, other), axis=1), (one * other).sum(axis=1))
     return angle
@@ -84,7 +117,7 @@ def _published(values: Sequence[object]) -> Floats:
     return np.array([np.nan if value is UNSET else value for value in values], dtype=float)
 
 
-def _ned_of_a(poses: Sequence[RelativePose], attitude_a: Track | None, info_a: NodeInfo | None) -> Floats:
+def _ned_of_a(poses: Sequence[RelativePose], attitude_a: PoseHistory | None, info_a: NodeInfo | None) -> Floats:
     """Return q_ned_camera (N, 4) of node a at each pose, NaN where unknown."""
     q_ned_camera = np.full((len(poses), 4), np.nan)
     if info_a is None or attitude_a is None:
@@ -101,43 +134,27 @@ def pose_errors(
     poses: Sequence[RelativePose],
     track: TruthTrack,
     is_right: Callable[[RelativePose], bool | None],
-    attitude_a: Track | None,
+    attitude_a: PoseHistory | None,
     infos: Mapping[str, NodeInfo],
 ) -> PoseErrors:
     """Compare the poses of one pair with truth; poses without truth are left out."""
     found = [(pose, known) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
     found.sort(key=lambda pair: pair[0].stamp_ns)
     known_poses = [pose for pose, _ in found]
-    t_m = np.array([pose.t_a_b_m for pose in known_poses]).reshape(-1, 3)
-    q = normalized(np.array([pose.q_a_b_xyzw for pose in known_poses]).reshape(-1, 4))
-    true_t_m = np.array([known[0] for _, known in found]).reshape(-1, 3)
-    true_q = np.array([known[1] for _, known in found]).reshape(-1, 4)
-    true_range_m = np.linalg.norm(true_t_m, axis=1)
-
-    offset_m = true_t_m - t_m
-    w_rad = rotation_vector(multiply(true_q, conjugate(q)))
-    translation_m = np.linalg.norm(offset_m, axis=1)
-    covariances = np.array([pose.covariance for pose in known_poses]).reshape(-1, 6, 6)
+    off = differences(found)
 
     info_a = infos.get(known_poses[0].node_a) if known_poses else None
-    true_ned_m = rotate(_ned_of_a(known_poses, attitude_a, info_a), true_t_m)
-    north, east, down = true_ned_m.T
+    north, east, down = rotate(_ned_of_a(known_poses, attitude_a, info_a), off.true_t_m).T
+    true_inclination_rad = np.arctan2(-down, np.hypot(north, east))
     right = (is_right(pose) for pose in known_poses)
     return PoseErrors(
         stamp_ns=np.array([pose.stamp_ns for pose in known_poses], dtype=np.int64),
         trigger=np.array([pose.trigger for pose in known_poses], dtype=np.int64),
-        t_m=t_m,
-        true_t_m=true_t_m,
-        true_range_m=true_range_m,
-        translation_m=translation_m,
-        rotation_rad=np.linalg.norm(w_rad, axis=1),
-        range_m=np.array([pose.range_m for pose in known_poses]) - true_range_m,
-        bearing_rad=_angle_between(t_m, true_t_m),
+        range_m=np.array([pose.range_m for pose in known_poses]) - off.true_range_m,
+        bearing_rad=_angle_between(off.t_m, off.true_t_m),
         azimuth_rad=_wrapped(_published([pose.azimuth_rad for pose in known_poses]) - np.arctan2(east, north)),
-        inclination_rad=_published([pose.inclination_rad for pose in known_poses])
-        - np.arctan2(-down, np.hypot(north, east)),
-        nees6=nees(np.concatenate([offset_m, w_rad], axis=1), covariances),
-        nees3=nees(offset_m, covariances[:, :3, :3]),
-        wrong=translation_m > WRONG_SHARE * true_range_m,
+        inclination_rad=_published([pose.inclination_rad for pose in known_poses]) - true_inclination_rad,
+        wrong=off.translation_m > WRONG_SHARE * off.true_range_m,
         right_pair=np.array([np.nan if verdict is None else float(verdict) for verdict in right]),
+        **vars(off),
     )

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from buddyline.tools.evaluation.detection import Detection
+from buddyline.tools.evaluation.detection import DetectionFigures
 from buddyline.tools.evaluation.pairing import Pairing
 from buddyline.tools.evaluation.poses import WRONG_SHARE
 from buddyline.tools.evaluation.result import Accuracy, RangeBin, Result
 from buddyline.tools.evaluation.statistics import Stats
+from buddyline.tools.measure.tables import number, percent, text_table
 
 _DEGREES = 180.0 / math.pi
 
@@ -48,25 +49,6 @@ def as_text(result: Result) -> str:
     return "\n\n".join(parts)
 
 
-def _number(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Align: the first column left, the others right."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True))]
-        ).rstrip()
-        for row in rows
-    )
-
-
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items()) or "none"
 
@@ -76,8 +58,8 @@ def _triggers_text(result: Result) -> str:
     where = f" in {result.environment}" if result.environment else ""
     lines = [
         f"pair {result.node_a}/{result.node_b}{where}: {result.poses} poses of {triggers.total} triggers"
-        f" in {triggers.span_s:.1f} s ({_number(triggers.poses_hz, 2)} of {_number(triggers.triggers_hz, 2)} Hz,"
-        f" longest time without a pose {_number(triggers.gap_s, 2)} s)",
+        f" in {triggers.span_s:.1f} s ({number(triggers.poses_hz, 2)} of {number(triggers.triggers_hz, 2)} Hz,"
+        f" longest time without a pose {number(triggers.gap_s, 2)} s)",
         f"rejected: {_counts(triggers.rejected)}",
         f"triggers without a result: {'not known' if triggers.unanswered is None else triggers.unanswered}"
         f", with more than one: {triggers.doubled}",
@@ -97,7 +79,7 @@ def _pairing_text(pairing: Pairing) -> str:
     how = "all four lights in view" if pairing.marked else "all four lights inside the pictures (by projection)"
     lines = [f"triggers with {how}: {pairing.visible}"]
     if pairing.right is not None:
-        lines.append(f"  right pair   {_percent(pairing.right_share):>7}  {pairing.right} poses")
+        lines.append(f"  right pair   {percent(pairing.right_share):>7}  {pairing.right} poses")
         lines.append(f"  another pair          {pairing.other_pair} poses")
         lines.append(f"  three lights          {pairing.partial} poses")
         lines.append(f"  wrong poses           {pairing.wrong}")
@@ -105,13 +87,13 @@ def _pairing_text(pairing: Pairing) -> str:
     if pairing.detected is not None:
         lines.append(f"  with a candidate near all four: {pairing.detected}")
     if pairing.right_detected is not None:
-        lines.append(f"    right pair {_percent(pairing.right_detected_share):>7}  {pairing.right_detected} poses")
+        lines.append(f"    right pair {percent(pairing.right_detected_share):>7}  {pairing.right_detected} poses")
     return "\n".join(lines)
 
 
 def _stats_row(name: str, stats: Stats, digits: int, scale: float = 1.0) -> list[str]:
     figures = (stats.median, stats.p95, stats.rmse, stats.mean)
-    scaled = [_number(None if figure is None else figure * scale, digits) for figure in figures]
+    scaled = [number(None if figure is None else figure * scale, digits) for figure in figures]
     return [name, str(stats.count), *scaled]
 
 
@@ -133,13 +115,13 @@ def _accuracy_text(accuracy: Accuracy) -> str:
         ["  were it honest", "", "2.37", "7.81", "3.87", "3.00"],
     ]
     inside = (
-        f"inside the 95 % bound of the covariance: pose {_percent(accuracy.honest6)},"
-        f" position {_percent(accuracy.honest3)}"
+        f"inside the 95 % bound of the covariance: pose {percent(accuracy.honest6)},"
+        f" position {percent(accuracy.honest3)}"
     )
     wrong = (
         f"wrong poses (position off by more than {WRONG_SHARE:.0%} of the range): {accuracy.wrong} of {accuracy.poses}"
     )
-    return f"{wrong}, {_percent(accuracy.wrong_share)}\n{_table(rows)}\n{inside}"
+    return f"{wrong}, {percent(accuracy.wrong_share)}\n{text_table(rows)}\n{inside}"
 
 
 def _bins_text(bins: Sequence[RangeBin]) -> str:
@@ -153,35 +135,35 @@ def _bins_text(bins: Sequence[RangeBin]) -> str:
             [
                 f"{part.from_m:g} - {part.to_m:g}" if math.isfinite(part.to_m) else f"{part.from_m:g} -",
                 str(part.pairing.visible if part.pairing else 0),
-                _percent(part.pairing.right_share if part.pairing else None),
+                percent(part.pairing.right_share if part.pairing else None),
                 str(accuracy.poses),
-                _percent(accuracy.wrong_share),
-                _number(accuracy.translation_m.median, 4),
-                _number(accuracy.translation_m.p95, 4),
-                *(_number(None if angle is None else angle * _DEGREES) for angle in rotation),
-                _number(accuracy.nees6.median, 2),
+                percent(accuracy.wrong_share),
+                number(accuracy.translation_m.median, 4),
+                number(accuracy.translation_m.p95, 4),
+                *(number(None if angle is None else angle * _DEGREES) for angle in rotation),
+                number(accuracy.nees6.median, 2),
             ]
         )
-    return f"by range (medians beside p95)\n{_table(rows)}"
+    return f"by range (medians beside p95)\n{text_table(rows)}"
 
 
-def _detection_text(detection: Detection) -> str:
+def _detection_text(detection: DetectionFigures) -> str:
     first = {n: share for n, share in detection.both_first.items() if n}
     rows = [
-        ["recall within 2 px", _percent(detection.recall_close)],
-        ["recall within 1 % of the width", _percent(detection.recall_near)],
-        *([f"both lights among the first {n}", _percent(share)] for n, share in first.items()),
-        ["both lights among all", _percent(detection.both_first[0])],
-        ["candidates per picture", _number(detection.candidates_per_picture, 1)],
-        ["false candidates per picture", _number(detection.false_per_picture, 2)],
-        ["error of the nearest, median, px", _number(detection.error_median_px, 2)],
-        ["error of the nearest, p90, px", _number(detection.error_p90_px, 2)],
-        ["error over sigma, per axis, RMS (honest: 1)", _number(detection.normalized_rms, 2)],
-        ["the same from the median", _number(detection.normalized_robust, 2)],
+        ["recall within 2 px", percent(detection.recall_close)],
+        ["recall within 1 % of the width", percent(detection.recall_near)],
+        *([f"both lights among the first {n}", percent(share)] for n, share in first.items()),
+        ["both lights among all", percent(detection.both_first[0])],
+        ["candidates per picture", number(detection.candidates_per_picture, 1)],
+        ["false candidates per picture", number(detection.false_per_picture, 2)],
+        ["error of the nearest, median, px", number(detection.error_median_px, 2)],
+        ["error of the nearest, p90, px", number(detection.error_p90_px, 2)],
+        ["error over sigma, per axis, RMS (honest: 1)", number(detection.normalized_rms, 2)],
+        ["the same from the median", number(detection.normalized_robust, 2)],
     ]
     lost = f", {detection.lost_pictures} of them without candidates" if detection.lost_pictures else ""
     head = (
         f"detection: {detection.pictures} pictures{lost}; {detection.visible_lights} lights in view,"
         f" {detection.both_visible} pictures with both"
     )
-    return f"{head}\n{_table(rows)}"
+    return f"{head}\n{text_table(rows)}"

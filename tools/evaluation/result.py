@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.messages import Candidates, LightTruth
-from buddyline.tools.evaluation.detection import Detection, detection_figures
+from buddyline.tools.evaluation.detection import DetectionFigures, detection_figures
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
-from buddyline.tools.evaluation.pairing import Pairing, Sighting, pairing_figures, sightings_of
+from buddyline.tools.evaluation.pairing import Pairing, VisibleTrigger, pairing_figures, visible_triggers
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.recorded import Recorded
-from buddyline.tools.evaluation.statistics import Stats, share
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.evaluation.statistics import Stats, in_bins, share
 from buddyline.tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
-from buddyline.tools.evaluation.truth import Track, TruthTrack
+from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 
 RANGE_EDGES_M: Final = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, float("inf"))
 # The 95 % points of chi-square with 6 and 3 degrees of freedom.
@@ -45,22 +45,23 @@ class Accuracy:
     @classmethod
     def of(cls, errors: PoseErrors) -> Accuracy:
         """Return the figures of these poses."""
-        known6, known3 = errors.nees6[np.isfinite(errors.nees6)], errors.nees3[np.isfinite(errors.nees3)]
+        wrong = int(errors.wrong.sum())
         return cls(
             poses=len(errors),
-            wrong=int(errors.wrong.sum()),
-            wrong_share=share(int(errors.wrong.sum()), len(errors)),
-            translation_m=Stats.of(errors.translation_m),
-            rotation_rad=Stats.of(errors.rotation_rad),
-            range_m=Stats.of(errors.range_m),
-            bearing_rad=Stats.of(errors.bearing_rad),
-            azimuth_rad=Stats.of(errors.azimuth_rad),
-            inclination_rad=Stats.of(errors.inclination_rad),
-            nees6=Stats.of(errors.nees6),
-            nees3=Stats.of(errors.nees3),
-            honest6=share(int((known6 <= NEES6_GATE).sum()), len(known6)),
-            honest3=share(int((known3 <= NEES3_GATE).sum()), len(known3)),
+            wrong=wrong,
+            wrong_share=share(wrong, len(errors)),
+            honest6=_share_within(errors.nees6, NEES6_GATE),
+            honest3=_share_within(errors.nees3, NEES3_GATE),
+            **{name: Stats.of(getattr(errors, name)) for name in _MEASURED},
         )
+
+
+_MEASURED: Final = tuple(field.name for field in fields(Accuracy) if field.type == "Stats")
+
+
+def _share_within(values: Floats, gate: float) -> float | None:
+    known = values[np.isfinite(values)]
+    return share(int((known <= gate).sum()), len(known))
 
 
 @dataclass(frozen=True)
@@ -89,18 +90,17 @@ class Result:
     accuracy: Accuracy
     bins: list[RangeBin]
     pairing: Pairing | None
-    detection: Detection | None
+    detection: DetectionFigures | None
     errors: PoseErrors
     environment: str = ""
 
 
-def _bins(errors: PoseErrors, sightings: Sequence[Sighting]) -> list[RangeBin]:
+def _bins(errors: PoseErrors, triggers_seen: Sequence[VisibleTrigger]) -> list[RangeBin]:
     bins = []
-    for start_m, end_m in pairwise(RANGE_EDGES_M):
-        chosen = errors.select((errors.true_range_m >= start_m) & (errors.true_range_m < end_m))
-        seen = [sighting for sighting in sightings if start_m <= sighting.range_m < end_m]
-        if len(chosen) or seen:
-            bins.append(RangeBin(start_m, end_m, Accuracy.of(chosen), pairing_figures(seen)))
+    for start_m, end_m, inside in in_bins(RANGE_EDGES_M, errors.true_range_m):
+        seen = [one for one in triggers_seen if start_m <= one.range_m < end_m]
+        if inside.any() or seen:
+            bins.append(RangeBin(start_m, end_m, Accuracy.of(errors.select(inside)), pairing_figures(seen)))
     return bins
 
 
@@ -118,14 +118,18 @@ def evaluate(recorded: Recorded) -> Result:
     blobs = {key: Blobs.of(frame) for key, frame in frames.items()}
     lights = true_lights(nodes, frames.values(), recorded.light_truths, infos, track)
     errors = pose_errors(
-        poses, track, lambda pose: is_right_pair(pose, blobs, lights), Track.of_attitudes(recorded.attitudes_a), infos
+        poses,
+        track,
+        lambda pose: is_right_pair(pose, blobs, lights),
+        PoseHistory.of_attitudes(recorded.attitudes_a),
+        infos,
     )
     ranges_m: dict[int, float] = {}
     for (_, trigger), stamp_ns in _stamps_ns(frames, recorded.light_truths).items():
         known = track.at(stamp_ns, trigger)
         if known is not None:
             ranges_m[trigger] = float(np.linalg.norm(known[0]))
-    sightings = sightings_of(
+    triggers_seen = visible_triggers(
         nodes, poses, rejected, lights, blobs, ranges_m, set(errors.trigger[errors.wrong].tolist())
     )
     return Result(
@@ -136,8 +140,8 @@ def evaluate(recorded: Recorded) -> Result:
         triggers=trigger_figures(poses, rejected, list(frames.values()), recorded.doubled),
         skew=skew_figures(poses),
         accuracy=Accuracy.of(errors),
-        bins=_bins(errors, sightings),
-        pairing=pairing_figures(sightings),
+        bins=_bins(errors, triggers_seen),
+        pairing=pairing_figures(triggers_seen),
         detection=detection_figures(lights, blobs),
         errors=errors,
         environment=recorded.environment,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from buddyline.tools.evaluation.rotation import Floats
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -37,3 +40,9 @@ class Stats:
 def share(part: int | float, whole: int | float) -> float | None:
     """Return part / whole, None where there is no whole."""
     return part / whole if whole else None
+
+
+def in_bins(edges: Sequence[float], values: Floats) -> Iterator[tuple[float, float, NDArray[np.bool_]]]:
+    """Yield each bin's edges and which of the values (N,) lie in it: start <= value < end."""
+    for start, end in pairwise(edges):
+        yield start, end, (values >= start) & (values < end)

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import RelativePose, Track, TrackMode
-from buddyline.tools.evaluation.poses import WRONG_SHARE, nees
-from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
+from buddyline.tools.evaluation.poses import WRONG_SHARE, differences
 from buddyline.tools.evaluation.statistics import Stats, share
 from buddyline.tools.evaluation.truth import TruthTrack
 
@@ -53,30 +52,21 @@ def _figures(
     mode: TrackMode, tracks: Sequence[Track], poses: Sequence[RelativePose], truth: TruthTrack
 ) -> TrackFigures:
     found = [(track, known) for track in tracks if (known := truth.interpolated(track.stamp_ns)) is not None]
-    t_m = np.array([track.t_a_b_m for track, _ in found]).reshape(-1, 3)
-    q = normalized(np.array([track.q_a_b_xyzw for track, _ in found]).reshape(-1, 4))
-    true_t_m = np.array([known[0] for _, known in found]).reshape(-1, 3)
-    true_q = np.array([known[1] for _, known in found]).reshape(-1, 4)
-    covariances = np.array([track.covariance for track, _ in found]).reshape(-1, 6, 6)
+    off = differences(found)
     in_gap = np.array([track.age_s > GAP_S for track, _ in found], dtype=bool)
-
-    offset_m = true_t_m - t_m
-    turn_rad = rotation_vector(multiply(true_q, conjugate(q)))
-    away_m = np.linalg.norm(offset_m, axis=1)
-    nees3 = nees(offset_m, covariances[:, :3, :3])
-    wrong = (away_m > WRONG_SHARE * np.linalg.norm(true_t_m, axis=1)) & ~(nees3 <= WRONG_SIGMAS**2)
+    wrong = (off.translation_m > WRONG_SHARE * off.true_range_m) & ~(off.nees3 <= WRONG_SIGMAS**2)
     return TrackFigures(
         mode=mode,
         samples=len(found),
         covered=covered_share(tracks, poses),
         wrong=int(wrong.sum()),
         wrong_in_gaps=int((wrong & in_gap).sum()),
-        position_m=Stats.of(away_m),
-        rotation_rad=Stats.of(np.linalg.norm(turn_rad, axis=1)),
-        in_gaps_m=Stats.of(away_m[in_gap]),
-        outside_m=Stats.of(away_m[~in_gap]),
-        nees6=Stats.of(nees(np.concatenate([offset_m, turn_rad], axis=1), covariances)),
-        nees3=Stats.of(nees3),
+        position_m=Stats.of(off.translation_m),
+        rotation_rad=Stats.of(off.rotation_rad),
+        in_gaps_m=Stats.of(off.translation_m[in_gap]),
+        outside_m=Stats.of(off.translation_m[~in_gap]),
+        nees6=Stats.of(off.nees6),
+        nees3=Stats.of(off.nees3),
     )
 
 

@@ -25,7 +25,7 @@ def inverted(truth: Truth) -> Truth:
     return replace(truth, t_a_b_m=(x, y, z), q_a_b_xyzw=tuple(q.tolist()))
 
 
-class Track:
+class PoseHistory:
     """Rotations, and positions where there are any, over time: between its samples it interpolates."""
 
     def __init__(self, stamps_ns: Sequence[int], t_m: Floats, q_xyzw: Floats) -> None:
@@ -35,7 +35,7 @@ class Track:
         self.q_xyzw = normalized(q_xyzw[order])
 
     @classmethod
-    def of_attitudes(cls, attitudes: Iterable[Attitude]) -> Track:
+    def of_attitudes(cls, attitudes: Iterable[Attitude]) -> PoseHistory:
         """Return q_ned_body over time; its positions are zero."""
         samples = list(attitudes)
         q = np.array([sample.q_ned_body_xyzw for sample in samples]).reshape(-1, 4)
@@ -63,7 +63,7 @@ class TruthTrack:
     def __init__(self, truths: Sequence[Truth]) -> None:
         t = np.array([truth.t_a_b_m for truth in truths]).reshape(-1, 3)
         q = np.array([truth.q_a_b_xyzw for truth in truths]).reshape(-1, 4)
-        self._track = Track([truth.stamp_ns for truth in truths], t, q)
+        self._track = PoseHistory([truth.stamp_ns for truth in truths], t, q)
         self._by_trigger: dict[int, tuple[Floats, Floats]] = {
             truth.trigger: (t[i], normalized(q[i])) for i, truth in enumerate(truths) if truth.trigger is not UNSET
         }

@@ -174,7 +174,7 @@ def pair_rows(pairs: dict[str, dict[str, dict[str, Any]]]) -> list[list[str]]:
 def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output: Path) -> str:
     """Return the report's HTML."""
     quick = "<p><b>Quick look: short dives, not figures to quote.</b></p>" if found["quick"] else ""
-    head = table(rows, ("", "ours", "the paper's method (or AR tags) here", "the paper reports"))
+    head = table(rows, numbers.HEAD)
     sections = [
         ("At a glance", quick + head + "<p>Simulated dives, of seeds that nothing was tuned on: not the sea.</p>"),
         (

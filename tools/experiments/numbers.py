@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -12,10 +11,12 @@ from buddyline.tools.bound import pose_bounds
 from buddyline.tools.evaluation.poses import PoseErrors
 from buddyline.tools.evaluation.report import as_dict
 from buddyline.tools.evaluation.rotation import Floats
-from buddyline.tools.evaluation.statistics import Stats, share
+from buddyline.tools.evaluation.statistics import Stats, in_bins, share
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.experiments.runs import OURS, OURS_CAMERA, PAPER, PAPER_CAMERA, TAGS, Rendered
+from buddyline.tools.measure.tables import markdown_table, percent
 
+HEAD: Final = ("", "ours", "the paper's method (or AR tags) here", "the paper reports")
 EDGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.5, 15.0, 17.5, 20.0)
 # What the paper reports.
 PAPER_REPORTS: Final = {
@@ -31,10 +32,10 @@ _ENDS_AT: Final = 0.5
 def by_range(errors: PoseErrors) -> list[dict[str, Any]]:
     """Return position errors by true range, bins without poses left out."""
     rows = []
-    for start_m, end_m in pairwise(EDGES_M):
-        chosen = errors.select((errors.true_range_m >= start_m) & (errors.true_range_m < end_m))
-        if not len(chosen):
+    for start_m, end_m, inside in in_bins(EDGES_M, errors.true_range_m):
+        if not inside.any():
             continue
+        chosen = errors.select(inside)
         position, along = Stats.of(chosen.translation_m), Stats.of(chosen.range_m)
         rows.append(
             {
@@ -65,8 +66,8 @@ def bounds(errors: PoseErrors, track: TruthTrack, infos: Mapping[str, NodeInfo],
 def over_bound(errors: PoseErrors, bound_m: Floats) -> dict[str, dict[str, float]]:
     """Return by range the RMS of position error over its bound (1: nothing better is possible) and the bound itself."""
     rows = {}
-    for start_m, end_m in pairwise(EDGES_M):
-        inside = (errors.true_range_m >= start_m) & (errors.true_range_m < end_m) & np.isfinite(bound_m) & ~errors.wrong
+    for start_m, end_m, in_bin in in_bins(EDGES_M, errors.true_range_m):
+        inside = in_bin & np.isfinite(bound_m) & ~errors.wrong
         if inside.any():
             ratio = errors.translation_m[inside] / bound_m[inside]
             rows[f"{start_m:g}-{end_m:g}"] = {
@@ -84,8 +85,7 @@ def reach(truth_ranges_m: Floats, truth_triggers: Sequence[int], errors: PoseErr
     solved = set(errors.trigger[~errors.wrong].tolist())
     got = np.array([trigger in solved for trigger in truth_triggers])
     bins, ends_m = [], None
-    for start_m, end_m in pairwise(EDGES_M):
-        inside = (truth_ranges_m >= start_m) & (truth_ranges_m < end_m)
+    for start_m, end_m, inside in in_bins(EDGES_M, truth_ranges_m):
         if inside.any():
             part = float(got[inside].mean())
             bins.append({"from_m": start_m, "to_m": end_m, "triggers": int(inside.sum()), "share": part})
@@ -142,26 +142,26 @@ def headline(numbers: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     rows = [
         (
             "right pair of lights, all sensors",
-            _percent(found[OURS]["all"]["right_share"]),
-            _percent(found[PAPER]["all"]["right_share"]),
-            _percent(PAPER_REPORTS["right_pairs_all_sensors"]),
+            percent(found[OURS]["all"]["right_share"]),
+            percent(found[PAPER]["all"]["right_share"]),
+            percent(PAPER_REPORTS["right_pairs_all_sensors"]),
         ),
         (
             "right pair of lights, camera only",
-            _percent(found[OURS_CAMERA]["all"]["right_share"]),
-            _percent(found[PAPER_CAMERA]["all"]["right_share"]),
-            _percent(PAPER_REPORTS["right_pairs_camera"]),
+            percent(found[OURS_CAMERA]["all"]["right_share"]),
+            percent(found[PAPER_CAMERA]["all"]["right_share"]),
+            percent(PAPER_REPORTS["right_pairs_camera"]),
         ),
         (
             "another pair taken, all sensors",
-            _percent(share(found[OURS]["all"]["other_pair"], found[OURS]["all"]["visible"])),
-            _percent(share(found[PAPER]["all"]["other_pair"], found[PAPER]["all"]["visible"])),
+            percent(share(found[OURS]["all"]["other_pair"], found[OURS]["all"]["visible"])),
+            percent(share(found[PAPER]["all"]["other_pair"], found[PAPER]["all"]["visible"])),
             "-",
         ),
         (
             "range within 0.08 m, 1.5 to 4 m",
-            _percent(near["ours"]),
-            _percent(near["paper's"]),
+            percent(near["ours"]),
+            percent(near["paper's"]),
             "all",
         ),
     ]
@@ -191,15 +191,10 @@ def headline(numbers: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100 * value:.1f} %"
-
-
 def _metres(ends: Mapping[str, Any] | None) -> str:
     return "none" if ends is None or ends["farthest_m"] is None else f"{ends['farthest_m']:.1f} m"
 
 
 def markdown(rows: Sequence[tuple[str, str, str, str]]) -> str:
     """Return the table for a README."""
-    lines = ["| | ours | the paper's method (or AR tags) here | the paper reports |", "|---|---|---|---|"]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
+    return markdown_table(HEAD, rows)

@@ -3,39 +3,36 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from buddyline.node.detect import make_detector
-from buddyline.node.drivers.stored import decode_picture
-from buddyline.protocol.messages import Candidates, CompressedImage
+from buddyline.protocol.messages import Candidates
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.closed_form import eq1_range_m
 from buddyline.tools.dives import Dive
+from buddyline.tools.measure.pictures import stored_pictures
+from buddyline.tools.measure.turns import fastest_s, seconds_of
 
 _PICTURES: Final = 12
 _TRIGGERS: Final = 100
-
-
-def milliseconds(work: Callable[[], object], repeats: int) -> float:
-    """Return the processor time of one call, the least of five series."""
-    taken = []
-    for _ in range(5):
-        began_s = time.process_time()
-        for _ in range(repeats):
-            work()
-        taken.append((time.process_time() - began_s) / repeats * 1e3)
-    return min(taken)
+_EVALUATIONS: Final = 500
 
 
 def equation_1() -> float:
     """Return the time of one evaluation of the paper's Eq. 1, both ranges, ms."""
     cos_alpha, sin_beta = np.cos([0.2, 0.21]), np.array([0.1, -0.1])
     sin_alpha, length_m = np.sin([0.2, 0.21]), np.array([0.88, 0.88])
-    return milliseconds(lambda: eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m), 500)
+
+    def series() -> None:
+        for _ in range(_EVALUATIONS):
+            eq1_range_m(cos_alpha, sin_alpha, sin_beta, length_m)
+
+    return 1e3 * fastest_s(series, 5, time.process_time) / _EVALUATIONS
 
 
 def trigger(found: Path) -> dict[str, float]:
@@ -57,20 +54,10 @@ def trigger(found: Path) -> dict[str, float]:
 
 def frame(dive: Path) -> dict[str, float]:
     """Return the time of detection in one picture by each detector, ms, the median over pictures of a dive."""
-    pictures = []
-    with Dive([dive]) as log:
-        for envelope in log.messages("image"):
-            if isinstance(envelope.message, CompressedImage):
-                pictures.append(decode_picture(envelope.message.data, envelope.key))
-            if len(pictures) == _PICTURES:
-                break
+    pictures = list(islice(stored_pictures(dive), _PICTURES))
     times = {}
     for method in ("source", "paper"):
-        detector = make_detector(method, "auto")
-        taken_ms = []
-        for picture in pictures:
-            began_s = time.process_time()
-            detector.detect(picture)
-            taken_ms.append((time.process_time() - began_s) * 1e3)
-        times[f"{method}_ms"] = float(np.median(taken_ms))
+        detect = make_detector(method, "auto").detect
+        taken_s = [seconds_of(partial(detect, picture), time.process_time) for picture in pictures]
+        times[f"{method}_ms"] = 1e3 * float(np.median(taken_s))
     return times

@@ -10,7 +10,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
-from buddyline.tools.evaluation.truth import Track, TruthTrack, inverted
+from buddyline.tools.evaluation.truth import TruthTrack, inverted
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.panel import judged_picture
 from buddyline.tools.monitor.picture import PairPicture, Point
@@ -57,7 +57,7 @@ class Summary:
 
     def errors(self) -> PoseErrors:
         """Compare the poses with the truth, where the logs hold it."""
-        return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, Track.of_attitudes([]), {})
+        return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, None, {})
 
 
 def summarize(dive: Dive, pair: Pair | None) -> Summary:
