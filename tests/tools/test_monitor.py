@@ -6,6 +6,8 @@ import base64
 import math
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,8 +22,9 @@ from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.coverage import Coverage, clock_words
 from buddyline.tools.monitor.live import subscribe
+from buddyline.tools.monitor.page import MISSES, TimePlots
 from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, columns
-from buddyline.tools.monitor.scene import R_LEVEL, age_colours, ellipsoid, fit, frame_of, holds
+from buddyline.tools.monitor.scene import R_LEVEL, Floats, age_colours, ellipsoid, fit, frame_of, holds
 from msgspec.structs import replace
 
 from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection
@@ -258,6 +261,44 @@ class TestPanel:
 
 def replace_detail(detail: str) -> Message:
     return replace(rejection(29), detail=detail)
+
+
+class PlotFolder:
+    """Stands for viser's panel: keeps the plots that are added."""
+
+    def __init__(self) -> None:
+        self.plots: dict[str, SimpleNamespace] = {}
+
+    def add_folder(self, _: str) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def add_uplot(self, data: tuple[Floats, ...], _: object, *, title: str, **how: object) -> SimpleNamespace:
+        self.plots[title] = SimpleNamespace(data=data, visible=True)
+        return self.plots[title]
+
+
+class TestTimePlots:
+    def test_plots_get_finite_values_in_order_of_time(self) -> None:
+        picture, gui = watched(), PlotFolder()
+        for k in (30, 31, 32, 45):
+            take(picture, rejection(k), at(k))
+        take(picture, pose(40, azimuth_rad=1.0, inclination_rad=0.1), at(40))
+        TimePlots(gui).draw(picture, at(50))  # type: ignore[arg-type]
+        assert {title.split(",")[0] for title in gui.plots} >= {"Range", "Azimuth", "Triggers without a pose"}
+        for plot in gui.plots.values():
+            assert all(np.isfinite(column).all() for column in plot.data)
+            assert (np.diff(plot.data[0]) > 0).all()
+            assert len(plot.data[0]) == len(plot.data[1])
+        # The azimuth was known once.
+        assert next(len(plot.data[1]) for title, plot in gui.plots.items() if title.startswith("Azimuth")) == 1
+        assert gui.plots[MISSES].data[1][-3:].tolist() == [0.0, 3.0, 1.0]
+
+    def test_a_plot_without_values_is_hidden_until_there_are_some(self) -> None:
+        picture, gui = watched(), PlotFolder()
+        plots = TimePlots(gui)  # type: ignore[arg-type]
+        for now_ns, visible in ((at(29), True), (at(29) + 200 * S_NS, False), (at(29), True)):
+            plots.draw(picture, now_ns)
+            assert {plot.visible for plot in gui.plots.values()} == {visible}
 
 
 class TestScene:

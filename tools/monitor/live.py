@@ -8,17 +8,7 @@ import threading
 import webbrowser
 from typing import TYPE_CHECKING, Final
 
-from buddyline.protocol.topics import (
-    ATTITUDE,
-    CANDIDATES,
-    DEPTH,
-    IMAGE,
-    INFO,
-    NODE_STATUS,
-    POSE,
-    REJECTED,
-    SOLVER_STATUS,
-)
+from buddyline.protocol import topics
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.pairs import add_pair_argument
@@ -33,8 +23,8 @@ log = logging.getLogger(__name__)
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
-STATES: Final = (INFO, NODE_STATUS, SOLVER_STATUS)
-STREAMS: Final = (POSE, REJECTED, CANDIDATES, ATTITUDE, DEPTH)
+STATES: Final = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
+STREAMS: Final = (topics.POSE, topics.REJECTED, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +95,6 @@ def subscribe(bus: Bus, refusals: Refusals, picture: PairPicture, lock: threadin
         with lock:
             picture.alive(name, is_alive, bus.clock.now_ns())
 
-    for topics, capacity, history in ((STATES, 64, True), (STREAMS, 1024, False), ((IMAGE,), 4, False)):
-        follow(bus, tuple(topic.key_any() for topic in topics), refusals, take, capacity=capacity, history=history)
+    for followed, capacity, history in ((STATES, 64, True), (STREAMS, 1024, False), ((topics.IMAGE,), 4, False)):
+        follow(bus, tuple(topic.key_any() for topic in followed), refusals, take, capacity=capacity, history=history)
     bus.watch_alive(alive)
