@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.closed_form import closed_form
-from buddyline.solver_service.geometry.rotation import matrix_of, rotation_exp
+from buddyline.solver_service.geometry.rotation import quat_to_matrix, rotation_exp
 from buddyline.solver_service.geometry.trigger import Fix, Rig
 from numpy.typing import NDArray
 
@@ -82,7 +82,7 @@ class ClockAlignment:
         if self._window and not 0 < time_s - self._window[-1].time_s <= HALF_WINDOW_S:
             self._window.clear()
             self._next = 0
-        self._window.append(_Sighting(time_s, fix, matrix_of(fix.q_a_b_xyzw), known_s, sigma_rad))
+        self._window.append(_Sighting(time_s, fix, quat_to_matrix(fix.q_a_b_xyzw), known_s, sigma_rad))
         while self._window[self._next].time_s <= time_s - HALF_WINDOW_S:
             centre = self._window[self._next]
             rates = self._rates(centre)

@@ -5,20 +5,25 @@ The pair's memory (motion prior, heading bias, clock alignment) lives here and n
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.solver_service.alignment import ClockAlignment
-from buddyline.solver_service.geometry.evidence import heading_offset
-from buddyline.solver_service.geometry.observation import Heading
-from buddyline.solver_service.geometry.rotation import matrix_of
-from buddyline.solver_service.geometry.trigger import Fix, NoFix, Rig, Sensed, Settings, solve_trigger
+from buddyline.solver_service.geometry.fix import Fix, NoFix
+from buddyline.solver_service.geometry.observation import Heading, Observation, Sensed, Settings
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.trigger import TriggerReadings, read_triggers
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.results import view_of
+
+# Triggers whose pictures are solved at once: beyond, arrays outgrow the processor's caches.
+_BATCH: Final = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +59,12 @@ class PairSolver:
 
         The triggers come in increasing order, also from call to call. How they are split into calls changes nothing.
         """
-        return [self._solve_one(one) for one in matched]
+        results: list[Fix | NoFix] = []
+        for _, same in itertools.groupby(matched, key=lambda one: (one.rig_a, one.rig_b)):
+            alike = list(same)
+            for start in range(0, len(alike), _BATCH):
+                results += self._solve_batch(alike[start : start + _BATCH])
+        return results
 
     def forget(self) -> None:
         """Forget what earlier fixes told: a clock was set, or the values make no sense."""
@@ -65,40 +75,46 @@ class PairSolver:
         """Return how far the two headings disagree at stamp_ns, None where too few fixes have told it."""
         return self._headings.predict(stamp_ns)
 
-    def _solve_one(self, matched: Matched) -> Fix | NoFix:
+    def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
         try:
-            found = solve_trigger(
-                view_of(matched.frame_a),
-                view_of(matched.frame_b),
-                matched.rig_a,
-                matched.rig_b,
-                matched.sensed_a,
-                matched.sensed_b,
-                self.settings,
-                self._prior.predict(matched.stamp_ns),
-                self._headings.predict(matched.stamp_ns),
-            )
-            if isinstance(found, Fix):
-                self._remember(matched, found)
+            readings = self._read(batch)
         except (ArithmeticError, ValueError) as error:
-            # Absurd but finite values, such as 1e300, overflow or leave a singular matrix.
-            self.forget()
-            nodes = f"{matched.frame_a.node} or {matched.frame_b.node}"
-            return NoFix("degenerate", f"values from {nodes} are out of numeric range ({error})")
+            if len(batch) == 1:
+                return [self._out_of_range(batch[0], error)]
+            # One of them holds absurd but finite values, such as 1e300, that leave a singular matrix.
+            return [fix for one in batch for fix in self._solve_batch([one])]
+        return [self._decide(one, readings, place) for place, one in enumerate(batch)]
+
+    def _read(self, batch: Sequence[Matched]) -> TriggerReadings:
+        observations = [
+            Observation(view_of(one.frame_a), view_of(one.frame_b), one.sensed_a, one.sensed_b) for one in batch
+        ]
+        return read_triggers(observations, batch[0].rig_a, batch[0].rig_b, self.settings)
+
+    def _decide(self, matched: Matched, readings: TriggerReadings, place: int) -> Fix | NoFix:
+        stamp_ns = matched.stamp_ns
+        try:
+            found = readings.decide(place, self._prior.predict(stamp_ns), self._headings.predict(stamp_ns))
+            if isinstance(found, Fix):
+                self._remember(matched, found, readings.heading_offset(place, found))
+        except (ArithmeticError, ValueError) as error:
+            return self._out_of_range(matched, error)
         return found
 
-    def _remember(self, matched: Matched, fix: Fix) -> None:
+    def _out_of_range(self, matched: Matched, error: Exception) -> NoFix:
+        self.forget()
+        nodes = f"{matched.frame_a.node} or {matched.frame_b.node}"
+        return NoFix("degenerate", f"values from {nodes} are out of numeric range ({error})")
+
+    def _remember(self, matched: Matched, fix: Fix, heading_offset: tuple[float, float] | None) -> None:
         if not (np.isfinite(fix.t_a_b_m).all() and np.isfinite(fix.covariance).all()):
             raise ValueError("the pose is not finite")
         self._prior.update(matched.stamp_ns, fix)
-        q_a, q_b = matched.sensed_a.q_ned_body_xyzw, matched.sensed_b.q_ned_body_xyzw
-        rigs = matched.rig_a, matched.rig_b
-        if q_a is not None and q_b is not None and fix.method != "three_lights":
-            R_a_b, covariance = matrix_of(fix.q_a_b_xyzw), fix.covariance[3:, 3:]
-            self._headings.update(matched.stamp_ns, *heading_offset(R_a_b, covariance, rigs, (q_a, q_b)))
+        if heading_offset is not None and fix.method != "three_lights":
+            self._headings.update(matched.stamp_ns, *heading_offset)
         if self.alignment is not None:
             stamp_a_ns, stamp_b_ns = matched.frame_a.stamp_ns, matched.frame_b.stamp_ns
-            infos = matched.info_a, matched.info_b
+            infos, rigs = (matched.info_a, matched.info_b), (matched.rig_a, matched.rig_b)
             sigma_a_rad, sigma_b_rad = (info.sigma_px / info.camera.fx_px for info in infos)
             known_s = (stamp_b_ns - stamp_a_ns) / S_NS
             self.alignment.add(stamp_a_ns, fix, rigs, known_s, (sigma_a_rad, sigma_b_rad))

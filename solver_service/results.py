@@ -7,7 +7,7 @@ import math
 import numpy as np
 from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.solver_service.geometry.trigger import Fix, Rig, Sensed, View
 from buddyline.solver_service.sensors import SampleStream, attitude_at, depth_at
 from msgspec import UNSET
@@ -28,7 +28,7 @@ def rig_of(info: NodeInfo) -> Rig:
             np.array(camera.distortion),
         ),
         lights_m=np.array([info.light_left_m, info.light_right_m]),
-        R_body_camera=matrix_of(np.array(info.q_body_camera_xyzw)),
+        R_body_camera=quat_to_matrix(np.array(info.q_body_camera_xyzw)),
         depth_port_m=np.array(info.depth_port_m),
         declination_rad=info.declination_rad,
     )
@@ -69,7 +69,7 @@ def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a
     """Return the message for a fix; azimuth and inclination follow A's attitude."""
     t_ned_m = None
     if sensed_a.q_ned_body_xyzw is not None:
-        t_ned_m = matrix_of(sensed_a.q_ned_body_xyzw) @ rig_a.R_body_camera @ fix.t_a_b_m
+        t_ned_m = quat_to_matrix(sensed_a.q_ned_body_xyzw) @ rig_a.R_body_camera @ fix.t_a_b_m
     return RelativePose(
         node_a=frame_a.node,
         node_b=frame_b.node,

@@ -18,7 +18,7 @@ from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus, Truth
 from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS
-from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.live import follow
@@ -109,7 +109,7 @@ class Dashboard:
         age_s = time.monotonic() - self._recent[-1]
         stale = f"   (STALE: {age_s:.1f} s old)" if age_s >= stale_after_s(POSE, self._period_s) else ""
         sigma_m = math.sqrt(max(np.trace(np.array(pose.covariance).reshape(6, 6)[:3, :3]), 0.0))
-        R = R_BODY_CAMERA @ matrix_of(np.array(pose.q_a_b_xyzw)) @ R_BODY_CAMERA.T
+        R = R_BODY_CAMERA @ quat_to_matrix(np.array(pose.q_a_b_xyzw)) @ R_BODY_CAMERA.T
         roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
         pitch = math.asin(min(max(-R[2, 0], -1.0), 1.0))
         roll_deg, pitch_deg, yaw_deg = map(math.degrees, (roll, pitch, yaw))

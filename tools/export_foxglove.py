@@ -26,7 +26,7 @@ from buddyline.protocol.messages import (
     RelativePose,
 )
 from buddyline.protocol.topics import parse_key
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
 from buddyline.tools.newfile import new_file
 
@@ -86,7 +86,8 @@ class FoxgloveTranslation:
         if before_ns is not None and 0 <= stamp_ns - before_ns < ATTITUDE_SPACING_NS:
             return
         self._attitude_ns[node] = stamp_ns
-        R_ned_camera = matrix_of(np.array(attitude.q_ned_body_xyzw)) @ matrix_of(np.array(info.q_body_camera_xyzw))
+        R_ned_body, R_body_camera = quat_to_matrix(np.array((attitude.q_ned_body_xyzw, info.q_body_camera_xyzw)))
+        R_ned_camera = R_ned_body @ R_body_camera
         origin_m = np.array([0.0, 0.0, -self._depth_m.get(node, 0.0)])
         transform = self._transform(WORLD, f"{node}_camera", origin_m, R_ENU_NED @ R_ned_camera, stamp_ns)
         yield TRANSFORMS, stamp_ns, transform
@@ -133,7 +134,7 @@ class FoxgloveTranslation:
     def _pose(self, pose: RelativePose) -> Iterator[tuple[str, int, Any]]:
         fox, stamp_ns = self._fox, pose.stamp_ns
         base, child = f"{pose.node_a}_camera", f"{pose.node_b}_camera"
-        t_m, R = np.array(pose.t_a_b_m), matrix_of(np.array(pose.q_a_b_xyzw))
+        t_m, R = np.array(pose.t_a_b_m), quat_to_matrix(np.array(pose.q_a_b_xyzw))
         yield TRANSFORMS, stamp_ns, self._transform(base, child, t_m, R, stamp_ns)
         placed = fox.PoseInFrame(
             timestamp=self._time(stamp_ns),
@@ -188,7 +189,7 @@ class FoxgloveTranslation:
         return self._fox.Vector3(x=x, y=y, z=z)
 
     def _quaternion(self, R: Any) -> Any:
-        x, y, z, w = (float(value) for value in quaternion_of(R))
+        x, y, z, w = (float(value) for value in matrix_to_quat(R))
         return self._fox.Quaternion(x=x, y=y, z=z, w=w)
 
 

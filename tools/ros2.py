@@ -22,7 +22,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
 from buddyline.protocol.security import ROS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 
@@ -87,7 +87,7 @@ class Translation:
             yield from self._pose(message)
 
     def _imu(self, attitude: Attitude) -> RosMessage:
-        R_enu_flu = R_ENU_NED @ matrix_of(np.array(attitude.q_ned_body_xyzw)) @ R_FRD_FLU
+        R_enu_flu = R_ENU_NED @ quat_to_matrix(np.array(attitude.q_ned_body_xyzw)) @ R_FRD_FLU
         unknown = np.array([-1.0] + [0.0] * 8)
         nothing = self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
         value = self._new(
@@ -112,7 +112,8 @@ class Translation:
         if before_ns is not None and 0 <= stamp_ns - before_ns < TRANSFORM_SPACING_NS:
             return
         self._transform_ns[node] = stamp_ns
-        R_ned_camera = matrix_of(np.array(attitude.q_ned_body_xyzw)) @ matrix_of(np.array(info.q_body_camera_xyzw))
+        R_ned_body, R_body_camera = quat_to_matrix(np.array((attitude.q_ned_body_xyzw, info.q_body_camera_xyzw)))
+        R_ned_camera = R_ned_body @ R_body_camera
         above_m = (0.0, 0.0, -self._depth_m.get(node, 0.0))
         yield self._transform(stamp_ns, MAP, f"{name_of(node)}_camera", above_m, R_ENU_NED @ R_ned_camera)
 
@@ -124,7 +125,7 @@ class Translation:
 
     def _pose(self, pose: RelativePose) -> Iterator[RosMessage]:
         a, b = name_of(pose.node_a), name_of(pose.node_b)
-        R_a_b = matrix_of(np.array(pose.q_a_b_xyzw))
+        R_a_b = quat_to_matrix(np.array(pose.q_a_b_xyzw))
         # Position, then rotation about A's fixed axes: ROS's order and meaning are ours.
         value = self._posed(pose.stamp_ns, f"{a}_camera", pose.t_a_b_m, R_a_b, np.array(pose.covariance))
         yield RosMessage(f"/buddyline/{a}/{b}/pose", POSE_TYPE, value)
@@ -159,7 +160,7 @@ class Translation:
         return self._new("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
     def _quaternion(self, R: Any) -> Any:
-        x, y, z, w = (float(value) for value in quaternion_of(R))
+        x, y, z, w = (float(value) for value in matrix_to_quat(R))
         return self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
     def _new(self, type_name: str, **fields: Any) -> Any:

@@ -1,127 +1,115 @@
-"""Both nodes' candidates of one trigger as bearings, in one table."""
+"""The candidates of many triggers as bearings, in one table."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.observation import View
+from buddyline.solver_service.geometry.observation import Observation
+from buddyline.solver_service.geometry.ragged import places, starts_of
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.geometry.scalars import ONE, PI, scalar
-from numpy.typing import NDArray
+from buddyline.solver_service.geometry.rotation import Floats, Indices
 
-# A message holds no more.
+# As many as a Candidates message holds.
 _MAX_CANDIDATES: Final = 64
-_MIN_SIGMA_PX: Final = scalar(0.05)
-# Scores beyond say no more; half the log odds are then at most 1.5.
+# No detector finds a light's centre better than this.
+_MIN_SIGMA_PX: Final = 0.05
+# A score is a detector's opinion: its log odds count half, and at most 3 either way.
+_SCORE_WEIGHT: Final = 0.5
 _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 
 
 @dataclass(eq=False, slots=True)
 class Candidates:
-    """The usable candidates, A's first. counts: (A's, B's), their sum N.
+    """The usable candidates of T triggers, N in all: by trigger, A's picture before B's.
 
-    frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, in its own rig's level frame. table: (7, N)
-    bearing, position over the picture's width and height, variance of the bearing, rad^2 per axis, and square of the
-    radius that a disc of its area would have, rad^2. index: (N,) into the view. sigma_px: (N,). dt_s: (N,) after the
-    instant that the pose is for. log_score: (N,) weak evidence for a light, None where no candidate has a score.
-    log_area: (N,).
+    triggers: T. image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
+    picture's candidates begin. index: (N,) into the view. bearing: (3, N), bar frame. frames: (N, 3, 3) bearing and
+    both tangents, px per rad over sigma_px, bar frame. place: (2, N) over the picture's width and height. variance:
+    (N,) of the bearing, rad^2 per axis. disc2: (N,) square of the radius of a disc of its area, rad^2. sigma_px (N,).
+    dt_s: (N,) after the instant that the pose is for, the mean of both stamps. log_score, log_area: (N,).
     """
 
-    counts: tuple[int, int]
+    triggers: int
+    image: Indices
+    starts: Indices
+    index: Indices
+    bearing: Floats
     frames: Floats
-    table: Floats
-    index: NDArray[np.intp]
+    place: Floats
+    variance: Floats
+    disc2: Floats
     sigma_px: Floats
     dt_s: Floats
-    log_score: Floats | None
+    log_score: Floats
     log_area: Floats
 
     @property
-    def bearings(self) -> Floats:
-        """(3, N), each in its own rig's level frame."""
-        return self.table[:3]
-
-    @property
-    def variance(self) -> Floats:
-        """(N,) of the bearing, rad^2 per axis."""
-        variance: Floats = self.table[5]
-        return variance
+    def counts(self) -> Indices:
+        """(T, 2) in A's and in B's picture."""
+        return (self.starts[1:] - self.starts[:-1]).reshape(-1, 2)
 
 
-def find_candidates(views: tuple[View, View], rigs: RigPair) -> Candidates:
-    """Turn both views into bearings; the instant of the pose is the mean of both stamps.
+def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candidates:
+    """Turn all views into bearings.
 
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
     """
-    view_a, view_b = views
-    rig_a, rig_b = rigs.rigs
-    pixels_a, pixels_b = view_a.pixels.reshape(-1, 2)[:_MAX_CANDIDATES], view_b.pixels.reshape(-1, 2)[:_MAX_CANDIDATES]
-    in_a, in_b = len(pixels_a), len(pixels_b)
-    pixels = np.concatenate((pixels_a, pixels_b))
-    index, turns, size_px = _places(rigs, in_a, in_b)
-    if rigs.one_camera:
-        in_camera, px2_per_sr = rig_a.camera.frames(pixels)
-    else:
-        of_each = zip(rig_a.camera.frames(pixels_a), rig_b.camera.frames(pixels_b), strict=True)
-        in_camera, px2_per_sr = map(np.concatenate, of_each)
-    frames = in_camera @ turns
-    table = np.empty((11, in_a + in_b))
-    offset_s = 0.5e-9 * (view_a.stamp_ns - view_b.stamp_ns)
-    for view, columns, shift_s in ((view_a, table[7:, :in_a], offset_s), (view_b, table[7:, in_a:], -offset_s)):
-        n = columns.shape[1]
-        np.add(view.dt_s[:n], shift_s, out=columns[0])
-        columns[1], columns[2], columns[3] = view.sigma_px[:n], view.score[:n], view.area_px[:n]
-    sigma_px = np.maximum(table[8], _MIN_SIGMA_PX)
+    views = [view for seen in observations for view in (seen.view_a, seen.view_b)]
+    counts = np.array([min(len(view.pixels), _MAX_CANDIDATES) for view in views])
+    image, index = places(counts)
+    node = image & 1
+
+    def joined(name: str) -> Floats:
+        return np.concatenate([getattr(view, name)[:_MAX_CANDIDATES] for view in views], dtype=np.float64)
+
+    pixels = joined("pixels")
+    sigma_px = np.maximum(joined("sigma_px"), _MIN_SIGMA_PX)
+    area_px = np.fmax(joined("area_px"), 1.0)
+    apart_s = [0.5e-9 * (seen.view_a.stamp_ns - seen.view_b.stamp_ns) for seen in observations]
+    dt_s = joined("dt_s") + np.outer(apart_s, (1.0, -1.0)).ravel()[image]
+    in_camera, px2_per_sr = _frames(pixels, node, rigs)
+    frames = in_camera @ rigs.R_bar_camera.swapaxes(1, 2)[node]
     frames[:, 1:] /= sigma_px[:, None, None]
-    table[:3] = frames[:, 0].T
-    np.divide(pixels.T, size_px, out=table[3:5])
-    np.divide(sigma_px * sigma_px, px2_per_sr, out=table[5])
-    np.fmax(table[10], ONE, out=table[10])
-    np.divide(table[10], PI * px2_per_sr, out=table[6])
-    if not math.isfinite(np.add.reduce(table[:9], None)):
-        usable = np.isfinite(table[:9].sum(0))
-        in_a = int(usable[:in_a].sum())
-        table, frames, index, sigma_px = table[:, usable], frames[usable], index[usable], sigma_px[usable]
+    variance = sigma_px * sigma_px / px2_per_sr
+    usable = np.isfinite(frames[:, 0].sum(1) + pixels.sum(1) + variance + area_px + dt_s)
+    image = image[usable]
+    frames, pixels, area_px = frames[usable], pixels[usable], area_px[usable]
     return Candidates(
-        counts=(in_a, table.shape[1] - in_a),
+        triggers=len(observations),
+        image=image,
+        starts=starts_of(np.bincount(image, minlength=len(views))),
+        index=index[usable],
+        bearing=np.ascontiguousarray(frames[:, 0].T),
         frames=frames,
-        table=table[:7],
-        index=index,
-        sigma_px=sigma_px,
-        dt_s=table[7],
-        log_score=_log_score(table[9], in_a),
-        log_area=np.log(table[10]),
+        place=(pixels / rigs.size_px[node[usable]]).T,
+        variance=variance[usable],
+        disc2=area_px / (math.pi * px2_per_sr[usable]),
+        sigma_px=sigma_px[usable],
+        dt_s=dt_s[usable],
+        log_score=_log_score(joined("score")[usable], image, len(views)),
+        log_area=np.log(area_px),
     )
 
 
-@lru_cache(maxsize=64)
-def _places(rigs: RigPair, in_a: int, in_b: int) -> tuple[NDArray[np.intp], Floats, Floats]:
-    """Give the place in its view of each of A's candidates and then of B's, with its rig's turn and picture size."""
-    index, node = np.concatenate((np.arange(in_a), np.arange(in_b))), np.repeat((0, 1), (in_a, in_b))
-    turns, size_px = rigs.turns[node], rigs.size_px[:, node]
-    index.flags.writeable = turns.flags.writeable = size_px.flags.writeable = False
-    return index, turns, size_px
+def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Floats]:
+    """Give bearing and tangents (N, 3, 3), camera frames, and px^2 per sr (N,)."""
+    camera_a, camera_b = (rig.camera for rig in rigs.rigs)
+    if camera_a.same_as(camera_b):
+        return camera_a.frames(pixels)
+    frames, px2_per_sr = np.empty((len(pixels), 3, 3)), np.empty(len(pixels))
+    for camera, own in ((camera_a, node == 0), (camera_b, node == 1)):
+        frames[own], px2_per_sr[own] = camera.frames(pixels[own])
+    return frames, px2_per_sr
 
 
-def _log_score(score: Floats, in_a: int) -> Floats | None:
-    """Give half the log odds of scores, within limits; on each picture's average, and where unknown, no evidence.
-
-    None where none is known.
-    """
-    known = np.isfinite(score)
-    count = np.count_nonzero(known)
-    if not count:
-        return None
-    odds = score if count == len(score) else np.where(known, score, 0.5)
-    odds = np.minimum(np.maximum(odds, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
-    weight: Floats = 0.5 * np.log(odds / (1.0 - odds))
-    ratio = np.exp(weight)
-    for part in (slice(0, in_a), slice(in_a, None)):
-        if len(ratio[part]):
-            weight[part] -= math.log(float(np.add.reduce(ratio[part])) / len(ratio[part]))
-    return weight
+def _log_score(score: Floats, image: Indices, images: int) -> Floats:
+    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score is no evidence."""
+    odds = np.clip(np.where(np.isfinite(score), score, 0.5), _LEAST_SCORE, 1.0 - _LEAST_SCORE)
+    weight = _SCORE_WEIGHT * np.log(odds / (1.0 - odds))
+    count, total = np.bincount(image, minlength=images), np.bincount(image, np.exp(weight), minlength=images)
+    balanced: Floats = weight - np.log(total / np.maximum(count, 1))[image]
+    return balanced

@@ -10,13 +10,14 @@ Arrays hold both nodes' views on their first axis, 0: A sees B's lights, 1: B se
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rig import Rig, RigPair, pair_of
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.geometry.scalars import FOUR, HALF, ONE, QUARTER, TURN, TWO
+from buddyline.solver_service.geometry.se3 import SE3
 
 Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"]
 
@@ -28,7 +29,7 @@ _ENDS: Final[Floats] = np.array((-1.0, 1.0)).reshape(2, 1, 1, 1)
 
 @dataclass(frozen=True, eq=False)
 class Bars:
-    """The two light bars along the x axes of their level frames: middle (2, 3, 1), length (2, 1)."""
+    """The two light bars along the x axes of their bar frames: middle (2, 3, 1), length (2, 1)."""
 
     middle_m: Floats
     length_m: Floats
@@ -59,7 +60,7 @@ class Spans:
         total, difference = left + right, right - left
         chord2 = dot(difference, difference)
         chord = np.sqrt(chord2)
-        return Spans(ends, total / np.sqrt(FOUR - chord2)[:, None], difference / chord[:, None], chord)
+        return Spans(ends, total / np.sqrt(4.0 - chord2)[:, None], difference / chord[:, None], chord)
 
 
 @dataclass(eq=False, slots=True)
@@ -67,38 +68,42 @@ class ClosedForm:
     """What the closed form says of K hypotheses.
 
     u: (2, 3, K) bearings of the other bar's middle from one's own. range_m: (2, K) l_A and l_B.
-    twist_rad: (2, K) tau_A and tau_B; twist_gap_rad: (K,) the difference, within +-pi. R_a_b: (3, 3, K), t_a_b_m:
-    (3, K).
+    twist_rad: (2, K) tau_A and tau_B; twist_gap_rad: (K,) the difference, within +-pi. T_a_b: K poses.
     """
 
     u: Floats
     range_m: Floats
     twist_rad: Floats
     twist_gap_rad: Floats
-    R_a_b: Floats
-    t_a_b_m: Floats
+    T_a_b: SE3
 
 
 def wrap(angle_rad: Floats) -> Floats:
     """Bring angles into [-pi, pi]."""
-    wrapped: Floats = angle_rad - TURN * np.rint(angle_rad / TURN)
+    wrapped: Floats = angle_rad - (2.0 * math.pi) * np.rint(angle_rad / (2.0 * math.pi))
     return wrapped
 
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar product over the axis before the last."""
-    total: Floats = np.add.reduce(a * b, -2)
+    total: Floats = (a * b).sum(-2)
     return total
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross product over the axis before the last."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -2, 0), np.moveaxis(b, -2, 0)
+    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-2)
 
 
 def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m: Floats) -> Floats:
     """Eq. 1: the distance of the bar's middle from the camera that sees the bar of length_m under alpha."""
-    return _eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.sqrt(ONE - sin_beta * sin_beta), length_m)
+    return _eq1_range_m(cos_alpha, sin_alpha, sin_beta, np.sqrt(1.0 - sin_beta * sin_beta), length_m)
 
 
 def _eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, cos_beta: Floats, length_m: Floats) -> Floats:
     shortened = cos_alpha * sin_beta
-    range_m: Floats = length_m / (TWO * sin_alpha) * (cos_alpha * cos_beta + np.sqrt(ONE - shortened * shortened))
+    range_m: Floats = length_m / (2.0 * sin_alpha) * (cos_alpha * cos_beta + np.sqrt(1.0 - shortened * shortened))
     return range_m
 
 
@@ -109,8 +114,8 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
     "paper" splits alpha in half, "paper_midpoint" takes the middle of the two images on the plane z = 1,
     "paper_literal" the latter and the angle to the optical axis for beta, as the paper's text has them.
     """
-    levels = np.array((rig_a.R_level_camera, rig_b.R_level_camera))
-    spans = Spans.of(levels @ np.array((left, right)))
+    turns = np.array((rig_a.R_bar_camera, rig_b.R_bar_camera))
+    spans = Spans.of(turns @ np.array((left, right)))
     bars = Bars.of(pair_of(rig_a, rig_b))
     if variant == "exact":
         solved = solve_exact(spans, bars)
@@ -118,26 +123,25 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
         u = spans.c
         if variant != "paper":
             u = left / left[:, 2:3] + right / right[:, 2:3]
-            u = levels @ (u / np.sqrt(dot(u, u))[:, None])
+            u = turns @ (u / np.sqrt(dot(u, u))[:, None])
         slant = None
         if variant == "paper_literal":
-            slant = np.sqrt(np.clip(1.0 - (levels.swapaxes(1, 2) @ u)[:, 2] ** 2, 0.0, 1.0))
+            slant = np.sqrt(np.clip(1.0 - (turns.swapaxes(1, 2) @ u)[:, 2] ** 2, 0.0, 1.0))
         span = spans.w - u * dot(u, spans.w)[:, None]
         span /= np.sqrt(dot(span, span))[:, None]
         solved = _pose(u, span, slant, _angles(spans.chord), bars, mean_twist=False)
-    turn_a, turn_b = levels
+    from_bar = [SE3(turn.T, np.zeros(3)) for turn in turns]
     return ClosedForm(
-        u=levels.swapaxes(1, 2) @ solved.u,
+        u=turns.swapaxes(1, 2) @ solved.u,
         range_m=solved.range_m,
         twist_rad=solved.twist_rad,
         twist_gap_rad=solved.twist_gap_rad,
-        R_a_b=np.einsum("ia,ijk,jb->abk", turn_a, solved.R_a_b, turn_b),
-        t_a_b_m=turn_a.T @ solved.t_a_b_m,
+        T_a_b=from_bar[0] @ solved.T_a_b @ from_bar[1].inverse(),
     )
 
 
 def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
-    """Solve K hypotheses between the level frames."""
+    """Solve K hypotheses between the bar frames."""
     # What tells only how to move the bearings need not be split as finely.
     angles = _angles(spans.chord)
     u, span = _split(spans, angles[0], split_rounds if bars.centred else 1)
@@ -152,7 +156,7 @@ def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset
 def _angles(chord: Floats) -> tuple[Floats, Floats]:
     """Give cos and sin of alpha."""
     chord2 = chord * chord
-    return ONE - HALF * chord2, chord * np.sqrt(ONE - QUARTER * chord2)
+    return 1.0 - 0.5 * chord2, chord * np.sqrt(1.0 - 0.25 * chord2)
 
 
 def _split(spans: Spans, cos_alpha: Floats, rounds: int) -> tuple[Floats, Floats]:
@@ -168,7 +172,7 @@ def _split(spans: Spans, cos_alpha: Floats, rounds: int) -> tuple[Floats, Floats
 def _off_bisector(sin_beta: Floats, cos_alpha: Floats) -> tuple[Floats, Floats]:
     """Give cos and sin of how far the bars' middles stand off the bisectors; sin_beta: as either node sees them."""
     other = sin_beta[::-1]
-    half = HALF * (np.arcsin(other) - np.arcsin(other * cos_alpha))
+    half = 0.5 * (np.arcsin(other) - np.arcsin(other * cos_alpha))
     return np.cos(half), np.sin(half)
 
 
@@ -177,7 +181,7 @@ def _pose(
 ) -> ClosedForm:
     """Put a pose together from lines of sight u and the bars across them; slant: what Eq. 1 takes for sin beta."""
     ux, uy, uz = u.swapaxes(0, 1)
-    cos_beta = np.sqrt(ONE - ux * ux)
+    cos_beta = np.sqrt(1.0 - ux * ux)
     cos_alpha, sin_alpha = angles[0][::-1], angles[1][::-1]
     if slant is None:
         range_m = _eq1_range_m(cos_alpha, sin_alpha, ux, cos_beta, bars.length_m)
@@ -186,34 +190,32 @@ def _pose(
     twist = np.arctan2(uz * span[:, 1] - uy * span[:, 2], span[:, 0])
     twist_gap = wrap(twist[0] - twist[1])
     # The paper uses one of the two twists only.
-    mean = twist[0] - HALF * twist_gap if mean_twist else twist[0]
+    mean = twist[0] - 0.5 * twist_gap if mean_twist else twist[0]
     # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
-    side = np.zeros(u.shape)
-    np.divide(uz, cos_beta, out=side[:, 1])
-    np.divide(uy, -cos_beta, out=side[:, 2])
-    own = u * (ux / -cos_beta)[:, None]
+    side = np.stack((np.zeros(ux.shape), uz / cos_beta, -uy / cos_beta), axis=1)
+    own = u * (-ux / cos_beta)[:, None]
     own[:, 0] = cos_beta
     cosine, sine = np.cos(mean), np.sin(mean)
     y = own[0] * cosine + side[0] * sine
     z = side[0] * cosine - own[0] * sine
     # B's frame about the same line of sight: -u_B, its bar across it, and their cross product.
     R = y[:, None] * own[1] - u[0][:, None] * u[1] - z[:, None] * side[1]
-    t = u[0] * (HALF * (range_m[0] + range_m[1]))
+    t = u[0] * (0.5 * (range_m[0] + range_m[1]))
     if not bars.centred:
         t = t + bars.middle_m[0] - bars.middle_m[1, :, 0] @ R
-    return ClosedForm(u, range_m, twist, twist_gap, R, t)
+    return ClosedForm(u, range_m, twist, twist_gap, SE3(R.transpose(2, 0, 1), t.T))
 
 
 def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, Floats], bars: Bars) -> Floats:
     """Move the bearings (2, 2, 3, K) from the cameras to the middles of their own bars, by the distances so far."""
     cos_alpha, sin_alpha = angles
     sin_beta = u[:, 0]
-    cos_beta = np.sqrt(ONE - sin_beta * sin_beta)
+    cos_beta = np.sqrt(1.0 - sin_beta * sin_beta)
     of_a_m, of_b_m = _eq1_range_m(cos_alpha[::-1], sin_alpha[::-1], sin_beta, cos_beta, bars.length_m)
-    range_m = HALF * (of_a_m + of_b_m)
+    range_m = 0.5 * (of_a_m + of_b_m)
     sin_beta, cos_beta = sin_beta[::-1, None], cos_beta[::-1, None]
     middle = bars.middle_m + range_m * u
-    arm = HALF * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
+    arm = 0.5 * bars.length_m[::-1, None] * (span * cos_beta - u * sin_beta)
     light = middle + _ENDS * arm
     ray = ends * np.sqrt(dot(light, light))[:, :, None] - bars.middle_m
     moved: Floats = ray / np.sqrt(dot(ray, ray))[:, :, None]

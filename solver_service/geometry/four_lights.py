@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.candidates import Candidates
-from buddyline.solver_service.geometry.closed_form import Bars, dot, solve_exact
-from buddyline.solver_service.geometry.evidence import log_chance, log_gaps, weigh
-from buddyline.solver_service.geometry.hypotheses import Pairs, search
+from buddyline.solver_service.geometry.batch import Batch
+from buddyline.solver_service.geometry.closed_form import Bars, ClosedForm, closed_form, solve_exact
+from buddyline.solver_service.geometry.evidence import (
+    CHANCE_ODDS,
+    POOR_FIT,
+    Support,
+    false_light_odds,
+    log_chance,
+    log_gaps,
+    weigh,
+)
 from buddyline.solver_service.geometry.observation import Reason
-from buddyline.solver_service.geometry.readings import Readings
-from buddyline.solver_service.geometry.refinement import Sightings, refine
+from buddyline.solver_service.geometry.quads import Quads, find_quads
+from buddyline.solver_service.geometry.ragged import largest, rank, starts_of
+from buddyline.solver_service.geometry.readings import Poses, Readings
+from buddyline.solver_service.geometry.refinement import Refined, Rows, light_rows, refine
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.geometry.scalars import TURN
-from buddyline.solver_service.geometry.terms import Terms
+from buddyline.solver_service.geometry.rotation import Floats, Indices
+from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
-# So many of the best are refined; what lies further below the best (log ratio) does not matter.
-_REFINED: Final = 6
+# So many of the best are refined; what lies further below the best (log ratio) does not matter, even if the past
+# speaks for it.
+_REFINED: Final = 8
 _NEGLIGIBLE: Final = 16.0
 # What the refinement does not have to be spared: two rounds leave less than the noise.
 _SPLIT_ROUNDS: Final = 2
@@ -32,116 +40,178 @@ _SMALL_OFFSET: Final = 0.02
 
 @dataclass(eq=False, slots=True)
 class FourLights:
-    """The best readings; others: the sum of all other likelihood ratios. why: the reason where there are none."""
+    """The quads of T triggers, the likeliest first, of which the best are refined.
 
-    readings: Readings | None
-    others: float = 0.0
-    why: tuple[Reason, str] = ("ambiguous", "")
+    poses: of all quads, closed form; those of trigger i from starts[i] on. readings: of the best, those of trigger i
+    from refined_starts[i] on. why: where a trigger has no quad. doubtful: (T,) whether three of the
+    lights may tell more. by_method: the readings' poses by the closed form that is to be published, None where the
+    refined ones are.
+    """
+
+    starts: Indices
+    poses: Poses
+    refined_starts: Indices
+    readings: Readings
+    why: list[tuple[Reason, str] | None]
+    doubtful: NDArray[np.bool_]
+    by_method: ClosedForm | None
+
+    def of(self, trigger: int) -> tuple[Poses, Readings]:
+        """Give one trigger's; the poses of the readings come first."""
+        first, last = self.starts[trigger : trigger + 2]
+        first_refined, last_refined = self.refined_starts[trigger : trigger + 2]
+        return self.poses[first:last], self.readings[first_refined:last_refined]
 
 
-def read_four_lights(terms: Terms, pairs: Pairs) -> FourLights:
+def read_four_lights(batch: Batch) -> FourLights:
     """Search, weigh and refine."""
-    settings = terms.settings
-    in_a, in_b = terms.candidates.counts
-    if min(in_a, in_b) < 2:
-        what = f"{in_a} candidates in A's picture, {in_b} in B's: not 2 each"
-        return FourLights(None, why=("too_few_candidates", what))
-    if not min(pairs.counts):
-        what = f"no two candidates stand as far apart as the lights would {terms.range_limits}"
-        return FourLights(None, why=("out_of_range", what))
-    found = search(terms.candidates, pairs, terms.rigs, _motion_variance(terms, pairs), settings)
-    if isinstance(found, str):
-        combinations = f"{pairs.counts[0]} pairs in A's picture and {pairs.counts[1]} in B's"
-        same = "the same twist where their ranges agree" if found == "twist_gap" else "the same range"
-        return FourLights(None, why=(found, f"no two of {combinations} have {same}"))
+    settings, rigs = batch.settings, batch.rigs
+    variance = _motion_variance(batch)
+    quads, near = find_quads(batch.candidates, batch.pairs, rigs, variance, settings)
     solved = solve_exact(
-        found.spans, Bars.of(terms.rigs), split_rounds=_SPLIT_ROUNDS, offset_rounds=_offset_rounds(terms.rigs)
+        quads.spans, Bars.of(rigs), split_rounds=_SPLIT_ROUNDS, offset_rounds=1 if _centred(rigs) else 4
     )
-    t, variance = solved.t_a_b_m, found.variance
-    support = weigh(solved.R_a_b, t, variance, terms.rigs, terms.sensors, terms.prediction, settings.checks)
-    gaps = settings.gaps
-    base = support.log_ratio + found.log_weight + log_chance(terms.rigs, terms.candidates.counts, settings)
-    base -= (0.5 * gaps) * np.log(TURN * variance)
-    gap2 = np.zeros(len(variance))
-    if "range" in settings.checks:
-        gap2 = gap2 + np.log(solved.range_m[0] / solved.range_m[1]) ** 2
-    if "twist" in settings.checks:
-        gap2 = gap2 + solved.twist_gap_rad**2
-    chi2 = gap2 / variance
-    range2 = dot(t, t)
-    inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(base)
-    log_ratio = np.where(inside, base + log_gaps(chi2, gaps), -np.inf)
-    likeliest = float(np.maximum.reduce(log_ratio))
-    if likeliest == -np.inf:
-        what = f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {terms.range_limits}"
-        return FourLights(None, why=("out_of_range", what))
-    best = (log_ratio > likeliest - _NEGLIGIBLE).nonzero()[0]
-    if len(best) > _REFINED:
-        best = best[(-log_ratio[best]).argsort(kind="stable")[:_REFINED]]
-    lights = found.lights.take(best, 1).T
-    ratio = np.exp(log_ratio)
-    ratio[best] = 0.0
-    refined = refine(
-        t.take(best, 1).T,
-        solved.R_a_b.take(best, 2).transpose(2, 0, 1),
-        _sightings(terms.candidates, lights),
-        *terms.rigs.levels,
-        terms.motion,
-    )
-    # Without both gaps the picture's chi2 would bring in what the settings leave out.
-    chi2 = refined.chi2 if gaps == 2 else chi2[best]
+    support = weigh(solved.T_a_b, quads.trigger, quads.variance, rigs, batch.sensors, settings.checks)
+    base = support.log_ratio + quads.log_weight + log_chance(rigs, batch.candidates.counts, settings)[quads.trigger]
+    base -= 0.5 * settings.gaps * np.log(2.0 * math.pi * quads.variance)
+    gap_chi2 = _gap_chi2(batch, solved, quads.variance)
+    range2 = (solved.T_a_b.t_m**2).sum(1)
+    log_ratio = base + log_gaps(gap_chi2, settings.gaps)
+    inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(log_ratio)
+    log_ratio[~inside] = -np.inf
+    order, place = rank(quads.trigger, -log_ratio, batch.triggers)
+    trigger, ranked = quads.trigger[order], log_ratio[order]
+    likeliest = largest(trigger, ranked, batch.triggers, -np.inf)
+    best = order[(place < _REFINED) & (ranked > likeliest[trigger] - _NEGLIGIBLE)]
+    refined = refine_lights(solved.T_a_b[best], batch.candidates.frames[quads.lights[:, best].T], rigs.lights_m)
+    readings = _readings(batch, quads, solved, support, base, gap_chi2, best, refined)
     return FourLights(
-        Readings(
-            lights=lights,
-            t_a_b_m=refined.t_a_b_m,
-            R_a_b=refined.R_a_b,
-            covariance=refined.covariance,
-            chi2=chi2,
-            log_ratio=np.where(refined.sound, base[best] + log_gaps(chi2, gaps), -np.inf),
-            tilt_chi2=support.tilt_chi2[best],
-            depth_chi2=support.depth_chi2[best],
-            range_m=solved.range_m.take(best, 1).T,
-            twist_gap_rad=solved.twist_gap_rad[best],
-            clutter=_clutter(terms, lights) if gaps == 2 else np.zeros(len(best)),
-            log_prior=support.log_prior[best],
-            lone_odds=np.zeros(len(best)),
-        ),
-        others=float(np.add.reduce(ratio)),
+        starts=starts_of(np.bincount(trigger, minlength=batch.triggers)),
+        poses=_poses(batch, solved.T_a_b, log_ratio, support, quads)[order],
+        refined_starts=starts_of(np.bincount(quads.trigger[best], minlength=batch.triggers)),
+        readings=readings,
+        why=[
+            _why_none(batch, i, bool(near[i]), range2[quads.trigger == i]) if likeliest[i] == -np.inf else None
+            for i in range(batch.triggers)
+        ],
+        doubtful=_doubtful(batch, quads.trigger[best], readings, refined.solved.chi2),
+        by_method=_by_method(batch, quads.lights[:, best]),
     )
 
 
-def _sightings(candidates: Candidates, lights: NDArray[np.intp]) -> Sightings:
-    return Sightings(candidates.frames.take(lights, 0), candidates.dt_s[lights])
+def _doubtful(batch: Batch, trigger: Indices, readings: Readings, chi2: Floats) -> NDArray[np.bool_]:
+    """Tell in which triggers (T,) no reading is likely enough by pictures and sensors alone, or fits poorly."""
+    settings, triggers = batch.settings, batch.triggers
+    log_ratio = readings.log_ratio + log_gaps(chi2, settings.gaps)
+    log_ratio[~readings.sound] = -np.inf
+    best = largest(trigger, log_ratio, triggers, -np.inf)
+    total = np.bincount(trigger, np.exp(log_ratio), minlength=triggers)
+    poor = (log_ratio == best[trigger]) & (false_light_odds(chi2, readings.clutter) > POOR_FIT)
+    unlikely = ~(np.exp(best) > settings.min_probability * (CHANCE_ODDS + total))
+    return unlikely | (np.bincount(trigger[poor], minlength=triggers) > 0)
 
 
-def _clutter(terms: Terms, lights: NDArray[np.intp]) -> Floats:
-    """Give how many candidates chance puts into the variance of the positions of K times four lights (K, 4)."""
-    clutter: Floats = terms.candidates.sigma_px[lights] ** 2 @ _density_px2(terms.rigs, *terms.candidates.counts)
-    return clutter
+def _why_none(batch: Batch, trigger: int, near: bool, range2: Floats) -> tuple[Reason, str]:
+    """Say why a trigger has no reading; range2: of its quads."""
+    in_a, in_b = batch.candidates.counts[trigger]
+    if min(in_a, in_b) < 2:
+        return "too_few_candidates", f"{in_a} candidates in A's picture, {in_b} in B's: not 2 each"
+    pairs_a, pairs_b = batch.pairs.counts[trigger]
+    if not min(pairs_a, pairs_b):
+        return "out_of_range", f"no two candidates stand as far apart as the lights would {batch.range_limits}"
+    if len(range2):
+        return "out_of_range", f"what agrees, at {math.sqrt(range2[0]):.3g} m, is not {batch.range_limits}"
+    combinations = f"{pairs_a} pairs in A's picture and {pairs_b} in B's"
+    if near or "range" not in batch.settings.checks:
+        return "twist_gap", f"no two of {combinations} have the same twist where their ranges agree"
+    return "range_gap", f"no two of {combinations} have the same range"
 
 
-@lru_cache(maxsize=64)
-def _density_px2(rigs: RigPair, in_a: int, in_b: int) -> Floats:
-    """Give the candidates per px^2 of the picture that each of the four lights is seen in."""
-    density: Floats = np.array((in_a, in_a, in_b, in_b)) / rigs.area_px2
-    density.flags.writeable = False
-    return density
+def _gap_chi2(batch: Batch, solved: ClosedForm, variance: Floats) -> Floats:
+    """Give chi^2 (K,) of the gaps that may speak."""
+    total = np.zeros(len(variance))
+    if "range" in batch.settings.checks:
+        total = total + np.log(solved.range_m[0] / solved.range_m[1]) ** 2
+    if "twist" in batch.settings.checks:
+        total = total + solved.twist_gap_rad**2
+    chi2: Floats = total / variance
+    return chi2
 
 
-def _motion_variance(terms: Terms, pairs: Pairs) -> Floats:
-    """Give what relative motion between the exposures may add to ln range and twist of A's pairs, rad^2."""
-    in_a, motion = terms.candidates.counts[0], terms.motion
-    dt_s = terms.candidates.dt_s.tolist()
-    apart_s = sum(dt_s[:in_a]) / in_a - sum(dt_s[in_a:]) / (len(dt_s) - in_a)
-    square_s2 = apart_s * apart_s + motion.skew_sigma_s**2
-    if square_s2 == 0.0:
-        return np.zeros(pairs.split)
-    speed2, turn2 = motion.mean_squares
-    per_range = pairs.chord[: pairs.split] / float(terms.rigs.length_m[1])
-    variance: Floats = square_s2 * (speed2 * per_range * per_range + turn2)
+def _poses(batch: Batch, T_a_b: SE3, log_ratio: Floats, support: Support, quads: Quads) -> Poses:
+    """Bring the quads' poses from the bar frames into the cameras'."""
+    return Poses(
+        T_a_b=batch.rigs.between_cameras(T_a_b),
+        log_ratio=log_ratio,
+        turn=support.turn,
+        sensed_variance=batch.sensors.heading_variance[quads.trigger],
+        picture_variance=0.25 * quads.variance,
+    )
+
+
+def _readings(
+    batch: Batch,
+    quads: Quads,
+    solved: ClosedForm,
+    support: Support,
+    base: Floats,
+    gap_chi2: Floats,
+    best: Indices,
+    refined: Refined,
+) -> Readings:
+    """Put together what is known of the best quads (M,)."""
+    seen, rigs = batch.candidates, batch.rigs
+    lights = quads.lights[:, best].T
+    counts = seen.counts[quads.trigger[best]].repeat(2, 1)
+    clutter = (seen.sigma_px[lights] ** 2 * counts / rigs.area_px2.repeat(2)).sum(1)
+    return Readings(
+        lights=seen.index[lights],
+        T_a_b=rigs.between_cameras(refined.T_a_b),
+        J=rigs.by_camera_step(refined.J),
+        r=refined.r,
+        dt_s=seen.dt_s[lights].repeat(2, 1),
+        sound=refined.sound,
+        log_ratio=base[best],
+        tilt_chi2=support.tilt_chi2[best],
+        depth_chi2=support.depth_chi2[best],
+        gap_chi2=gap_chi2[best],
+        range_m=solved.range_m[:, best].T,
+        twist_gap_rad=solved.twist_gap_rad[best],
+        clutter=clutter if batch.settings.gaps == 2 else np.zeros(len(best)),
+        lone_odds=np.zeros(len(best)),
+    )
+
+
+def _by_method(batch: Batch, lights: Indices) -> ClosedForm | None:
+    """Solve lights (4, M) by the method that the settings name."""
+    if batch.settings.method == "refined":
+        return None
+    # (3, 4, M) into both views' left and right lights (2, 3, M), camera frames.
+    ends = batch.candidates.bearing[:, lights].reshape(3, 2, 2, -1).transpose(2, 1, 0, 3)
+    left, right = batch.rigs.R_bar_camera.swapaxes(1, 2) @ ends
+    return closed_form(left, right, *batch.rigs.rigs, batch.settings.method)
+
+
+def refine_lights(T_a_b: SE3, frames: Floats, lights_m: Floats) -> Refined:
+    """Refine K poses by their lights alone; frames, lights_m: as `light_rows` takes them."""
+
+    def rows_at(T_a_b: SE3, chosen: Indices) -> Rows:
+        return light_rows(T_a_b, frames[chosen], lights_m)
+
+    return refine(T_a_b, rows_at)
+
+
+def _motion_variance(batch: Batch) -> Floats:
+    """Give what relative motion between the exposures may add to ln range and twist of each pair, rad^2."""
+    seen, settings, pairs = batch.candidates, batch.settings, batch.pairs
+    total_s = np.bincount(seen.image, seen.dt_s, minlength=2 * batch.triggers).reshape(-1, 2)
+    mean_s = total_s / np.maximum(seen.counts, 1)
+    square_s2 = (mean_s[:, 0] - mean_s[:, 1]) ** 2 + settings.skew_sigma_s**2
+    per_range = pairs.chord / batch.rigs.length_m[1 - (pairs.image & 1)]
+    variance: Floats = square_s2[pairs.trigger] * ((settings.speed_mps * per_range) ** 2 + settings.turn_radps**2)
     return variance
 
 
-def _offset_rounds(rigs: RigPair) -> int:
-    """Give how often the closed form moves the bearings to the bars' middles before the refinement takes over."""
-    return 1 if rigs.offset_m < _SMALL_OFFSET * float(rigs.length_m.min()) else 4
+def _centred(rigs: RigPair) -> bool:
+    """Tell whether one round of moving the bearings to the bars' middles is enough."""
+    return rigs.offset_m < _SMALL_OFFSET * float(rigs.length_m.min())

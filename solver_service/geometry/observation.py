@@ -1,4 +1,4 @@
-"""What goes into one trigger: what two nodes saw and sensed, what is expected, and how to decide."""
+"""What goes into one trigger: what two nodes saw and sensed, what earlier fixes say, and how to decide."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Final, Literal, TypeAlias
 
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.se3 import SE3
 
 Method: TypeAlias = Literal["refined", "exact", "paper", "paper_midpoint", "paper_literal"]
 Reason: TypeAlias = Literal[
@@ -51,14 +52,23 @@ class Sensed:
 
 
 @dataclass(frozen=True, eq=False)
+class Observation:
+    """What nodes A and B saw and sensed at one trigger."""
+
+    view_a: View
+    view_b: View
+    sensed_a: Sensed = Sensed()
+    sensed_b: Sensed = Sensed()
+
+
+@dataclass(frozen=True, eq=False)
 class Prior:
     """A prediction from earlier fixes for this instant, its covariance (6, 6) widened for the time since.
 
     rates: (6,) velocity (m/s) and turn (rad/s) of B in A's camera frame, with covariance (6, 6); None: unknown.
     """
 
-    t_a_b_m: Floats
-    q_a_b_xyzw: Floats
+    T_a_b: SE3
     covariance: Floats
     rates: Floats | None = None
     rates_covariance: Floats | None = None

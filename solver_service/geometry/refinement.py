@@ -1,16 +1,15 @@
-"""Gauss-Newton on the eight image coordinates, with calibrated light positions, for many hypotheses at once."""
+"""Gauss-Newton on the eight image coordinates, with calibrated light positions, for many readings at once."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rig import Rig
-from buddyline.solver_service.geometry.rotation import Floats, rotation_near, skew
-from buddyline.solver_service.geometry.scalars import ONE, ZERO
+from buddyline.solver_service.geometry.past import Motion
+from buddyline.solver_service.geometry.rotation import Floats, Indices, skew
+from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
 _MAX_STEPS: Final = 12
@@ -20,183 +19,136 @@ _SMALL: Final = 5e-4
 _LEFT: Final = 0.01
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
-DAMPING: Final = 1e-13 * np.eye(6)
-_EYE: Final = np.eye(8)
-# y @ _TURNED, reshaped to (3, 7), is what a turn w of y moves it by, w x y, before w, and y itself in the last column.
-_UNTURNED: Final = np.eye(3)
-_TURNED: Final = np.concatenate((np.zeros((3, 3, 3)), -skew(_UNTURNED), _UNTURNED[:, :, None]), 2).reshape(3, 21)
-# Which sightings a later clock of B moves, and where to.
-_SKEW_SIGNS: Final = 0.5 * np.repeat((1.0, 1.0, -1.0, -1.0), 2)[:, None]
+_DAMPING: Final = 1e-13 * np.eye(6)
 
 
 @dataclass(eq=False, slots=True)
-class Sightings:
-    """Four lights as K hypotheses read them: B's left and right in A's image, A's left and right in B's.
+class Rows:
+    """Residuals of unit noise at K poses: derivatives J (K, n, 6) by the pose's step, residuals r (K, n).
 
-    frames: (K, 4, 3, 3) bearing, then both tangents in pixels per radian over sigma_px, so that residuals have unit
-    noise. dt_s: (K, 4) time of each sighting after the instant that the pose is for.
+    depth: (K, 4) distances of the lights along their bearings.
     """
 
-    frames: Floats
-    dt_s: Floats
+    J: Floats
+    r: Floats
+    depth: Floats
 
 
-@dataclass(eq=False)
-class Motion:
-    """How the pose moves: d/dt of t_a_b (m/s), then of the small rotation w (rad/s), in A's camera frame.
+@dataclass(eq=False, slots=True)
+class Solved:
+    """The least squares of K poses: steps (K, 6) to take, covariance (K, 6, 6) of T_a_b.retract, chi2 (K,) after it.
 
-    rates: (6,), covariance: (6, 6). skew_sigma_s: how well the two clocks agree, 1 sd.
+    determined: (K,).
     """
 
-    rates: Floats
+    step: Floats
     covariance: Floats
-    skew_sigma_s: float = 0.0
-
-    @cached_property
-    def mean_squares(self) -> tuple[float, float]:
-        """Of one component of the velocity, (m/s)^2, and of the turn, (rad/s)^2, as far as both are known."""
-        squares = (self.covariance.diagonal() + self.rates**2).tolist()
-        return sum(squares[:3]) / 3.0, sum(squares[3:]) / 3.0
+    chi2: Floats
+    determined: NDArray[np.bool_]
 
 
 @dataclass(eq=False, slots=True)
 class Refined:
-    """K poses: t_a_b_m (K, 3), R_a_b (K, 3, 3), covariance (K, 6, 6), chi2 (K,) of two degrees of freedom.
+    """K poses where they were last linearized, and what is left to take there: the last step.
 
-    covariance: of position in A's camera frame, then of the small rotation w with R_true = exp(w) R_a_b, in A's
-    camera frame. sound: (K,), False where the pose is not determined or lies behind a camera.
+    T_a_b, J (K, n, 6), r (K, n), solved: as in Rows and Solved. sound: (K,), False where the pose is not determined
+    or lies behind a camera.
     """
 
-    t_a_b_m: Floats
-    R_a_b: Floats
-    covariance: Floats
-    chi2: Floats
+    T_a_b: SE3
+    J: Floats
+    r: Floats
+    solved: Solved
     sound: NDArray[np.bool_]
 
 
-def refine(
-    t_a_b_m: Floats,
-    R_a_b: Floats,
-    seen: Sightings,
-    rig_a: Rig,
-    rig_b: Rig,
-    motion: Motion,
-) -> Refined:
-    """Refine K poses, t_a_b_m (K, 3) and R_a_b (K, 3, 3)."""
-    t, R = t_a_b_m, R_a_b
-    lights = rig_a.lights_m, rig_b.lights_m
-    timed = bool(np.count_nonzero(seen.dt_s))
-    shifts = shifts_of(seen.dt_s, motion.rates) if timed else None
-    weight = None
-    steps = 0
-    while True:
-        J, depth = linearize(t, R, seen, lights, shifts)
-        if steps == 0 and (timed or motion.skew_sigma_s > 0.0):
-            weight = weight_of(J[:, :, :6], seen.dt_s, motion)
-        Jt = J.swapaxes(1, 2)
-        normal = (Jt if weight is None else Jt @ weight) @ J
-        covariance, inverse, move, chi2 = solve_normal(normal)
-        if steps == _MAX_STEPS:
-            chi2 = normal[:, 6, 6]
+def refine(T_a_b: SE3, rows_at: Callable[[SE3, Indices], Rows], max_steps: int = _MAX_STEPS) -> Refined:
+    """Refine K poses, each until the last step leaves little of the noise.
+
+    rows_at: gives the residuals of the K poses chosen by an index.
+    """
+    R, t = T_a_b.R.copy(), T_a_b.t_m.copy()
+    rows = rows_at(T_a_b, np.arange(len(t)))
+    solved = least_squares(rows.J, rows.r)
+    left = np.flatnonzero(_is_large(solved, rows.r, t))
+    for _ in range(max_steps - 1):
+        if not len(left):
             break
-        t, R = moved(t, R, move)
-        steps += 1
-        if not is_large(move, t, normal[:, 6, 6], chi2):
-            break
-    each = zip(inverse.diagonal(0, 1, 2).tolist(), depth.tolist(), chi2.tolist(), strict=True)
+        moved = SE3(R[left], t[left]).retract(solved.step[left])
+        again = rows_at(moved, left)
+        part = least_squares(again.J, again.r)
+        R[left], t[left] = moved.R, moved.t_m
+        rows.J[left], rows.r[left], rows.depth[left] = again.J, again.r, again.depth
+        solved.step[left], solved.covariance[left], solved.chi2[left] = part.step, part.covariance, part.chi2
+        solved.determined[left] = part.determined
+        left = left[_is_large(part, again.r, moved.t_m)]
     # A step that is not finite makes chi^2 not finite either.
-    sound = [max(openness) < _UNDETERMINED and min(far) > 0.0 and math.isfinite(off) for openness, far, off in each]
-    return Refined(t, R, covariance, np.maximum(chi2, ZERO), np.array(sound))
+    sound = solved.determined & (rows.depth > 0.0).all(1) & np.isfinite(solved.chi2)
+    return Refined(SE3(R, t), rows.J, rows.r, solved, sound)
 
 
-def solve_normal(normal: Floats) -> tuple[Floats, NDArray[np.floating[Any]], Floats, Floats]:
-    """Solve normal equations (K, 7, 7) of derivatives by the pose and, in the last row and column, residuals.
-
-    Returns covariances (K, 6, 6), the same over what each coordinate alone would have, the steps (K, 6) and what
-    chi^2 is after them (K,).
-    """
-    H, g = normal[:, :6, :6], normal[:, :6, 6:]
+def least_squares(J: Floats, r: Floats, weight: Floats | None = None) -> Solved:
+    """Solve for the steps that make J step + r least; weight: (K, n, n) the residuals' inverse covariance."""
+    Jt = J.swapaxes(1, 2)
+    if weight is not None:
+        Jt = Jt @ weight
+    H, g = Jt @ J, Jt @ r[:, :, None]
     # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-    unit = ONE / np.sqrt(H.diagonal(0, 1, 2))
+    unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
     scale = unit[:, :, None] * unit[:, None]
-    inverse = np.linalg.inv(H * scale + DAMPING)
+    inverse = np.linalg.inv(H * scale + _DAMPING)
     covariance = inverse * scale
-    move = covariance @ g
-    chi2 = normal[:, 6, 6] - (move.swapaxes(1, 2) @ g)[:, 0, 0]
-    return covariance, inverse, move[:, :, 0], chi2
+    step = -(covariance @ g)
+    before = (r * r).sum(1) if weight is None else ((weight @ r[:, :, None])[:, :, 0] * r).sum(1)
+    chi2 = np.maximum(before + (step * g).sum((1, 2)), 0.0)
+    return Solved(step[:, :, 0], covariance, chi2, inverse.diagonal(0, 1, 2).max(1) < _UNDETERMINED)
 
 
-def moved(t: Floats, R: Floats, move: Floats) -> tuple[Floats, Floats]:
-    """Take steps (K, 6) off K poses."""
-    return t - move[:, :3], rotation_near(-move[:, 3:]) @ R
+def _is_large(solved: Solved, r: Floats, t: Floats) -> NDArray[np.bool_]:
+    """Tell which steps leave what matters; t: (K, 3) before them."""
+    moved = np.abs(solved.step)
+    size = np.maximum(moved[:, :3].max(1) / np.sqrt((t * t).sum(1)), moved[:, 3:].max(1))
+    # The geometry changes by about this share over the step, and so the step: in sd, the root of what chi^2 loses.
+    lost = (r * r).sum(1) - solved.chi2
+    large: NDArray[np.bool_] = (size > _SMALL) & (size * size * lost > _LEFT**2 * solved.chi2)
+    return large
 
 
-def is_large(move: Floats, t: Floats, before: Floats, chi2: Floats) -> bool:
-    """Whether any of the steps (K, 6) leaves what matters; they led to t (K, 3), and from chi^2 before (K,) to chi2."""
-    each = zip(move.tolist(), t.tolist(), before.tolist(), chi2.tolist(), strict=True)
-    for step, place_m, at_first, at_last in each:
-        size = max(max(map(abs, step[:3])) / (math.hypot(*place_m) or 1.0), *map(abs, step[3:]))
-        # The geometry changes by about this share over the step, and so the step: in sd, the root of what chi^2 loses.
-        if size > _SMALL and size * size * (at_first - at_last) > _LEFT**2 * at_last:
-            return True
-    return False
+def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> Rows:
+    """Linearize the eight coordinates at K poses.
 
+    frames: (K, 4, 3, 3) of B's left and right light in A's picture, A's left and right in B's: bearing, then both
+    tangents in pixels per radian over sigma_px. lights_m: (2, 2, 3) A's and B's left and right light.
 
-def shifts_of(dt_s: Floats, rates: Floats) -> tuple[Floats, Floats] | None:
-    """Give how far (K, 4, 3) the pose has moved and turned (K, 4, 3, 3) at each sighting, None where it rests."""
-    if not np.count_nonzero(rates):
-        return None
-    shift = dt_s[:, :, None] * rates
-    return shift[:, :, :3], rotation_near(shift[:, :, 3:])
-
-
-def linearize(
-    t: Floats, R: Floats, seen: Sightings, lights: tuple[Floats, Floats], shifts: tuple[Floats, Floats] | None
-) -> tuple[Floats, Floats]:
-    """Give the derivatives of the residuals by the pose, the residuals as a seventh column (K, 8, 7), and distances.
-
-    shifts: of the pose at each sighting, as by `shifts_of`. The distances (K, 4) are those along the bearings.
+    From a camera to a light, in A's axes, q = R l_b + t, and back from B to A's lights, q = R^T (l_a - t). A step moves
+    the first by dt + dw x R l_b, the second by R^T (-dt - dw x (l_a - t)).
     """
-    K = len(t)
-    Rt = R.swapaxes(1, 2)
-    # The lights about the point that the pose turns them about, in A's axes: B's about B, A's seen from B.
-    y = np.empty((K, 4, 3))
-    np.matmul(lights[1], Rt, out=y[:, :2])
-    np.subtract(lights[0], t[:, None], out=y[:, 2:])
-    if shifts is not None:
-        shift, turn = shifts
-        y[:, :2] = (turn[:, :2] @ y[:, :2, :, None])[..., 0]
-        y[:, 2:] = ((y[:, 2:] - shift[:, 2:])[:, :, None] @ turn[:, 2:])[:, :, 0]
-    # From the camera to the light, q, behind its derivatives. All in A's axes; what B sees is taken backwards, from the
-    # light to B: then t moves all four alike, and so does a turn w, by w x y.
-    arms = (y @ _TURNED).reshape(K, 4, 3, 7)
-    arms[..., :3] = _UNTURNED
-    q = arms[..., 6]
-    q[:, :2] += t[:, None]
-    np.negative(q[:, 2:], out=q[:, 2:])
-    if shifts is not None:
-        q[:, :2] += shift[:, :2]
-    frames = seen.frames.copy()
-    np.matmul(seen.frames[:, 2:], -Rt[:, None], out=frames[:, 2:])
+    R, t = T_a_b.R, T_a_b.t_m
+    about_b = lights_m[1] @ R.swapaxes(1, 2)
+    to_a = lights_m[0] - t[:, None]
+    # (K, 4, 3, 7): derivatives by dt and dw, then q itself, in A's axes.
+    q = np.empty((len(t), 4, 3, 7))
+    q[:, :2, :, :3], q[:, 2:, :, :3] = np.eye(3), -np.eye(3)
+    q[:, :2, :, 3:6], q[:, 2:, :, 3:6] = -skew(about_b), skew(to_a)
+    q[:, :2, :, 6], q[:, 2:, :, 6] = about_b + t[:, None], to_a
+    frames = np.concatenate((frames[:, :2], frames[:, 2:] @ R.swapaxes(1, 2)[:, None]), axis=1)
     # How q and its derivatives extend along the bearing and along both tangents.
-    extent = frames @ arms
-    along, across = extent[:, :, :1], extent[:, :, 1:]
-    depth = along[..., 6:]
-    r = across[..., 6:] / depth
-    J = across - r * along
-    J /= depth
-    J[..., 6:] = r
-    return J.reshape(K, 8, 7), depth[:, :, 0, 0]
+    extent = frames @ q
+    depth = extent[:, :, :1, 6:]
+    r = extent[:, :, 1:, 6:] / depth
+    J = (extent[:, :, 1:, :6] - r * extent[:, :, :1, :6]) / depth
+    return Rows(J.reshape(-1, 8, 6), r.reshape(-1, 8), depth[:, :, 0, 0])
 
 
-def weight_of(J: Floats, dt_s: Floats, motion: Motion) -> Floats:
-    """Give the inverse covariance (K, 8, 8) of the residuals: pixel noise, and what is not known of the motion."""
-    by_rate = J * dt_s.repeat(2, 1)[:, :, None]
-    total: Floats = _EYE + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
+def at_one_instant(J: Floats, r: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion) -> Solved:
+    """Solve again for what is known of the motion between the sightings, by the same linearization.
+
+    dt_s: (K, n) of each residual. skew_sign: (n,) half of the clocks' disagreement moves it so.
+    """
+    by_rate = J * dt_s[:, :, None]
+    total = np.eye(J.shape[1]) + by_rate @ motion.covariance @ by_rate.swapaxes(1, 2)
     if motion.skew_sigma_s > 0.0:
-        square = motion.covariance + np.outer(motion.rates, motion.rates)
-        by_skew = J * (motion.skew_sigma_s * _SKEW_SIGNS)
-        total += by_skew @ square @ by_skew.swapaxes(1, 2)
-    if not np.isfinite(np.add.reduce(total, None)):
-        total[~np.isfinite(total.sum(axis=(1, 2)))] = _EYE
-    return np.asarray(np.linalg.inv(total), dtype=np.float64)
+        by_skew = J * (0.5 * motion.skew_sigma_s * skew_sign)[:, None]
+        total += by_skew @ (motion.covariance + np.outer(motion.rates, motion.rates)) @ by_skew.swapaxes(1, 2)
+    weight = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    return least_squares(J, r + by_rate @ motion.rates, weight)

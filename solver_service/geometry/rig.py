@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.se3 import SE3
 
 # Camera to body for the nominal mount: x forward is z, y right is x, z down is y.
 NOMINAL_R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -35,7 +36,7 @@ class Rig:
 
     @cached_property
     def offset_m(self) -> float:
-        """How far the bar's middle stands off the camera."""
+        """The distance of the bar's middle from the camera."""
         return float(np.linalg.norm(self.middle_m))
 
     @cached_property
@@ -50,8 +51,8 @@ class Rig:
         return axis
 
     @cached_property
-    def R_level_camera(self) -> Floats:
-        """The turn (3, 3) of the camera's frame that lays the x axis along the bar, y as near to y as it goes."""
+    def R_bar_camera(self) -> Floats:
+        """From the camera frame to the bar frame (3, 3): x along the bar, y as near to the camera's y as possible."""
         x = self.axis
         y = np.array([0.0, 1.0, 0.0]) if abs(x[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
         y = y - x * (x @ y)
@@ -59,16 +60,9 @@ class Rig:
         return np.array((x, y, np.cross(x, y)))
 
     @cached_property
-    def both_level_camera(self) -> Floats:
-        """The same turn (6, 6) of a position and a small rotation."""
-        both = np.zeros((6, 6))
-        both[:3, :3] = both[3:, 3:] = self.R_level_camera
-        return both
-
-    @cached_property
-    def level(self) -> Rig:
-        """The same rig in a frame whose x axis is the bar's. Its camera still gives bearings in the camera's frame."""
-        turn = self.R_level_camera
+    def in_bar_frame(self) -> Rig:
+        """The same rig in its bar frame. Its camera still gives bearings in the camera frame."""
+        turn = self.R_bar_camera
         return Rig(
             camera=self.camera,
             lights_m=self.lights_m @ turn.T,
@@ -87,44 +81,63 @@ class Rig:
 class RigPair:
     """What follows from two rigs together; arrays hold A's value first.
 
-    levels: the rigs in their level frames. length_m (2,): of the bars. area_px2 (4,): of
-    the picture that each of B's left and right light and A's left and right light is seen in. views_sr: product of
-    both solid angles. middle_m (2, 3): of the bars, level frames; offset_m: of both together. one_camera:
-    whether both cameras have the same parameters. ported: whether a depth port stands off its camera.
+    rigs: as given. in_bar_frames: the same. R_bar_camera (2, 3, 3). lights_m (2, 2, 3), middle_m (2, 3),
+    port_m (2, 3): bar frames. length_m (2,): of the bars. size_px (2, 2): width and height of the pictures.
+    solid_angle_sr (2,): of the pictures. offset_m: of both bars' middles from their cameras, together.
     gap_per_bearing_m2: half the sum of the bars' lengths^-2, the variance of a gap over that of a bearing and range^2.
-    turns (2, 3, 3): from the level frames to the cameras'. size_px (2, 2): width and height of A's and of B's picture.
     """
 
     rigs: tuple[Rig, Rig]
-    levels: tuple[Rig, Rig]
-    length_m: Floats
+    in_bar_frames: tuple[Rig, Rig]
+    R_bar_camera: Floats
+    lights_m: Floats
     middle_m: Floats
-    area_px2: Floats
-    views_sr: float
-    offset_m: float
-    one_camera: bool
-    ported: bool
-    gap_per_bearing_m2: float
-    turns: Floats
+    port_m: Floats
+    length_m: Floats
     size_px: Floats
+    solid_angle_sr: Floats
+    offset_m: float
+    gap_per_bearing_m2: float
+
+    @cached_property
+    def area_px2(self) -> Floats:
+        """Both pictures' areas (2,)."""
+        area: Floats = self.size_px.prod(1)
+        return area
+
+    @cached_property
+    def views_sr2(self) -> float:
+        """The product of both solid angles."""
+        return float(self.solid_angle_sr.prod())
+
+    def between_cameras(self, T_a_b: SE3) -> SE3:
+        """Bring poses from the bar frames into the cameras'."""
+        turn_a, turn_b = self.R_bar_camera
+        return SE3(turn_a.T @ T_a_b.R @ turn_b, T_a_b.t_m @ turn_a)
+
+    def by_camera_step(self, J: Floats) -> Floats:
+        """Turn derivatives (..., 6) by a step in A's bar frame into those by a step in its camera's."""
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = self.R_bar_camera[0]
+        by_step: Floats = J @ turn
+        return by_step
 
 
 @lru_cache(maxsize=16)
 def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
     """Give what two rigs have together, once for each two."""
-    a, b = rig_a.camera.area_px2, rig_b.camera.area_px2
-    levels = rig_a.level, rig_b.level
+    rigs = rig_a, rig_b
+    in_bar_frames = rig_a.in_bar_frame, rig_b.in_bar_frame
     return RigPair(
-        rigs=(rig_a, rig_b),
-        levels=levels,
-        length_m=np.array((rig_a.length_m, rig_b.length_m)),
-        middle_m=np.array([level.middle_m for level in levels]),
-        area_px2=np.array((a, a, b, b)),
-        views_sr=rig_a.camera.solid_angle_sr * rig_b.camera.solid_angle_sr,
+        rigs=rigs,
+        in_bar_frames=in_bar_frames,
+        R_bar_camera=np.array([rig.R_bar_camera for rig in rigs]),
+        lights_m=np.array([rig.lights_m for rig in in_bar_frames]),
+        middle_m=np.array([rig.middle_m for rig in in_bar_frames]),
+        port_m=np.array([rig.depth_port_m for rig in in_bar_frames]),
+        length_m=np.array([rig.length_m for rig in rigs]),
+        size_px=np.array([(rig.camera.width_px, rig.camera.height_px) for rig in rigs], dtype=np.float64),
+        solid_angle_sr=np.array([rig.camera.solid_angle_sr for rig in rigs]),
         offset_m=rig_a.offset_m + rig_b.offset_m,
-        one_camera=rig_a.camera.same_as(rig_b.camera),
-        ported=any(bool(rig.depth_port_m.any()) for rig in (rig_a, rig_b)),
         gap_per_bearing_m2=0.5 * (rig_a.length_m**-2 + rig_b.length_m**-2),
-        turns=np.array((rig_a.R_level_camera.T, rig_b.R_level_camera.T)),
-        size_px=np.hstack((rig_a.camera.size_px, rig_b.camera.size_px)),
     )

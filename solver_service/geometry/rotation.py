@@ -1,4 +1,4 @@
-"""Rotations: unit quaternions (x, y, z, w), matrices, rotation vectors."""
+"""Rotations: unit quaternions (x, y, z, w), matrices, rotation vectors; leading axes are a batch."""
 
 from __future__ import annotations
 
@@ -9,44 +9,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
+Indices: TypeAlias = NDArray[np.intp]
+Index: TypeAlias = int | slice | NDArray[np.intp] | NDArray[np.bool_]
 
 # v @ _CROSS, reshaped to (3, 3), is the matrix of the cross product v x .
-_CROSS: Final[Floats] = np.zeros((3, 3, 3))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _CROSS[_i, _k, _j] = 1.0
-    _CROSS[_i, _j, _k] = -1.0
-_CROSS_FLAT: Final[Floats] = _CROSS.reshape(3, 9)
-_EYE: Final[Floats] = np.eye(3)
+_CROSS: Final[Floats] = np.zeros((3, 9))
+for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+    _CROSS[_axis, 3 * _row + _column] = 1.0
+    _CROSS[_axis, 3 * _column + _row] = -1.0
+_IDENTITY: Final[Floats] = np.eye(3)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
 
 
 def skew(v: Floats) -> Floats:
     """Give the (..., 3, 3) matrices of the cross products with v (..., 3)."""
-    return (v @ _CROSS_FLAT).reshape(*v.shape, 3)
+    return (v @ _CROSS).reshape(*v.shape, 3)
 
 
-def matrix_of(q_xyzw: Floats) -> Floats:
-    """Turn one quaternion (4,), of any length but zero, into its matrix (3, 3)."""
-    x, y, z, w = np.asarray(q_xyzw, dtype=np.float64).tolist()
-    s = 2.0 / (x * x + y * y + z * z + w * w)
-    return np.array(_rodrigues(x, y, z, s * w, s))
+def quat_to_matrix(q_xyzw: Floats) -> Floats:
+    """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
+    K = skew(q_xyzw[..., :3])
+    length2 = (q_xyzw * q_xyzw).sum(-1)[..., None, None]
+    R: Floats = _IDENTITY + (2.0 * q_xyzw[..., 3, None, None] * K + 2.0 * K @ K) / length2
+    return R
 
 
-def _rodrigues(x: float, y: float, z: float, first: float, second: float) -> tuple[tuple[float, float, float], ...]:
-    """Give the rows of 1 + first K + second K^2, K the matrix of the cross product (x, y, z) x."""
-    a, b, c = first * x, first * y, first * z
-    xy, xz, yz = second * x * y, second * x * z, second * y * z
-    xx, yy, zz = second * x * x, second * y * y, second * z * z
-    return (1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)
-
-
-def quaternion_of(R: Floats) -> Floats:
-    """Turn one rotation matrix (3, 3) into its quaternion (4,), the largest component positive.
+def matrix_to_quat(R: Floats) -> Floats:
+    """Turn rotation matrices (..., 3, 3) into quaternions (..., 4), the largest component positive.
 
     Which component is divided by follows from the matrix (Shepperd 1978), so that no rotation is near a
     singularity.
     """
+    if R.ndim > 2:
+        return np.array([matrix_to_quat(each) for each in R.reshape(-1, 3, 3)]).reshape(*R.shape[:-2], 4)
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     # Four times the outer product of the quaternion with itself, row by row.
     rows = (
@@ -55,44 +51,40 @@ def quaternion_of(R: Floats) -> Floats:
         (c + g, f + h, 1.0 - a - e + i, d - b),
         (h - f, c - g, d - b, 1.0 + a + e + i),
     )
-    squares = rows[0][0], rows[1][1], rows[2][2], rows[3][3]
-    x, y, z, w = rows[squares.index(max(squares))]
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return np.array((x / norm, y / norm, z / norm, w / norm))
+    largest = max(range(4), key=lambda row: rows[row][row])
+    norm = math.hypot(*rows[largest])
+    return np.array(rows[largest]) / norm
 
 
 def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
-    # sin(x)/x and (1 - cos x)/x^2, without a division by zero.
-    if w_rad.ndim == 1:
-        x, y, z = w_rad.tolist()
-        angle = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
-        sinc = math.sin(angle) / angle
-        return np.array(_rodrigues(x, y, z, sinc * math.cos(angle), 0.5 * sinc * sinc))
-    half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)
+    if w_rad.size == 3:
+        return _one_exp(*w_rad.ravel().tolist()).reshape(*w_rad.shape, 3)
+    half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)[..., None, None]
+    # sin(x) / x and (1 - cos x) / x^2, without a division by zero.
     sine = np.sin(half) / half
-    first, second = sine * np.cos(half), 0.5 * sine * sine
     K = skew(w_rad)
-    R: Floats = _EYE + first[..., None, None] * K + second[..., None, None] * (K @ K)
+    R: Floats = _IDENTITY + (sine * np.cos(half)) * K + (0.5 * sine * sine) * (K @ K)
     return R
 
 
-def rotation_near(w_rad: Floats) -> Floats:
-    """Turn small rotation vectors (..., 3) into matrices (..., 3, 3), like exp to within |w|^3 / 12 (Cayley)."""
-    rows = []
-    for x, y, z in w_rad.reshape(-1, 3).tolist():
-        scale = 2.0 / (4.0 + x * x + y * y + z * z)
-        rows.append(_rodrigues(x, y, z, 2.0 * scale, scale))
-    return np.array(rows).reshape(*w_rad.shape, 3)
+def _one_exp(x: float, y: float, z: float) -> Floats:
+    """The same of one: a tracker asks for one at a time, and Python's numbers are faster than arrays of three."""
+    half = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
+    sine = math.sin(half) / half
+    first, second = sine * math.cos(half), 0.5 * sine * sine
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    xx, yy, zz = second * x * x, second * y * y, second * z * z
+    a, b, c = first * x, first * y, first * z
+    return np.array(((1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)))
 
 
 def rotation_log(R: Floats) -> Floats:
-    """Turn one rotation matrix (3, 3) into its rotation vector (3,), at most pi long."""
-    q = quaternion_of(R)
-    if q[3] < 0.0:
-        q = -q
-    sine = math.sqrt(float(q[:3] @ q[:3]))
-    if sine < 1e-12:
-        return 2.0 * q[:3]
-    vector: Floats = q[:3] * (2.0 * math.atan2(sine, float(q[3])) / sine)
-    return vector
+    """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3), at most pi long."""
+    if R.ndim > 2:
+        return np.array([rotation_log(each) for each in R.reshape(-1, 3, 3)]).reshape(R.shape[:-1])
+    x, y, z, w = matrix_to_quat(R).tolist()
+    sine = math.copysign(math.sqrt(x * x + y * y + z * z), w)
+    # The angle over the sine of its half; 2 near none.
+    ratio = 2.0 * math.atan2(abs(sine), abs(w)) / sine if abs(sine) > 1e-12 else math.copysign(2.0, w)
+    return np.array((ratio * x, ratio * y, ratio * z))

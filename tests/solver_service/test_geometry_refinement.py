@@ -1,11 +1,16 @@
 """The refinement: exact without noise, at its own covariance with it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.refinement import Motion, Sightings, refine
+from buddyline.solver_service.geometry.four_lights import refine_lights
+from buddyline.solver_service.geometry.past import Motion
+from buddyline.solver_service.geometry.refinement import at_one_instant
 from buddyline.solver_service.geometry.rig import Rig
-from buddyline.solver_service.geometry.rotation import rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import rotation_exp
+from buddyline.solver_service.geometry.se3 import SE3
 
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, project, random_scene
 
@@ -19,7 +24,27 @@ RIGS = {
 }
 
 
-def sightings(scenes, rng=None, sigma_px=1.0, dt_s=None):
+@dataclass
+class Estimate:
+    T_a_b: SE3
+    covariance: np.ndarray
+    chi2: np.ndarray
+    sound: np.ndarray
+
+
+def poses(scenes):
+    return SE3(np.array([s.R for s in scenes]), np.array([s.t for s in scenes]))
+
+
+def refine(T_a_b, frames, rig_a, rig_b, motion=STILL, dt_s=(0.0, 0.0, 0.0, 0.0)):
+    """Refine by the pictures alone, then bring all sightings to one instant."""
+    found = refine_lights(T_a_b, frames, np.array((rig_a.lights_m, rig_b.lights_m)))
+    times_s = np.tile(np.repeat(dt_s, 2), (len(frames), 1))
+    solved = at_one_instant(found.J, found.r, times_s, np.repeat((1.0, -1.0), 4), motion)
+    return Estimate(found.T_a_b.retract(solved.step), solved.covariance, solved.chi2, found.sound)
+
+
+def sightings(scenes, rng=None, sigma_px=1.0):
     pixels = np.array([np.concatenate((s.clear_a, s.clear_b)) for s in scenes])
     if rng is not None:
         pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
@@ -27,13 +52,12 @@ def sightings(scenes, rng=None, sigma_px=1.0, dt_s=None):
     of_each = a.frames(pixels[:, :2].reshape(-1, 2)), b.frames(pixels[:, 2:].reshape(-1, 2))
     frames = np.concatenate([of_one.reshape(-1, 2, 3, 3) for of_one, _ in of_each], axis=1)
     frames[:, :, 1:] /= sigma_px
-    return Sightings(frames, np.zeros((len(scenes), 4)) if dt_s is None else dt_s)
+    return frames
 
 
 def errors(refined, scenes):
     """Position and small rotation (K, 6), truth minus estimate."""
-    turns = [rotation_log(s.R @ R.T) for s, R in zip(scenes, refined.R_a_b, strict=True)]
-    return np.concatenate((np.array([s.t for s in scenes]) - refined.t_a_b_m, turns), axis=1)
+    return poses(scenes).minus(refined.T_a_b)
 
 
 def nees(refined, scenes):
@@ -45,9 +69,9 @@ def nees(refined, scenes):
 def test_exact_without_noise_from_a_poor_start(rigs):
     rng = np.random.default_rng(1)
     scenes = [random_scene(rng, (1.5, 20.0), *rigs) for _ in range(100)]
-    t = np.array([s.t for s in scenes]) * 1.05
-    R = rotation_exp(0.03 * rng.standard_normal((len(scenes), 3))) @ np.array([s.R for s in scenes])
-    refined = refine(t, R, sightings(scenes), *rigs, STILL)
+    true = poses(scenes)
+    poor = SE3(rotation_exp(0.03 * rng.standard_normal((len(scenes), 3))) @ true.R, 1.05 * true.t_m)
+    refined = refine(poor, sightings(scenes), *rigs)
     assert refined.sound.all()
     assert np.abs(errors(refined, scenes)).max() < 1e-6
     assert refined.chi2.max() < 1e-6
@@ -58,8 +82,7 @@ def test_exact_without_noise_from_a_poor_start(rigs):
 def test_covariance_is_true(rigs, range_m, sigma_px):
     rng = np.random.default_rng(int(100 * range_m))
     scenes = [random_scene(rng, range_m, *rigs) for _ in range(150)] * 4
-    t, R = np.array([s.t for s in scenes]), np.array([s.R for s in scenes])
-    refined = refine(t, R, sightings(scenes, rng, sigma_px), *rigs, STILL)
+    refined = refine(poses(scenes), sightings(scenes, rng, sigma_px), *rigs)
     # The mean of 600 chi^2 of six degrees, over six: 1 +- 0.024.
     assert np.mean(nees(refined, scenes)) / 6 == pytest.approx(1.0, abs=0.1)
     assert np.mean(refined.chi2) == pytest.approx(2.0, abs=0.3)
@@ -70,16 +93,25 @@ def test_what_the_last_step_leaves_is_little_of_the_noise(rigs):
     rng = np.random.default_rng(11)
     scenes = [random_scene(rng, (1.5, 20.0), *rigs) for _ in range(100)]
     seen = sightings(scenes, rng, 0.5)
-    # One by one: among many, the poorest start decides how often all are linearized.
-    for k, scene in enumerate(scenes):
-        of_one = Sightings(seen.frames[k : k + 1], seen.dt_s[k : k + 1])
-        R = rotation_exp(0.004 * rng.standard_normal((1, 3))) @ scene.R
-        once = refine((1.0 + 0.004 * rng.standard_normal()) * scene.t[None], R, of_one, *rigs, STILL)
-        again = once
-        for _ in range(3):
-            again = refine(again.t_a_b_m, again.R_a_b, of_one, *rigs, STILL)
-        e = np.concatenate((again.t_a_b_m[0] - once.t_a_b_m[0], rotation_log(again.R_a_b[0] @ once.R_a_b[0].T)))
-        assert e @ np.linalg.inv(again.covariance[0]) @ e / 6.0 < 0.02**2
+    turns = rotation_exp(0.004 * rng.standard_normal((len(scenes), 3)))
+    true = poses(scenes)
+    start = SE3(turns @ true.R, true.t_m * (1.0 + 0.004 * rng.standard_normal((len(scenes), 1))))
+    once = again = refine(start, seen, *rigs)
+    for _ in range(3):
+        again = refine(again.T_a_b, seen, *rigs)
+    e = again.T_a_b.minus(once.T_a_b)
+    assert (np.einsum("ki,kij,kj->k", e, np.linalg.inv(again.covariance), e) / 6.0).max() < 0.02**2
+
+
+def test_each_pose_is_refined_as_if_alone():
+    rng = np.random.default_rng(12)
+    scenes = [random_scene(rng, (1.5, 20.0)) for _ in range(20)]
+    seen, start = sightings(scenes, rng, 0.5), poses(scenes).retract(0.03 * rng.standard_normal((20, 6)))
+    together = refine(start, seen, IDEAL, IDEAL)
+    for k in range(20):
+        alone = refine(start[k : k + 1], seen[k : k + 1], IDEAL, IDEAL)
+        np.testing.assert_allclose(alone.T_a_b.t_m[0], together.T_a_b.t_m[k], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(alone.covariance[0], together.covariance[k], rtol=1e-9, atol=1e-18)
 
 
 def moving(rng, rates, dt_s, count):
@@ -104,10 +136,10 @@ def test_sightings_of_a_moving_pair_are_brought_to_one_instant():
     rng = np.random.default_rng(5)
     dt_s = np.array([0.025, 0.027, -0.025, -0.026])
     scenes, views = moving(rng, RATES, dt_s, 40)
-    seen = sightings(views, dt_s=np.tile(dt_s, (len(views), 1)))
-    t, R = np.array([s.t for s in scenes]), np.array([s.R for s in scenes])
-    assert np.abs(errors(refine(t, R, seen, IDEAL, IDEAL, Motion(RATES, 1e-12 * np.eye(6))), scenes)).max() < 1e-4
-    unaware = refine(t, R, seen, IDEAL, IDEAL, Motion(np.zeros(6), 1e-12 * np.eye(6)))
+    seen, true = sightings(views), poses(scenes)
+    aware = refine(true, seen, IDEAL, IDEAL, Motion(RATES, 1e-12 * np.eye(6)), dt_s)
+    assert np.abs(errors(aware, scenes)).max() < 5e-4
+    unaware = refine(true, seen, IDEAL, IDEAL, Motion(np.zeros(6), 1e-12 * np.eye(6)), dt_s)
     assert np.abs(errors(unaware, scenes)).max() > 5e-3
 
 
@@ -118,11 +150,10 @@ def test_what_is_not_known_of_the_motion_is_in_the_covariance():
     total, aware, unaware = 0, 0.0, 0.0
     for _ in range(60):
         scenes, views = moving(rng, 0.2 * rng.standard_normal(6), dt_s, 5)
-        t, R = np.array([s.t for s in scenes]), np.array([s.R for s in scenes])
-        seen = sightings(views, rng, 0.5, np.tile(dt_s, (len(views), 1)))
-        aware += nees(refine(t, R, seen, IDEAL, IDEAL, Motion(np.zeros(6), spread)), scenes).sum()
         seen = sightings(views, rng, 0.5)
-        unaware += nees(refine(t, R, seen, IDEAL, IDEAL, STILL), scenes).sum()
+        motion = Motion(np.zeros(6), spread)
+        aware += nees(refine(poses(scenes), seen, IDEAL, IDEAL, motion, dt_s), scenes).sum()
+        unaware += nees(refine(poses(scenes), sightings(views, rng, 0.5), IDEAL, IDEAL), scenes).sum()
         total += 6 * len(scenes)
     assert aware / total == pytest.approx(1.0, abs=0.15)
     assert unaware / total > 1.5
@@ -134,9 +165,8 @@ def test_clocks_that_disagree_are_in_the_covariance():
     for _ in range(60):
         skew = sigma_s * rng.standard_normal()
         scenes, views = moving(rng, RATES, np.array([0.5, 0.5, -0.5, -0.5]) * skew, 5)
-        t, R = np.array([s.t for s in scenes]), np.array([s.R for s in scenes])
         motion = Motion(RATES, 1e-12 * np.eye(6), sigma_s)
-        sum_ += nees(refine(t, R, sightings(views, rng, 0.5), IDEAL, IDEAL, motion), scenes).sum()
+        sum_ += nees(refine(poses(scenes), sightings(views, rng, 0.5), IDEAL, IDEAL, motion), scenes).sum()
         total += 6 * len(scenes)
     assert sum_ / total == pytest.approx(1.0, abs=0.15)
 
@@ -144,12 +174,10 @@ def test_clocks_that_disagree_are_in_the_covariance():
 def test_a_pose_that_the_lights_do_not_determine_is_not_sound():
     """Both lights of B in one pixel: nothing tells its range."""
     scene = random_scene(np.random.default_rng(8), 5.0)
-    seen = sightings([scene])
-    frames = seen.frames.copy()
+    frames = sightings([scene])
     frames[:, 1:] = frames[:, :1]
     with np.errstate(all="ignore"):
-        t, R = scene.t[None] * 1e9, scene.R[None]
-        refined = refine(t, R, Sightings(frames, seen.dt_s), IDEAL, IDEAL, STILL)
+        refined = refine(SE3(scene.R[None], scene.t[None] * 1e9), frames, IDEAL, IDEAL)
     assert not refined.sound.any()
 
 

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import rotation_exp
+from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, solve_trigger
 
 from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, view
@@ -29,11 +30,11 @@ def followed(scene, rng, sigma=(0.1, 0.05)):
     sigma = np.repeat(sigma, 3)
     off = sigma * rng.standard_normal(6)
     R = rotation_exp(off[3:]) @ scene.R
-    return Prior(scene.t + off[:3], quaternion_of(R), np.diag(sigma**2))
+    return Prior(SE3(R, scene.t + off[:3]), np.diag(sigma**2))
 
 
 def error(fix, scene):
-    return np.concatenate((scene.t - fix.t_a_b_m, rotation_log(scene.R @ matrix_of(fix.q_a_b_xyzw).T)))
+    return SE3(scene.R, scene.t).minus(fix.T_a_b)
 
 
 @pytest.mark.parametrize("missing", range(4))
@@ -66,7 +67,7 @@ def test_beside_last_poses_three_lights_must_be_likelier_than_what_sensors_tell_
         scene = random_scene(rng, (1.5, 6.0))
         views = without(scene, int(rng.integers(4)), rng, 0.1)
         prior = followed(scene, rng, (0.4, 0.2))
-        elsewhere = replace(prior, t_a_b_m=1.3 * scene.t)
+        elsewhere = replace(prior, T_a_b=SE3(prior.T_a_b.R, 1.3 * scene.t))
         for given, found in ((prior, led), (elsewhere, against), (None, alone)):
             fix = solve(scene, views, scene.sensed(), prior=given)
             if isinstance(fix, Fix):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
-from buddyline.solver_service.geometry.rotation import matrix_of, rotation_log
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
+from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, View, solve_trigger
 
 from tests.solver_service.scenes import (
@@ -32,8 +33,7 @@ def solve(scene, views, sensed=BLIND, settings=DEFAULT, prior=None):
 
 
 def error(fix, scene):
-    turn = rotation_log(scene.R @ matrix_of(fix.q_a_b_xyzw).T)
-    return np.concatenate((scene.t - fix.t_a_b_m, turn))
+    return SE3(scene.R, scene.t).minus(fix.T_a_b)
 
 
 def facing(range_m=4.0, rig_a=IDEAL, rig_b=IDEAL):
@@ -148,14 +148,14 @@ def test_gravity_tells_left_from_right():
     assert np.abs(error(fix, rolled)).max() < 1e-6
     assumed = solve(rolled, (a, b))
     assert "upright_assumed" in assumed.checks
-    assert matrix_of(assumed.q_a_b_xyzw)[1, 1] > 0
+    assert quat_to_matrix(assumed.q_a_b_xyzw)[1, 1] > 0
 
 
 def test_a_wrong_tilt_is_refused_by_its_name():
     scene = facing()
     (a, _), (b, _) = scene.views()
     sensed_a, sensed_b = scene.sensed()
-    tilted = matrix_of(sensed_a.q_ned_body_xyzw) @ rotation((0, 1, 0), math.radians(40))
+    tilted = quat_to_matrix(sensed_a.q_ned_body_xyzw) @ rotation((0, 1, 0), math.radians(40))
     found = solve(
         scene,
         (view(np.concatenate((a.pixels, [[300.0, 300.0], [900.0, 1000.0]]))), b),
@@ -202,8 +202,8 @@ def test_a_prior_helps_and_a_wrong_one_does_not_hurt():
     for _ in range(60):
         scene = random_scene(rng, (2.0, 8.0))
         (a, pair_a), (b, pair_b) = scene.views(rng, 1.0, 7)
-        near = Prior(scene.t + 0.05, quaternion(scene.R), np.diag([0.1**2] * 3 + [0.05**2] * 3))
-        far = Prior(scene.t * 1.7, quaternion(scene.R @ rotation((0, 1, 0), 0.5)), near.covariance)
+        near = Prior(SE3(scene.R, scene.t + 0.05), np.diag([0.1**2] * 3 + [0.05**2] * 3))
+        far = Prior(SE3(scene.R @ rotation((0, 1, 0), 0.5), scene.t * 1.7), near.covariance)
         for prior in (None, near, far):
             fix = solve(scene, (a, b), prior=prior)
             good = isinstance(fix, Fix) and (fix.pair_a, fix.pair_b) == (pair_a, pair_b)
@@ -288,7 +288,7 @@ def test_bad_sensors_never_end_as_an_error(sensed):
 def test_bad_priors_never_end_as_an_error(covariance):
     scene = facing()
     (a, _), (b, _) = scene.views()
-    found = solve(scene, (a, b), prior=Prior(scene.t, quaternion(scene.R), covariance))
+    found = solve(scene, (a, b), prior=Prior(SE3(scene.R, scene.t), covariance))
     assert isinstance(found, Fix)
 
 

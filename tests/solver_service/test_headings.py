@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from buddyline.protocol.messages import Attitude, Candidates, RelativePose
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.geometry.evidence import heading_offset
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
+from buddyline.solver_service.geometry.se3 import SE3
+from buddyline.solver_service.geometry.sensors import heading_offset
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.headings import ENOUGH, LIFETIME_NS, HeadingOffset
 
@@ -65,8 +66,9 @@ def test_what_a_pose_tells_is_the_error_of_the_heading():
     for error_rad in (0.0, 0.4, -2.8):
         scene = random_scene(rng, 5.0)
         q_a, q_b = (one.q_ned_body_xyzw for one in scene.sensed())
-        turned = quaternion_of(rotation((0, 0, 1), error_rad) @ matrix_of(q_b))
-        offset_rad, variance = heading_offset(scene.R, 1e-4 * np.eye(3), (IDEAL, IDEAL), (q_a, turned))
+        R_ned_a, R_ned_b = (quat_to_matrix(q) @ IDEAL.R_body_camera for q in (q_a, q_b))
+        turned = rotation((0, 0, 1), error_rad) @ R_ned_b
+        offset_rad, variance = heading_offset(SE3(scene.R, scene.t), 1e-4 * np.eye(6), R_ned_a, turned)
         assert offset_rad == pytest.approx(-error_rad, abs=1e-9)
         assert variance == pytest.approx(1e-4)
 
@@ -104,8 +106,8 @@ def turned(message):
     """B's compass is 80 degrees off."""
     if not isinstance(message, Attitude) or message.node != "b":
         return message
-    R = rotation((0, 0, 1), math.radians(80.0)) @ matrix_of(np.array(message.q_ned_body_xyzw))
-    return msgspec.structs.replace(message, q_ned_body_xyzw=tuple(quaternion_of(R).tolist()))
+    R = rotation((0, 0, 1), math.radians(80.0)) @ quat_to_matrix(np.array(message.q_ned_body_xyzw))
+    return msgspec.structs.replace(message, q_ned_body_xyzw=tuple(matrix_to_quat(R).tolist()))
 
 
 def solved(messages):

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import rotation_exp
+from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix
 from buddyline.solver_service.prior import LIFETIME_NS, PosePrior
 
@@ -11,8 +12,7 @@ STEP_NS = 100_000_000
 
 def fix(t_a_b_m, R_a_b, covariance):
     return Fix(
-        t_a_b_m=np.asarray(t_a_b_m, float),
-        q_a_b_xyzw=quaternion_of(R_a_b),
+        T_a_b=SE3(R_a_b, np.asarray(t_a_b_m, float)),
         covariance=covariance,
         range_a_m=3.0,
         range_b_m=3.0,
@@ -45,7 +45,7 @@ def test_predictions_cover_what_comes():
     for stamp_ns, t, R, seen in moving(60, rng):
         predicted = prior.predict(stamp_ns)
         if predicted is not None and stamp_ns > 20 * STEP_NS:
-            off = np.concatenate((t - predicted.t_a_b_m, rotation_log(R @ matrix_of(predicted.q_a_b_xyzw).T)))
+            off = SE3(R, t).minus(predicted.T_a_b)
             errors.append(off @ np.linalg.solve(predicted.covariance, off))
         prior.update(stamp_ns, seen)
     # Wider than the truth needs is allowed, too narrow is not: six degrees of freedom.
@@ -75,7 +75,7 @@ def test_lost_after_a_while_and_found_again():
     assert prior.predict(stamp_ns - 1) is None
     later_ns = stamp_ns + 10 * LIFETIME_NS
     prior.update(later_ns, fixes[5][3])
-    assert prior.predict(later_ns).t_a_b_m == pytest.approx(fixes[5][3].t_a_b_m)
+    assert prior.predict(later_ns).T_a_b.t_m == pytest.approx(fixes[5][3].t_a_b_m)
     prior.reset()
     assert prior.predict(later_ns) is None
 
@@ -89,5 +89,5 @@ def test_a_fix_elsewhere_starts_it_anew():
     elsewhere = fix([5.0, -3.0, 9.0], rotation_exp(np.array([0.0, 1.0, 0.0])) @ R, seen.covariance)
     prior.update(stamp_ns + STEP_NS, elsewhere)
     predicted = prior.predict(stamp_ns + STEP_NS)
-    assert predicted.t_a_b_m == pytest.approx(elsewhere.t_a_b_m)
+    assert predicted.T_a_b.t_m == pytest.approx(elsewhere.t_a_b_m)
     assert not predicted.rates.any()

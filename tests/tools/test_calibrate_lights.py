@@ -15,7 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob, CameraModel, Candidates, NodeInfo, RelativePose
 from buddyline.protocol.topics import CANDIDATES, INFO, POSE
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.rotation import quaternion_of, rotation_exp
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, rotation_exp
 from buddyline.tools import calibrate
 from buddyline.tools.calibration.leastsquares import PoorCalibration
 from buddyline.tools.calibration.lights import Noise, TapedPlace, fit
@@ -145,7 +145,7 @@ def solved(tmp_path):
                     writer.write(CANDIDATES.key(node), encode(message), stamp_ns, stamp_ns)
                 pose = RelativePose(
                     node_a="a", node_b="b", stamp_ns=stamp_ns, trigger=trigger,
-                    t_a_b_m=tuple(station.t_a_b_m), q_a_b_xyzw=tuple(quaternion_of(station.R_a_b)),
+                    t_a_b_m=tuple(station.t_a_b_m), q_a_b_xyzw=tuple(matrix_to_quat(station.R_a_b)),
                     covariance=[0.0] * 36, range_m=station.distance_m, range_a_m=0.0, range_b_m=0.0,
                     range_gap_m=0.0, twist_gap_rad=0.0, chi2=0.0, hypotheses=1,
                     blobs_a=(2, 1), blobs_b=(2, 1), method="refined", checks=[], skew_ns=0,

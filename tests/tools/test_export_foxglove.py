@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
-from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
 
 from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, write_log
@@ -47,7 +47,7 @@ def last(exported: dict[str, list[Any]], topic: str) -> Any:
 
 
 def matrix(rotation: Any) -> np.ndarray[Any, Any]:
-    return matrix_of(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
+    return quat_to_matrix(np.array([rotation.x, rotation.y, rotation.z, rotation.w]))
 
 
 def test_every_topic_has_foxglove_s_own_schema(exported: dict[str, list[Any]]) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.messages import Message
-from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
 
 from tests.processes import free_endpoint
@@ -41,7 +41,7 @@ def of(messages: list[RosMessage], topic: str) -> Any:
 
 
 def turned(q: Any, vector: tuple[float, float, float]) -> np.ndarray[Any, Any]:
-    result: np.ndarray[Any, Any] = matrix_of(np.array([q.x, q.y, q.z, q.w])) @ vector
+    result: np.ndarray[Any, Any] = quat_to_matrix(np.array([q.x, q.y, q.z, q.w])) @ vector
     return result
 
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.geometry.closed_form import closed_form
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp, rotation_log
 from buddyline.solver_service.geometry.trigger import Fix, Settings
 from buddyline.tools.bench.triggers import CAMERA, INFO, RIG, Trigger, simulate
 from buddyline.tools.bound import pose_bounds
@@ -56,14 +56,14 @@ def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
     bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in (*METHODS, *PNP)}, []
     for _ in range(count):
         trigger = simulate(rng, (range_m, range_m), sigma_px=sigma_px)
-        covariance = pose_bounds(trigger.t_a_b_m[None], quaternion_of(trigger.R_a_b)[None], INFO, INFO, sigma_px)[0]
+        covariance = pose_bounds(trigger.t_a_b_m[None], matrix_to_quat(trigger.R_a_b)[None], INFO, INFO, sigma_px)[0]
         bound += np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])
         for method in METHODS:
             settings = Settings(method=method, min_probability=0.0, range_min_m=0.5, range_max_m=60.0)
             fix = trigger.solve(settings, sensors=False)
             if not isinstance(fix, Fix):
                 raise BuddylineError(f"{method} finds no pose at {range_m:g} m: {fix.detail}")
-            error = error_of(trigger, fix.t_a_b_m, matrix_of(fix.q_a_b_xyzw))
+            error = error_of(trigger, fix.t_a_b_m, quat_to_matrix(fix.q_a_b_xyzw))
             squares[method] += error[:3] @ error[:3], error[3:] @ error[3:]
             if method == "refined":
                 nees.append(float(error @ np.linalg.solve(fix.covariance, error)) / 6.0)

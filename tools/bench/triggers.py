@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import CameraModel, NodeInfo
-from buddyline.solver_service.geometry.rotation import quaternion_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Sensed, Settings, View, solve_trigger
 from buddyline.solver_service.results import rig_of
 from numpy.typing import NDArray
@@ -85,7 +85,7 @@ def simulate(rng: np.random.Generator, range_m: tuple[float, float], false: int 
     depths_m = 10.0, 10.0 + float((R_ned_a @ t)[2])
     sensed = [
         Sensed(
-            quaternion_of(R_ned @ mount.T @ _turn(rng.normal(0.0, sigma_rad[::-1]))),
+            matrix_to_quat(R_ned @ mount.T @ _turn(rng.normal(0.0, sigma_rad[::-1]))),
             sigma_rad,
             depth_m + rng.normal(0.0, DEPTH_SIGMA_M),
             DEPTH_SIGMA_M,

@@ -11,7 +11,7 @@ from buddyline.node.drivers.stored import decode_picture, picture_files
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
-from buddyline.solver_service.geometry.rotation import matrix_of
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.calibration.leastsquares import Floats
 from buddyline.tools.calibration.lights import TapedPlace
 from buddyline.tools.dives import Dive
@@ -121,5 +121,5 @@ def _place(
     middle = np.median(pixels, axis=0)
     pose = poses[len(poses) // 2]
     return TapedPlace(
-        name, middle[:2], middle[2:], np.array(pose.t_a_b_m), matrix_of(np.array(pose.q_a_b_xyzw)), distance_m
+        name, middle[:2], middle[2:], np.array(pose.t_a_b_m), quat_to_matrix(np.array(pose.q_a_b_xyzw)), distance_m
     )

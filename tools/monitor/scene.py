@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.messages import Attitude, NodeInfo, RelativePose
-from buddyline.solver_service.geometry.rotation import matrix_of, quaternion_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from msgspec import UNSET
 from numpy.typing import NDArray
 
@@ -48,7 +48,7 @@ class SceneFrame:
 
     def turn_b(self, pose: RelativePose) -> Floats:
         """Return R_s_b: B's camera in the scene."""
-        R_s_b: Floats = self.R_s_a @ matrix_of(np.array(pose.q_a_b_xyzw))
+        R_s_b: Floats = self.R_s_a @ quat_to_matrix(np.array(pose.q_a_b_xyzw))
         return R_s_b
 
 
@@ -56,8 +56,8 @@ def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> SceneFrame:
     """Return how a camera stands by its mount and its node's attitude."""
     if info is None or attitude is None:
         return SceneFrame.unknown()
-    R_s_body = matrix_of(np.array(attitude.q_ned_body_xyzw))
-    return SceneFrame(R_s_body @ matrix_of(np.array(info.q_body_camera_xyzw)), True)
+    R_s_body = quat_to_matrix(np.array(attitude.q_ned_body_xyzw))
+    return SceneFrame(R_s_body @ quat_to_matrix(np.array(info.q_body_camera_xyzw)), True)
 
 
 def ellipsoid(pose: RelativePose, frame: SceneFrame) -> tuple[Floats, Floats]:
@@ -72,7 +72,7 @@ def ellipsoid(pose: RelativePose, frame: SceneFrame) -> tuple[Floats, Floats]:
 
 def wxyz(R: Floats) -> tuple[float, float, float, float]:
     """Return a rotation as a quaternion with its real part first."""
-    x, y, z, w = quaternion_of(R).tolist()
+    x, y, z, w = matrix_to_quat(R).tolist()
     return w, x, y, z
 
 

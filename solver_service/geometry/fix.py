@@ -1,0 +1,51 @@
+"""What becomes of a trigger: a pose, or the reason why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from buddyline.solver_service.geometry.observation import Reason
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.se3 import SE3
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """A pose. T_a_b maps B's camera frame into A's.
+
+    covariance: (6, 6), position in A's camera frame, then the small rotation w with R_true = exp(w) R_a_b, in
+    A's camera frame. pair_a: indices into view A of B's (left, right) light, -1 where it was not seen; pair_b
+    likewise. chi2: of the picture coordinates, two degrees of freedom. probability: against chance and others.
+    """
+
+    T_a_b: SE3
+    covariance: Floats
+    range_a_m: float
+    range_b_m: float
+    range_gap_m: float
+    twist_gap_rad: float
+    chi2: float
+    hypotheses: int
+    pair_a: tuple[int, int]
+    pair_b: tuple[int, int]
+    method: str
+    checks: tuple[str, ...]
+    probability: float
+
+    @property
+    def t_a_b_m(self) -> Floats:
+        """Where B's camera is (3,), in A's camera frame."""
+        return self.T_a_b.t_m
+
+    @property
+    def q_a_b_xyzw(self) -> Floats:
+        """How B's camera is turned (4,), from its frame to A's."""
+        return self.T_a_b.q_xyzw
+
+
+@dataclass(frozen=True)
+class NoFix:
+    """Why there is no pose: detail is for a person."""
+
+    reason: Reason
+    detail: str

@@ -1,0 +1,126 @@
+"""What earlier fixes say of a trigger: where B is, how it moves, how far the headings are off.
+
+All of it is applied to readings that the pictures and sensors of the trigger have given without it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.evidence import weigh_heading
+from buddyline.solver_service.geometry.observation import Heading, Prior, Settings
+from buddyline.solver_service.geometry.rig import RigPair
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.se3 import SE3
+from buddyline.solver_service.geometry.sensors import Turn
+
+# Nobody knows a moving diver to less than a millimetre and a milliradian.
+_LEAST_KNOWN: Final = 1e-6 * np.eye(6)
+# A prediction from earlier fixes is wrong this often, and where it is right it is believed this much at most (log).
+_PRIOR_WRONG: Final = 0.15
+_MAX_LOG_PRIOR: Final = 7.0
+
+
+@dataclass(eq=False)
+class Motion:
+    """How the pose moves: d/dt of t_a_b (m/s), then of the small rotation w (rad/s), in A's axes.
+
+    rates: (6,), covariance: (6, 6). skew_sigma_s: how well the two clocks agree, 1 sd.
+    """
+
+    rates: Floats
+    covariance: Floats
+    skew_sigma_s: float = 0.0
+
+    @staticmethod
+    def of(prior: Prior | None, settings: Settings) -> Motion:
+        """Take what is predicted, or what a pair may do."""
+        if prior is None or prior.rates is None or prior.rates_covariance is None:
+            speed2, turn2 = settings.speed_mps**2, settings.turn_radps**2
+            return Motion(np.zeros(6), np.diag((speed2, speed2, speed2, turn2, turn2, turn2)), settings.skew_sigma_s)
+        return Motion(prior.rates, prior.rates_covariance, settings.skew_sigma_s)
+
+
+@dataclass(eq=False, slots=True)
+class Prediction:
+    """Where earlier fixes put this one: T_a_b, and the information (6, 6) of a pose against it.
+
+    log_gain: of a pose that is exactly there, against chance.
+    """
+
+    T_a_b: SE3
+    information: Floats
+    log_gain: float
+
+    @staticmethod
+    def of(prior: Prior, bearing_variance: float, rigs: RigPair, settings: Settings) -> Prediction:
+        """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
+        t = prior.T_a_b.t_m
+        range2 = float(t @ t) + 1e-6
+        sight = np.outer(t, t) / range2
+        # Of ln range and of the twist, by both pictures.
+        relative = bearing_variance * range2 * rigs.gap_per_bearing_m2
+        total = prior.covariance + _LEAST_KNOWN
+        total[:3, :3] += relative * range2 * sight
+        total[3:, 3:] += relative * sight
+        spread = math.log(settings.range_max_m / settings.range_min_m)
+        # Chance puts a pose anywhere in both pictures, at any range and twist.
+        log_chance = -math.log(range2**1.5 * spread * rigs.views_sr2 * 2.0 * math.pi)
+        log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
+        information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
+        return Prediction(prior.T_a_b, information, -log_area - log_chance)
+
+    def weigh(self, T_a_b: SE3) -> Floats:
+        """Weigh K poses: a bounded gain and a bounded loss (log)."""
+        turned = T_a_b.R @ self.T_a_b.R.T
+        # The sine of the turn about each axis; half a turn away it is short again, and the trace is not above 1.
+        lower, upper = turned[:, (2, 0, 1), (1, 2, 0)], turned[:, (1, 2, 0), (2, 0, 1)]
+        off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, 0.5 * (lower - upper)), axis=1)
+        chi2 = ((off @ self.information) * off).sum(1)
+        near = turned.trace(0, 1, 2) > 1.0
+        log_gain = np.where(near, np.minimum(self.log_gain - 0.5 * chi2, _MAX_LOG_PRIOR), -np.inf)
+        gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
+        return gain
+
+
+@dataclass(eq=False, slots=True)
+class Past:
+    """What earlier fixes say of one trigger."""
+
+    prediction: Prediction | None
+    heading: Heading | None
+    motion: Motion
+
+    @staticmethod
+    def of(
+        prior: Prior | None, heading: Heading | None, bearing_variance: float, rigs: RigPair, settings: Settings
+    ) -> Past:
+        """Take a prediction, None or not finite where there is none, and what is learned of the headings."""
+        if prior is not None and not _sound(prior):
+            prior = None
+        prediction = None if prior is None else Prediction.of(prior, bearing_variance, rigs, settings)
+        return Past(prediction, heading, Motion.of(prior, settings))
+
+    def weigh(self, T_a_b: SE3) -> Floats:
+        """Weigh K poses between the cameras' frames by the prediction."""
+        return np.zeros(len(T_a_b)) if self.prediction is None else self.prediction.weigh(T_a_b)
+
+    def weigh_turn(self, turn: Turn, sensed_variance: Floats, picture_variance: Floats) -> Floats:
+        """Give what the learned heading adds (K,), in place of the sensors' own word of their headings.
+
+        sensed_variance: of both headings, without what the picture adds (K,), picture_variance.
+        """
+        if self.heading is None:
+            return np.zeros(len(turn.level))
+        alone = weigh_heading(turn.off_rad(), sensed_variance + picture_variance)
+        learned = weigh_heading(turn.off_rad(self.heading.offset_rad), self.heading.variance + picture_variance)
+        return learned - alone
+
+
+def _sound(prior: Prior) -> bool:
+    parts = prior.T_a_b.t_m, prior.T_a_b.R, prior.covariance, prior.rates, prior.rates_covariance
+    finite = math.isfinite(sum(float(part.sum()) for part in parts if part is not None))
+    return finite and prior.covariance.shape == (6, 6)
