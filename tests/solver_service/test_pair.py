@@ -1,4 +1,4 @@
-"""One pair's solver: how its triggers are split into calls changes nothing, and absurd values spoil no other trigger."""
+"""One pair's solver: splitting its triggers into calls changes nothing, and absurd values spoil no other trigger."""
 
 from dataclasses import replace
 
