@@ -20,8 +20,8 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
     """Return Zenoh's `access_control`: a node publishes its own keys, the solver its pair's, all read all.
 
     A surveyor marks where any node stands; a player stands in for all the nodes of a stored dive; a bridge to ROS
-    publishes ROS's keys. Everything else is denied, whoever asks. Caches live under `@adv`, which `*` and `**` do
-    not match: they are named beside each key, or history would be lost in silence.
+    publishes ROS's keys. Everything else is denied. Caches live under `@adv`, which `*` and `**` do
+    not match: they are named beside each key, or history would be lost without a word.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
     everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**", *_ROS_KEYS]

@@ -1,6 +1,6 @@
-"""The bus as everyone but its two implementations sees it: publish, subscribe, know who is alive.
+"""The bus: publish, subscribe, know who is alive. This is the contract of its two implementations.
 
-protocol.zenoh_bus carries it between processes, protocol.local_bus within one; both keep this contract.
+protocol.zenoh_bus works between processes, protocol.local_bus within one.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class Bus(ABC):
     def newest(self, topic: Topic) -> list[Received]:
         """Return the newest message of each key of a retained topic, whether who sent it is still there or not.
 
-        None where the hub was started since, or is another program than ours.
+        The list is empty where the hub was started since, or is another program than ours.
         """
 
     @abstractmethod
@@ -196,7 +196,7 @@ def each_of(keys: KeyExprs) -> tuple[str, ...]:
 def held_order(key: str, payload: bytes) -> tuple[bool, int]:
     """Order what publishers hold for a late joiner: the topics with only a latest message, then by time.
 
-    By time, because whoever matches two nodes' frames would otherwise wait for one through all of the other's.
+    By time, because a solver would otherwise get all frames of one node before the first of the other.
     """
     parsed = parse_key(key)
     return parsed is None or not parsed[0].latest_only, payload_stamp_ns(payload) or 0

@@ -1,7 +1,6 @@
 """Messages to and from the bytes of the bus and of dive logs: one JSON object a message, UTF-8.
 
-`encode` lets nothing out that `decode` would refuse, and writes every number that is not an integer by nature as a
-float.
+`encode` writes nothing that `decode` would refuse. Numbers that are not integers by nature are written as floats.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def decode(payload: bytes, schema: type[M]) -> M:
 
 
 def _non_finite_field(payload: bytes) -> str | None:
-    """Name the NaN or infinity that makes a payload malformed JSON, where that is what ails it."""
+    """Return which field holds a NaN or an infinity; None where none does."""
     if not any(word in payload for word in (b"NaN", b"Infinity")):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Ending a TCP connection of this process from outside whatever holds it."""
+"""Shuts down a TCP connection of this process that a library holds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _DESCRIPTORS: Final = "/proc/self/fd"
 def cut_connection(host: str, port: int) -> bool:
     """Shut down this process's connection whose own end is host:port; False where there is none, or no /proc.
 
-    Whoever holds it finds it broken at its next read or write.
+    Its owner finds it broken at its next read or write.
     """
     try:
         descriptors = os.listdir(_DESCRIPTORS)
@@ -22,7 +22,7 @@ def cut_connection(host: str, port: int) -> bool:
         try:
             if not os.readlink(f"{_DESCRIPTORS}/{descriptor}").startswith("socket:"):
                 continue
-            # A copy: the descriptor itself is not ours to close.
+            # A copy, because closing it must not close the owner's descriptor.
             with socket.socket(fileno=os.dup(int(descriptor))) as connection:
                 if connection.type == socket.SOCK_STREAM and connection.getsockname()[:2] == (host, port):
                     connection.shutdown(socket.SHUT_RDWR)

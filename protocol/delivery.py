@@ -1,4 +1,4 @@
-"""What both buses are made of: a bounded queue with its own thread, a rate cap, the news of a thread's death."""
+"""Parts of both buses: a bounded queue with its own thread, a rate cap, and a latch for the first thread that dies."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ThreadDiedError(RuntimeError):
 
 
 class FailureLatch:
-    """Keeps the first thread that died and tells whom it concerns."""
+    """Keeps the first failure of a thread and tells its handlers."""
 
     def __init__(self) -> None:
         self.failure: ThreadDiedError | None = None
@@ -29,7 +29,7 @@ class FailureLatch:
         self._handlers: list[Callable[[ThreadDiedError], None]] = []
 
     def on_failure(self, handle: Callable[[ThreadDiedError], None]) -> None:
-        """Call handle at the first failure, or now where it was."""
+        """Call handle at the first failure; at once where it has happened."""
         with self._lock:
             self._handlers.append(handle)
             failure = self.failure
@@ -86,7 +86,7 @@ class Delivery(Generic[T]):
             self._changed.notify()
 
     def close(self, timeout_s: float = CLOSE_S) -> None:
-        """Take no more, hand over what is queued within timeout_s, end the thread."""
+        """Accept no more items, hand over the queued ones within timeout_s, end the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -137,6 +137,6 @@ class RateCap:
             # A clock that was set back by more than a period must not silence the topic for as long.
             if -self._period_ns <= late_ns < 0:
                 return False
-            # On time, the next is due a period after this one was; after a pause, a period from now.
+            # In time: the next is due one period after this one was due. After a pause: one period from now.
             self._due_ns = now_ns + self._period_ns - (late_ns if 0 <= late_ns < self._period_ns else 0)
             return True

@@ -1,4 +1,4 @@
-"""Dive logs: MCAP files that describe themselves, survive a cut power, and are read tolerantly."""
+"""Dive logs: self-describing MCAP files that survive a power cut and can be read when they are damaged."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 CHUNK_BYTES: Final = 1024 * 1024
-# What one flipped bit takes with it.
+# One flipped bit costs a chunk.
 CHUNK_NS: Final = S_NS
 LOG_NOTE: Final = "buddyline.log"
 MAX_NOTES: Final = 100
@@ -83,13 +83,13 @@ class DiveLogWriter:
         self.count = 0
         if metadata:
             self._writer.add_metadata(LOG_NOTE, metadata)
-        # Who loses power in the first second leaves a log that says what it is. A full disk is the next flush's affair.
+        # A power cut in the first second leaves a log that can be read. Where the disk is full, the next flush says so.
         with suppress(OSError):
             self.flush(sync=True)
 
     @property
     def size_bytes(self) -> int:
-        """How long the file is, without the chunk in progress."""
+        """The file's length, without the chunk in progress."""
         return self._file.tell()
 
     def write(
@@ -97,8 +97,7 @@ class DiveLogWriter:
     ) -> None:
         """Add one payload; publish_time_ns: its stamp, by default read from it; schema: for keys not ours.
 
-        Raises OSError where the disk takes nothing; that payload is not in the log then, and all before it are kept
-        to be written later.
+        Raises OSError where the disk refuses; this payload is not in the log then, and the earlier ones stay queued.
         """
         if self._file.stuck:
             self._file.flush()
@@ -140,7 +139,7 @@ class DiveLogWriter:
         return channel
 
     def flush(self, *, sync: bool = False) -> None:
-        """Finish the chunk and hand it to the system; sync: and to the disk. Raises OSError; then call it again."""
+        """Finish the chunk and write it; sync: to the disk. Raises OSError; a later call tries again."""
         self._writer.flush()
         self._cut_ns = None
         if sync:
@@ -158,7 +157,7 @@ class DiveLogWriter:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it stands, without what the disk did not take."""
+        """Close the file as it is, without what the disk refused."""
         self._file.close()
 
     def __enter__(self) -> DiveLogWriter:
@@ -170,7 +169,7 @@ class DiveLogWriter:
 
 @dataclass
 class _Contents:
-    """Where the chunks of a log stand, by log time, and what of it is readable."""
+    """Where the chunks of a log are, with their log times, and its channels and metadata."""
 
     # start, end (ns), offset in the file, and the channels in it (None: not known before it is read)
     chunks: list[tuple[int, int, int, frozenset[int] | None]] = field(default_factory=list)
@@ -180,9 +179,9 @@ class _Contents:
 
 
 class DiveLogReader:
-    """Reads one MCAP file, whole or damaged; `damage` says in words what could not be read.
+    """Reads one MCAP file, whole or damaged. damage: what could not be read, a line each.
 
-    trust_index: take the index at the end of a file that has one, or walk through the file all the same.
+    trust_index: use the index at the end of a file that has one; False: walk through the file in any case.
     """
 
     def __init__(self, path: Path | str, *, trust_index: bool = True) -> None:
@@ -227,8 +226,8 @@ class DiveLogReader:
     def records(self, wanted: Callable[[str], bool] | None = None, since_ns: int | None = None) -> Iterator[Record]:
         """Yield the records by log time (ties: as in the file); memory holds only chunks that overlap.
 
-        wanted: whether a topic is to be read; since_ns: the least log time. Chunks without any such record are
-        passed over unread, where the log's index tells.
+        wanted: whether a topic is to be read; since_ns: the least log time. Where the log has an index, chunks
+        without such records are not read.
         """
         wanted = cache(wanted) if wanted else None
         heap: list[tuple[int, int, Record]] = []
@@ -299,7 +298,7 @@ class DiveLogReader:
                 self._contents.channels[record.id] = (record.topic, schemas.get(record.schema_id, ""))
 
     def _index(self) -> _Contents | None:
-        """Take the summary at the end of a log that was closed; None where there is none."""
+        """Read the index at the end of a log that was closed; None where there is none."""
         self._file.seek(0)
         try:
             reader = SeekingReader(self._file, record_size_limit=MAX_RECORD_BYTES)
@@ -330,7 +329,7 @@ class DiveLogReader:
         return contents
 
     def _scan(self) -> _Contents:
-        """Walk through a log, past what is damaged, to where it ends or breaks off."""
+        """Find the chunks of a log by walking through it, past damage."""
         contents = self._contents = _Contents()
         declared: list[object] = []
         for found in walk(self._file, self._size, self._note):

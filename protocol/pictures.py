@@ -1,4 +1,4 @@
-"""A dive's pictures in files of their own beside its log, so that the oldest can go before anything else is lost.
+"""A dive's pictures, in files of their own beside its log: when the disk fills up, the oldest pictures go first.
 
 `a-....mcap` has its pictures in the folder `a-....pictures`, in `000000.mcap` and so on; each is a dive log.
 """
@@ -35,11 +35,11 @@ def with_pictures(paths: Iterable[Path | str]) -> list[Path]:
 
 
 class PictureLog:
-    """Writes pictures beside a log; where room runs out, deletes the oldest, and at last stops recording them.
+    """Writes pictures beside a log. Where room runs out it deletes the oldest, and then stops recording them.
 
-    kin: which other logs of the same folder are of this node, as a pattern of their names; their pictures are older,
-    and go first. min_free_bytes: room to be left on the disk. dropped: pictures that were not written; deleted: files
-    that were.
+    kin: a pattern of the names of this node's logs in the same folder; pictures of older ones are deleted first.
+    min_free_bytes: room to leave on the disk. dropped: pictures that were not written; deleted: files that were
+    deleted.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class PictureLog:
         self._folder = log_path.with_suffix(SUFFIX)
         self._kin = kin
         self._min_free_bytes = min_free_bytes
-        # What one file gives back is to count, on a small disk too.
+        # On a small disk, too, deleting one file must make enough room.
         self._segment_bytes = min(SEGMENT_BYTES, min_free_bytes // 2) if min_free_bytes else SEGMENT_BYTES
         self._metadata = metadata
         self._writer: DiveLogWriter | None = None
@@ -70,7 +70,7 @@ class PictureLog:
         return ""
 
     def write(self, key: str, payload: bytes, log_time_ns: int, schema: str = "") -> None:
-        """Add one picture, where there is room; a disk that does not take it is reported, and nothing else."""
+        """Add one picture where there is room; a disk that refuses is reported and raises nothing."""
         if self._paused:
             self.dropped += 1
             return
@@ -85,7 +85,7 @@ class PictureLog:
             self._fail(error)
 
     def flush(self) -> None:
-        """Have everything on the disk."""
+        """Sync everything to the disk."""
         if self._writer is None:
             return
         try:
@@ -94,11 +94,11 @@ class PictureLog:
             self._fail(error)
 
     def keep_room(self, *, full: bool = False) -> None:
-        """Delete the oldest pictures as long as there is too little room; full: the disk says that there is none."""
+        """Delete the oldest pictures while there is too little room; full: a write failed for lack of room."""
         try:
             free_bytes = self._free_bytes()
             if not full and free_bytes >= self._min_free_bytes:
-                # A little more than the least, so that it does not come and go.
+                # Some more than the least, so that recording does not start and stop all the time.
                 if self._paused and free_bytes >= self._min_free_bytes + self._segment_bytes:
                     self._paused, self._error = False, ""
                     log.info("pictures are recorded again")

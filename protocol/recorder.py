@@ -1,4 +1,4 @@
-"""A dive log written by a thread of its own: whoever records never waits for the disk."""
+"""A dive log written by its own thread, so that nobody who records waits for the disk."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class RecordError(BuddylineError):
 
 
 class Recorder:
-    """Writes payloads into a dive log; at most a second of it is ever off the disk.
+    """Writes payloads into a dive log and syncs it every second.
 
-    Where the disk cannot keep up, or takes nothing, messages wait in memory; beyond 64 MB the oldest pictures are
-    dropped first, then the oldest messages; `dropped` counts them. `error` says why nothing can be written, None
-    while it can: the thread tries again until it is closed. pictures: where pictures go, instead of into the log.
+    Where the disk is slow or refuses, messages wait in memory. Beyond 64 MB the oldest pictures are dropped first,
+    then the oldest messages; `dropped` counts them. `error` says why nothing can be written, None while it can: the
+    thread tries again until it is closed. pictures: where pictures go, instead of into the log.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Recorder:
             self.error = error
 
     def _turn(self) -> bool:
-        """Write for a second, then sync; return whether that was the last time."""
+        """Write for a second, then sync; return whether the log is closed now."""
         ends_s = time.monotonic() + SYNC_INTERVAL_S
         closing = False
         try:
@@ -116,7 +116,7 @@ class Recorder:
             self.written += 1
 
     def _refused(self, error: OSError, unwritten: deque[Item]) -> bool:
-        """Keep what the disk did not take, make room where there is none, and wait; return whether it is given up."""
+        """Queue again what the disk refused, make room where it is full, and wait; return False: go on."""
         with self._ready:
             if self._last_try:
                 self._writer.abandon()
@@ -140,7 +140,7 @@ class Recorder:
         self._writer.close()
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Write what is queued, and the log's end; raise RecordError where the disk does not take it."""
+        """Write what is queued and the log's end; raise RecordError where the disk refuses them."""
         with self._ready:
             self._closing = True
             self._ready.notify()

@@ -1,8 +1,8 @@
-"""Walks an MCAP file record by record, past what is damaged, to its end or to where it breaks off.
+"""Walks an MCAP file record by record, past damage, to its end or to where it breaks off.
 
-Where a record makes no sense, the next chunk (or note of a channel) is looked for byte by byte: each begins with
-bytes, and lengths that agree with one another, which other data has only by a rare chance. A chunk's own
-checksum is left to whoever reads it.
+After a malformed record the next chunk (or channel note) is searched byte by byte. It is known by its first bytes and
+by lengths that agree with one another; other data looks like this only by rare chance. Checksums of chunks are checked
+when they are read.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ Found: TypeAlias = ChunkAt | McapMessage | Schema | Channel | Metadata
 
 
 class MalformedError(ValueError):
-    """Bytes that are no record."""
+    """Bytes that are not a valid record."""
 
 
 def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Found]:
-    """Yield what stands in an MCAP file of size bytes; note is told of everything that is passed over."""
+    """Yield the records of an MCAP file of size bytes; note gets a line for everything that is skipped."""
     offset = suspect = len(MAGIC)
     while offset < size:
         try:
@@ -74,7 +74,7 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
             continue
         if found is not None:
             yield found
-        # Lengths of records that prove nothing may have led astray: what is looked for begins after the last chunk.
+        # A damaged length may have led too far: the search begins after the last sound chunk.
         if isinstance(found, ChunkAt):
             suspect = end
         offset = end
@@ -87,7 +87,7 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
 
 
 def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
-    """Return the record's end, what it is where anyone wants it, and whether it is the last."""
+    """Return the record's end, its content where it is of a kind that readers use, and whether it is the last."""
     file.seek(offset)
     head = file.read(_HEAD_BYTES)
     if len(head) < _HEAD_BYTES:
@@ -120,13 +120,13 @@ def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | No
 
 
 def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Schema | Channel]:
-    """Return what is in the chunk at offset; raise MalformedError, or what ails its compression or checksum."""
+    """Return the records of the chunk at offset; raise MalformedError, or the error of its compression or checksum."""
     end, found, _ = _record_at(file, offset, size)
     if not isinstance(found, ChunkAt):
         raise MalformedError("no chunk where the index says")
     file.seek(offset + _HEAD_BYTES)
     chunk = Chunk.read(ReadDataStream(BytesIO(file.read(end - offset - _HEAD_BYTES))))
-    # What a frame says of its size is allocated before it is looked at.
+    # The decompressor allocates the size that the frame claims.
     if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MAX_RECORD_BYTES:
         raise MalformedError("a chunk too big to unpack")
     return [record for record in breakup_chunk(chunk, validate_crc=True) if isinstance(record, _IN_CHUNKS)]
@@ -157,7 +157,7 @@ def _chunk_at(file: IO[bytes], offset: int, length: int) -> ChunkAt:
 
 
 def _resume(file: IO[bytes], begin: int, damaged: int, size: int) -> int | None:
-    """Return where the next sound chunk or channel note begins: after `begin`, other than at `damaged`."""
+    """Return where the next sound chunk or channel note begins, from `begin` on and not at `damaged`."""
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         at = begin
         while (match := _RESUME.search(data, at)) is not None:

@@ -1,7 +1,7 @@
-"""TLS identities of the bus: checked before use, so that a person is told which file is wrong, and how.
+"""TLS identities of the bus, checked before use, so that errors name the wrong file and its fault.
 
-Zenoh says of every refusal only that it cannot connect. What ails an identity is found by a handshake with
-itself, and why a hub refuses is found by a handshake with it; both with Python's own ssl.
+Zenoh reports every refusal as a failure to connect. Faults of an identity are found by a handshake with itself, and a
+hub's reason to refuse by a handshake with the hub; both use Python's ssl.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def check_identity(tls: Tls, expected: str) -> None:
 
 
 def refusal(endpoint: str, tls: Tls | None) -> str | None:
-    """Return why the hub at endpoint and this client refuse each other; None where that is not what ails them."""
+    """Return why the hub at endpoint and this client refuse each other; None where they do not."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE

@@ -1,6 +1,6 @@
-"""Each publisher's samples in order and once, whatever became of them on their way.
+"""Puts each publisher's samples in order, each once, though the network drops, doubles and reorders them.
 
-Pure: no bus, no clock, no threads. The bus says what came and what could be fetched; this says what is due.
+Pure: no bus, no clock, no threads. The bus says what arrived and what could be fetched; this says what is due.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Source = tuple[str, int]
 
 @dataclass(frozen=True)
 class Gap:
-    """Numbers that are missing before a sample that has come. known: the publisher was heard of before them."""
+    """Numbers missing before a sample that has arrived. known: the publisher was heard of before them."""
 
     source: Source
     key: str
@@ -28,7 +28,7 @@ class Gap:
 
 @dataclass
 class _Publisher(Generic[S]):
-    """The number that is due next, and what came after a gap that is still open."""
+    """The number that is due next, and what arrived after a gap that is still open."""
 
     due: int
     known: bool
@@ -36,27 +36,27 @@ class _Publisher(Generic[S]):
 
 
 class Sequence(Generic[S]):
-    """Hands samples to deliver. What comes after a gap is held until the gap is closed, its publisher's alone.
+    """Hands samples to deliver. A gap holds up the later samples of its own publisher until it is closed.
 
-    missed: how many numbers nobody could give any more.
+    missed: how many numbers could not be fetched.
     """
 
     def __init__(self, deliver: Callable[[S], None]) -> None:
         self.missed = 0
         self._deliver = deliver
-        # The one longest silent first.
+        # The one that has been silent longest comes first.
         self._publishers: dict[Source, _Publisher[S]] = {}
 
     def begin(self, source: Source, number: int) -> None:
-        """Take number as a publisher's first: what it sent before is gone."""
+        """Take number as a publisher's first: earlier samples can no longer be fetched."""
         self._publishers.setdefault(source, _Publisher(number, known=True))
 
     def accept(
         self, source: Source, number: int, key: str, sample: S, *, recover: bool = True, newest_only: bool = False
     ) -> Gap | None:
-        """Deliver or hold what came; return the gap that it opened, to be closed.
+        """Deliver or hold a sample; return the gap that it opened, to be closed.
 
-        Without recover, what is missing is passed over and counted. newest_only: it is of no interest at all.
+        Without recover, missing numbers are skipped and counted. newest_only: they are skipped and not counted.
         """
         publisher = self._publishers.pop(source, None) or _Publisher[S](0, known=False)
         self._publishers[source] = publisher

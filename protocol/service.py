@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 JOIN_TIMEOUT_S: Final = 1.5
 STUCK_S: Final = 15.0
-# A stuck thread may hold what the process needs to end in good order.
+# A stuck thread may hold a lock that the process needs to end in good order.
 END_ANYWAY_S: Final = 10.0
 WATCH_S: Final = 0.2
 BEAT_S: Final = 1.0 - WATCH_S / 2

@@ -1,4 +1,4 @@
-"""A file that is written to its end whatever the disk says meanwhile: what it does not take is kept and tried again."""
+"""A new file whose writes never fail: what the disk refuses stays in memory and is tried again."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ HELD_BYTES: Final = 1024 * 1024
 class Spool:
     """A new file, as a stream to write to.
 
-    `write` never fails; `flush` raises OSError, loses nothing, and goes on where it stopped when it is called again.
-    stuck: whether the disk refused what was last tried.
+    `write` never fails. `flush` raises OSError and loses nothing: the next call goes on where this one stopped.
+    stuck: whether the disk refused the last flush.
     """
 
     def __init__(self, path: Path) -> None:
@@ -31,11 +31,11 @@ class Spool:
         return self._fd < 0
 
     def tell(self) -> int:
-        """Return how much was written to it, on the disk or not."""
+        """Return how many bytes were written, queued ones included."""
         return self._length
 
     def write(self, data: bytes) -> int:
-        """Take bytes; large amounts go on to the disk at once, if it is sound."""
+        """Queue bytes; past HELD_BYTES they go to the system at once, unless the file is stuck."""
         self._held.append(bytes(data))
         self._held_bytes += len(data)
         self._length += len(data)
@@ -45,7 +45,7 @@ class Spool:
         return len(data)
 
     def flush(self) -> None:
-        """Hand everything to the system; raise OSError where it does not take it."""
+        """Write what is queued; raise OSError where the system refuses it."""
         self.stuck = True
         while self._held:
             data = self._held.popleft()
@@ -60,11 +60,11 @@ class Spool:
         self.stuck = False
 
     def sync(self) -> None:
-        """Have the system write it to the disk; raise OSError."""
+        """Have the system write everything to the disk (fsync); raise OSError."""
         os.fsync(self._fd)
 
     def close(self) -> None:
-        """Close the file; what the disk did not take is lost."""
+        """Close the file; what is still queued is lost."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)

@@ -1,8 +1,8 @@
-"""How a service is, in a small file for whoever drives a lamp, a beeper or a script by it.
+"""A service's health in a small file, for lamps, beepers and scripts.
 
 JSON, rewritten once a second, always whole: `service`, `stamp_ns`, `problems` (plain words; empty where all is well),
-and `status`, the last status message (NodeStatus, SolverStatus; null before there is one). The file goes when the
-service ends in good order; one that is older than a few seconds is of a service that hangs or was killed.
+and `status`, the last status message (NodeStatus, SolverStatus; null before there is one). The file is
+removed when the service ends in good order; one older than a few seconds is from a service that hangs or was killed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class StatusFile:
-    """The status file of one service. A place that cannot be written is reported once, and costs nothing else."""
+    """The status file of one service. A file that cannot be written is reported once; the service goes on."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -41,7 +41,7 @@ class StatusFile:
         return cls(Path(session) / "buddyline" / f"{name}.json") if session else None
 
     def write(self, service: str, problems: list[str], status: Message | None) -> None:
-        """Put how it is now into the file."""
+        """Write the present state."""
         content = {"service": service, "stamp_ns": time.time_ns(), "problems": problems, "status": status}
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
@@ -56,6 +56,6 @@ class StatusFile:
             self._failed = False
 
     def remove(self) -> None:
-        """Take the file away: the service ends."""
+        """Remove the file: the service ends."""
         with contextlib.suppress(OSError):
             self.path.unlink()

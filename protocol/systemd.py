@@ -1,7 +1,7 @@
-"""What a service tells systemd (Type=notify), or whatever else started it and listens at NOTIFY_SOCKET.
+"""Notifications to systemd (Type=notify), or to another manager that listens at NOTIFY_SOCKET.
 
 sd_notify(3): a datagram of lines KEY=VALUE to the socket of Unix whose path is in NOTIFY_SOCKET; a path that begins
-with @ is an abstract one. Without that variable nothing is said.
+with @ is an abstract one. Without that variable nothing is sent.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PATIENCE_S: Final = 0.5
 
 
 class Notifier:
-    """Says that a service is ready, goes on, or stops. Nothing here fails, or waits for long."""
+    """Says that a service is ready, goes on, or stops. No method raises, or waits for more than PATIENCE_S."""
 
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
@@ -33,16 +33,16 @@ class Notifier:
         self._socket = notified
 
     def ready(self) -> None:
-        """Say that the start is over."""
+        """Tell that the service has started."""
         self._send("READY=1")
 
     def tell(self, text: str, *, goes_on: bool) -> None:
-        """Give a text for `systemctl status`, and feed the watchdog where the work goes on."""
+        """Send a text for `systemctl status`; goes_on: feed the watchdog, too."""
         lines = f"STATUS={' '.join(text.split())[:MAX_TEXT]}"
         self._send(f"WATCHDOG=1\n{lines}" if goes_on else lines)
 
     def stopping(self) -> None:
-        """Say that the end has begun; it is the last thing said."""
+        """Tell that the service is stopping, and close the socket."""
         self._send("STOPPING=1")
         if self._socket is not None:
             self._socket.close()

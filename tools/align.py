@@ -1,4 +1,4 @@
-"""`buddyline align`: the offset between two nodes' clocks, out of a dive in which they moved."""
+"""`buddyline align`: estimate the offset between two nodes' clocks from a dive in which they moved."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     with Dive(args.dives) as dive:
         node_a, node_b = pair_of(dive, args.nodes)
         offset: ClockOffset | None = None
-        # Each pass brings B's times to A's clock by what the one before found: what is left shrinks to nothing.
+        # Each pass corrects B's times by the offset found so far, until what is left is well below its sigma.
         for number in range(1, PASSES + 1):
             found = _pass(dive, args, (node_a, node_b), offset.offset_s if offset else 0.0, number)
             offset = found and ClockOffset(

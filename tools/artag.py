@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class TagSolver:
-    """Finds tags picture by picture, and gives the poses of all triggers when the pictures are through."""
+    """Finds tags picture by picture; `poses` then gives the poses of all triggers."""
 
     node_a: str
     node_b: str
@@ -86,7 +86,7 @@ class TagSolver:
     def _message(
         self, trigger: int, stamps_ns: dict[str, int], solved: TagPose, attitudes_a: PoseHistory
     ) -> RelativePose:
-        # A node whose picture is missing says nothing: the other's stamp stands for both.
+        # Where one node's picture is missing, the other's stamp stands for both.
         stamp_a_ns = stamps_ns.get(self.node_a, stamps_ns.get(self.node_b, 0))
         stamp_b_ns = stamps_ns.get(self.node_b, stamp_a_ns)
         t_ned_m = None

@@ -1,4 +1,4 @@
-"""`buddyline backfill`: a topside recording completed out of the nodes' own logs."""
+"""`buddyline backfill`: complete a topside recording from the nodes' own logs."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Stamps: TypeAlias = dict[str, tuple[np.ndarray, np.ndarray]]  # key: stamps (ns)
 
 
 class Union:
-    """Tells which messages of several logs go into their union, each key and stamp once, the first log's first."""
+    """Chooses the messages of several logs' union: each key and stamp once, from the first log that has it."""
 
     def __init__(self) -> None:
         self.differing: Counter[str] = Counter()
         self._known: Stamps = {}
 
     def choose(self, reader: DiveLogReader) -> dict[str, np.ndarray]:
-        """Read a log once; return for each key, which of its messages in their order are new: (n,) bool."""
+        """Read a log once; return for each key which of its messages, in their order, are new: (n,) bool."""
         stamps: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
         sums: defaultdict[str, array[int]] = defaultdict(lambda: array("L"))
         for record in reader.records():
@@ -49,10 +49,10 @@ class Union:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the union of the logs; say what the topside recording had missed."""
+    """Write the union of the logs; tell what the topside recording had missed."""
     with Dive([args.topside, *args.nodes]) as dive:
         union = Union()
-        # A node's own log goes first: its times are those of the measurement, and its pictures are whole.
+        # Nodes' own logs come first: their log times are the node's, and their pictures are not previews.
         topside = Path(args.topside)
         ordered = sorted(dive.readers, key=lambda reader: reader.path == topside)
         chosen = [union.choose(reader) for reader in ordered]
@@ -87,5 +87,5 @@ def _new(reader: DiveLogReader, new: dict[str, np.ndarray]) -> Iterator[Record]:
 
 
 def _stamp_ns(record: Record) -> int:
-    """Return what tells a message of its key from others: its stamp; where it has none, its time in the log."""
+    """Return what identifies a message of its key: its stamp, or its log time where it has none."""
     return min(record.publish_time_ns, 2**63 - 1)

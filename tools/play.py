@@ -1,4 +1,4 @@
-"""`buddyline play`: stored dives onto the bus, as if they happened now."""
+"""`buddyline play`: send stored dives over the bus, as if they happened now."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ IMAGES_HZ: Final = 2.0
 AHEAD_NS: Final = 1_500_000_000
 # ... and more where the dive itself has nothing of a node for so long, since there it does wait.
 AHEAD_OF_SILENT_NS: Final = 2_200_000_000
-# A solver that answers nothing for so long waits for something that the dive has not.
+# A solver that is silent for this long waits for something that the dive does not hold.
 SOLVER_SILENT_S: Final = 5.0
 # Calibration goes ahead of the frames, which have a higher priority on the bus.
 INFO_AHEAD_S: Final = 0.3
 
 
 class SolverFollower:
-    """Knows how far a solver on the bus has come, so that a fast playback does not outrun it."""
+    """Follows a solver's outcomes on the bus, so that a fast playback does not outrun it."""
 
     def __init__(self, bus: Bus, nodes: Iterable[str]) -> None:
         self._changed = threading.Condition()
@@ -74,7 +74,7 @@ class SolverFollower:
         """Wait until the solver is close behind a frame at stamp_ns that goes out next; not at all without a solver."""
         with self._changed:
             if self._resolved_ns < 0:
-                # All before the first frame counts as resolved.
+                # Everything before the first frame counts as resolved.
                 self._resolved_ns = stamp_ns
             silent = min(self._sent_ns.values(), default=-1) < stamp_ns - AHEAD_NS
             ahead_ns = AHEAD_OF_SILENT_NS if silent else AHEAD_NS
@@ -182,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
                         player.send(envelope, lap * laps_triggers, period_ns)
                         progress.show((envelope.time_ns - start_ns) / S_NS)
                 lap += 1
-            # What was just sent is on its way: leave the recovery of lost samples its time.
+            # Subscribers may still fetch lost samples from this process.
             client.stop.wait(1.0)
             log.info("play: %d messages sent, %d bad", player.sent, dive.refused)
 

@@ -1,4 +1,4 @@
-"""`buddyline record`: the bus into a dive log."""
+"""`buddyline record`: record the bus into a dive log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`buddyline repair`: a proper, indexed log out of a damaged one, and what was lost."""
+"""`buddyline repair`: make a whole, indexed log out of a damaged one, and tell what was lost."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHOWN_GAPS: Final = 20
 
 def run(args: argparse.Namespace) -> int:
     """Repair one log; say what was lost."""
-    # The walk finds what an index that is itself wrong would hide.
+    # A wrong index would hide chunks; walking through the file finds them.
     with DiveLogReader(args.input, trust_index=False) as reader:
         numbers, times_ns = array("q"), array("q")
         metadata = {**reader.metadata(), "repaired_from": Path(args.input).name}
@@ -39,10 +39,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def missing(numbers: np.ndarray, times_ns: np.ndarray) -> list[str]:
-    """Say what the messages' own consecutive numbers tell of those that are gone, a line a gap.
+    """Return a line for each gap in the messages' sequence numbers.
 
-    numbers, times_ns: (n,) int, in any order. A log whose writer did not number its messages tells nothing; nor
-    does any of what came after its last message.
+    numbers, times_ns: (n,) int, in any order. Where the writer did not number its messages there is nothing to tell;
+    messages lost after the last one are not seen.
     """
     order = np.argsort(numbers, kind="stable")
     numbers, times_ns = numbers[order], times_ns[order]

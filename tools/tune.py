@@ -1,7 +1,7 @@
-"""`buddyline tune`: propose a detector's values from a site's own pictures, and show the pictures they were judged on.
+"""`buddyline tune`: propose a detector's values from a site's own pictures, and mark the pictures they were judged on.
 
-Where the dive carries truth for its lights, that is what counts; else the likely candidates of the default detector
-stand in for it, and the proposed values are the strictest that keep them.
+The values are judged by the dive's light truth where there is any. Otherwise the default detector's likely candidates
+take its place, and the proposed values are the strictest that keep them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The bus over Zenoh: one hub that listens, everyone else its client. Nothing outside this package imports zenoh.
+"""The bus over Zenoh: one hub listens, all others are its clients. Nothing outside this package imports zenoh.
 
-Nothing but the hub listens, and nothing is found by multicast: a client speaks to the endpoint it was given.
-Streams are recovered by their publishers' caches, never blocked for: one frozen viewer must not stall the rest.
+There is no multicast: a client connects to the endpoint it was given. Missed samples are fetched from their
+publishers' caches; publishers never block, so that one frozen viewer does not stall the rest.
 """
 
 from buddyline.protocol.zenoh_bus.bus import ZenohBus, connect

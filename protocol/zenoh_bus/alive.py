@@ -1,4 +1,4 @@
-"""Who is alive: tokens that end with their process or its link."""
+"""Who is alive, by Zenoh's liveliness tokens: a token ends with its process or its link."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import zenoh
 from buddyline.protocol.delivery import Delivery, FailureLatch
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake
 
-# `**` does not match chunks that begin with @: nobody takes a token for a message.
+# `**` does not match parts that begin with @, so that no subscriber takes a token for a message.
 ALIVE: Final = "buddyline/@alive"
 
 
 class ZenohWatch:
-    """Who is alive, told to one handler. A process counts once, however often its token is reported."""
+    """Tells one handler who is alive. A process counts once, however often its token is reported."""
 
     missed = 0
 

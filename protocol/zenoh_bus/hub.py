@@ -1,4 +1,4 @@
-"""The hub's session, and what it remembers of those that are gone."""
+"""The hub's session, and the retained messages of clients that are gone."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from buddyline.protocol.topics import TOPICS
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import hub_settings
 
-# Whoever invents keys, or sends what is no pose, must not fill the hub's memory.
+# A client that invents keys or sends huge payloads must not fill the hub's memory.
 MAX_RETAINED: Final = 256
 MAX_RETAINED_BYTES: Final = 65536
 
 
 class Retained:
-    """The newest message of each key whose topic is retained, for those that ask (protocol.bus.Bus.newest).
+    """The newest message of each key of the retained topics, for `protocol.bus.Bus.newest`.
 
-    Nothing is recovered: what passes unheard, as the first of a publisher may, is made up for by the next.
+    Nothing is recovered: where a message is missed, as a publisher's first may be, the next one takes its place.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -52,7 +52,7 @@ class Retained:
 
 
 class Hub:
-    """The one process that listens; closing it sends everyone else waiting for it."""
+    """The one process that listens. When it closes, its clients wait for the next hub."""
 
     def __init__(self, session: zenoh.Session, endpoint: str) -> None:
         self.endpoint = endpoint

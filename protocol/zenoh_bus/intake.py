@@ -1,4 +1,4 @@
-"""Samples out of Zenoh as they come."""
+"""Takes samples out of Zenoh as soon as they arrive."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ AnySubscriber: TypeAlias = (
 
 
 class Intake:
-    """A thread that takes samples out of Zenoh as they come, so that its own ring never overflows.
+    """A thread that takes samples out of Zenoh at once, so that Zenoh's ring does not overflow.
 
-    name tells the thread from others; accept gets each sample, and must not wait for its consumer.
+    name: the thread's. accept: gets each sample, and must not wait.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Intake:
         self._thread.start()
 
     def close(self) -> None:
-        """Undeclare the subscriber, take in what has come, end the thread."""
+        """Undeclare the subscriber, take what has arrived, end the thread."""
         if not self._closed:
             self._closed = True
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]

@@ -1,4 +1,4 @@
-"""Zenoh sessions: opened once the hub is there, interruptibly; and one more for what is big."""
+"""Zenoh sessions: one that waits for the hub and can be interrupted, and one for large messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def config_of(settings: Mapping[str, object]) -> zenoh.Config:
 def open_session(
     endpoint: str, *, stop: threading.Event, on_wait: Callable[[str], None], tls: Tls | None = None
 ) -> zenoh.Session | None:
-    """Connect as `connect` does, for what speaks keys and payloads that are not ours; the caller closes it."""
+    """Connect as `connect` does, for a client with keys and payloads of its own; the caller closes the session."""
     return open_client(config_of(client_settings(endpoint, None, tls)), endpoint, tls, stop, on_wait)
 
 
@@ -51,7 +51,7 @@ def _open_when_there(
 ) -> zenoh.Session | None:
     """Open a session, trying again until stop is set; on_wait is called once, after the first failure.
 
-    Raises RefusedError where why_refused finds, after a failure, that trying again is of no use.
+    Raises RefusedError where why_refused gives a reason after a failure.
     """
     waiting = False
     while not stop.is_set():
@@ -69,7 +69,7 @@ def _open_when_there(
 
 
 def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | None:
-    """Open a session within a thread of its own: a listener that does not answer holds it for seconds."""
+    """Open a session in a thread of its own, because a listener that does not answer blocks it for seconds."""
     opened: list[zenoh.Session] = []
     errors: list[Exception] = []
     ended = threading.Event()
@@ -101,9 +101,9 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
 
 
 class BulkLink:
-    """A session for big messages alone, opened at the first that asks for it.
+    """A session for large messages alone, opened on demand.
 
-    In a session with others, a big message holds up what is queued behind it in the same connection.
+    In a shared connection, a large message holds up all that is queued behind it.
     """
 
     def __init__(self, config: zenoh.Config) -> None:
@@ -114,7 +114,7 @@ class BulkLink:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """See to it that session is set once the hub is there; does not wait for that."""
+        """Start to connect, without waiting; session is set once the hub answers."""
         with self._lock:
             if self._thread is None and not self._stop.is_set():
                 self._thread = threading.Thread(target=self._run, name="bus bulk", daemon=True)

@@ -1,4 +1,4 @@
-"""Zenoh's settings for the hub and its clients, which keep everyone else from opening a socket of their own."""
+"""Zenoh's settings for the hub and its clients; only the hub listens."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import Tls
 
-# The lease is how long a link that fell silent is held for alive. A hub that accepts and then does not answer is
-# given up within open_timeout, or a client would be deaf for ten seconds after it thawed.
+# lease: a link that is silent for this long counts as dead. open_timeout: how long a client waits for a hub that
+# accepts the connection and does not answer; by default ten seconds.
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,

@@ -1,4 +1,4 @@
-"""Samples of some key expressions in order, each once, with what a fault of the link took."""
+"""A subscription that hands on samples in order, each once, and fetches those that the link lost."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ FETCHES: Final = 16
 
 
 class ZenohSubscription:
-    """A Subscription over Zenoh: samples in order, each once, with what can be fetched of those that are missing.
+    """A Subscription over Zenoh: samples in order, each once; missing ones are fetched where they can be.
 
-    Zenoh's own recovery does most of it. What it leaves: a publisher first heard of in the middle of its
-    numbers, and gaps whose query was lost with the link, as when the hub stood still for longer than the lease.
+    Zenoh's own recovery does most of it. It does not cover a publisher first heard of in the middle of its numbers,
+    and gaps whose query was lost with the link, as when the hub stood still for longer than the lease.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class ZenohSubscription:
             gap = self._sequence.accept(
                 _source(sample), _number(sample), key, sample, recover=self._history, newest_only=newest_only
             )
-            # Whoever invents publishers with gaps must not have a thread for each.
+            # A client that invents publishers with gaps must not cost a thread for each.
             while gap is not None and len(self._fetching) >= MAX_FETCHING:
                 gap = self._sequence.close(gap, [])
             if gap is not None:
