@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, quaternion_of, rotation_exp, skew
+from buddyline.solver_service.geometry.rotation import Floats, matrix_to_quat, rotation_exp, skew
 from buddyline.solver_service.track.state import CLOCK, NAV, PHI, R_, SIZE, V_, State
 
 # A position no better than this share of the range is not told.
@@ -87,7 +87,7 @@ def row_of(stamp_ns: int, state: State, P: Floats, rate_b_radps: Floats, lights:
     return TrackRow(
         stamp_ns=stamp_ns,
         t_a_b_m=t_a_b,
-        q_a_b_xyzw=quaternion_of(now.R[0].T @ now.R[1]),
+        q_a_b_xyzw=matrix_to_quat(now.R[0].T @ now.R[1]),
         covariance=covariance,
         v_a_b_mps=v_a_b,
         v_covariance=v_covariance,
