@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -119,8 +120,6 @@ def test_import_linter_finds_what_breaks_a_contract(tree, plant, path, text, con
 
 
 def test_every_contract_of_import_linter_is_tried():
-    import tomllib
-
     configured = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     assert [contract["name"] for contract in configured] == [WAY, ZENOH, SIMULATOR, COMMANDS]
 
@@ -149,3 +148,9 @@ def test_a_circle_is_found(tree, plant):
     plant("tools/planted.py", "from buddyline.tools.planted_too import f\n")
     plant("tools/planted_too.py", "def f():\n    import buddyline.tools.planted\n")
     assert circles(tree) == [["buddyline.tools.planted", "buddyline.tools.planted_too"]]
+
+
+def test_every_package_is_installed():
+    configured = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    there = {name for name, path in modules(REPOSITORY).items() if path.name == "__init__.py"}
+    assert set(configured) == there
