@@ -104,6 +104,20 @@ class TestHealth:
     def test_a_healthy_pair_is_said_to_be_well(self) -> None:
         assert "All is well" in words(watched(), at(29) + S_NS // 10)
 
+    def test_slow_triggers_are_neither_silent_nor_stale_between_two(self) -> None:
+        picture = PairPicture()
+        for node in "ab":
+            take(picture, replace(INFOS[node], trigger_period_ns=4 * S_NS), at(0))
+            take(picture, frame(node, 0), at(0))
+        take(picture, pose(0), at(0))
+        for k in range(0, 39, 10):
+            take(picture, solver_status(at(k)), at(k))
+        assert "All is well" not in words(watched(1), at(0) + 38 * S_NS // 10)
+        said = words(picture, at(0) + 38 * S_NS // 10)
+        assert "silent" not in said
+        assert not picture.is_stale(at(0) + 38 * S_NS // 10)
+        assert picture.is_stale(at(0) + 12 * S_NS)
+
     def test_nothing_yet(self) -> None:
         assert "start hub, nodes and solver" in words(PairPicture(), 5)
 
