@@ -26,12 +26,13 @@ class TrueLights:
     """The other node's left and right light in one picture.
 
     pixels: (2, 2), NaN where a light has no place in it. visible: (2,). marked: from LightTruth; else projected
-    from the true pose, which knows nothing of what stands in between.
+    from the true pose, which knows nothing of what stands in between. range_m: the true one, NaN where unknown.
     """
 
     pixels: Floats
     visible: NDArray[np.bool_]
     marked: bool
+    range_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,17 +98,19 @@ def _projected(
     half = np.array([own.width_px, own.height_px]) / 2.0
     inside = np.asarray((np.abs(pixels - half + 0.5) <= half).all(axis=-1))
     for i, (frame, _) in enumerate(known):
-        yield frame, TrueLights(pixels[i], inside[i], marked=False)
+        yield frame, TrueLights(pixels[i], inside[i], marked=False, range_m=float(np.linalg.norm(t[i])))
 
 
-def _marked(truth: LightTruth) -> TrueLights:
+def _marked(truth: LightTruth, track: TruthTrack) -> TrueLights:
     pixels = np.full((2, 2), np.nan)
     visible = np.zeros(2, dtype=bool)
     for light in truth.lights:
         side = NAMES.index(light.name)
         pixels[side] = light.u_px, light.v_px
         visible[side] = light.visible
-    return TrueLights(pixels, visible, marked=True)
+    known = track.at(truth.stamp_ns, truth.trigger)
+    range_m = np.nan if known is None else float(np.linalg.norm(known[0]))
+    return TrueLights(pixels, visible, marked=True, range_m=range_m)
 
 
 def true_lights(
@@ -118,7 +121,7 @@ def true_lights(
     track: TruthTrack,
 ) -> dict[tuple[str, int], TrueLights]:
     """Return the true lights by node and trigger, from LightTruth; for a node without any, projected."""
-    lights = {(truth.node, truth.trigger): _marked(truth) for truth in light_truths if truth.node in nodes}
+    lights = {(truth.node, truth.trigger): _marked(truth, track) for truth in light_truths if truth.node in nodes}
     marked = {node for node, _ in lights}
     if not all(node in infos for node in nodes):
         return lights

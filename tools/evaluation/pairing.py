@@ -64,30 +64,27 @@ def visible_triggers(
     rejected: Sequence[Rejected],
     lights: Mapping[tuple[str, int], TrueLights],
     blobs: Mapping[tuple[str, int], Blobs],
-    ranges_m: Mapping[int, float],
     wrong: Collection[int],
 ) -> list[VisibleTrigger]:
-    """Return the triggers at which both pictures show both lights; ranges_m: the true range by trigger.
-
-    wrong: the triggers of wrong poses.
-    """
+    """Return the triggers at which both pictures show both lights; wrong: the triggers of wrong poses."""
     pose_at = {pose.trigger: pose for pose in poses}
     reason_at = {rejection.trigger: rejection.reason for rejection in rejected}
     answered = bool(blobs and (poses or rejected))
-    triggers_seen = []
+    found = []
     for trigger in sorted({trigger for _, trigger in lights}):
-        views = [(lights.get((node, trigger)), blobs.get((node, trigger))) for node in nodes]
-        if not all(true is not None and true.visible.all() for true, _ in views):
+        views = [lights[node, trigger] for node in nodes if (node, trigger) in lights]
+        if len(views) < 2 or not all(true.visible.all() for true in views):
             continue
         pose = pose_at.get(trigger)
+        seen = [blobs.get((node, trigger)) for node in nodes]
         near = [
-            seen is not None and true is not None and bool((seen.distances_px(true) <= seen.tolerance_px).any(0).all())
-            for true, seen in views
+            one is not None and bool((one.distances_px(true) <= one.tolerance_px).any(0).all())
+            for one, true in zip(seen, views, strict=True)
         ]
-        triggers_seen.append(
+        found.append(
             VisibleTrigger(
-                range_m=ranges_m.get(trigger, float("nan")),
-                marked=all(true is not None and true.marked for true, _ in views),
+                range_m=views[1].range_m,
+                marked=all(true.marked for true in views),
                 detected=all(near) if blobs else None,
                 right=(pose is not None and is_right_pair(pose, blobs, lights) is True) if answered else None,
                 partial=pose is not None and min(*pose.blobs_a, *pose.blobs_b) < 0,
@@ -95,30 +92,26 @@ def visible_triggers(
                 ended="pose" if pose is not None else reason_at.get(trigger, "no result"),
             )
         )
-    return triggers_seen
+    return found
 
 
-def pairing_figures(triggers_seen: Sequence[VisibleTrigger]) -> Pairing | None:
+def pairing_figures(found: Sequence[VisibleTrigger]) -> Pairing | None:
     """Return the figures of these triggers, None where there are none."""
-    if not triggers_seen:
+    if not found:
         return None
-    judged = all(seen_trigger.right is not None for seen_trigger in triggers_seen)
-    searched = all(seen_trigger.detected is not None for seen_trigger in triggers_seen)
-    posed = sum(seen_trigger.ended == "pose" for seen_trigger in triggers_seen)
-    right = sum(bool(seen_trigger.right) for seen_trigger in triggers_seen)
-    partial = sum(seen_trigger.partial for seen_trigger in triggers_seen)
+    judged = all(one.right is not None for one in found)
+    searched = all(one.detected is not None for one in found)
+    ended = Counter(one.ended for one in found)
+    posed = ended.pop("pose", 0)
+    right, partial = sum(bool(one.right) for one in found), sum(one.partial for one in found)
     return Pairing(
-        marked=all(seen_trigger.marked for seen_trigger in triggers_seen),
-        visible=len(triggers_seen),
+        marked=all(one.marked for one in found),
+        visible=len(found),
         right=right if judged else None,
         other_pair=posed - right - partial if judged else None,
         partial=partial if judged else None,
-        wrong=sum(seen_trigger.wrong for seen_trigger in triggers_seen),
-        ended=dict(
-            Counter(seen_trigger.ended for seen_trigger in triggers_seen if seen_trigger.ended != "pose").most_common()
-        ),
-        detected=sum(bool(seen_trigger.detected) for seen_trigger in triggers_seen) if searched else None,
-        right_detected=sum(bool(seen_trigger.detected and seen_trigger.right) for seen_trigger in triggers_seen)
-        if judged
-        else None,
+        wrong=sum(one.wrong for one in found),
+        ended=dict(ended.most_common()),
+        detected=sum(bool(one.detected) for one in found) if searched else None,
+        right_detected=sum(bool(one.detected and one.right) for one in found) if judged else None,
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import Candidates, LightTruth
+from buddyline.protocol.messages import Candidates
 from buddyline.tools.evaluation.detection import DetectionFigures, detection_figures
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
 from buddyline.tools.evaluation.pairing import Pairing, VisibleTrigger, pairing_figures, visible_triggers
@@ -95,10 +95,10 @@ class Result:
     environment: str = ""
 
 
-def _bins(errors: PoseErrors, triggers_seen: Sequence[VisibleTrigger]) -> list[RangeBin]:
+def _bins(errors: PoseErrors, visible: Sequence[VisibleTrigger]) -> list[RangeBin]:
     bins = []
     for start_m, end_m, inside in in_bins(RANGE_EDGES_M, errors.true_range_m):
-        seen = [one for one in triggers_seen if start_m <= one.range_m < end_m]
+        seen = [one for one in visible if start_m <= one.range_m < end_m]
         if inside.any() or seen:
             bins.append(RangeBin(start_m, end_m, Accuracy.of(errors.select(inside)), pairing_figures(seen)))
     return bins
@@ -124,14 +124,7 @@ def evaluate(recorded: Recorded) -> Result:
         PoseHistory.of_attitudes(recorded.attitudes_a),
         infos,
     )
-    ranges_m: dict[int, float] = {}
-    for (_, trigger), stamp_ns in _stamps_ns(frames, recorded.light_truths).items():
-        known = track.at(stamp_ns, trigger)
-        if known is not None:
-            ranges_m[trigger] = float(np.linalg.norm(known[0]))
-    triggers_seen = visible_triggers(
-        nodes, poses, rejected, lights, blobs, ranges_m, set(errors.trigger[errors.wrong].tolist())
-    )
+    seen = visible_triggers(nodes, poses, rejected, lights, blobs, set(errors.trigger[errors.wrong].tolist()))
     return Result(
         node_a=nodes[0],
         node_b=nodes[1],
@@ -140,16 +133,9 @@ def evaluate(recorded: Recorded) -> Result:
         triggers=trigger_figures(poses, rejected, list(frames.values()), recorded.doubled),
         skew=skew_figures(poses),
         accuracy=Accuracy.of(errors),
-        bins=_bins(errors, triggers_seen),
-        pairing=pairing_figures(triggers_seen),
+        bins=_bins(errors, seen),
+        pairing=pairing_figures(seen),
         detection=detection_figures(lights, blobs),
         errors=errors,
         environment=recorded.environment,
     )
-
-
-def _stamps_ns(
-    frames: Mapping[tuple[str, int], Candidates], light_truths: Iterable[LightTruth]
-) -> dict[tuple[str, int], int]:
-    stamps_ns = {(truth.node, truth.trigger): truth.stamp_ns for truth in light_truths}
-    return stamps_ns | {key: frame.stamp_ns for key, frame in frames.items()}
