@@ -106,13 +106,13 @@ def frozen_viewer(times: int) -> Report:
     report = Report(f"viewer frozen for {FREEZE_S:g} s")
     with running() as system:
         assert system.observer is not None
-        system.start("viewer")
+        system.start("recorder")
         for _ in range(times):
             time.sleep(1.0)
-            system.freeze("viewer")
+            system.freeze("recorder")
             frozen_ns = time.time_ns()
             time.sleep(FREEZE_S)
-            system.thaw("viewer")
+            system.thaw("recorder")
             thawed_ns = time.time_ns()
             measure(system, report, thawed_ns)
             arrivals = sorted(r for _, r in system.observer.outcomes if frozen_ns <= r <= thawed_ns)
@@ -120,8 +120,8 @@ def frozen_viewer(times: int) -> Report:
             report.notes.append(f"longest time without an outcome meanwhile {gap_s:.2f} s")
         report.tally = system.finish()
         seen = len({(m.node, m.boot, m.seq) for m, _ in system.observer.frames})
-        system.processes.pop("viewer").end()
-        with DiveLogReader(system.directory / "viewer.mcap") as reader:
+        system.processes.pop("recorder").end()
+        with DiveLogReader(system.directory / "recorder.mcap") as reader:
             recorded = sum(1 for _ in reader.records(lambda key: key.endswith("/candidates")))
         report.notes.append(f"the viewer itself recorded {recorded} of {seen} frames")
     return report

@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 
 from buddyline.protocol.endpoint import is_loopback
+from buddyline.tools.measure.children import free_port
 
 from tests.faults.observer import Observer, Tally
 from tests.processes import Process, free_endpoint
@@ -15,53 +16,75 @@ node = "{node}"
 connect = "{endpoint}"
 rate_hz = {rate_hz}
 [camera]
-name = "simulated"
-width_px = 410
-height_px = 308
+name = "{devices}"
+width_px = {width_px}
+height_px = {height_px}
+[sensors]
+name = "{devices}"
 [record]
 directory = "{directory}"
 images_hz = 0.0
 [preview]
-rate_hz = 0.0
+rate_hz = {preview_hz}
 [simulation]
 environment = "basin"
 """
 
-READY = {"hub": "listens", "a": "connected", "b": "connected", "solver": "connected", "viewer": "into"}
+# A node may have to render its pictures first.
+START_S = 60.0
+READY = {"hub": "listens", "a": "connected", "b": "connected", "solver": "connected", "recorder": "into"}
+READY |= {"monitor": "look at"}
 
 
 class System:
-    """Processes by name: hub, a, b, solver, viewer."""
+    """Processes by name: hub, a, b, solver, recorder (of everything, into recorder.mcap), monitor.
 
-    def __init__(self, directory: Path, rate_hz: float, endpoint: str | None = None) -> None:
+    devices: the nodes' camera and sensors; node_module: what runs them.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        rate_hz: float,
+        endpoint: str | None = None,
+        *,
+        devices: str = "simulated",
+        width_px: int = 410,
+        preview_hz: float = 0.0,
+        node_module: str = "buddyline",
+    ) -> None:
         self.directory = directory
-        self.rate_hz = rate_hz
         self.endpoint = endpoint or free_endpoint()
         self.processes: dict[str, Process] = {}
         self.observer: Observer | None = None
+        self._node = {"rate_hz": rate_hz, "devices": devices, "width_px": width_px, "preview_hz": preview_hz}
+        self._node_module = node_module
 
     def spawn(self, name: str, namespace: str | None = None) -> Process:
         """Start a process and do not wait for it; namespace: the network namespace it lives in."""
+        connect, module = ("--connect", self.endpoint), "buddyline"
         if name == "hub":
             words = ["hub", "--listen", self.endpoint, *([] if is_loopback(self.endpoint) else ["--insecure"])]
         elif name == "solver":
-            words = ["solver", "--connect", self.endpoint]
-        elif name == "viewer":
-            words = ["record", str(self.directory / "viewer.mcap"), "--connect", self.endpoint]
+            words = ["solver", *connect]
+        elif name == "recorder":
+            words = ["record", str(self.directory / "recorder.mcap"), *connect]
+        elif name == "monitor":
+            words = ["monitor", *connect, "--port", str(free_port())]
         else:
-            config = self.directory / f"{name}.toml"
-            config.write_text(
-                NODE.format(node=name, endpoint=self.endpoint, rate_hz=self.rate_hz, directory=self.directory)
-            )
-            words = ["node", "--config", str(config)]
+            config, module = self.directory / f"{name}.toml", self._node_module
+            height_px = round(int(self._node["width_px"]) * 308 / 410)
+            place = {"endpoint": self.endpoint, "directory": self.directory, "height_px": height_px}
+            config.write_text(NODE.format(node=name, **place, **self._node))
+            words = [*(["node"] if module == "buddyline" else []), "--config", str(config)]
         prefix = ("ip", "netns", "exec", namespace) if namespace else ()
-        self.processes[name] = Process(*words, prefix=prefix)
+        self.processes[name] = Process(*words, prefix=prefix, module=module)
         return self.processes[name]
 
     def start(self, *names: str) -> None:
         """Start processes, each once the one before is ready."""
         for name in names:
-            self.spawn(name).wait_for(READY[name])
+            self.spawn(name).wait_for(READY[name], timeout=START_S)
 
     def observe(self) -> Observer:
         """Connect the observer; the hub must be there."""

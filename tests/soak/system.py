@@ -13,10 +13,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from buddyline.protocol.clock import S_NS
-from buddyline.tools.measure.children import free_port
 from buddyline.tools.measure.load import Load, load_of
 
-from tests.processes import Process, free_endpoint
+from tests.faults.system import System
+from tests.processes import Process
 from tests.soak.meter import Stream, Streams, Viewer, stamps_of, streams_of
 
 RATE_HZ = 30.0
@@ -33,23 +33,6 @@ MAX_GROWTH_MIB_PER_H = 10.0
 MAX_MORE_FILES = 4
 # Of the p99 of a minute's latencies: the median of the last third over that of the first.
 MAX_P99_RATIO, MAX_P99_MORE_MS = 1.5, 10.0
-
-NODE = """
-node = "{node}"
-connect = "{endpoint}"
-rate_hz = {rate_hz}
-[camera]
-name = "repeating"
-width_px = 205
-height_px = 154
-[sensors]
-name = "repeating"
-[record]
-directory = "{directory}"
-images_hz = 0.0
-[simulation]
-environment = "basin"
-"""
 
 
 @dataclass
@@ -88,29 +71,16 @@ class Result:
 
 def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute], None] = lambda _: None) -> Result:
     """Run the system for so long; measure every so many seconds, and at the end compare with the nodes' logs."""
-    result, endpoint = Result(), free_endpoint()
-    with ExitStack() as stack:
-
-        def start(name: str, ready: str, *words: str, module: str = "buddyline") -> None:
-            process = stack.enter_context(Process(*words, module=module))
-            processes[name] = process
-            process.wait_for(ready, timeout=60.0)
-
-        processes: dict[str, Process] = {}
-        start("hub", "listens", "hub", "--listen", endpoint)
-        viewer = Viewer(endpoint)
+    result, repeating = Result(), {"devices": "repeating", "width_px": 205, "preview_hz": 1.0}
+    with System(directory, RATE_HZ, **repeating, node_module="tests.soak.node") as system, ExitStack() as stack:
+        system.start("hub")
+        viewer = Viewer(system.endpoint)
         stack.callback(viewer.bus.close)
-        start("recorder", "into", "record", str(directory / "topside.mcap"), "--connect", endpoint)
-        if find_spec("viser"):
-            start("monitor", "look at", "monitor", "--connect", endpoint, "--port", str(free_port()))
-        start("solver", "connected", "solver", "--connect", endpoint)
-        for node in ("a", "b"):
-            config = directory / f"{node}.toml"
-            config.write_text(NODE.format(node=node, endpoint=endpoint, rate_hz=RATE_HZ, directory=directory))
-            start(f"node {node}", "connected", "--config", str(config), module="tests.soak.node")
+        system.start("recorder", *(["monitor"] if find_spec("viser") else []), "solver", "a", "b")
+        processes = dict(system.processes)
         pace = stack.enter_context(Process(module="buddyline.tools.measure.pace"))
         _measure(result, processes, viewer, pace, seconds, every_s, show)
-        statuses = {name: processes[name].end() for name in ("node a", "node b")}
+        statuses = {name: processes[name].end() for name in ("a", "b")}
         # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
         time.sleep(4.0)
         statuses["solver"] = processes["solver"].end()
@@ -166,7 +136,7 @@ def _measure(
 
 def _compare(result: Result, directory: Path, viewer: Streams) -> None:
     """Count what was published, by the nodes' own logs, from the first of each key that was on the bus."""
-    seen = {"viewer": viewer, "recorder": streams_of(directory / "topside.mcap")}
+    seen = {"viewer": viewer, "recorder": streams_of(directory / "recorder.mcap")}
     published = {key: stamps for log in sorted(directory.glob("[ab]-*.mcap")) for key, stamps in stamps_of(log).items()}
     for key in sorted(viewer.by_key):
         stamps = published.get(key)
