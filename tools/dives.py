@@ -37,7 +37,7 @@ _OUTCOMES: Final = (POSE, REJECTED)
 
 @dataclass
 class _Pass:
-    """What one reading of a dive left out: bad messages by log, and outcomes of triggers that had one, by key."""
+    """What one reading of a dive left out: bad messages, by log, and second outcomes of triggers, by pair."""
 
     refusals: dict[Path, Refusals] = field(default_factory=dict)
     repeated: Counter[str] = field(default_factory=Counter)
@@ -46,9 +46,9 @@ class _Pass:
 class Dive:
     """One dive out of one or more logs (each node's own, say), with the pictures beside them.
 
-    A log that is empty is left out where there are others. Raises BuddylineError for a file that is no dive log, and
-    where logs of one time describe a node differently. one_rig: False where that may be, as for solved logs beside
-    the logs that were solved.
+    An empty log is left out where there are others. Raises BuddylineError for a file that is no dive log, and where
+    two logs describe a node differently at the same time. one_rig: False allows that, for a solved log beside the
+    logs that it was made from.
     """
 
     def __init__(self, paths: Sequence[str] | Sequence[Path], *, one_rig: bool = True) -> None:
@@ -56,6 +56,7 @@ class Dive:
         self._passes: list[_Pass] = []
         self._left_out: list[str] = []
         self._one_rig = one_rig
+        self._closed = False
         self.readers: list[DiveLogReader] = []
         try:
             with_content, self._left_out = _without_empty(with_pictures(_distinct(paths)))
@@ -92,13 +93,12 @@ class Dive:
     @property
     def seconds(self) -> float:
         """From the first message to the last; 0 where there is none."""
-        return (
-            (self.end_ns - self.start_ns) / S_NS if any(reader.start_ns is not None for reader in self.readers) else 0.0
-        )
+        starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
+        return (self.end_ns - min(starts)) / S_NS if starts else 0.0
 
     @property
     def losses(self) -> list[str]:
-        """What has not been read so far, though it should have been: a line each, with file and byte."""
+        """What could not be read so far, a line each: file, byte or key, loss."""
         found = [*self._left_out, *(f"{reader.path}: {text}" for reader in self.readers for text in reader.damage)]
         return found + [f"{path}: {line}" for path, refusals in self._refusals().items() for line in refusals.lines()]
 
@@ -113,7 +113,7 @@ class Dive:
         return {key: max(one.repeated[key] for one in self._passes) for one in self._passes for key in one.repeated}
 
     def _refusals(self) -> dict[Path, Refusals]:
-        # A dive that is read twice has lost its bad messages once.
+        # Each reading of a dive meets the same bad messages: the longest reading counts.
         found: dict[Path, Refusals] = {}
         for reading in self._passes:
             for path, refusals in reading.refusals.items():
@@ -122,13 +122,15 @@ class Dive:
         return found
 
     def nodes(self, *topic_names: str) -> list[str]:
-        """Return the ids of the nodes that sent on any of these topics, sorted."""
-        return sorted({ids[0] for ids in self.ids(*topic_names)})
+        """Return the ids of the nodes that any of these topics is of, sorted."""
+        found = [parsed for key in filter(_wanted(topic_names), self.keys) if (parsed := parse_key(key))]
+        return sorted(
+            {one for topic, ids in found for field, one in zip(topic.id_fields, ids, strict=True) if field != "net"}
+        )
 
     def ids(self, *topic_names: str) -> list[tuple[str, ...]]:
         """Return the ids, of nodes or pairs, that these topics have in the logs, sorted."""
-        wanted = _wanted(topic_names)
-        return sorted({parsed[1] for key in self.keys if wanted(key) and (parsed := parse_key(key))})
+        return sorted({parsed[1] for key in filter(_wanted(topic_names), self.keys) if (parsed := parse_key(key))})
 
     def messages(self, *topic_names: str, since_ns: int | None = None, doing: str = "") -> Iterator[Envelope]:
         """Yield the sound messages of these topics (none named: of all), by log time.
@@ -169,7 +171,7 @@ class Dive:
                 reading.refusals.setdefault(reader.path, Refusals()).note(record.key, error)
 
     def metadata(self) -> dict[str, str]:
-        """Return what the logs say about themselves; the first named prevails."""
+        """Return what the writers noted about the logs; the first named log takes precedence."""
         noted: dict[str, str] = {}
         for reader in reversed(self.readers):
             noted |= reader.metadata()
@@ -200,10 +202,12 @@ class Dive:
     def close(self) -> None:
         """Close all logs, and let the command line say what was lost."""
         self._stack.close()
+        if self._closed:
+            return
+        self._closed = True
         losses.report(self.losses)
         for pair, count in self.repeated.items():
             log.warning("%s: %d second outcomes of triggers of %s left out: the first counts", self.name, count, pair)
-        self._passes.clear()
 
     def __enter__(self) -> Dive:
         return self
@@ -213,7 +217,7 @@ class Dive:
 
 
 def open_each(paths: Sequence[str], stack: ExitStack) -> list[Dive]:
-    """Open each log as a dive of its own, for who prefers some logs to others; the stack closes them."""
+    """Open each log as a dive of its own, where some logs take precedence over others; the stack closes them."""
     with_content, left_out = _without_empty(_distinct(paths))
     losses.report(left_out)
     return [stack.enter_context(Dive([path])) for path in with_content]
