@@ -47,13 +47,8 @@ class Authority:
         key = ec.generate_private_key(ec.SECP256R1())
         # Two authorities differ by name, so that a foreign certificate is told from a forged one.
         name = _name(f"buddyline authority {secrets.token_hex(4)}")
-        certificate = (
-            _begin(name, name, key.public_key(), days)
-            .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-            .add_extension(_key_usage(signs_certificates=True), critical=True)
-            .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
-            .sign(key, hashes.SHA256())
-        )
+        identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
+        certificate = _builder(name, name, key.public_key(), days, identifier, signs=True).sign(key, hashes.SHA256())
         authority = cls(directory, certificate, key)
         _write_pair(authority.certificate_path, certificate, authority.key_path, key)
         return authority
@@ -76,14 +71,12 @@ class Authority:
         """Make certificate and key for name, as a client, or as the server at server_host; return their files."""
         key = ec.generate_private_key(ec.SECP256R1())
         purpose = ExtendedKeyUsageOID.SERVER_AUTH if server_host else ExtendedKeyUsageOID.CLIENT_AUTH
-        builder = (
-            _begin(_name(name), self._certificate.subject, key.public_key(), days)
-            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_key_usage(signs_certificates=False), critical=True)
-            .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
-            .add_extension(x509.SubjectAlternativeName([_general_name(server_host or name)]), critical=False)
-            .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()), critical=False)
+        extensions = (
+            x509.ExtendedKeyUsage([purpose]),
+            x509.SubjectAlternativeName([_general_name(server_host or name)]),
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key()),
         )
+        builder = _builder(_name(name), self._certificate.subject, key.public_key(), days, *extensions, signs=False)
         paths = [self.directory / f"{name}.crt", self.directory / f"{name}.key"]
         _write_pair(paths[0], builder.sign(self._key, hashes.SHA256()), paths[1], key)
         return paths
@@ -100,17 +93,34 @@ class Authority:
         return f"[{host}]" if isinstance(host, ipaddress.IPv6Address) else str(host)
 
 
-def _begin(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int) -> x509.CertificateBuilder:
+def _builder(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePublicKey,
+    days: int,
+    *extensions: x509.ExtensionType,
+    signs: bool,
+) -> x509.CertificateBuilder:
+    """Return a certificate to sign; signs: whether its owner may sign other certificates."""
     now = datetime.datetime.now(datetime.UTC)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
+    usage = dict.fromkeys(
+        ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "encipher_only"), False
+    )
+    builder = (
+        x509.CertificateBuilder(issuer, subject, key, x509.random_serial_number())
         .not_valid_before(now - BACKDATED)
         .not_valid_after(now + datetime.timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
+        .add_extension(
+            x509.KeyUsage(
+                digital_signature=not signs, key_cert_sign=signs, crl_sign=signs, decipher_only=False, **usage
+            ),
+            critical=True,
+        )
     )
+    for extension in extensions:
+        builder = builder.add_extension(extension, critical=False)
+    return builder
 
 
 def _name(common_name: str) -> x509.Name:
@@ -122,20 +132,6 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
     except ValueError:
         return x509.DNSName(host)
-
-
-def _key_usage(*, signs_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not signs_certificates,
-        key_cert_sign=signs_certificates,
-        crl_sign=signs_certificates,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
 
 
 def _write_pair(

@@ -13,7 +13,6 @@ from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
 
-SERVICES: Final = ("node", "hub", "solver")
 STATE: Final = Path("/var/lib/buddyline")
 # Chrony first, where it is installed: the triggers are instants of its clock.
 AFTER: Final = {
@@ -45,19 +44,19 @@ WITHOUT_DEVICES: Final = "PrivateDevices=yes\nProtectClock=yes"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("service", choices=SERVICES, help="which unit to write: buddyline-<service>.service")
+    parser.add_argument("service", choices=tuple(AFTER), help="which unit to write: buddyline-<service>.service")
     parser.add_argument("--config", metavar="FILE.toml", help="its configuration; a node must have one")
     parser.add_argument(
-        "--run-as", metavar="USER", help="default: whoever called sudo; needs no rights but the camera's and the bus's"
+        "--run-as", metavar="USER", help="default: whoever called sudo; needs access to camera and I2C bus, no more"
     )
     parser.add_argument("--print", action="store_true", help="show the unit, write nothing")
     parser.add_argument("--user", action="store_true", help="a unit of your own (systemctl --user), not hardened")
-    parser.add_argument("--root", metavar="DIR", help="write below this directory: a mounted card, say")
+    parser.add_argument("--root", metavar="DIR", help="write below this directory, such as a mounted card")
     parser.add_argument("--force", action="store_true", help="replace a unit that has other contents")
 
 
 @dataclass(frozen=True)
-class Plan:
+class UnitSource:
     """What a unit is made from. groups: those whose devices it opens; writable: where it writes besides its state."""
 
     service: str
@@ -71,55 +70,50 @@ def run(args: argparse.Namespace) -> int:
     """Write one unit, or show it."""
     if args.user and (args.root or args.run_as):
         raise BuddylineError("--user writes a unit of your own: it goes with neither --root nor --run-as")
-    plan = _plan(args)
-    text = user_unit(plan) if args.user else system_unit(plan)
+    source = _source(args)
+    text = user_unit(source) if args.user else system_unit(source)
     if args.print:
         sys.stdout.write(text)
         return 0
-    path = _directory(args) / f"buddyline-{plan.service}.service"
+    unit = f"buddyline-{source.service}"
+    path = _directory(args) / f"{unit}.service"
     print(f"{path}: {_write(path, text, force=args.force)}")
     if not args.root:
-        print("\n".join(_next_commands(f"buddyline-{plan.service}", user=args.user)))
+        print(_next_commands(unit, user=args.user))
     return 0
 
 
-def system_unit(plan: Plan) -> str:
+def system_unit(source: UnitSource) -> str:
     """Return the unit of the whole machine."""
     lines = [
         "StateDirectory=buddyline",
-        "RuntimeDirectory=buddyline",
-        # The three services share it: the one that ends first must not take it from the others.
-        "RuntimeDirectoryPreserve=yes",
         f"WorkingDirectory={STATE}",
-        f"User={plan.user}",
+        f"User={source.user}",
+        *([f"SupplementaryGroups={' '.join(source.groups)}"] if source.groups else []),
+        *(f"ReadWritePaths={_quoted(f'-{path}')}" for path in source.writable),
+        HARDENING,
+        *([] if source.groups else [WITHOUT_DEVICES]),
     ]
-    if plan.groups:
-        lines.append(f"SupplementaryGroups={' '.join(plan.groups)}")
-    lines += [f"ReadWritePaths={_quoted(f'-{path}')}" for path in plan.writable]
-    lines.append(HARDENING)
-    if not plan.groups:
-        lines.append(WITHOUT_DEVICES)
-    return _unit(plan, lines, "multi-user.target")
+    return _unit(source, lines, "multi-user.target")
 
 
-def user_unit(plan: Plan) -> str:
+def user_unit(source: UnitSource) -> str:
     """Return the unit of one user's own manager, which lacks the rights to harden anything."""
-    directory = plan.config.parent if plan.config else Path.home()
-    lines = ["RuntimeDirectory=buddyline", "RuntimeDirectoryPreserve=yes", f"WorkingDirectory={_escaped(directory)}"]
-    return _unit(plan, lines, "default.target")
+    directory = source.config.parent if source.config else Path.home()
+    return _unit(source, [f"WorkingDirectory={str(directory).replace('%', '%%')}"], "default.target")
 
 
-def _unit(plan: Plan, lines: list[str], target: str) -> str:
-    words = [str(_program()), plan.service, *(["--config", str(plan.config)] if plan.config else [])]
-    after = AFTER[plan.service]
-    wants = f"Wants={after}\n" if plan.service == "hub" else ""
+def _unit(source: UnitSource, lines: list[str], target: str) -> str:
+    words = [str(_program()), source.service, *(["--config", str(source.config)] if source.config else [])]
+    after = AFTER[source.service]
     own = "\n".join(lines)
     return f"""\
-# Written by `buddyline install-service {plan.service}`; your own changes: `systemctl edit buddyline-{plan.service}`.
+# Written by `buddyline install-service`; your own changes: `systemctl edit buddyline-{source.service}`.
 [Unit]
-Description=Buddyline {plan.service}
+Description=Buddyline {source.service}
 After={after}
-{wants}# However often it fails: under water nobody is there to start it.
+{f"Wants={after}" if source.service == "hub" else ""}
+# However often it fails: under water nobody is there to start it.
 StartLimitIntervalSec=0
 
 [Service]
@@ -130,6 +124,9 @@ WatchdogSec=10
 Restart=on-failure
 RestartSec=2
 TimeoutStopSec=10
+RuntimeDirectory=buddyline
+# The three services share it: the one that ends first must not take it from the others.
+RuntimeDirectoryPreserve=yes
 {own}
 
 [Install]
@@ -137,40 +134,32 @@ WantedBy={target}
 """
 
 
-def _plan(args: argparse.Namespace) -> Plan:
+def _source(args: argparse.Namespace) -> UnitSource:
+    """Check the service's configuration, and take from it what the unit needs."""
     config = Path(args.config).resolve() if args.config else None
-    if args.service != "node":
-        if config is not None:
-            _check_config(args.service, config)
-        return Plan(args.service, config, _user(args))
-    if config is None:
-        raise BuddylineError("a node needs its configuration: --config FILE.toml")
-    from buddyline.node.config import load_node_config
+    user: str = args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
+    if not all(letter.isalnum() or letter in "_-." for letter in user):
+        raise BuddylineError(f"--run-as {user}: not a user's name")
+    if args.service == "node":
+        if config is None:
+            raise BuddylineError("a node needs its configuration: --config FILE.toml")
+        from buddyline.node.config import load_node_config
 
-    node = load_node_config(config)
-    groups = ["video"] if node.camera.name == "picamera2" else []
-    groups += ["i2c"] if node.sensors.name == "i2c" else []
-    directory = Path(node.record.directory)
-    writable = (directory,) if directory.is_absolute() and not directory.is_relative_to(STATE) else ()
-    return Plan("node", config, _user(args), tuple(groups), writable)
-
-
-def _check_config(service: str, config: Path) -> None:
-    if service == "hub":
+        node = load_node_config(config)
+        groups = ["video"] if node.camera.name == "picamera2" else []
+        groups += ["i2c"] if node.sensors.name == "i2c" else []
+        directory = Path(node.record.directory)
+        writable = (directory,) if directory.is_absolute() and not directory.is_relative_to(STATE) else ()
+        return UnitSource("node", config, user, tuple(groups), writable)
+    if config is not None and args.service == "hub":
         from buddyline.tools.hub import load_hub_config
 
         load_hub_config(str(config))
-    else:
+    elif config is not None:
         from buddyline.solver_service.config import load_solver_config
 
         load_solver_config(config)
-
-
-def _user(args: argparse.Namespace) -> str:
-    name: str = args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
-    if not all(letter.isalnum() or letter in "_-." for letter in name):
-        raise BuddylineError(f"--run-as {name}: not a user's name")
-    return name
+    return UnitSource(args.service, config, user)
 
 
 def _program() -> Path:
@@ -211,21 +200,17 @@ def _write(path: Path, text: str, *, force: bool) -> str:
     return "written" if before is None else "replaced"
 
 
-def _next_commands(unit: str, *, user: bool) -> list[str]:
-    systemctl, journalctl = ("systemctl --user", "journalctl --user") if user else ("sudo systemctl", "journalctl")
-    lines = [
-        "next:",
-        f"  {systemctl} daemon-reload",
-        f"  {systemctl} enable {unit}          # from the next start of the machine on",
-        f"  {systemctl} restart {unit}         # and now",
-        f"  systemctl {'--user ' if user else ''}status {unit}",
-        f"  {journalctl} -fu {unit}",
-    ]
-    return [*lines, "  loginctl enable-linger             # without you being logged in"] if user else lines
-
-
-def _escaped(text: object) -> str:
-    return str(text).replace("%", "%%")
+def _next_commands(unit: str, *, user: bool) -> str:
+    own = " --user" if user else ""
+    systemctl = "systemctl --user" if user else "sudo systemctl"
+    linger = "\n  loginctl enable-linger             # without you being logged in" if user else ""
+    return f"""\
+next:
+  {systemctl} daemon-reload
+  {systemctl} enable {unit}          # from the next start of the machine on
+  {systemctl} restart {unit}         # and now
+  systemctl{own} status {unit}
+  journalctl{own} -fu {unit}{linger}"""
 
 
 def _quoted(text: str) -> str:

@@ -10,37 +10,42 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
+from buddyline.protocol.security import HUB, node_name
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.newfile import write_new
 
 if TYPE_CHECKING:
     from buddyline.tools.authority import Authority
 
-DIRECTORY: Final = "keys"
 PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
 
-ROLES: Final = (SOLVER, VIEWER, SURVEYOR, PLAYER, ROS)
+# Whose certificate a command makes, and what it is for.
+ROLES: Final = {
+    "solver": "make the solver's certificate, which may publish poses",
+    "viewer": "make the certificate of everything that only reads: record, monitor",
+    "surveyor": "make the certificate of whoever marks stations: mark, survey watch; it reads as well",
+    "ros2": "make the certificate of `ros2`, which may publish what it makes for ROS; it reads as well",
+    "player": "make the certificate of `play`, which may publish what any node publishes",
+}
 
 _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--directory", default=DIRECTORY, metavar="DIR", help=f"where all of it is: {DIRECTORY}/")
-    parser.add_argument("--days", type=int, metavar="N", help=f"how long it is valid; {DAYS}, the authority 10 years")
-    whose = parser.add_subparsers(dest="whose", required=True, metavar="init|node|solver|viewer|surveyor|player|ros2")
+    parser.add_argument("--directory", default="keys", metavar="DIR", help="where all files are; default: %(default)s")
+    parser.add_argument(
+        "--days", type=int, metavar="N", help=f"how long it is valid; default: {DAYS}, the authority 10 years"
+    )
+    whose = parser.add_subparsers(dest="whose", required=True, metavar="|".join(("init", "node", *ROLES)))
     first = whose.add_parser("init", help="make the authority and the hub's certificate")
-    first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find the hub; 127.0.0.1")
-    node = whose.add_parser("node", help="make a node's certificate, and let it publish what is its own")
+    first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find it; default: %(default)s")
+    node = whose.add_parser("node", help="make a node's certificate; the hub then lets it publish its own keys")
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
-    whose.add_parser("solver", help="make the solver's certificate, which may publish poses")
-    whose.add_parser("viewer", help="make the certificate of all that only read: record, monitor")
-    whose.add_parser("surveyor", help="make the certificate of who marks stations: mark, survey watch; reads, too")
-    whose.add_parser(ROS, help="make the certificate of `ros2`, which may publish what it makes for ROS; reads, too")
-    whose.add_parser("player", help="make the certificate of `play`, which may publish what any node publishes")
+    for role, text in ROLES.items():
+        whose.add_parser(role, help=text)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -119,6 +124,3 @@ def _admit(path: Path, node: str) -> None:
 
 def _say(text: str) -> None:
     print(f"keys: {text}", file=sys.stderr)
-
-
-__all__ = ["add_arguments", "run"]

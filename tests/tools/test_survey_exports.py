@@ -224,4 +224,4 @@ def test_drawings_and_report_hold_every_station():
     assert page.count("<svg") == 2
     assert "misclosure" in page
     assert "ALARM: leg 3-4" in page
-    assert "http" not in page
+    assert "://" not in page

@@ -99,13 +99,11 @@ def _legs(args: argparse.Namespace) -> int:
     project = load_project(path)
     if not project.dive:
         raise BuddylineError(f"{path}: names no dive; add [[dive]] with its logs")
+    marks = project.mark + (of_table(args.marks) if args.marks else [])
     derived = Derived()
     for number, one in enumerate(project.dive, 1):
         pairs = of_logs([str(path.parent / log) for log in one.logs])
-        start_ns = int(pairs[0].stamps_ns[0])
-        by_hand = of_project(project.mark, number, start_ns)
-        if args.marks and number == 1:
-            by_hand += of_table(args.marks, start_ns)
+        by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
     stations = derived.stations()
     write_derived(

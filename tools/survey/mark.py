@@ -12,7 +12,7 @@ from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
-from buddyline.tools.survey.marks import KINDS, stamp_ns_of
+from buddyline.tools.survey.marks import KINDS, stamp_ns_of, time_of
 from buddyline.tools.survey.project import STATION_NAME
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
     if args.kind == "note" and not args.note:
         raise BuddylineError("a note needs --note TEXT")
     try:
-        stamp_ns = stamp_ns_of(args.at, now_ns) if args.at else now_ns
+        stamp_ns = stamp_ns_of(time_of(args.at), now_ns) if args.at else now_ns
     except ValueError as error:
         raise BuddylineError(f"--at {args.at}: {error}") from error
     return Mark(node=check_node_id(args.node), stamp_ns=stamp_ns, kind=args.kind, name=args.name, note=args.note)

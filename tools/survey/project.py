@@ -12,7 +12,7 @@ import re
 from datetime import UTC, date, datetime
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import msgspec
 from buddyline.protocol.clock import S_NS
@@ -91,6 +91,9 @@ class DiveFiles(Config, frozen=True, kw_only=True):
     note: str = ""
 
 
+MarkKind: TypeAlias = Literal["station", "point", "note"]
+
+
 class HandMark(Config, frozen=True, kw_only=True):
     """[[mark]]: like the bus's Mark, by hand. time: UTC; or seconds from the dive's first fix."""
 
@@ -98,7 +101,7 @@ class HandMark(Config, frozen=True, kw_only=True):
     time: datetime | UnsetType = UNSET
     seconds: float | UnsetType = UNSET
     dive: Annotated[int, Meta(ge=1)] = 1
-    kind: Literal["station", "point", "note"] = "station"
+    kind: MarkKind = "station"
     name: str = ""
     note: str = ""
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable
+from html import escape
 from typing import Final
 
+from buddyline.tools.draw import page as html
 from buddyline.tools.draw.figures import inline_svg
 from buddyline.tools.draw.survey import plan, profile
 from buddyline.tools.survey.lines import SightPair, bearing_of
@@ -14,12 +15,9 @@ from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Sheet
 from msgspec import UNSET
 
-CLASS_ALARM: Final = ' class="alarm"'
-STYLE: Final = (
-    "body{font:14px/1.4 sans-serif;margin:2em auto;padding:0 1em;max-width:72em}table{border-collapse:collapse}"
-    "td,th{border:1px solid #ccc;padding:2px 6px;text-align:right;white-space:nowrap}"
-    "td:last-child{text-align:left;white-space:normal;min-width:16em}.wide{overflow-x:auto}"
-    ".alarm{color:#c00000}svg{max-width:100%;height:auto}"
+# Numbers stand to the right, words to the left.
+CSS: Final = (
+    "td,th{text-align:right;white-space:nowrap}td:last-child{text-align:left;white-space:normal;min-width:16em}"
 )
 
 
@@ -57,7 +55,7 @@ def summary(sheet: Sheet) -> list[str]:
 
 # The table of legs: a column's head, and its text for a leg, its bearing (None: it has none) and its residual's chi^2.
 COLUMNS: Final[dict[str, Callable[[Leg, SightPair | None, float | None], str]]] = {
-    "leg": lambda leg, _b, _c: html.escape(leg.name),
+    "leg": lambda leg, _b, _c: leg.name,
     "distance m": lambda leg, _b, _c: f"{leg.distance_m:.2f} ± {leg.distance_sigma_m:.2f}",
     "foresight°": lambda leg, _b, _c: _number(leg.azimuth_deg, 1),
     "backsight°": lambda leg, _b, _c: _number(leg.back_azimuth_deg, 1),
@@ -71,41 +69,33 @@ COLUMNS: Final[dict[str, Callable[[Leg, SightPair | None, float | None], str]]] 
     "fixes": lambda leg, _b, _c: str(leg.fixes),
     "grade": lambda leg, _b, _c: str(leg.grade),
     "residual χ²": lambda _, _b, chi2: "" if chi2 is None else f"{chi2:.1f}",
-    "alarms and notes": lambda leg, _b, _c: "<br>".join(html.escape(s) for s in [*leg.alarms, leg.note] if s),
+    "alarms and notes": lambda leg, _b, _c: "\n".join(said for said in [*leg.alarms, leg.note] if said),
 }
 
 
 def page(sheet: Sheet) -> str:
     """Return the report as one HTML file without outside requests."""
     chi2 = {id(one.leg): one.chi2 for one in sheet.adjusted.residuals}
+    legs = sheet.project.leg + sheet.project.point
     rows = []
-    for leg in sheet.project.leg + sheet.project.point:
-        given = leg, bearing_of(leg, sheet.project), chi2.get(id(leg))
-        cells = "".join(f"<td>{text(*given)}</td>" for text in COLUMNS.values())
-        rows.append(f"<tr{CLASS_ALARM if leg.alarms else ''}>{cells}</tr>")
-    title = html.escape(sheet.title)
+    for leg in legs:
+        bearing = bearing_of(leg, sheet.project)
+        rows.append([text(leg, bearing, chi2.get(id(leg))) for text in COLUMNS.values()])
     facts = [sheet.date, ", ".join(sheet.team), *(f"{kind}: {text}" for kind, text in sheet.instruments.items())]
-    return "\n".join(
-        [
-            "<!doctype html><html><head><meta charset='utf-8'>",
-            "<meta name='viewport' content='width=device-width'>",
-            f"<title>{title}</title><style>{STYLE}</style></head><body><h1>{title}</h1>",
-            "<p>" + "<br>".join(html.escape(fact) for fact in [*facts, *sheet.notes] if fact) + "</p><ul>",
-            *(_item(line) for line in summary(sheet)),
-            "</ul>",
-            inline_svg(plan(sheet.adjusted, sheet.title), "plan"),
-            inline_svg(profile(sheet.adjusted, sheet.title), "profile"),
-            f"<div class='wide'><table><tr>{''.join(f'<th>{name}</th>' for name in COLUMNS)}</tr>",
-            *rows,
-            "</table></div></body></html>",
-            "",
-        ]
+    return html.page(
+        sheet.title,
+        "<p>" + "<br>".join(escape(fact) for fact in [*facts, *sheet.notes] if fact) + "</p>",
+        "<ul>" + "".join(_item(line) for line in summary(sheet)) + "</ul>",
+        inline_svg(plan(sheet.adjusted, sheet.title), "plan"),
+        inline_svg(profile(sheet.adjusted, sheet.title), "profile"),
+        html.table(rows, list(COLUMNS), [number for number, leg in enumerate(legs) if leg.alarms]),
+        css=CSS,
     )
 
 
 def _item(line: str) -> str:
     wrong = line.startswith(("ALARM", "BLUNDER", "left out", "NO LEG"))
-    return f"<li{CLASS_ALARM if wrong else ''}>{html.escape(line)}</li>"
+    return f"<li class='alarm'>{escape(line)}</li>" if wrong else f"<li>{escape(line)}</li>"
 
 
 def _number(value: object, digits: int) -> str:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.averages import Bools, Floats, Ints
 from buddyline.tools.survey.readings import NodeReadings, PairReadings
 from buddyline.tools.survey.settings import SurveySettings
@@ -46,23 +47,20 @@ class Rest:
 def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> list[Rest]:
     """Return the rests of a dive in their order; too_short where not rest_s long with rest_fixes fixes.
 
-    What is shorter than half of that is no rest, but a swimmer's pause; unless poses were refused meanwhile, which
-    makes up for the fixes in being one, though not in making a leg.
+    A rest shorter than half of that is only a swimmer's pause and left out. Where poses were refused meanwhile, these
+    make up for missing fixes of a rest, though not of a leg.
     """
     handled_by = [handled(node, seen.stamps_ns, settings) for node in readings.pair]
     yaw_rad = np.nan_to_num(seen.sigma_rad[:, :, 2].max(axis=0))
     wander_mps = np.maximum(WANDER_RADPS, WANDER_SHARE_HZ * yaw_rad) * seen.range_m
     still = (speeds_mps(seen) < settings.rest_speed_mps + wander_mps) & ~np.any(handled_by, axis=0)
-    runs = _merged(_runs(seen, still), seen)
     found: list[Rest] = []
-    for run in runs:
+    for run in _merged(_runs(seen, still), seen):
         start_ns, end_ns = int(seen.stamps_ns[run[0]]), int(seen.stamps_ns[run[-1]])
-        seconds = (end_ns - start_ns) / 1e9
-        if len(run) < settings.rest_fixes / 2 or seconds < settings.rest_s / 2:
+        if not _long_enough(len(run), end_ns - start_ns, settings, 0.5):
             continue
-        too_short = ""
-        if len(run) < settings.rest_fixes or seconds < settings.rest_s:
-            too_short = f"{seconds:.0f} s with {len(run)} fixes"
+        whole = _long_enough(len(run), end_ns - start_ns, settings)
+        too_short = "" if whole else f"{(end_ns - start_ns) / 1e9:.0f} s with {len(run)} fixes"
         chosen = np.zeros(len(seen.stamps_ns), dtype=bool)
         chosen[run] = True
         inside = (seen.stamps_ns >= start_ns) & (seen.stamps_ns <= end_ns) & ~chosen
@@ -74,6 +72,10 @@ def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> lis
     return sorted([*found, *_refused(readings, seen, still, found, settings)], key=lambda one: one.start_ns)
 
 
+def _long_enough(count: int, span_ns: int, settings: SurveySettings, share: float = 1.0) -> bool:
+    return count >= share * settings.rest_fixes and span_ns >= share * settings.rest_s * S_NS
+
+
 def _refused(
     readings: PairReadings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings
 ) -> list[Rest]:
@@ -81,22 +83,20 @@ def _refused(
     events = [(int(seen.stamps_ns[i]), "fix") for i in np.flatnonzero(still).tolist()]
     events += [(one.stamp_ns, one.reason) for one in readings.rejected if one.reason not in UNSEEN]
     groups: list[list[tuple[int, str]]] = []
-    for stamp_ns, reason in sorted(events):
-        if any(one.start_ns - PAUSE_NS <= stamp_ns <= one.end_ns + PAUSE_NS for one in found):
+    for event in sorted(events):
+        if any(one.start_ns - PAUSE_NS <= event[0] <= one.end_ns + PAUSE_NS for one in found):
             continue
-        if groups and stamp_ns - groups[-1][-1][0] < PAUSE_NS:
-            groups[-1].append((stamp_ns, reason))
+        if groups and event[0] - groups[-1][-1][0] < PAUSE_NS:
+            groups[-1].append(event)
         else:
-            groups.append([(stamp_ns, reason)])
+            groups.append([event])
     lost = []
     for group in groups:
         start_ns, end_ns = group[0][0], group[-1][0]
-        seconds = (end_ns - start_ns) / 1e9
-        if seconds < settings.rest_s / 2 or len(group) < settings.rest_fixes / 2:
+        if not _long_enough(len(group), end_ns - start_ns, settings, 0.5):
             continue
         reasons = Counter(reason for _, reason in group)
-        fixes = reasons.pop("fix", 0)
-        text = f"{seconds:.0f} s with {fixes} fixes"
+        text = f"{(end_ns - start_ns) / 1e9:.0f} s with {reasons.pop('fix', 0)} fixes"
         if reasons:
             text += "; refused: " + ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
         lost.append(Rest(np.zeros(len(still), dtype=bool), start_ns, end_ns, np.zeros(3), text))
@@ -110,20 +110,18 @@ def same_line(one_m: Floats, other_m: Floats) -> bool:
 
 
 def speeds_mps(seen: Sights) -> Floats:
-    """Return how fast B moves relative to A at each fix, (n,): slope of the line over SLOPE_NS.
+    """Return how fast b moves relative to a at each fix, (n,): slope of the line over SLOPE_NS.
 
     Without any attitude, of the range alone.
     """
     line_m = seen.line_m
     known = np.asarray(~np.isnan(line_m).any(axis=1))
-    value = np.where(known[:, None], line_m, np.column_stack([seen.range_m] + [np.zeros_like(seen.range_m)] * 2))
+    value = np.where(known[:, None], line_m, np.outer(seen.range_m, [1.0, 0.0, 0.0]))
     stamps = seen.stamps_ns
-    first = np.searchsorted(stamps, stamps - SLOPE_NS // 2)
-    last = np.searchsorted(stamps, stamps + SLOPE_NS // 2, "right")
     speed = np.zeros(len(stamps))
-    for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
+    for i, (start, end) in enumerate(_around(stamps, stamps, SLOPE_NS // 2)):
         part = np.flatnonzero(known[start:end] == known[i]) + start
-        if len(part) < 3:
+        if len(part) < LEAST_RUN:
             continue
         t_s = (stamps[part] - stamps[i]) / 1e9
         # Halves' medians: one gross fix makes no motion.
@@ -136,19 +134,20 @@ def speeds_mps(seen: Sights) -> Floats:
 
 def handled(node: NodeReadings, stamps_ns: Ints, settings: SurveySettings) -> Bools:
     """Tell, for each of stamps_ns (n,), whether the node is turned or jolted; False where it has no IMU."""
-    result = np.zeros(len(stamps_ns), dtype=bool)
-    if not len(node.imu):
-        return result
     turn = np.linalg.norm(node.imu["gyro_radps"], axis=1)
     jolt = np.abs(np.linalg.norm(node.imu["accel_mps2"], axis=1) - GRAVITY_MPS2)
-    first = np.searchsorted(node.imu.stamps_ns, stamps_ns - FEEL_NS)
-    last = np.searchsorted(node.imu.stamps_ns, stamps_ns + FEEL_NS, "right")
-    for i, (start, end) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
-        if start < end:
-            result[i] = bool(
-                np.median(turn[start:end]) > settings.turn_radps or np.median(jolt[start:end]) > settings.jolt_mps2
-            )
-    return result
+    felt = [
+        start < end
+        and (np.median(turn[start:end]) > settings.turn_radps or np.median(jolt[start:end]) > settings.jolt_mps2)
+        for start, end in _around(node.imu.stamps_ns, stamps_ns, FEEL_NS)
+    ]
+    return np.array(felt, dtype=bool)
+
+
+def _around(series_ns: Ints, stamps_ns: Ints, within_ns: int) -> list[tuple[int, int]]:
+    """Return, for each of stamps_ns, which samples of a series are within within_ns of it, from start to end."""
+    first = np.searchsorted(series_ns, stamps_ns - within_ns).tolist()
+    return list(zip(first, np.searchsorted(series_ns, stamps_ns + within_ns, "right").tolist(), strict=True))
 
 
 def _runs(seen: Sights, still: Bools) -> list[list[int]]:
