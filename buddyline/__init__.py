@@ -55,7 +55,7 @@ if TYPE_CHECKING:
         TruthColumns,
     )
     from buddyline.tools.livestream import LiveStream
-    from buddyline.tools.offline import Solved
+    from buddyline.tools.offline import SolvedDive
     from numpy.typing import NDArray
 
 __all__ = [
@@ -78,7 +78,7 @@ __all__ = [
     "Rejected",
     "RejectionColumns",
     "RelativePose",
-    "Solved",
+    "SolvedDive",
     "Track",
     "TrackColumns",
     "Truth",
@@ -107,7 +107,7 @@ _MODULES: Final = {
         *("PoseColumns", "RejectionColumns", "TrackColumns", "TruthColumns"),
     ),
     "buddyline.tools.livestream": ("LiveStream",),
-    "buddyline.tools.offline": ("Solved",),
+    "buddyline.tools.offline": ("SolvedDive",),
 }
 _MODULE_OF: Final = {name: module for module, names in _MODULES.items() for name in names}
 
@@ -145,7 +145,7 @@ def solve(
     clock_offset_s: float = 0.0,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
-) -> Solved:
+) -> SolvedDive:
     """Solve a stored dive in memory, as `buddyline solve` does; pictures are detected first where need be.
 
     pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's.
@@ -171,7 +171,7 @@ def solve_messages(
     method: str = "refined",
     checks: Sequence[str] = ALL_CHECKS,
     clock_offset_s: float = 0.0,
-) -> Solved:
+) -> SolvedDive:
     """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Attitude and Depth if any.
 
     They are taken in the order given, which is that of their stamps but for a second at most.

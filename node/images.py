@@ -12,14 +12,14 @@ from buddyline.protocol.messages import CompressedImage, FoxgloveTime
 from numpy.typing import NDArray
 
 
-class Turn:
+class RateLimiter:
     """Picks at most rate_hz of the frames, whatever the clock does meanwhile; none where that is 0."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = round(0.99e9 / rate_hz) if rate_hz > 0 else 0
         self._next_ns = 0
 
-    def has_come(self, stamp_ns: int) -> bool:
+    def allow(self, stamp_ns: int) -> bool:
         """Return whether the frame of this stamp is to be taken."""
         # A clock that is set back must not make pictures wait until it is there again.
         if self._period_ns == 0 or 0 < self._next_ns - stamp_ns <= self._period_ns:
@@ -36,15 +36,15 @@ class Images:
         self._record = config.record
         self._preview = config.preview
         self._outlet = outlet
-        self._record_turn = Turn(config.record.images_hz)
-        self._preview_turn = Turn(config.preview.rate_hz)
+        self._record_limit = RateLimiter(config.record.images_hz)
+        self._preview_limit = RateLimiter(config.preview.rate_hz)
 
     def send(self, frame: Frame) -> None:
         """Record or publish a frame's picture where its turn has come."""
-        if self._record_turn.has_come(frame.stamp_ns):
+        if self._record_limit.allow(frame.stamp_ns):
             image = self._encoded(frame.image, frame.stamp_ns, self._record.image_quality)
             self._outlet.send(image, publish=False)
-        if self._preview_turn.has_come(frame.stamp_ns):
+        if self._preview_limit.allow(frame.stamp_ns):
             height, width = frame.image.shape[:2]
             scale = min(self._preview.width_px / width, 1.0)
             size = (round(width * scale), max(round(height * scale), 1))

@@ -27,7 +27,7 @@ class Gap:
 
 
 @dataclass
-class _Publisher(Generic[S]):
+class _Sender(Generic[S]):
     """The number that is due next, and what arrived after a gap that is still open."""
 
     due: int
@@ -45,11 +45,11 @@ class Sequence(Generic[S]):
         self.missed = 0
         self._deliver = deliver
         # The one that has been silent longest comes first.
-        self._publishers: dict[Source, _Publisher[S]] = {}
+        self._publishers: dict[Source, _Sender[S]] = {}
 
     def begin(self, source: Source, number: int) -> None:
         """Take number as a publisher's first: earlier samples can no longer be fetched."""
-        self._publishers.setdefault(source, _Publisher(number, known=True))
+        self._publishers.setdefault(source, _Sender(number, known=True))
 
     def accept(
         self, source: Source, number: int, key: str, sample: S, *, recover: bool = True, newest_only: bool = False
@@ -58,7 +58,7 @@ class Sequence(Generic[S]):
 
         Without recover, missing numbers are skipped and counted. newest_only: they are skipped and not counted.
         """
-        publisher = self._publishers.pop(source, None) or _Publisher[S](0, known=False)
+        publisher = self._publishers.pop(source, None) or _Sender[S](0, known=False)
         self._publishers[source] = publisher
         if len(self._publishers) > MAX_PUBLISHERS:
             del self._publishers[next(iter(self._publishers))]
@@ -93,7 +93,7 @@ class Sequence(Generic[S]):
             self._pass(publisher, number, sample)
         return None
 
-    def _pass(self, publisher: _Publisher[S], number: int, sample: S) -> None:
+    def _pass(self, publisher: _Sender[S], number: int, sample: S) -> None:
         if publisher.known:
             self.missed += number - publisher.due
         publisher.known = True

@@ -158,13 +158,13 @@ def _lights(args: argparse.Namespace) -> None:
     import numpy as np
     from buddyline.solver_service.results import rig_of
     from buddyline.tools.calibration.inputs import places
-    from buddyline.tools.calibration.lights import Noise, fit
+    from buddyline.tools.calibration.lights import CalibrationNoise, fit
     from buddyline.tools.calibration.pictures import draw_lights, write_picture
     from msgspec.structs import replace
 
     taped, infos = places(args.dives, [tuple(tape) for tape in args.tape], args.nodes)
     rigs = rig_of(infos[0]), rig_of(infos[1])
-    noise = Noise(args.pixel_sigma, args.tape_sigma_mm / 1e3, args.ruler_sigma_mm / 1e3)
+    noise = CalibrationNoise(args.pixel_sigma, args.tape_sigma_mm / 1e3, args.ruler_sigma_mm / 1e3)
     found = fit(taped, (rigs[0].camera, rigs[1].camera), (rigs[0].lights_m, rigs[1].lights_m), noise)
     write_picture(Path(args.picture), draw_lights(found, taped))
     log.info("chi2 %.2f, tape within %.1f mm; see %s", found.chi2, 1e3 * np.abs(found.tape_gaps_m).max(), args.picture)

@@ -17,7 +17,7 @@ from buddyline.tools.dives import Dive
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class SolvedDive:
     """What became of a dive's triggers, as columns by time. pair: a and b of T_a_b."""
 
     pair: Pair
@@ -32,7 +32,7 @@ def solve_messages(
     method: str = "refined",
     checks: Sequence[str] = CHECKS,
     clock_offset_s: float = 0.0,
-) -> Solved:
+) -> SolvedDive:
     """Solve a pair's messages (NodeInfo, Candidates, Attitude, Depth), in the order in which they were received.
 
     pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. The results are those
@@ -47,7 +47,7 @@ def solve_messages(
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
     core = SolverCore(settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)})
     outcomes = [outcome for message in taken for outcome in core.handle(message)] + core.flush()
-    return Solved(
+    return SolvedDive(
         chosen,
         pose_columns(in_order(one for one in outcomes if isinstance(one, RelativePose))),
         rejection_columns(sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)),
@@ -63,7 +63,7 @@ def solve_logs(
     clock_offset_s: float = 0.0,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
-) -> Solved:
+) -> SolvedDive:
     """Solve a stored dive; the pictures of a node without candidates are detected first.
 
     infos: calibrations in place of the logs' own. environment: of the detector. The others as in solve_messages.

@@ -132,7 +132,7 @@ def compensate_02ba(c: Sequence[int], d1: int, d2: int) -> tuple[int, int]:
     return (d1 * (terms.sens - sensi) >> 21) - (terms.off - offi) >> 15, terms.temp - ti
 
 
-class _State(Enum):
+class _Phase(Enum):
     LOST = 0
     RESETTING = 1
     IDLE = 2
@@ -150,7 +150,7 @@ class Ms5837:
         self.model = model
         self.next_due_ns = 0
         self._bus = bus
-        self._state = _State.LOST
+        self._phase = _Phase.LOST
         self._since_ns = 0
         self._cycle_ns = 0
         self._c: tuple[int, ...] = ()
@@ -174,7 +174,7 @@ class Ms5837:
     @property
     def ready(self) -> bool:
         """Whether the PROM has been read and the chip converts."""
-        return self._state not in (_State.LOST, _State.RESETTING)
+        return self._phase not in (_Phase.LOST, _Phase.RESETTING)
 
     def step(self, now_ns: int) -> DepthSample | None:
         """Do what is due at now_ns; return a sample where one is complete.
@@ -188,40 +188,40 @@ class Ms5837:
         try:
             return self._advance(now_ns, backwards)
         except BuddylineError:
-            self._enter(_State.LOST, now_ns, RETRY_NS)
+            self._enter(_Phase.LOST, now_ns, RETRY_NS)
             raise
 
     def _advance(self, now_ns: int, backwards: bool) -> DepthSample | None:
-        if self._state is _State.LOST:
+        if self._phase is _Phase.LOST:
             self._bus.command(ADDRESS, RESET)
-            self._enter(_State.RESETTING, now_ns, RESET_NS)
+            self._enter(_Phase.RESETTING, now_ns, RESET_NS)
         elif backwards:
             self._convert_pressure(now_ns)
-        elif self._state is _State.RESETTING:
+        elif self._phase is _Phase.RESETTING:
             self._read_prom()
-            self._enter(_State.IDLE, now_ns, 0)
-        elif self._state is _State.IDLE:
+            self._enter(_Phase.IDLE, now_ns, 0)
+        elif self._phase is _Phase.IDLE:
             self._convert_pressure(now_ns)
-        elif self._state is _State.PRESSURE:
+        elif self._phase is _Phase.PRESSURE:
             self._d1 = self._read_adc()
             self._pressure_stamp_ns = self._since_ns + CONVERSION_NS[OVERSAMPLING] // 2
             self._bus.command(ADDRESS, CONVERT_TEMPERATURE + 2 * OVERSAMPLING)
-            self._enter(_State.TEMPERATURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
+            self._enter(_Phase.TEMPERATURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
         else:
             sample = self._compensate(self._read_adc())
-            self._enter(_State.IDLE, now_ns, max(0, self._cycle_ns + PERIOD_NS - now_ns))
+            self._enter(_Phase.IDLE, now_ns, max(0, self._cycle_ns + PERIOD_NS - now_ns))
             return sample
         return None
 
-    def _enter(self, state: _State, now_ns: int, wait_ns: int) -> None:
-        self._state = state
+    def _enter(self, state: _Phase, now_ns: int, wait_ns: int) -> None:
+        self._phase = state
         self._since_ns = now_ns
         self.next_due_ns = now_ns + wait_ns
 
     def _convert_pressure(self, now_ns: int) -> None:
         self._bus.command(ADDRESS, CONVERT_PRESSURE + 2 * OVERSAMPLING)
         self._cycle_ns = now_ns
-        self._enter(_State.PRESSURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
+        self._enter(_Phase.PRESSURE, now_ns, CONVERSION_NS[OVERSAMPLING] + TRANSFERS_NS)
 
     def _read_prom(self) -> None:
         words = [int.from_bytes(self._bus.read(ADDRESS, PROM + 2 * i, 2), "big") for i in range(7)]

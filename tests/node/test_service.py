@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import pytest
 from buddyline.node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, SensorsConfig
-from buddyline.node.images import Turn
+from buddyline.node.images import RateLimiter
 from buddyline.node.service import NodeService
 from buddyline.protocol.clock import MS_NS, S_NS, SystemClock
 from buddyline.protocol.codec import decode
@@ -224,8 +224,8 @@ def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, capl
 
 @pytest.mark.parametrize("step_ns", [-3600 * S_NS, -S_NS, 0, S_NS])
 def test_pictures_keep_their_rate_when_the_clock_is_set(step_ns):
-    turn = Turn(2.0)
-    taken = [i for i in range(40) if turn.has_come(i * 100 * MS_NS + 7200 * S_NS + (step_ns if i >= 20 else 0))]
+    turn = RateLimiter(2.0)
+    taken = [i for i in range(40) if turn.allow(i * 100 * MS_NS + 7200 * S_NS + (step_ns if i >= 20 else 0))]
     assert all(4 <= later - earlier <= 6 or earlier < 20 <= later for earlier, later in pairwise(taken))
     assert len(taken) in (8, 9)
 

@@ -17,7 +17,7 @@ from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.tools import calibrate
 from buddyline.tools.calibration import camera
 from buddyline.tools.calibration.board import Board
-from buddyline.tools.calibration.camera import CornerFinder, View, coverage, distinct, draw
+from buddyline.tools.calibration.camera import BoardView, CornerFinder, coverage, distinct, draw
 from buddyline.tools.calibration.leastsquares import PoorCalibration
 
 from tests.tools import boards
@@ -26,7 +26,7 @@ BOARD = Board()
 CORNERS = np.asarray(BOARD.charuco().getChessboardCorners(), float)
 
 
-def views(n: int = 16, noise_px: float = 0.1, **how: float) -> list[View]:
+def views(n: int = 16, noise_px: float = 0.1, **how: float) -> list[BoardView]:
     """Corners as a known camera sees them."""
     rng = np.random.default_rng(4)
     seen = []
@@ -34,7 +34,7 @@ def views(n: int = 16, noise_px: float = 0.1, **how: float) -> list[View]:
         points = cv2.projectPoints(CORNERS, rvec, tvec, boards.K, boards.DISTORTION)[0].reshape(-1, 2)
         inside = ((points > 5) & (points < np.array(boards.SIZE) - 5)).all(axis=1)
         points = points[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
-        seen.append(View(f"view {i}", np.flatnonzero(inside).astype(np.int32), points))
+        seen.append(BoardView(f"view {i}", np.flatnonzero(inside).astype(np.int32), points))
     return seen
 
 
@@ -113,7 +113,7 @@ def test_another_board_than_the_print_is_refused():
 def test_one_bent_view_is_left_out_and_named():
     seen = views()
     bent = seen[3]
-    seen[3] = View("bent", bent.ids, bent.points_px + 6 * np.sin(bent.points_px / 40))
+    seen[3] = BoardView("bent", bent.ids, bent.points_px + 6 * np.sin(bent.points_px / 40))
     found = camera.calibrate(seen, boards.SIZE, BOARD)
     assert found.dropped == ("bent",)
     assert found.camera.fx_px == pytest.approx(boards.FOCAL_PX, rel=0.003)
@@ -121,7 +121,7 @@ def test_one_bent_view_is_left_out_and_named():
 
 def test_pictures_of_a_board_at_rest_count_once():
     seen = views(4)
-    still = [View(f"{v.name} again {k}", v.ids, v.points_px + 0.1 * k) for v in seen for k in range(10)]
+    still = [BoardView(f"{v.name} again {k}", v.ids, v.points_px + 0.1 * k) for v in seen for k in range(10)]
     assert len(distinct(still, 640)) == 4
 
 

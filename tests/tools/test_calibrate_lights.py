@@ -18,12 +18,12 @@ from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, rotation_exp
 from buddyline.tools import calibrate
 from buddyline.tools.calibration.leastsquares import PoorCalibration
-from buddyline.tools.calibration.lights import Noise, TapedPlace, fit
+from buddyline.tools.calibration.lights import CalibrationNoise, TapedPlace, fit
 
 FOCAL_PX = 1000.0
 CAMERA = Camera("pinhole", 1640, 1232, FOCAL_PX, FOCAL_PX, 819.5, 615.5, (0.0,) * 5)
 ENTERED = np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]])
-NOISE = Noise(pixel_px=0.3, tape_m=0.003, ruler_m=0.01)
+NOISE = CalibrationNoise(pixel_px=0.3, tape_m=0.003, ruler_m=0.01)
 
 
 def project(points: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def bar(lights: np.ndarray) -> float:
 
 def test_without_noise_the_bars_are_exact():
     stations, lights_a, lights_b = world(20, pixel_px=0.0, tape_m=0.0)
-    found = fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), Noise(0.02, 0.0002, 0.05))
+    found = fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), CalibrationNoise(0.02, 0.0002, 0.05))
     assert bar(found.lights_m[0]) == pytest.approx(bar(lights_a), abs=2e-4)
     assert bar(found.lights_m[1]) == pytest.approx(bar(lights_b), abs=2e-4)
     assert found.chi2 < 0.3
@@ -100,7 +100,7 @@ def test_a_wrong_distance_is_refused_and_named():
 def test_distances_too_coarse_are_refused():
     stations, *_ = world(6)
     with pytest.raises(PoorCalibration, match="tape their distances better"):
-        fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), Noise(0.5, 0.05, 0.01))
+        fit(stations, (CAMERA, CAMERA), (ENTERED, ENTERED), CalibrationNoise(0.5, 0.05, 0.01))
 
 
 def node_info(node: str) -> NodeInfo:

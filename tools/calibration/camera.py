@@ -28,7 +28,7 @@ OUTLIER_VIEWS: Final = 2.5
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """The board's corners in one picture: name, ids (n,), points_px (n, 2)."""
 
     name: str
@@ -64,7 +64,7 @@ class CornerFinder:
         self._detector: Any = cv2.aruco.CharucoDetector(board.charuco())
         self.size: tuple[int, int] | None = None
 
-    def find(self, name: str, image: Image) -> View | None:
+    def find(self, name: str, image: Image) -> BoardView | None:
         """Return the corners, None where too few are seen; raise PoorCalibration for another picture size."""
         size = (image.shape[1], image.shape[0])
         if self.size is not None and size != self.size:
@@ -76,7 +76,7 @@ class CornerFinder:
             return None
         # OpenCV 4 has a dimension more here than OpenCV 5.
         points = np.asarray(corners, np.float32).reshape(-1, 2)
-        return View(name, np.asarray(ids, np.int32).reshape(-1), _refined(grey, points))
+        return BoardView(name, np.asarray(ids, np.int32).reshape(-1), _refined(grey, points))
 
 
 def _refined(grey: Image, points: NDArray[np.float32]) -> Floats:
@@ -92,9 +92,9 @@ def _refined(grey: Image, points: NDArray[np.float32]) -> Floats:
     return np.asarray(refined, np.float64).reshape(-1, 2)
 
 
-def distinct(views: Iterable[View], width_px: int) -> list[View]:
+def distinct(views: Iterable[BoardView], width_px: int) -> list[BoardView]:
     """Return the views in which the board has moved since the one kept before, evenly thinned to a maximum."""
-    kept: list[View] = []
+    kept: list[BoardView] = []
     for view in views:
         if not kept or _moved_px(kept[-1], view) > MOVED_SHARE * width_px:
             kept.append(view)
@@ -103,14 +103,14 @@ def distinct(views: Iterable[View], width_px: int) -> list[View]:
     return kept
 
 
-def _moved_px(one: View, other: View) -> float:
+def _moved_px(one: BoardView, other: BoardView) -> float:
     _, i, j = np.intersect1d(one.ids, other.ids, return_indices=True)
     if len(i) < LEAST_CORNERS // 2:
         return float("inf")
     return float(np.linalg.norm(one.points_px[i] - other.points_px[j], axis=1).mean())
 
 
-def calibrate(views: list[View], size: tuple[int, int], board: Board) -> CameraFit:
+def calibrate(views: list[BoardView], size: tuple[int, int], board: Board) -> CameraFit:
     """Fit a pinhole with OpenCV's k1 k2 p1 p2 k3; raise PoorCalibration where the views do not tell it."""
     require(
         (
@@ -169,7 +169,7 @@ def cells(points_px: Floats, size: tuple[int, int]) -> NDArray[np.int64]:
 
 
 def _solve(
-    views: list[View], size: tuple[int, int], corners: NDArray[np.float32], dropped: tuple[str, ...]
+    views: list[BoardView], size: tuple[int, int], corners: NDArray[np.float32], dropped: tuple[str, ...]
 ) -> tuple[CameraFit, Floats]:
     """Return the fit of these views and each view's reprojection error (n,), px."""
     objects = [corners[view.ids] for view in views]

@@ -47,7 +47,7 @@ class Exchanges:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockOffset:
+class OffsetEstimate:
     """B's clock minus A's at stamp_ns (A's clock), of exchanges from begin_ns to end_ns.
 
     sigma_s: 1 sd, with what the two ways may differ by; scatter_s: 1 sd without it. bound_s: half the quickest round
@@ -128,7 +128,7 @@ def windows(exchanges: Exchanges) -> list[Exchanges]:
     return found
 
 
-def estimate(exchanges: Exchanges) -> ClockOffset:
+def estimate(exchanges: Exchanges) -> OffsetEstimate:
     """Fit offset and drift to exchanges without a step; raise ValueError where there are none.
 
     Each is weighted by how much longer than the quickest it took: half of that may be its error. What the quickest
@@ -156,7 +156,7 @@ def estimate(exchanges: Exchanges) -> ClockOffset:
         residuals_s = residuals_s - drift * lever_s
         drift_sigma = _spread(weights * lever_s, residuals_s, sigmas_s) / spread_s2
     scatter_s = _spread(weights, residuals_s, sigmas_s)
-    return ClockOffset(
+    return OffsetEstimate(
         stamp_ns=first_ns + round(middle_s * S_NS),
         begin_ns=first_ns,
         end_ns=int(exchanges.stamp_ns[-1]),
@@ -175,7 +175,7 @@ def _spread(weights: NDArray[np.float64], residuals_s: NDArray[np.float64], sigm
     return math.sqrt(max(float(weights**2 @ residuals_s**2), float(weights**2 @ sigmas_s**2)))
 
 
-def drift_between(first: ClockOffset, last: ClockOffset) -> tuple[float, float]:
+def drift_between(first: OffsetEstimate, last: OffsetEstimate) -> tuple[float, float]:
     """Return the drift from one estimate to a later one, and its sd.
 
     Ways that differ alike in both cancel; by what one's quickest round trip is longer, its ways may differ by more.

@@ -16,7 +16,7 @@ from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
 from buddyline.protocol.topics import CLOCK, NODE_STATUS
-from buddyline.tools.calibration.clock import ClockOffset, OneWayTimes, drift_between, estimate, steps, windows
+from buddyline.tools.calibration.clock import OffsetEstimate, OneWayTimes, drift_between, estimate, steps, windows
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import open_bus_within
@@ -96,7 +96,7 @@ class Report:
 
     node_a: str
     node_b: str
-    offsets: list[ClockOffset]
+    offsets: list[OffsetEstimate]
     set_times: list[int]
 
     def problem(self) -> str:
@@ -182,7 +182,7 @@ def _at(stamp_ns: int) -> str:
     return time.strftime("at %H:%M:%S UTC", time.gmtime(stamp_ns / S_NS))
 
 
-def _offset(offset: ClockOffset) -> str:
+def _offset(offset: OffsetEstimate) -> str:
     return (
         f"{1e3 * offset.offset_s:+.3f} ms (1 sd {1e3 * offset.sigma_s:.3f}, at most {1e3 * offset.bound_s:.3f} from "
         f"unequal ways) {_at(offset.stamp_ns)}, {offset.exchanges} exchanges"

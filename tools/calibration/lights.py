@@ -36,7 +36,7 @@ class TapedPlace:
 
 
 @dataclass(frozen=True)
-class Noise:
+class CalibrationNoise:
     """Standard deviations of the measurements."""
 
     pixel_px: float = 0.5
@@ -64,10 +64,10 @@ def fit(
     places: list[TapedPlace],
     cameras: tuple[Camera, Camera],
     entered: tuple[Floats, Floats],
-    noise: Noise | None = None,
+    noise: CalibrationNoise | None = None,
 ) -> LightsFit:
     """Fit both nodes' lights, from entered (2, 3) each; raise PoorCalibration where the places do not tell them."""
-    noise = noise or Noise()
+    noise = noise or CalibrationNoise()
     n = len(places)
     require((n >= LEAST_PLACES, f"{n} places, {LEAST_PLACES} are needed, at different distances, turned and tilted"))
     first_lights = np.vstack(entered)

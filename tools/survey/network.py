@@ -256,7 +256,7 @@ def _triple(vector: Floats) -> Triple:
 
 
 @dataclass(frozen=True)
-class _Step:
+class _Edge:
     """One line of the tree of shortest ways: from `back`, nearer to a fixed point, along line `index`."""
 
     back: str
@@ -264,13 +264,13 @@ class _Step:
     sign: float
 
 
-def _tree(lines: list[Line], fixed: Fixed) -> dict[str, _Step | None]:
+def _tree(lines: list[Line], fixed: Fixed) -> dict[str, _Edge | None]:
     """Return the last step of the shortest way from a fixed point to each station; None at the fixed points."""
-    touching: dict[str, list[tuple[str, _Step]]] = {}
+    touching: dict[str, list[tuple[str, _Edge]]] = {}
     for i, line in enumerate(lines):
-        touching.setdefault(line.leg.from_, []).append((line.leg.to, _Step(line.leg.from_, i, 1.0)))
-        touching.setdefault(line.leg.to, []).append((line.leg.from_, _Step(line.leg.to, i, -1.0)))
-    tree: dict[str, _Step | None] = dict.fromkeys(fixed)
+        touching.setdefault(line.leg.from_, []).append((line.leg.to, _Edge(line.leg.from_, i, 1.0)))
+        touching.setdefault(line.leg.to, []).append((line.leg.from_, _Edge(line.leg.to, i, -1.0)))
+    tree: dict[str, _Edge | None] = dict.fromkeys(fixed)
     queue = deque(fixed)
     while queue:
         for other, step in touching.get(queue.popleft(), []):
@@ -288,7 +288,7 @@ def loops(lines: list[Line], fixed: Fixed) -> list[Loop]:
     tree = _tree(lines, fixed)
     in_tree = {step.index for step in tree.values() if step is not None}
 
-    def way(name: str) -> tuple[list[str], list[_Step]]:
+    def way(name: str) -> tuple[list[str], list[_Edge]]:
         """Return the stations from `name` back to a fixed point, and the steps between them."""
         names, steps = [name], []
         while (step := tree[names[-1]]) is not None:
