@@ -7,9 +7,12 @@ import json
 import logging
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.draw import figures
+from buddyline.tools.draw.errors import write_figures
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.report import as_dict, as_text
 from buddyline.tools.evaluation.result import evaluate
+from buddyline.tools.newfile import new_folder
 
 log = logging.getLogger(__name__)
 
@@ -17,9 +20,8 @@ log = logging.getLogger(__name__)
 def run(args: argparse.Namespace) -> int:
     """Measure, print, and draw where asked for; return 0."""
     if args.plots is not None:
-        from buddyline.tools.draw import errors
-
-        errors.check_folder(args.plots)
+        figures.check()
+        new_folder(args.plots)
     recorded = load_for_evaluation(args.logs, args.truth, args.pair)
     for problem in recorded.problems:
         log.warning("%s", problem)
@@ -28,6 +30,6 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"{args.logs[0]}: no pose has truth at its trigger or time; is the truth of this dive?")
     print(json.dumps(as_dict(result), allow_nan=False) if args.json else as_text(result))
     if args.plots is not None:
-        for path in errors.write_figures(result, args.plots):
+        for path in write_figures(result, args.plots):
             log.info("%s", path)
     return 0

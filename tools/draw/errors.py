@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.draw.figures import broken, check, new_figure, save
+from buddyline.tools.draw.figures import broken, new_figure, save
 from buddyline.tools.evaluation.poses import PoseErrors
 from buddyline.tools.evaluation.result import Result
 from buddyline.tools.evaluation.rotation import Floats
@@ -143,18 +142,6 @@ def normalized_errors(errors: PoseErrors) -> Figure:
 def _shown(errors: Floats) -> Floats:
     """Return errors with exact zeros raised to 1e-6: a logarithmic axis has no zero."""
     return np.maximum(errors, 1e-6)
-
-
-def check_folder(folder: Path) -> None:
-    """Make the folder for a result's figures; raise BuddylineError where they could not be written."""
-    check()
-    for name in FILES:
-        if (folder / name).exists():
-            raise BuddylineError(f"{folder / name}: exists; name another directory or remove it first")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BuddylineError(f"{folder}: cannot be made: {error.strerror}") from error
 
 
 def write_figures(result: Result, folder: Path) -> list[Path]:

@@ -22,8 +22,11 @@ GAP_S: Final = 1.5
 COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
 NO_POSE_COLOUR: Final = "#d0483f"
 _STYLE: Final[dict[Any, Any]] = {
+    # Coordinates of a grid stand in full.
+    "axes.formatter.limits": (-5, 9),
     "axes.formatter.useoffset": False,
     "axes.grid": True,
+    "axes.titlepad": 10.0,
     "figure.constrained_layout.use": True,
     "font.size": 9.0,
     "grid.linewidth": 0.4,
