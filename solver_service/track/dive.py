@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -14,10 +14,13 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import rows_between, smoothed
-from buddyline.solver_service.track.start import constants_of
+from buddyline.solver_service.track.start import CLOCK_S, constants_of
 from buddyline.solver_service.track.state import CLOCK, PHI, R_, State
 
 _BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
+# How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
+UNTOLD_CLOCK_S: Final = 0.3
+CLOCK_LEFT_S: Final = 0.003
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
 BROAD_R_M: Final = 0.5
 BROAD_TURN_RAD: Final = 0.15
@@ -47,9 +50,14 @@ class Smoothed:
     problems: list[str]
 
 
-def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int = 0) -> TrackFilter:
+def filter_of(
+    records: tuple[NodeRecord, NodeRecord],
+    fixes: Sequence[FixSeen],
+    clock_ns: int = 0,
+    clock_sigma_s: float = CLOCK_S,
+) -> TrackFilter:
     """Make a filter that keeps its steps and holds a whole dive."""
-    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf)
+    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=clock_sigma_s)
     track.clock_ns = clock_ns
     for node, record in enumerate(records):
         track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps)
@@ -67,14 +75,18 @@ def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], 
 def smooth(
     records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
 ) -> Smoothed:
-    """Give the whole dive's track at outputs_ns (A's clock)."""
-    first = filter_of(records, fixes, clock_ns)
+    """Give the whole dive's track at outputs_ns."""
+    first = filter_of(records, fixes, clock_ns, UNTOLD_CLOCK_S)
     end_ns = last_ns(records)
     first.advance(end_ns)
     parts = parts_of(first)
     if not parts:
         return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
-    second = filter_of(records, (), clock_ns)
+    # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
+    learned = parts[-1]
+    shift_s = learned.state.clock_s
+    clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
+    second = filter_of(records, (), clock_ns + round(shift_s * 1e9), clock_sigma_s)
     second.restarts = False
     told = sum(part.told for part in parts)
     if told > 100:
@@ -82,7 +94,7 @@ def smooth(
     for part in parts:
         results = smoothed(part.steps)
         guide_by(second, part.steps, results)
-        state = results[0][0]
+        state = replace(results[0][0], clock_s=0.0)
         second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state))
     second.advance(end_ns)
     return rows_of(second, parts_of(second), outputs_ns)
@@ -106,7 +118,7 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
 
 def broad_start(track: TrackFilter, state: State) -> tuple[State, Floats]:
     """Give a state to start again from, with a covariance that holds nothing of the lights yet."""
-    _, variances = constants_of(track.nodes, state.R, state.r_m)
+    _, variances = constants_of(track.nodes, state.R, state.r_m, track.clock_sigma_s)
     P = np.diag(variances)
     P[R_, R_] = BROAD_R_M**2 * np.eye(3)
     level = 0.15**2 * np.eye(3)
@@ -119,8 +131,8 @@ def guide_by(track: TrackFilter, steps: Sequence[Step], results: Sequence[tuple[
     """Tell a filter what a pass knew at each picture."""
     for step, (state, P) in zip(steps, results, strict=True):
         for look in step.looks:
-            key = look.sight.t_s, look.sight.node
-            track.guides[key] = Guide(step.t_s, state, P[_BLOCK], step.rates_radps, look.chosen)
+            key = look.sight.stamp_ns, look.sight.node
+            track.guides[key] = Guide(look.sight.t_s - step.t_s, state, P[_BLOCK], step.rates_radps, look.chosen)
 
 
 def rows_of(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:
@@ -128,7 +140,7 @@ def rows_of(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[
     rows: list[TrackRow] = []
     last: tuple[State, Floats] | None = None
     stamps = sorted(outputs_ns)
-    times = np.array([track.seconds(0, stamp) for stamp in stamps])
+    times = np.array([track.between(stamp) for stamp in stamps])
     for part in parts:
         results = smoothed(part.steps)
         last = results[-1]

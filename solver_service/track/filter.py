@@ -16,7 +16,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals, sight_of
 from buddyline.solver_service.track.output import TrackRow, at_one_time, pose_of, row_of
 from buddyline.solver_service.track.samples import Samples
-from buddyline.solver_service.track.start import state_from_fix
+from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
 from buddyline.solver_service.track.turning import Turning
@@ -32,6 +32,8 @@ ATTITUDE_EVERY_S: Final = 0.5
 CONFIRMED: Final = 25.0
 REPLACED: Final = 20.0
 CHALLENGE_S: Final = 4.0
+# What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a start is checked.
+IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
 CONTRADICTS: Final = 33.0
 MAX_DELAY_S: Final = 0.03
@@ -75,9 +77,12 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """What a whole pass over the dive knew at one picture: for the next pass to decide its lights again."""
+    """What a whole pass over the dive knew at one picture: for the next pass to decide its lights again.
 
-    t_s: float
+    after_s: the picture's time after the pass's step.
+    """
+
+    after_s: float
     state: State
     covariance: Floats
     rates_radps: Floats
@@ -115,10 +120,12 @@ class Estimate:
 class TrackFilter:
     """The track of nodes a (0) and b (1). Samples and events may be added in any order before `advance` passes them.
 
-    keep_s: for how long steps are kept to smooth over; inf: all.
+    keep_s: for how long steps are kept to smooth over; inf: all. clock_sigma_s: how far B's clock may be off, 1 sd.
     """
 
-    def __init__(self, node_a: TrackNode, node_b: TrackNode, *, keep_s: float = 0.0) -> None:
+    def __init__(
+        self, node_a: TrackNode, node_b: TrackNode, *, keep_s: float = 0.0, clock_sigma_s: float = CLOCK_S
+    ) -> None:
         self.nodes = (node_a, node_b)
         self.problems: list[str] = []
         self.main: Estimate | None = None
@@ -131,7 +138,8 @@ class TrackFilter:
         self._waiting: list[Estimate] = []
         self.restarts = True
         self.unrest = 1.0
-        self.guides: dict[tuple[float, int], Guide] = {}
+        self.clock_sigma_s = clock_sigma_s
+        self.guides: dict[tuple[int, int], Guide] = {}
         self._keep_s = keep_s
         self.samples = (Samples(), Samples())
         self._attitudes: tuple[list[tuple[float, AttitudeSeen]], list[tuple[float, AttitudeSeen]]] = ([], [])
@@ -147,6 +155,10 @@ class TrackFilter:
         if self.epoch_ns is None:
             self.epoch_ns = stamp_ns - stamp_ns % 86_400_000_000_000
         return (stamp_ns - (self.clock_ns if node else 0) - self.epoch_ns) * 1e-9
+
+    def between(self, stamp_ns: int) -> float:
+        """Give a stamp between both clocks, as those of fixes and rows are, as `seconds` does."""
+        return self.seconds(0, stamp_ns - self.clock_ns // 2)
 
     def add_imu(self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats) -> None:
         """Take inertial samples (N,), (N, 3), (N, 3) in the body frame."""
@@ -176,12 +188,12 @@ class TrackFilter:
         dt_s = np.zeros(len(frame.pixels))
         if len(frame.dt_ns):
             dt_s += frame.dt_ns * 1e-9
-        sight = sight_of(self.nodes[node].rig, node, t_s, frame.pixels, frame.sigma_px, dt_s)
+        sight = sight_of(self.nodes[node].rig, node, frame.stamp_ns, t_s, frame.pixels, frame.sigma_px, dt_s)
         self._push(t_s, 1 + node, sight)
 
     def add_fix(self, fix: FixSeen) -> None:
         """Take a pose that one trigger's lights gave by themselves."""
-        self._push(self.seconds(0, fix.stamp_ns), 0, fix)
+        self._push(self.between(fix.stamp_ns), 0, fix)
 
     def _push(self, t_s: float, kind: int, what: Sight | FixSeen | int) -> None:
         # The count keeps two of a kind at one time in their order: they cannot be compared.
@@ -191,7 +203,7 @@ class TrackFilter:
     # -- what goes on
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
-        """Go on to to_ns, up to which all has been added; return the track at the asked stamps (A's clock) in between.
+        """Go on to to_ns, up to which all has been added; return the track at the asked stamps in between.
 
         Events within HOLD_S of to_ns wait for the next call, so that the result does not depend on how often it is
         called.
@@ -199,7 +211,7 @@ class TrackFilter:
         end_s = self.seconds(0, to_ns) - HOLD_S
         rows: list[TrackRow] = []
         for stamp_ns in outputs_ns or ():
-            self._push(self.seconds(0, stamp_ns), 3, stamp_ns)
+            self._push(self.between(stamp_ns), 3, stamp_ns)
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
             if isinstance(what, int):
@@ -323,15 +335,16 @@ class TrackFilter:
             detection = detection * np.where(inside, 1.0, 0.02)
         clutter = max(len(sight.index) - 1.0, 1.0) / camera.area_px2
         y, H = residuals(sight.bearings, sight.tangents, X, D)
-        found = associate(y, H, estimate.covariance[_BLOCK], sight.sigma_px, detection, clutter)
+        guide = self.guides.get((sight.stamp_ns, observer))
+        if guide is None:
+            found = associate(y, H, estimate.covariance[_BLOCK], sight.sigma_px, detection, clutter)
+        else:
+            found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
         estimate.evidence += found.evidence
         for light in (0, 1):
             if inside[light]:
                 old = estimate.detection[observer, light]
                 estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
-        guide = self.guides.get((sight.t_s, observer))
-        if guide is not None:
-            found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
         if found.chosen:
             self._update_lights(estimate, found, y, H, sight)
         return Look(sight, found.chosen)
@@ -348,7 +361,7 @@ class TrackFilter:
         The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
         """
         lights_m = self.nodes[1 - sight.node].rig.lights_m
-        dt_s = sight.dt_s + (sight.t_s - guide.t_s)
+        dt_s = sight.dt_s + guide.after_s
         X, D = light_positions(guide.state, sight.node, lights_m, guide.rates_radps, dt_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         P = guide.covariance
@@ -471,8 +484,8 @@ class TrackFilter:
 
     def _agrees(self, estimate: Estimate, t_s: float, fix: FixSeen) -> bool:
         row = self._predict(estimate, max(t_s, estimate.t_s))
-        t_a_b, covariance, _, _ = pose_of(*row, estimate.rates_radps[1])
-        R_a_b = at_one_time(row[0], estimate.rates_radps[1]).R
+        t_a_b, covariance, _, _ = pose_of(*row, estimate.rates_radps)
+        R_a_b = at_one_time(row[0], estimate.rates_radps).R
         R_a_b = R_a_b[0].T @ R_a_b[1]
         gap = np.concatenate((fix.t_a_b_m - t_a_b, rotation_log(fix.R_a_b @ R_a_b.T)))
         S = covariance + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
@@ -481,16 +494,27 @@ class TrackFilter:
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
         attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes]
         force = self.samples[0].between(t_s - 0.5, t_s, t_s)[1][:, :3].mean(0) if len(self.samples[0]) else None
-        made = state_from_fix(self.nodes, fix, attitudes[0][1] if attitudes[0] else None, force)
+        made = state_from_fix(self.nodes, fix, attitudes[0][1] if attitudes[0] else None, force, self.clock_sigma_s)
         if made is None:
             return None
         state, covariance = made
+        if attitudes[1] is not None and not self._faces(state, covariance, attitudes[1][1]):
+            return None
         estimate = Estimate(t_s, state, covariance, t_s)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s
         estimate.light_s = t_s
         self._open(estimate)
         return estimate
+
+    def _faces(self, state: State, P: Floats, seen: AttitudeSeen) -> bool:
+        """Whether B's attitude in a state is one that its message allows, its compass off by iron at worst.
+
+        Two nodes that both look at a third's bar fit each other's lights, but not each other's headings.
+        """
+        y, H = anchors.attitude_residual(state, 1, self.level_camera(1, seen))
+        noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
+        return float(y @ np.linalg.solve(noise + H @ P @ H.T, y)) < CONTRADICTS
 
     def _open(self, estimate: Estimate) -> None:
         if self._keep_s:
@@ -547,7 +571,7 @@ class TrackFilter:
             self._step(main, main.t_s + TICK_S, None)
         state, P = self._predict(main, t_s)
         return row_of(
-            stamp_ns, state, P, main.rates_radps[1], len({(n, i) for _, n, i in main.trigger}), t_s - main.light_s
+            stamp_ns, state, P, main.rates_radps, len({(n, i) for _, n, i in main.trigger}), t_s - main.light_s
         )
 
 

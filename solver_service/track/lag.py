@@ -23,7 +23,7 @@ class TrackLag:
         self._done_s = -np.inf
 
     def ask(self, stamps_ns: list[int]) -> None:
-        """Ask for rows at stamps (A's clock), in order."""
+        """Ask for rows at stamps, in order."""
         self._due += stamps_ns
 
     def rows(self) -> list[TrackRow]:
@@ -32,10 +32,10 @@ class TrackLag:
         if main is None or not main.confirmed or len(main.steps) < 2 or not self._due:
             return []
         ready_s = main.t_s - LAG_S
-        ready = [stamp for stamp in self._due if self._track.seconds(0, stamp) <= ready_s]
+        ready = [stamp for stamp in self._due if self._track.between(stamp) <= ready_s]
         if not ready or ready_s - self._done_s < EVERY_S:
             return []
         self._done_s = ready_s
         self._due = self._due[len(ready) :]
-        times_s = np.array([self._track.seconds(0, stamp) for stamp in ready])
+        times_s = np.array([self._track.between(stamp) for stamp in ready])
         return rows_between(main.steps, smoothed(main.steps), times_s, ready)

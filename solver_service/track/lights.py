@@ -38,7 +38,7 @@ def light_positions(
     R_other = state.R[other] @ rotation_exp(rates_radps[other] * (times + late_s)[:, None])
     arms = R_other @ lights_m.T  # (T, 3, L)
     arms = np.swapaxes(arms, 1, 2)  # (T, L, 3)
-    swept = np.swapaxes(R_other @ np.cross(rates_radps[other], lights_m).T, 1, 2)
+    swept = np.swapaxes(R_other @ (skew(rates_radps[other]) @ lights_m.T), 1, 2)
     ahead_s = times + late_s if observer == 0 else times
     r = (state.r_m + ahead_s[:, None] * state.v_mps)[:, None, :]
     sign = 1.0 if observer == 0 else -1.0
@@ -107,6 +107,7 @@ class Sight:
     index (K,): their places in the frame. t_s: on A's clock as believed; dt_s (K,).
     """
 
+    stamp_ns: int
     t_s: float
     node: int
     index: NDArray[np.intp]
@@ -116,10 +117,10 @@ class Sight:
     dt_s: Floats
 
 
-def sight_of(rig: Rig, node: int, t_s: float, pixels: Floats, sigma_px: Floats, dt_s: Floats) -> Sight:
+def sight_of(rig: Rig, node: int, stamp_ns: int, t_s: float, pixels: Floats, sigma_px: Floats, dt_s: Floats) -> Sight:
     """Prepare a picture's candidates; those that the camera model does not reach are left out."""
     with np.errstate(all="ignore"):
         bearings, tangents = rig.camera.rays(pixels.reshape(-1, 2))
     sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
     keep = np.flatnonzero(sound)
-    return Sight(t_s, node, keep, bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep])
+    return Sight(stamp_ns, t_s, node, keep, bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep])

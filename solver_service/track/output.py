@@ -16,7 +16,7 @@ WORST_SHARE: Final = 0.2
 
 @dataclass(frozen=True, eq=False)
 class TrackRow:
-    """The track at one time (A's clock), as the message Track has it."""
+    """The track at one time, between both clocks as a fix's stamp is, as the message Track has it."""
 
     stamp_ns: int
     t_a_b_m: Floats
@@ -35,50 +35,55 @@ class TrackRow:
     sigma_inclination_rad: float
 
 
-def at_one_time(state: State, rate_b_radps: Floats) -> State:
-    """Bring B's part of a state to A's time: what B has moved while its clock was ahead."""
-    turn = rotation_exp(rate_b_radps * state.clock_s)
-    return state.moved(state.r_m + state.clock_s * state.v_mps, state.v_mps, np.stack((state.R[0], state.R[1] @ turn)))
+def at_one_time(state: State, rates_radps: Floats) -> State:
+    """Bring both nodes' parts to one time, between their clocks as a fix's stamp is: A half the offset back, B on."""
+    half_s = 0.5 * state.clock_s
+    turns = rotation_exp(rates_radps * np.array(((-half_s,), (half_s,))))
+    return state.moved(state.r_m + half_s * state.v_mps, state.v_mps, state.R @ turns)
 
 
-def at_one_time_jacobian(state: State, rate_b_radps: Floats) -> Floats:
+def at_one_time_jacobian(state: State, rates_radps: Floats) -> Floats:
     """Give the errors (NAV, SIZE) of the state at one time by the state's."""
     J = np.zeros((NAV, SIZE))
     J[:, :NAV] = np.eye(NAV)
-    J[R_, V_] = state.clock_s * np.eye(3)
-    J[R_, CLOCK] = state.v_mps
-    J[PHI[1], CLOCK] = state.R[1] @ rate_b_radps
+    J[R_, V_] = 0.5 * state.clock_s * np.eye(3)
+    turned_a = -0.5 * state.R[0] @ rates_radps[0]
+    J[PHI[0], CLOCK] = turned_a
+    J[PHI[1], CLOCK] = 0.5 * state.R[1] @ rates_radps[1]
+    # The errors are those of plus: r turns with phi_A, which the clock turns here.
+    J[R_, CLOCK] = 0.5 * state.v_mps - np.cross(turned_a, state.r_m)
+    J[V_, CLOCK] = -np.cross(turned_a, state.v_mps)
     return J
 
 
-def pose_of(state: State, P: Floats, rate_b_radps: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def pose_of(state: State, P: Floats, rates_radps: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Give t_a_b_m (3,), its and the rotation's covariance (6, 6), v_a_b_mps (3,) and its covariance (3, 3).
 
     t = R_A^T r with r = exp(phi_A) r + dr, so dt = R_A^T dr whatever phi_A is, and w = R_A^T (phi_B - phi_A).
     """
-    toward = state.R[0].T
+    now = at_one_time(state, rates_radps)
+    toward = now.R[0].T
     J = np.zeros((9, NAV))
     J[0:3, R_] = toward
     J[3:6, PHI[0]], J[3:6, PHI[1]] = -toward, toward
     J[6:9, V_] = toward
-    J = J @ at_one_time_jacobian(state, rate_b_radps)
+    J = J @ at_one_time_jacobian(state, rates_radps)
     whole = J @ P @ J.T
-    now = at_one_time(state, rate_b_radps)
     return toward @ now.r_m, whole[:6, :6], toward @ now.v_mps, whole[6:, 6:]
 
 
-def row_of(stamp_ns: int, state: State, P: Floats, rate_b_radps: Floats, lights: int, age_s: float) -> TrackRow | None:
+def row_of(stamp_ns: int, state: State, P: Floats, rates_radps: Floats, lights: int, age_s: float) -> TrackRow | None:
     """Give the row of a state, None where its position is no better than WORST_SHARE of the range."""
-    t_a_b, covariance, v_a_b, v_covariance = pose_of(state, P, rate_b_radps)
+    t_a_b, covariance, v_a_b, v_covariance = pose_of(state, P, rates_radps)
     range_m = float(np.linalg.norm(t_a_b))
     if not np.isfinite(covariance).all() or math.sqrt(float(np.trace(covariance[:3, :3]))) > WORST_SHARE * range_m:
         return None
-    now = at_one_time(state, rate_b_radps)
+    now = at_one_time(state, rates_radps)
     r = now.r_m
     J = np.zeros((3, NAV))
     J[:, R_] = np.eye(3)
     J[:, PHI[0]] = -skew(r)
-    J = J @ at_one_time_jacobian(state, rate_b_radps)
+    J = J @ at_one_time_jacobian(state, rates_radps)
     of_ned = J @ P @ J.T
     flat2 = max(float(r[0] ** 2 + r[1] ** 2), 1e-12)
     flat = math.sqrt(flat2)

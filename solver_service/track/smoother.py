@@ -75,7 +75,7 @@ def _row_between(
         stamp_ns,
         state.moved(r, v, np.stack(R)),
         (1.0 - b) * P + b * P_after,
-        (1.0 - b) * one.rates_radps[1] + b * two.rates_radps[1],
+        (1.0 - b) * one.rates_radps + b * two.rates_radps,
         near.lights,
         max(t_s - near.light_s, 0.0),
     )

@@ -33,11 +33,13 @@ LEVER_TOLD_M: Final = 0.006
 LEVER_UNTOLD_M: Final = 0.05
 DELAY_TOLD_S: Final = 0.001
 DELAY_UNTOLD_S: Final = 0.004
-CLOCK_S: Final = 0.005
+CLOCK_S: Final = 0.05
 DEPTH_OFFSET_M: Final = 0.2
 
 
-def constants_of(nodes: tuple[TrackNode, TrackNode], R: Floats, r_m: Floats) -> tuple[State, Floats]:
+def constants_of(
+    nodes: tuple[TrackNode, TrackNode], R: Floats, r_m: Floats, clock_sigma_s: float = CLOCK_S
+) -> tuple[State, Floats]:
     """Give a state at r_m (3,), R (2, 3, 3), at rest, with the constants as told, and the variances (SIZE,) of all
     but position and attitude."""
     state = State(
@@ -60,7 +62,7 @@ def constants_of(nodes: tuple[TrackNode, TrackNode], R: Floats, r_m: Floats) -> 
         sigma[MOUNT[i]] = MOUNT_RAD
         sigma[LEVER[i]] = LEVER_UNTOLD_M if node.imu_m is None else LEVER_TOLD_M
         sigma[DELAY[i]] = DELAY_UNTOLD_S if node.imu_delay_ns is None else DELAY_TOLD_S
-    sigma[CLOCK] = CLOCK_S
+    sigma[CLOCK] = clock_sigma_s
     sigma[DEPTH_OFFSET] = DEPTH_OFFSET_M
     return state, sigma**2
 
@@ -79,7 +81,11 @@ def tilt_of(force_mps2: Floats) -> Floats | None:
 
 
 def state_from_fix(
-    nodes: tuple[TrackNode, TrackNode], fix: FixSeen, attitude: AttitudeSeen | None, force_mps2: Floats | None
+    nodes: tuple[TrackNode, TrackNode],
+    fix: FixSeen,
+    attitude: AttitudeSeen | None,
+    force_mps2: Floats | None,
+    clock_sigma_s: float = CLOCK_S,
 ) -> tuple[State, Floats] | None:
     """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
 
@@ -93,7 +99,7 @@ def state_from_fix(
         if tilt is None:
             return None
         R_A, level = tilt, np.diag((0.05, 0.05, math.pi)) ** 2
-    state, variances = constants_of(nodes, np.stack((R_A, R_A @ fix.R_a_b)), R_A @ fix.t_a_b_m)
+    state, variances = constants_of(nodes, np.stack((R_A, R_A @ fix.R_a_b)), R_A @ fix.t_a_b_m, clock_sigma_s)
     P = np.diag(variances)
     turn = np.kron(np.eye(2), R_A)
     # A fix's own covariance is the least; what it leaves out (frames apart, calibration) is a little more.

@@ -110,7 +110,7 @@ def integrate(
     # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
     whole_told = bool(told.all())
     lever = state.lever_m[node] if whole_told else np.zeros(3)
-    arm0, arm1 = R0 @ np.cross(w[0], lever), R @ np.cross(w[-1], lever)
+    arm0, arm1 = R0 @ (skew(w[0]) @ lever), R @ (skew(w[-1]) @ lever)
     dv, dp = weights @ u
     dv = dv - (arm1 - arm0)
     dp = dp - (R @ lever - R0 @ lever - arm0 * span)

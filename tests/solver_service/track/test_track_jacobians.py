@@ -171,7 +171,7 @@ def test_anchors() -> None:
 def test_pose_covariance() -> None:
     """The published covariance is the pose's, by differences of the pose."""
     state = a_state(2)
-    rate = np.array((0.3, -0.2, 0.4))
+    rate = np.array(((0.3, -0.2, 0.4), (-0.1, 0.5, 0.2)))
     now = at_one_time(state, rate)
     t0, R0 = now.R[0].T @ now.r_m, now.R[0].T @ now.R[1]
 
