@@ -37,6 +37,8 @@ def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
     Raises BuddylineError where a file is there (hint: what to do about it), or where the place cannot be written.
     """
     target = check_new(path, hint)
+    if not target.parent.is_dir():
+        raise BuddylineError(f"{path}: cannot be written: there is no folder {target.parent}")
     part = target.with_name(f"{target.name}.part")
     check_new(part, "a command still writes it, or was killed; remove it in that case")
     try:
