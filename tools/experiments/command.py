@@ -31,6 +31,7 @@ from buddyline.tools.experiments.runs import (
     long_dive,
     rendered,
 )
+from buddyline.tools.measure.tables import markdown_table
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -60,18 +61,18 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"{args.output}: cannot be made: {error.strerror}") from error
     cv2.setNumThreads(1)
     # What the commands say one by one is in the report, or of no interest.
-    logging.getLogger("tools").setLevel(logging.ERROR)
+    logging.getLogger("buddyline").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory() as folder:
         found = measure(QUICK if args.quick else FULL, Path(folder), args.output, args.tag_video)
     found["quick"] = args.quick
     found["code"] = code_hash
     rows = numbers.headline(found)
     (args.output / "experiments.json").write_text(json.dumps(found, allow_nan=False, indent=1) + "\n")
-    (args.output / "headline.md").write_text(numbers.markdown(rows))
+    (args.output / "headline.md").write_text(markdown_table(numbers.HEAD, rows))
     (args.output / "report.html").write_text(report(found, rows, args.output), encoding="utf-8")
     if args.readme is not None:
         # Read again: a run takes minutes, and the file may have been edited meanwhile.
-        text = readme.with_table(readme.read_readme(args.readme), numbers.markdown(rows), code_hash)
+        text = readme.with_table(readme.read_readme(args.readme), markdown_table(numbers.HEAD, rows), code_hash)
         args.readme.write_text(text, encoding="utf-8")
     print(args.output / "report.html")
     return 0
@@ -103,11 +104,8 @@ def measure(size: Size, folder: Path, output: Path, video: Path | None) -> dict[
         found["environments"] = numbers.environments(dives)
         found["distance"] = {name: numbers.by_range(result.errors) for name, result in long_results.items()}
         found["near"] = {name: numbers.near_share(result.errors) for name, result in long_results.items()}
-        for dive in dives:
-            if TAGS in dive.results:
-                found["distance"][f"AR tags, {dive.environment.replace('_', ' ')}"] = numbers.by_range(
-                    dive.results[TAGS].errors
-                )
+        tagged = {dive.environment: dive.results[TAGS].errors for dive in dives if TAGS in dive.results}
+        found["distance"] |= {f"AR tags, {named(name)}": numbers.by_range(errors) for name, errors in tagged.items()}
         errors = long_results[OURS].errors
         recorded = load([str(long_log)])
         bound_m = numbers.bounds(errors, TruthTrack(recorded.truths), recorded.infos, SIGMA_PX)
@@ -207,8 +205,8 @@ def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output:
     costs = [["Eq. 1, both ranges", number(times["eq1_ms"], 4)]]
     costs.append(["a whole trigger, median", number(times["trigger"]["median_ms"], 2)])
     for environment, frame in times["frame"].items():
-        costs.append([f"a frame, {environment}: ours", number(frame["source_ms"], 1)])
-        costs.append([f"a frame, {environment}: the paper's", number(frame["paper_ms"], 1)])
+        for name, detector in (("ours", "source_ms"), ("the paper's", "paper_ms")):
+            costs.append([f"a frame, {environment}: {name}", number(frame[detector], 1)])
     sections.append(("Run time", table(costs, ("processor time of one thread, this machine", "ms"))))
     if "tank" in found:
         listed = [[name.replace("_", " "), number(value)] for name, value in found["tank"].items()]

@@ -14,7 +14,7 @@ from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.evaluation.statistics import Stats, in_bins, share
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.experiments.runs import OURS, OURS_CAMERA, PAPER, PAPER_CAMERA, TAGS, Rendered
-from buddyline.tools.measure.tables import markdown_table, percent
+from buddyline.tools.measure.tables import percent
 
 HEAD: Final = ("", "ours", "the paper's method (or AR tags) here", "the paper reports")
 EDGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.5, 15.0, 17.5, 20.0)
@@ -104,31 +104,19 @@ def pairs(dives: Sequence[Rendered]) -> dict[str, dict[str, Any]]:
     """Return, by method and environment, how the triggers that show all four lights ended; "all": of them together."""
     table: dict[str, dict[str, Any]] = {}
     for name in (OURS, OURS_CAMERA, PAPER, PAPER_CAMERA):
-        rows: dict[str, Any] = {}
-        total = np.zeros(4, dtype=int)
+        counts: dict[str, list[int]] = {}
         for dive in dives:
             found = dive.results[name].pairing
-            if found is None or found.right is None:
-                continue
-            counts = np.array([found.visible, found.right, found.other_pair, found.wrong])
-            rows[dive.environment] = _pair_row(counts)
-            total += counts
-        rows["all"] = _pair_row(total)
-        table[name] = rows
+            if found is not None and found.right is not None:
+                counts[dive.environment] = [found.visible, found.right, found.other_pair or 0, found.wrong]
+        counts["all"] = [sum(column) for column in zip(*counts.values(), strict=True)] or [0, 0, 0, 0]
+        table[name] = {water: _pair_row(*of_water) for water, of_water in counts.items()}
     return table
 
 
-def _pair_row(counts: Any) -> dict[str, Any]:
-    visible, right, other, wrong = map(int, counts)
-    answered = right + other
-    return {
-        "visible": visible,
-        "right": right,
-        "other_pair": other,
-        "wrong": wrong,
-        "right_share": share(right, visible),
-        "right_of_poses": share(right, answered),
-    }
+def _pair_row(visible: int, right: int, other_pair: int, wrong: int) -> dict[str, Any]:
+    counts = {"visible": visible, "right": right, "other_pair": other_pair, "wrong": wrong}
+    return {**counts, "right_share": share(right, visible), "right_of_poses": share(right, right + other_pair)}
 
 
 def environments(dives: Sequence[Rendered]) -> dict[str, Any]:
@@ -138,63 +126,34 @@ def environments(dives: Sequence[Rendered]) -> dict[str, Any]:
 
 def headline(numbers: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     """Return the rows (what, ours, the paper's method here, what the paper reports)."""
-    found, near = numbers["right_pairs"], numbers["near"]
+    found, near, distance = numbers["right_pairs"], numbers["near"], numbers["distance"]
+
+    def right(ours: str, papers: str, reported: str) -> tuple[str, str, str]:
+        shares = [found[method]["all"]["right_share"] for method in (ours, papers)]
+        return percent(shares[0]), percent(shares[1]), percent(PAPER_REPORTS[reported])
+
+    others = [percent(share(one["other_pair"], one["visible"])) for one in (found[OURS]["all"], found[PAPER]["all"])]
     rows = [
-        (
-            "right pair of lights, all sensors",
-            percent(found[OURS]["all"]["right_share"]),
-            percent(found[PAPER]["all"]["right_share"]),
-            percent(PAPER_REPORTS["right_pairs_all_sensors"]),
-        ),
-        (
-            "right pair of lights, camera only",
-            percent(found[OURS_CAMERA]["all"]["right_share"]),
-            percent(found[PAPER_CAMERA]["all"]["right_share"]),
-            percent(PAPER_REPORTS["right_pairs_camera"]),
-        ),
-        (
-            "another pair taken, all sensors",
-            percent(share(found[OURS]["all"]["other_pair"], found[OURS]["all"]["visible"])),
-            percent(share(found[PAPER]["all"]["other_pair"], found[PAPER]["all"]["visible"])),
-            "-",
-        ),
-        (
-            "range within 0.08 m, 1.5 to 4 m",
-            percent(near["ours"]),
-            percent(near["paper's"]),
-            "all",
-        ),
+        ("right pair of lights, all sensors", *right(OURS, PAPER, "right_pairs_all_sensors")),
+        ("right pair of lights, camera only", *right(OURS_CAMERA, PAPER_CAMERA, "right_pairs_camera")),
+        ("another pair taken, all sensors", others[0], others[1], "-"),
+        ("range within 0.08 m, 1.5 to 4 m", percent(near["ours"]), percent(near["paper's"]), "all"),
     ]
-    ranges = {(row["from_m"], row["to_m"]): row for row in numbers["distance"][OURS]}
-    papers = {(row["from_m"], row["to_m"]): row for row in numbers["distance"]["paper's"]}
-    for bin_m in ((3.0, 4.0), (8.0, 10.0), (17.5, 20.0)):
-        if bin_m in ranges:
-            ours, theirs = ranges[bin_m], papers.get(bin_m)
-            bound = numbers["bound"].get(f"{bin_m[0]:g}-{bin_m[1]:g}")
-            rows.append(
-                (
-                    f"position error, median, {bin_m[0]:g} to {bin_m[1]:g} m (RMS / bound)",
-                    f"{ours['position_median_m']:.3f} m" + (f" ({bound['ratio']:.2f})" if bound else ""),
-                    f"{theirs['position_median_m']:.3f} m" if theirs else "-",
-                    "-",
-                )
-            )
+    ours, papers = ({row["from_m"]: row for row in distance[name]} for name in (OURS, "paper's"))
+    for from_m, to_m in ((3.0, 4.0), (8.0, 10.0), (17.5, 20.0)):
+        if from_m in ours:
+            bin_name, bound = f"{from_m:g} to {to_m:g} m", numbers["bound"].get(f"{from_m:g}-{to_m:g}")
+            ratio = f" ({bound['ratio']:.2f})" if bound else ""
+            medians = [
+                f"{row['position_median_m']:.3f} m" if row else "-" for row in (ours[from_m], papers.get(from_m))
+            ]
+            what = f"position error, median, {bin_name} (RMS / bound)"
+            rows.append((what, medians[0] + ratio, medians[1], "-"))
     for environment, ends in numbers["reach"].items():
-        rows.append(
-            (
-                f"farthest pose in the {environment.replace('_', ' ')}: ours / AR tags",
-                _metres(ends.get(OURS)),
-                _metres(ends.get(TAGS)),
-                "tags end at about 5 m",
-            )
-        )
+        what = f"farthest pose in the {environment.replace('_', ' ')}: ours / AR tags"
+        rows.append((what, _metres(ends.get(OURS)), _metres(ends.get(TAGS)), "tags end at about 5 m"))
     return rows
 
 
 def _metres(ends: Mapping[str, Any] | None) -> str:
     return "none" if ends is None or ends["farthest_m"] is None else f"{ends['farthest_m']:.1f} m"
-
-
-def markdown(rows: Sequence[tuple[str, str, str, str]]) -> str:
-    """Return the table for a README."""
-    return markdown_table(HEAD, rows)
