@@ -15,7 +15,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Reason
 from buddyline.solver_service.pair import Matched
 from buddyline.solver_service.results import sensed_of
-from buddyline.solver_service.streams import FAR_NS, FRAMES_TO_BELIEVE, Arrival, NodeStream, size_bytes
+from buddyline.solver_service.streams import FAR_NS, Arrival, NodeStream, size_bytes
 
 # How far a node's frames go on, in the dive's own time, before one that is missing is given up.
 MATCH_WINDOW_NS: Final = 1 * S_NS
@@ -24,7 +24,7 @@ SILENCE_WINDOW_NS: Final = 2 * S_NS
 # How long a trigger waits for anything at all, a sensor that has stopped for instance.
 LONGEST_WAIT_NS: Final = 3 * S_NS
 MAX_PENDING: Final = 512
-MAX_PENDING_BYTES: Final = 4 << 20
+MAX_PENDING_BYTES: Final = 16 << 20
 MAX_RESOLVED_MEMORY: Final = 4096
 
 TWO_FRAMES: Final = "two different frames claim this trigger: two nodes of one id?"
@@ -56,6 +56,14 @@ class _Waiting:
     conflict: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class _Resolved:
+    """Both nodes' time lines when a trigger was resolved (how often their clocks had been set), and who had a frame."""
+
+    time_lines: tuple[int, int]
+    had_frame: tuple[bool, bool]
+
+
 class PairMatcher:
     """Matches the frames of nodes a and b. Deterministic; time is an argument.
 
@@ -72,8 +80,8 @@ class PairMatcher:
         self._waiting: dict[int, _Waiting] = {}
         self._order: list[int] = []
         self._arrivals: deque[_Waiting] = deque()
-        self._resolved: OrderedDict[int, None] = OrderedDict()
-        self._far: deque[int] = deque(maxlen=4 * FRAMES_TO_BELIEVE)
+        self._time_lines = [0, 0]
+        self._resolved: OrderedDict[int, _Resolved] = OrderedDict()
         self._newest_resolved = -1
         self._now_ns: int | None = None
 
@@ -91,20 +99,20 @@ class PairMatcher:
         """
         if receive_ns is not None:
             self._now_ns = receive_ns
-        trigger = frame.trigger
+        trigger, side = frame.trigger, self._side(frame)
+        resolved = self._is_resolved(trigger, side)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
         if arrival is Arrival.FAR:
             self.late += 1
-            self._far.append(trigger)
-            if trigger in self._resolved:
+            if resolved:
                 return []
-            newest_ns = self.streams[self._side(frame)].newest_ns or 0
-            seconds = (frame.stamp_ns - newest_ns) / S_NS
+            seconds = (frame.stamp_ns - (self.streams[side].newest_ns or 0)) / S_NS
             detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
-            return [self._give_up(frame, "late", detail)]
-        if trigger in self._resolved:
+            # Should a new time line begin with it, it has its outcome there.
+            return [self._give_up(frame, "late", detail, ahead=1)]
+        if resolved:
             self.late += 1
             return []
         waiting = self._waiting.get(trigger)
@@ -124,14 +132,14 @@ class PairMatcher:
             self._arrivals.append(waiting)
             self._waiting[trigger] = waiting
             bisect.insort(self._order, trigger)
-        waiting.frames[self._side(frame)] = frame
+        waiting.frames[side] = frame
         self.pending_bytes += size_bytes(frame)
         return []
 
     def restart(self, node: str) -> list[Matched | Unmatched]:
         """Begin a new time line of a node whose clock was set; return what waited with a frame of the old one.
 
-        The same triggers may come again, as in a dive played twice; but not those that told of the new time.
+        The node's triggers may come again, as in a dive played twice; but not those that told of the new time.
         """
         side = 0 if self.streams[0].node == node else 1
         results = [
@@ -140,7 +148,7 @@ class PairMatcher:
             if self._waiting[trigger].frames[side] is not None
             and (result := self._resolve_one(self._waiting[trigger], at_once=True)) is not None
         ]
-        self._resolved = OrderedDict.fromkeys(self._far)
+        self._time_lines[side] += 1
         self._newest_resolved = -1
         return results
 
@@ -218,7 +226,7 @@ class PairMatcher:
             if (one.width_px, one.height_px) != (info.width_px, info.height_px):
                 sizes = f"{one.width_px}x{one.height_px} px, its calibration {info.width_px}x{info.height_px}"
                 return self._give_up(one, "no_info", f"frame of {one.node} is {sizes}")
-        self._finish(waiting.trigger)
+        self._finish(waiting.trigger, 0)
         self._newest_resolved = max(self._newest_resolved, waiting.trigger)
         return Matched(
             trigger=waiting.trigger,
@@ -243,18 +251,33 @@ class PairMatcher:
         own_ns = self.streams[self._side(frame)].newest_ns or 0
         return own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
 
-    def _give_up(self, frame: Candidates, reason: Reason, detail: str) -> Unmatched:
-        self._finish(frame.trigger)
+    def _is_resolved(self, trigger: int, side: int) -> bool:
+        """Whether a trigger has its outcome already, unless a node's new time line has come to it again."""
+        resolved = self._resolved.get(trigger)
+        if resolved is None:
+            return False
+        anew = [now > then for now, then in zip(self._time_lines, resolved.time_lines, strict=True)]
+        return not (anew[side] and (resolved.had_frame[side] or anew[1 - side]))
+
+    def _give_up(self, frame: Candidates, reason: Reason, detail: str, *, ahead: int = 0) -> Unmatched:
+        """End a trigger without a match; ahead: 1 where the frame may be the first of a new time line."""
+        self._finish(frame.trigger, self._side(frame), ahead)
         if reason != "late":
             self._newest_resolved = max(self._newest_resolved, frame.trigger)
         return Unmatched(frame.trigger, frame.stamp_ns, reason, detail)
 
-    def _finish(self, trigger: int) -> None:
+    def _finish(self, trigger: int, side: int, ahead: int = 0) -> None:
+        """Forget a trigger's frames, and remember that it has its outcome; side: of one of its frames."""
         waiting = self._waiting.pop(trigger, None)
+        had_frame = [False, False]
         if waiting is not None:
             del self._order[bisect.bisect_left(self._order, trigger)]
             self.pending_bytes -= sum(size_bytes(frame) for frame in waiting.frames if frame is not None)
+            had_frame = [frame is not None for frame in waiting.frames]
             waiting.frames = [None, None]
-        self._resolved[trigger] = None
+        had_frame[side] = True
+        time_lines = list(self._time_lines)
+        time_lines[side] += ahead
+        self._resolved[trigger] = _Resolved((time_lines[0], time_lines[1]), (had_frame[0], had_frame[1]))
         if len(self._resolved) > MAX_RESOLVED_MEMORY:
             self._resolved.popitem(last=False)

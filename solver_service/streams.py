@@ -25,7 +25,7 @@ FAR_NS: Final = 5 * S_NS
 FRAMES_TO_BELIEVE: Final = 5
 # Progress counts at most this much a frame: a gap in the dive is no time in which anything could have come.
 LONGEST_STEP_NS: Final = 1 * S_NS
-MAX_FRAME_BYTES: Final = 4 << 20
+MAX_FRAME_BYTES: Final = 8 << 20
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
 
@@ -42,7 +42,7 @@ class Arrival(Enum):
 
 def size_bytes(frame: Candidates) -> int:
     """Estimate the memory that a frame takes."""
-    return 512 + len(frame.boot) + 320 * len(frame.blobs)
+    return 512 + len(frame.boot) + 256 * len(frame.blobs)
 
 
 class FrameWindow:

@@ -225,6 +225,94 @@ def test_a_live_frame_waits_two_seconds_for_a_silent_node(dive):
     assert core.counts["unmatched"] > 20
 
 
+@pytest.mark.parametrize("live", [True, False])
+@pytest.mark.parametrize("rate_hz", [10, 1])
+def test_a_node_that_dies_before_its_last_attitude_holds_nobody_up(live, rate_hz):
+    """B's attitude ends 0.15 s before its last frame, and it sends nothing more; a goes on."""
+    messages, _ = dive_messages(seconds=16.0, period_ns=S_NS // rate_hz)
+    dies_ns = START_NS + 4 * S_NS
+    core, waits_s, frames = core_of(), [], []
+    for message in messages:
+        ends_ns = dies_ns - (150 * MS_NS if isinstance(message, Attitude | Depth) else 0)
+        if message.node == "b" and message.stamp_ns > ends_ns:
+            continue
+        frames += [message] if isinstance(message, Candidates) else []
+        now_ns = message.stamp_ns + 50 * MS_NS
+        results = core.handle(message, now_ns) if live else core.handle(message)
+        waits_s += [(message.stamp_ns - result.stamp_ns) / S_NS for result in results]
+    assert max(waits_s) < 3.5 if live else max(waits_s) < 3.5 + 2 / rate_hz
+    assert core.pending <= 3 * rate_hz
+    assert len(waits_s) + core.pending == len(triggers_of(frames))
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_frames_taken_thirty_seconds_apart_are_never_matched(live):
+    """B's clock jumps ahead by 30 s, and b ends soon after; half a minute later a comes to the same triggers."""
+    messages, _ = dive_messages(seconds=36.0, sensors=False)
+    ahead = 30 * S_NS // PERIOD_NS
+    core, results, jumped = core_of(), [], set()
+    for message in messages:
+        sent = message
+        if message.node == "b" and message.stamp_ns > START_NS + 3 * S_NS:
+            continue
+        if message.node == "b" and isinstance(message, Candidates) and message.stamp_ns > START_NS + 2 * S_NS:
+            sent = msgspec.structs.replace(
+                message, stamp_ns=message.stamp_ns + 30 * S_NS, trigger=message.trigger + ahead
+            )
+            jumped.add(sent.trigger)
+        results += core.handle(sent, message.stamp_ns + 50 * MS_NS) if live else core.handle(sent)
+    results += core.flush()
+    assert len(jumped) == 10
+    assert {result.reason for result in results if result.trigger in jumped} <= {"unmatched", "late"}
+
+
+def test_what_waits_when_a_clock_is_set_has_its_outcome(dive):
+    """A alone, whose clock is set back by an hour: the frames of its last seconds wait for b then."""
+    messages, _ = dive
+    frames = [m for m in messages if isinstance(m, Candidates) and m.node == "a"]
+    hour_ns = 3600 * S_NS
+    back = [
+        msgspec.structs.replace(m, stamp_ns=m.stamp_ns - hour_ns, trigger=m.trigger - hour_ns // PERIOD_NS)
+        for m in frames
+    ]
+    results, _ = solve([*frames, *back])
+    assert_each_ends_once(results, [*frames, *back])
+
+
+def test_a_node_that_appears_later_is_paired_with_what_the_others_still_hold(dive):
+    messages, _ = dive
+    core = SolverCore(Settings())
+    ordered = sorted(messages, key=lambda m: (m.node == "b", m.stamp_ns))
+    results = [result for message in ordered for result in core.handle(message, START_NS + 7 * S_NS)] + core.flush()
+    assert_each_ends_once(results, messages)
+    assert list(core.pairs) == [("a", "b")]
+    assert sum(isinstance(r, RelativePose) for r in results) > 0.8 * len(results)
+
+
+def test_three_nodes_give_each_pair_what_it_gives_alone(dive):
+    """C is b over again: pair a, c gives what a, b gives, and b, c has its outcomes."""
+    messages, _ = dive
+    renamed = [msgspec.structs.replace(m, node="c") for m in messages if m.node == "b"]
+    three = sorted([*messages, *renamed], key=lambda m: (m.stamp_ns, isinstance(m, Candidates)))
+    core = SolverCore(Settings())
+    found = {nodes: [] for nodes in (("a", "b"), ("a", "c"), ("b", "c"))}
+    for result in [result for message in three for result in core.handle(message)] + core.flush():
+        found[result.node_a, result.node_b].append(result)
+    alone, _ = solve(sorted(messages, key=lambda m: (m.stamp_ns, isinstance(m, Candidates))))
+    assert found["a", "b"] == alone
+    assert [msgspec.structs.replace(result, node_b="b") for result in found["a", "c"]] == alone
+    for results in found.values():
+        assert_each_ends_once(results, messages)
+
+
+def test_together_or_one_by_one_gives_the_same(dive):
+    messages, _ = dive
+    expected, _ = solve(messages)
+    core = core_of()
+    results = [r for at in range(0, len(messages), 97) for r in core.handle_many(messages[at : at + 97])]
+    assert results + core.flush() == expected
+
+
 def test_without_calibration_every_trigger_says_so(dive):
     messages, _ = dive
     results, _ = solve([m for m in messages if not (isinstance(m, NodeInfo) and m.node == "b")])

@@ -1,0 +1,131 @@
+"""Three nodes, one solver: every pair has its outcomes, offline and with real processes over a hub."""
+
+import json
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import Candidates, Rejected, RelativePose, SolverStatus
+from msgspec.structs import replace
+
+from tests.processes import REPOSITORY, Process, buddyline, free_endpoint
+from tests.solver_service.conftest import dive_messages
+
+PAIRS = {("a", "b"), ("a", "c"), ("b", "c")}
+THIRD_BAR = REPOSITORY.parent / "shared" / "data" / "dives" / "odd_third_bar.mcap"
+
+
+def log_of(path):
+    """Every message of a log that the solver made, by pair and kind."""
+    with DiveLogReader(path) as reader:
+        found = [record.open().message for record in reader.records(lambda key: key.startswith("buddyline/pair/"))]
+    outcomes = {pair: {} for pair in PAIRS}
+    counts = Counter()
+    for one in found:
+        if isinstance(one, RelativePose | Rejected):
+            outcomes[one.node_a, one.node_b][one.trigger] = one
+            counts[one.node_a, one.node_b, one.trigger] += 1
+    return outcomes, counts, [one for one in found if isinstance(one, SolverStatus)]
+
+
+@pytest.fixture(scope="module")
+def three_logs(tmp_path_factory):
+    """A sees b and c, which stand in one place: pairs a, b and a, c have poses."""
+    folder = tmp_path_factory.mktemp("three")
+    messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05)
+    messages += [replace(message, node="c") for message in messages if message.node == "b"]
+    logs = []
+    for node in ("a", "b", "c"):
+        logs.append(folder / f"{node}.mcap")
+        with DiveLogWriter(logs[-1]) as writer:
+            for message in messages:
+                if message.node == node:
+                    writer.write_message(message)
+    return logs, {message.trigger for message in messages if isinstance(message, Candidates)}
+
+
+@pytest.fixture(scope="module")
+def offline(three_logs):
+    logs, _ = three_logs
+    out = logs[0].with_name("offline.mcap")
+    done = buddyline("solve", *logs, "-o", out, "--json")
+    assert done.returncode == 0, done.stderr
+    return out, json.loads(done.stdout)
+
+
+def test_offline_every_pair_has_an_outcome_for_every_trigger(three_logs, offline):
+    _, triggers = three_logs
+    out, summary = offline
+    outcomes, counts, _ = log_of(out)
+    assert all(set(outcomes[pair]) == triggers for pair in PAIRS)
+    assert set(counts.values()) == {1}
+    for pair in (("a", "b"), ("a", "c")):
+        assert sum(isinstance(one, RelativePose) for one in outcomes[pair].values()) > 20
+    assert {(one["node_a"], one["node_b"]) for one in summary["pairs"]} == PAIRS
+    assert summary["triggers"] == 3 * len(triggers)
+    assert summary["solved"] == sum(one["solved"] for one in summary["pairs"])
+
+
+@pytest.mark.parametrize("nodes", [["a,c"], ["c", "a"]])
+def test_offline_nodes_restrict(three_logs, offline, tmp_path, nodes):
+    logs, _ = three_logs
+    done = buddyline("solve", *logs, "-o", tmp_path / "out.mcap", "--json", "--nodes", *nodes)
+    summary = json.loads(done.stdout)
+    first, second = nodes[0].split(",") if len(nodes) == 1 else nodes
+    assert (summary["node_a"], summary["node_b"]) == (first, second)
+    pairs = {one["node_a"] + one["node_b"]: one for one in offline[1]["pairs"]}
+    if first == "a":
+        assert summary["solved"] == pairs["ac"]["solved"]
+    with DiveLogReader(tmp_path / "out.mcap") as reader:
+        assert not any(key.startswith("buddyline/node/b/") for key in reader.keys)
+
+
+@pytest.mark.skipif(not THIRD_BAR.exists(), reason="the shared sample dives are not here")
+def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):
+    done = buddyline("solve", THIRD_BAR, "-o", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    outcomes, counts, _ = log_of(tmp_path / "out.mcap")
+    assert set(counts.values()) == {1}
+    assert len({frozenset(found) for found in outcomes.values()}) == 1
+    for pair in (("a", "b"), ("a", "c")):
+        poses = [one for one in outcomes[pair].values() if isinstance(one, RelativePose)]
+        assert len(poses) > 0.8 * len(outcomes[pair])
+
+
+def wait_for_outcomes(path: Path, expected, seconds=30.0):
+    ends_s = time.monotonic() + seconds
+    while time.monotonic() < ends_s:
+        found = log_of(path)
+        if all(set(found[0][pair]) >= set(expected[pair]) for pair in PAIRS):
+            return found
+        time.sleep(0.3)
+    raise AssertionError({pair: len(found[0][pair]) for pair in PAIRS})
+
+
+def test_three_nodes_on_one_hub_and_one_solver(three_logs, offline, tmp_path):
+    logs, _ = three_logs
+    expected, _, _ = log_of(offline[0])
+    endpoint = free_endpoint()
+    with (
+        Process("hub", "--listen", endpoint) as hub,
+        Process("solver", "--connect", endpoint) as solver,
+        Process("record", tmp_path / "live.mcap", "--connect", endpoint) as record,
+    ):
+        hub.wait_for("listens")
+        solver.wait_for("connected")
+        record.wait_for("into")
+        players = [Process("play", path, "--connect", endpoint) for path in logs]
+        try:
+            outcomes, counts, statuses = wait_for_outcomes(tmp_path / "live.mcap", expected)
+            assert [player.wait() for player in players] == [0, 0, 0]
+        finally:
+            for player in players:
+                player.end()
+    assert set(counts.values()) == {1}
+    assert {(one.node_a, one.node_b) for one in statuses} == PAIRS
+    for pair in PAIRS:
+        assert set(outcomes[pair]) == set(expected[pair])
+        same = sum(outcomes[pair][trigger] == one for trigger, one in expected[pair].items())
+        assert same > 0.9 * len(expected[pair])
