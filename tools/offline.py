@@ -46,7 +46,7 @@ def solve_messages(
             raise BuddylineError(f"no NodeInfo of node {node}")
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
     core = SolverCore(settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)})
-    outcomes = [outcome for message in taken for outcome in core.handle(message)] + core.flush()
+    outcomes = core.handle_many(taken) + core.flush()
     return SolvedDive(
         chosen,
         pose_columns(in_order(one for one in outcomes if isinstance(one, RelativePose))),

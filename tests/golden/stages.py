@@ -46,6 +46,13 @@ def outcomes_of(log: Path) -> list[Record]:
     return sorted(outcomes, key=lambda one: (one["pair"], one["trigger"], one["stamp_ns"]))
 
 
+def outcomes_of_messages(payloads: list[bytes]) -> list[Record]:
+    """Return the same of encoded poses and rejections."""
+    messages = [json.loads(payload) for payload in payloads]
+    outcomes = [_outcome("pose" if "t_a_b_m" in message else "rejected", message) for message in messages]
+    return sorted(outcomes, key=lambda one: (one["pair"], one["trigger"], one["stamp_ns"]))
+
+
 def align(dives: list[Path]) -> tuple[int, list[Record]]:
     """Candidates -> offset of the clocks: exit status, and the one result, if there is one."""
     status, text = run("align", *dives, "--json")

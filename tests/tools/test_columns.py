@@ -50,8 +50,10 @@ def test_in_memory_and_by_command_are_the_same(solved):
     assert memory.pair == ("a", "b")
     assert dive.pairs == [("a", "b")]
     poses, rejections = dive.poses(), dive.rejections()
-    np.testing.assert_array_equal(memory.poses.t_a_b_m, poses.t_a_b_m)
-    np.testing.assert_array_equal(memory.poses.t_ned_m, poses.t_ned_m)
+    np.testing.assert_array_equal(memory.poses.trigger, poses.trigger)
+    # The command solves fewer triggers in one set of arrays.
+    np.testing.assert_allclose(memory.poses.t_a_b_m, poses.t_a_b_m, atol=1e-9)
+    np.testing.assert_allclose(memory.poses.t_ned_m, poses.t_ned_m, atol=1e-9)
     np.testing.assert_array_equal(memory.rejections.trigger, rejections.trigger)
     np.testing.assert_array_equal(memory.rejections.reason, rejections.reason)
 
