@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.client import add_client_arguments, client_config
+from buddyline.tools.newfile import check_new, write_new
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 "--picture",
                 default=f"calibrate-{name}.png",
                 metavar="OUT.png",
-                help="shows the fit; default: %(default)s",
+                help="a new file that shows the fit; default: %(default)s",
             )
         return kind
 
@@ -93,6 +94,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate; what goes into the node's TOML file is printed."""
+    if getattr(args, "picture", None):
+        check_new(args.picture)
     status: int | None = args.calibrate(args)
     return status or 0
 
@@ -233,7 +236,6 @@ def _numbers(values: Iterable[float] | np.ndarray, form: str) -> str:
 
 def _write_info(path: str, info: NodeInfo) -> None:
     from buddyline.protocol.codec import encode
-    from buddyline.tools.newfile import write_new
 
     write_new(path, encode(info))
     log.info("%s: for solve --info %s=%s", path, info.node, path)

@@ -1,4 +1,4 @@
-"""`buddyline plan`: how far a pair will measure well, before anyone is in the water."""
+"""`buddyline plan`: how far two nodes will measure well, before anyone is in the water."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from buddyline.tools.bound import pose_bounds
 from buddyline.tools.dives import load_info
 from buddyline.tools.draw.figures import new_figure, save
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized
+from buddyline.tools.newfile import check_new
 
 RANGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
 FIELD_OF_VIEW_RAD: Final = math.radians(48.8)
@@ -32,7 +33,7 @@ _ATTITUDES: Final = 16
 
 
 @dataclass(frozen=True)
-class Row:
+class PlannedRange:
     """What to expect at one range: RMS errors. azimuth_rad: compass and picture; in_view: all lights fit the picture.
 
     lit: the lights are bright enough for the water. within: whether all tolerances are met, lights seen.
@@ -48,59 +49,52 @@ class Row:
     within: bool
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Errors by range, and where each tolerance ends: None where it holds as far as was looked, 0 where nowhere.
+
+    ends_m: by "range", "position", "azimuth"; reach_m: where the lights become too faint. near_m: nearer than
+    that the lights do not both fit the picture. far_m, limit: the first of these ends, and which.
+    """
+
+    rows: list[PlannedRange]
+    ends_m: dict[str, float | None]
+    reach_m: float
+    near_m: float
+    far_m: float | None
+    limit: str
+
+
 def run(args: argparse.Namespace) -> int:
     """Print the plan; return 0."""
     for name in ("baseline", "visibility", "sigma_px", "range_tolerance", "position_tolerance", "azimuth_tolerance"):
         value = getattr(args, name)
         if value is not None and not 0 < value < math.inf:
             raise BuddylineError(f"--{name.replace('_', '-')} {value}: give a number above 0")
-    if args.plot is not None and args.plot.exists():
-        raise BuddylineError(f"{args.plot}: exists; name another or remove it first")
     if not 0 <= args.compass_deg < 90:
         raise BuddylineError(f"--compass-deg {args.compass_deg}: give 0 to 90")
+    if args.plot is not None:
+        check_new(args.plot)
     info = described(args.camera)
-    tolerances = Tolerances(args.range_tolerance, args.position_tolerance, math.radians(args.azimuth_tolerance))
+    tolerances = {
+        "range": args.range_tolerance,
+        "position": args.position_tolerance,
+        "azimuth": math.radians(args.azimuth_tolerance),
+    }
     sigma_px = args.sigma_px or info.sigma_px
     reach_m = math.inf if args.visibility is None else light_reach_m(args.visibility)
-    compass_rad = math.radians(args.compass_deg)
-
-    def planned(baseline_m: float) -> Plan:
-        return plan(with_baseline(info, baseline_m), sigma_px, compass_rad, reach_m, tolerances)
-
-    spacings = {share * args.baseline: planned(share * args.baseline) for share in (0.5, 0.75, 1.0, 1.5, 2.0)}
+    spacings = {}
+    for baseline_m in (share * args.baseline for share in (0.5, 0.75, 1.0, 1.5, 2.0)):
+        lights = with_baseline(info, baseline_m)
+        spacings[baseline_m] = plan(lights, sigma_px, math.radians(args.compass_deg), reach_m, tolerances)
     chosen = spacings[args.baseline]
     if args.json:
         print(json.dumps(as_dict(chosen, spacings), allow_nan=False))
     else:
         print(as_text(chosen, spacings, args.baseline, args.visibility))
     if args.plot is not None:
-        draw(spacings, tolerances, reach_m, args.plot)
+        draw(spacings, tolerances["position"], reach_m, args.plot)
     return 0
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """RMS errors that are still good enough."""
-
-    range_m: float
-    position_m: float
-    azimuth_rad: float
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Errors by range, and where each tolerance ends: None where it holds as far as was looked, 0 where nowhere.
-
-    ends_m: by "range", "position", "azimuth"; reach_m: where the water swallows the lights. near_m: nearer than
-    that the lights do not both fit the picture. far_m, limit: the first of these ends, and which.
-    """
-
-    rows: list[Row]
-    ends_m: dict[str, float | None]
-    reach_m: float
-    near_m: float
-    far_m: float | None
-    limit: str
 
 
 def described(path: str | None) -> NodeInfo:
@@ -180,33 +174,25 @@ def expected(info: NodeInfo, sigma_px: float, ranges_m: Floats) -> Floats:
     return errors
 
 
-def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, tolerances: Tolerances) -> Plan:
-    """Return the plan of two like nodes."""
+def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, tolerances: dict[str, float]) -> Plan:
+    """Return the plan of two like nodes; tolerances: RMS, of "range" and "position" (m) and "azimuth" (rad)."""
     length_m = math.dist(info.light_left_m, info.light_right_m)
     near_m = 1.1 * length_m / 2 / math.tan(math.atan(info.width_px / 2 / info.camera.fx_px))
+    errors = expected(info, sigma_px, np.array(RANGES_M))
+    # The compass adds to the bearing across.
+    errors[:, 2] = np.hypot(errors[:, 2], compass_rad)
     rows = []
-    errors = expected(info, sigma_px, np.array(RANGES_M)).tolist()
-    for range_m, (along_m, position_m, bearing_rad, rotation_rad) in zip(RANGES_M, errors, strict=True):
-        azimuth_rad = math.hypot(bearing_rad, compass_rad)
-        good = (
-            along_m <= tolerances.range_m
-            and position_m <= tolerances.position_m
-            and azimuth_rad <= tolerances.azimuth_rad
-        )
+    for range_m, (along_m, position_m, azimuth_rad, rotation_rad) in zip(RANGES_M, errors.tolist(), strict=True):
         in_view, lit = range_m >= near_m, range_m <= reach_m
-        rows.append(
-            Row(range_m, along_m, position_m, azimuth_rad, rotation_rad, in_view, lit, good and in_view and lit)
-        )
-    ends_m = {
-        "range": _end_m([row.range_error_m for row in rows], tolerances.range_m),
-        "position": _end_m([row.position_error_m for row in rows], tolerances.position_m),
-        "azimuth": _end_m([row.azimuth_error_rad for row in rows], tolerances.azimuth_rad),
-    }
-    candidates = {name: end_m for name, end_m in ends_m.items() if end_m is not None}
+        good = all(e <= t for e, t in zip((along_m, position_m, azimuth_rad), tolerances.values(), strict=True))
+        within = good and in_view and lit
+        rows.append(PlannedRange(range_m, along_m, position_m, azimuth_rad, rotation_rad, in_view, lit, within))
+    ends_m = {name: _end_m(errors[:, i].tolist(), limit) for i, (name, limit) in enumerate(tolerances.items())}
+    known = {name: end_m for name, end_m in ends_m.items() if end_m is not None}
     if math.isfinite(reach_m):
-        candidates["visibility"] = reach_m
-    limit = min(candidates, key=lambda name: candidates[name], default="")
-    return Plan(rows, ends_m, reach_m, near_m, candidates.get(limit), limit)
+        known["visibility"] = reach_m
+    limit = min(known, key=lambda name: known[name], default="")
+    return Plan(rows, ends_m, reach_m, near_m, known.get(limit), limit)
 
 
 def _end_m(errors: list[float], tolerance: float) -> float | None:
@@ -269,15 +255,15 @@ def _far(end_m: float | None) -> str:
     return f">{RANGES_M[-1]:g}" if end_m is None else f"{end_m:.1f}"
 
 
-def draw(spacings: dict[float, Plan], tolerances: Tolerances, reach_m: float, path: Path) -> None:
-    """Draw position errors by range, a line a spacing."""
+def draw(spacings: dict[float, Plan], tolerance_m: float, reach_m: float, path: Path) -> None:
+    """Draw position errors by range, a line for each spacing of the lights."""
     figure, (axis,) = new_figure(7.0, 4.2)
     for spacing, one in spacings.items():
         rows = [row for row in one.rows if row.in_view]
         axis.loglog(
             [row.range_m for row in rows], [row.position_error_m for row in rows], label=f"lights {spacing:g} m"
         )
-    axis.axhline(tolerances.position_m, color="0.4", linestyle="--", label="tolerance")
+    axis.axhline(tolerance_m, color="0.4", linestyle="--", label="tolerance")
     if math.isfinite(reach_m):
         axis.axvline(reach_m, color="tab:brown", linestyle=":", label="lights too faint")
     axis.set(xlabel="range, m", ylabel="position error, RMS, m")

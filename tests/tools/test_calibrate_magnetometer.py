@@ -152,6 +152,13 @@ def test_command_prints_what_the_node_takes(logged, tmp_path, capsys):
     assert cv2.imread(str(picture)) is not None
 
 
+def test_command_keeps_a_picture_that_is_there(logged, tmp_path):
+    (tmp_path / "p.png").write_text("precious")
+    with pytest.raises(BuddylineError, match=r"p\.png: exists"):
+        calibrate.run(arguments("magnetometer", logged(*turned_rig(n=300)), "--picture", str(tmp_path / "p.png")))
+    assert (tmp_path / "p.png").read_text() == "precious"
+
+
 def test_command_refuses_a_rig_that_was_hardly_tilted(logged, tmp_path):
     log = logged(*turned_rig(20.0, n=1500))
     with pytest.raises(PoorCalibration):

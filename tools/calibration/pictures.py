@@ -10,6 +10,7 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.calibration.ellipsoid import EllipsoidFit
 from buddyline.tools.calibration.lights import LightsFit, TapedPlace
+from buddyline.tools.newfile import write_new
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
@@ -23,13 +24,12 @@ BLUE: Final = (190, 110, 20)
 
 
 def write_picture(path: Path, picture: Image) -> None:
-    """Write a picture; raise BuddylineError where it cannot be."""
+    """Write a new picture; raise BuddylineError where one exists, or where it cannot be written."""
     try:
-        written = cv2.imwrite(str(path), picture)
+        _, data = cv2.imencode(path.suffix, picture)
     except cv2.error as error:
         raise BuddylineError(f"{path}: give a name that ends in .png or .jpg") from error
-    if not written:
-        raise BuddylineError(f"{path}: cannot be written")
+    write_new(path, data.tobytes())
 
 
 def draw_magnetometer(found: EllipsoidFit) -> Image:
