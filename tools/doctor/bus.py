@@ -10,6 +10,7 @@ from buddyline.protocol.bus import Bus
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo, NodeStatus
+from buddyline.protocol.security import check_identity, node_name
 from buddyline.protocol.topics import INFO, NODE_STATUS
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.health.finding import Finding
@@ -43,9 +44,11 @@ class Seen:
         (self.alive.add if alive else self.alive.discard)(name)
 
 
-def look(client: ClientConfig) -> Seen:
-    """Connect for a moment and see who is there."""
+def look(client: ClientConfig, own: str | None) -> Seen:
+    """Connect for a moment and see who is there. own: this machine's node, whose certificate it must be."""
     try:
+        if client.tls is not None and own is not None:
+            check_identity(client.tls, node_name(own))
         with open_bus_within(client, HUB_WITHIN_S) as bus:
             return watch(bus, LISTEN_S)
     except NoHubError as error:

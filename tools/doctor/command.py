@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict
 from typing import Final
 
 from buddyline.tools.health.finding import Finding, Level, status_of
@@ -35,7 +34,8 @@ def run(args: argparse.Namespace) -> int:
         client = replace(client, connect=args.connect)
     findings = diagnose(node, client)
     if args.json:
-        print(json.dumps({"status": status_of(findings), "findings": [asdict(finding) for finding in findings]}))
+        listed = [{name: getattr(one, name) for name in ("name", "level", "text", "advice")} for one in findings]
+        print(json.dumps({"status": status_of(findings), "findings": listed}))
     else:
         print("\n".join(line for finding in findings for line in lines_of(finding)))
     return status_of(findings)

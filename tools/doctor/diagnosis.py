@@ -14,11 +14,11 @@ from buddyline.node.chrony import ChronyError, read_tracking
 from buddyline.node.config import NodeConfig, load_node_config
 from buddyline.protocol.config import load_config
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.security import check_identity, node_name
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.doctor import bus, machine, rig
 from buddyline.tools.health import machine as judge
 from buddyline.tools.health.finding import Finding
+from msgspec.structs import replace
 
 WITHIN_S: Final = 10.0
 SAY_AFTER_S: Final = 2.0
@@ -36,28 +36,20 @@ def load(path: str | None) -> tuple[NodeConfig | None, ClientConfig]:
         table = {"node": ""}  # the loader says what is wrong with it
     if "node" not in table:
         config = load_config(path, ClientConfig)
-        return None, config if config.tls is None else ClientConfig(
-            connect=config.connect, namespace=config.namespace, tls=config.tls.beside(path)
-        )
+        return None, replace(config, tls=config.tls and config.tls.beside(path))
     node = load_node_config(path)
     return node, ClientConfig(connect=node.connect, namespace=node.namespace, tls=node.tls)
 
 
 def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
     """Check the machine and the bus, then, where no node has them in use already, camera and sensors."""
-    ends_s = time.monotonic() + WITHIN_S
+    ends_s, own = time.monotonic() + WITHIN_S, None if node is None else node.node
     seen = bus.Seen(error=f"{client.connect} did not answer")
 
     def look() -> list[Finding]:
         nonlocal seen
-        if client.tls is not None and node is not None:
-            try:
-                check_identity(client.tls, node_name(node.node))
-            except BuddylineError as error:
-                seen = bus.Seen(error=str(error))
-                return bus.check_bus(seen, client.connect, node.node)
-        seen = bus.look(client)
-        return bus.check_bus(seen, client.connect, None if node is None else node.node)
+        seen = bus.look(client, own)
+        return bus.check_bus(seen, client.connect, own)
 
     findings = together({"this machine": lambda: check_machine(node), "the bus": look}, ends_s)
     if node is None:

@@ -30,7 +30,8 @@ def _end_with_parent() -> None:
 class Child:
     """`buddyline words...` as a child process, from now on; its output goes to a file without a name.
 
-    A context manager that ends it. Nothing in the current folder can take the place of one of its modules.
+    A context manager that ends it. Nothing in the current folder can take the place of one of its modules. The kernel
+    ends it with the thread that started it: start it from one that lives as long.
     """
 
     def __init__(self, *words: str, name: str = "") -> None:
