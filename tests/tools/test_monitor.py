@@ -259,12 +259,12 @@ class TestPanel:
         for k in range(0, 40, 2):
             azimuth_rad = math.radians((350 + k) % 360)
             take(picture, pose(k, azimuth_rad=azimuth_rad, inclination_rad=0.0), at(k))
-        _, found = columns(list(picture.points), at(0))
-        (drawn,) = (values for title, values in found.items() if title.startswith("Azimuth"))
+        found = columns(list(picture.points), at(0))
+        (drawn,) = (values for title, (_, values) in found.items() if title.startswith("Azimuth"))
         np.testing.assert_allclose(np.diff(drawn), 2.0, atol=1e-9)
 
     def test_what_is_not_known_is_not_plotted(self) -> None:
-        _, found = columns(list(watched(9).points), at(0))
+        found = columns(list(watched(9).points), at(0))
         assert {title.split(",")[0] for title in found} == {"Range", "Gap between both nodes' ranges"}
 
     @pytest.mark.parametrize("draw", [panel.headline, panel.health])

@@ -29,10 +29,10 @@ def over_time(
     depths: by node, (ns, m). span_ns: the dive's start and end. without_ns: stretches without a pose, which are marked.
     """
     start_ns, end_ns = span_ns
-    t_s, found = columns(points, start_ns)
+    found = columns(points, start_ns)
     rows = max(len(found) + bool(depths), 1)
     figure, axes = new_figure(9.5, 1.4 * rows + 0.5, rows, 1, sharex=True)
-    for axis, (title, values) in zip(axes, found.items(), strict=False):
+    for axis, (title, (t_s, values)) in zip(axes, found.items(), strict=False):
         axis.plot(*broken(t_s, values, gap_s=_gap_s(points)), color=COLOURS[0], linewidth=1.0)
         axis.set_title(title, loc="left")
     if depths:

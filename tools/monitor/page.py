@@ -69,32 +69,32 @@ class TimePlots:
     def draw(self, picture: PairPicture, now_ns: int) -> None:
         """Draw each quantity that is known; a plot is there while it has values."""
         points = [point for point in picture.points if 0 <= now_ns - point.at_ns <= PLOTTED_S * S_NS]
-        t_s, found = columns(points, now_ns)
-        for title, values in found.items():
-            known = np.isfinite(values)
-            # Points without a line between them: nothing is known where there is no pose.
-            self._show(title, (t_s[known], values[known]), POSE_COLOUR, {"width": 0})
-        missed_s = [(miss.at_ns - now_ns) / S_NS for miss in picture.misses]
-        counts, edges_s = np.histogram(missed_s, int(PLOTTED_S), (-PLOTTED_S, 0.0))
+        plots = columns(points, now_ns)
         if picture.misses:
-            self._show(MISSES, (edges_s[1:], counts.astype(float)), NO_POSE_COLOUR, {})
+            missed_s = [(miss.at_ns - now_ns) / S_NS for miss in picture.misses]
+            counts, edges_s = np.histogram(missed_s, int(PLOTTED_S), (-PLOTTED_S, 0.0))
+            plots[MISSES] = edges_s[1:], counts.astype(float)
+        for title, data in plots.items():
+            if title in self._plots:
+                self._plots[title].data = data
+            else:
+                self._plots[title] = self._add(title, data)
         for title, plot in self._plots.items():
-            shown = title in found or (title == MISSES and bool(picture.misses))
-            if plot.visible != shown:
-                plot.visible = shown
+            if plot.visible != (title in plots):
+                plot.visible = title in plots
 
-    def _show(self, title: str, data: tuple[Floats, Floats], colour: str, style: dict[str, Any]) -> None:
-        if title in self._plots:
-            self._plots[title].data = data
-            return
-        points = {"show": bool(style), "size": 3, "fill": colour, "stroke": colour}
-        series: Any = ({"label": "s before now"}, {"label": title, "stroke": colour, "points": points} | style)
+    def _add(self, title: str, data: tuple[Floats, Floats]) -> viser.GuiUplotHandle:
+        # Poses are points without a line between them: nothing is known where there is none.
+        line, colour = (1, NO_POSE_COLOUR) if title == MISSES else (0, POSE_COLOUR)
+        points = {"show": not line, "size": 3, "fill": colour, "stroke": colour}
+        series: Any = ({"label": "s before now"}, {"label": title, "stroke": colour, "width": line, "points": points})
+        x_scale: Any = {"time": False, "range": (-PLOTTED_S, 0.0)}
         with self._folder:
-            self._plots[title] = self._gui.add_uplot(
+            return self._gui.add_uplot(
                 data,
                 series,
                 title=title,
-                scales={"x": {"time": False, "range": (-PLOTTED_S, 0.0)}},
+                scales={"x": x_scale},
                 axes=({"size": 26}, {}),
                 legend={"show": False},
                 height=PLOT_PX,

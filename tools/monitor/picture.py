@@ -67,21 +67,21 @@ QUANTITIES: Final = (
 )
 
 
-def columns(points: Sequence[Point], zero_ns: int) -> tuple[Floats, dict[str, Floats]]:
-    """Return the points' times from zero_ns (s), and of each quantity that is known its values by title.
+def columns(points: Sequence[Point], zero_ns: int) -> dict[str, tuple[Floats, Floats]]:
+    """Return, by title, the times from zero_ns (s) at which each quantity is known, and its values there.
 
-    Azimuths are continued past 360 deg, so that no line jumps where north is crossed.
+    Azimuths are continued past 360 deg, so that no line jumps where north is crossed. A quantity that is never known
+    is left out.
     """
     t_s = np.array([(point.at_ns - zero_ns) / S_NS for point in points], float)
     found = {}
     for title, value in QUANTITIES:
         values = np.array([value(point) for point in points], float)
         known = np.isfinite(values)
-        if title.startswith("Azimuth"):
-            values[known] = np.unwrap(values[known], period=360.0)
         if known.any():
-            found[title] = values
-    return t_s, found
+            column = values[known]
+            found[title] = t_s[known], np.unwrap(column, period=360.0) if title.startswith("Azimuth") else column
+    return found
 
 
 def _degrees(angle_rad: float | UnsetType) -> float:
