@@ -1,5 +1,6 @@
 """A short simulated dive as messages, in the order they were made."""
 
+import msgspec
 import pytest
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.world import World
@@ -26,6 +27,20 @@ def dive_messages(seconds=6.0, seed=3, sensors=True, period_ns=PERIOD_NS, **chan
                     timed.append((stamp_ns, 1, world.depth(node, stamp_ns)))
     timed.sort(key=lambda item: item[:2])
     return [message for _, _, message in timed], world
+
+
+def assert_same_outcomes(found, expected):
+    """What is solved together differs from what is solved alone by the order of sums, and by no more."""
+    found, expected = list(found), list(expected)
+    assert [type(one) for one in found] == [type(one) for one in expected]
+    for one, other in zip(map(msgspec.to_builtins, found), map(msgspec.to_builtins, expected), strict=True):
+        assert one.keys() == other.keys()
+        for field, value in one.items():
+            is_number = isinstance(value, float) or (isinstance(value, tuple | list) and "blobs" not in field)
+            wanted = (
+                pytest.approx(other[field], rel=1e-8, abs=1e-9) if is_number and field != "checks" else other[field]
+            )
+            assert value == wanted, field
 
 
 @pytest.fixture(scope="session")
