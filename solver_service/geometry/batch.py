@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from buddyline.solver_service.geometry.candidates import Candidates, find_candidates
+from buddyline.solver_service.geometry.candidates import CandidateBearings, find_candidates
 from buddyline.solver_service.geometry.observation import Observation, Settings
 from buddyline.solver_service.geometry.pairs import Pairs, find_pairs
 from buddyline.solver_service.geometry.rig import Rig, RigPair, pair_of
@@ -18,7 +18,7 @@ class Batch:
 
     rigs: RigPair
     settings: Settings
-    candidates: Candidates
+    candidates: CandidateBearings
     pairs: Pairs
     sensors: Sensors
 

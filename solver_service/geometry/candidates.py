@@ -23,7 +23,7 @@ _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 
 
 @dataclass(eq=False, slots=True)
-class Candidates:
+class CandidateBearings:
     """The usable candidates of T triggers, N in all: by trigger, A's picture before B's.
 
     triggers: T. image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
@@ -53,7 +53,7 @@ class Candidates:
         return (self.starts[1:] - self.starts[:-1]).reshape(-1, 2)
 
 
-def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candidates:
+def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> CandidateBearings:
     """Turn all views into bearings.
 
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
@@ -78,7 +78,7 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
     usable = np.isfinite(frames[:, 0].sum(1) + pixels.sum(1) + variance + area_px + dt_s)
     image = image[usable]
     frames, pixels, area_px = frames[usable], pixels[usable], area_px[usable]
-    return Candidates(
+    return CandidateBearings(
         triggers=len(observations),
         image=image,
         starts=starts_of(np.bincount(image, minlength=len(views))),

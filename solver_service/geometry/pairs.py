@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.candidates import Candidates
+from buddyline.solver_service.geometry.candidates import CandidateBearings
 from buddyline.solver_service.geometry.closed_form import dot
 from buddyline.solver_service.geometry.observation import Settings
 from buddyline.solver_service.geometry.ragged import largest, places
@@ -33,11 +33,12 @@ _LEAST_COS2: Final = 1e-6
 class Pairs:
     """P pairs by picture.
 
-    image: (P,) as in Candidates. ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and unit chord,
-    first to second, bar frame. key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's own bar to the
-    direction first -> second. variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2). log_weight: how rarely
-    chance puts two candidates so near each other. tan2_beta: (T,) of each trigger's widest. gravity_rad,
-    gravity_across_sight: gravity across the line of sight, its direction from one's own bar and its length.
+    image: (P,) as in CandidateBearings. ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and
+    unit chord, first to second, bar frame. key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's
+    own bar to the direction first -> second. variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2).
+    log_weight: how rarely chance puts two candidates so near each other. tan2_beta: (T,) of each trigger's widest.
+    gravity_rad, gravity_across_sight: gravity across the line of sight, its direction from one's own bar and its
+    length.
     """
 
     image: Indices
@@ -68,7 +69,7 @@ class Pairs:
         return np.flatnonzero((self.image & 1) == node)
 
 
-def find_pairs(candidates: Candidates, rigs: RigPair, down: Floats, settings: Settings) -> Pairs:
+def find_pairs(candidates: CandidateBearings, rigs: RigPair, down: Floats, settings: Settings) -> Pairs:
     """Give the pairs whose angle fits the other node's bar within the range limits; down: (T, 2, 3), bar frames."""
     seen = candidates
     # Each candidate with all that come after it in its picture.

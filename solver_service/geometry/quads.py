@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.candidates import Candidates
+from buddyline.solver_service.geometry.candidates import CandidateBearings
 from buddyline.solver_service.geometry.closed_form import Spans
 from buddyline.solver_service.geometry.evidence import GROSS_SCALE
 from buddyline.solver_service.geometry.observation import Settings
@@ -59,7 +59,7 @@ class Quads:
 
 
 def find_quads(
-    candidates: Candidates, pairs: Pairs, rigs: RigPair, motion_variance: Floats, settings: Settings
+    candidates: CandidateBearings, pairs: Pairs, rigs: RigPair, motion_variance: Floats, settings: Settings
 ) -> tuple[Quads, NDArray[np.bool_]]:
     """Give the quads whose gaps pass, read as gravity has them; and (T,) whether any combination has like ranges.
 
