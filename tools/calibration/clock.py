@@ -16,15 +16,15 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import ClockBeacon
 from numpy.typing import NDArray
 
-# A way there and one back belong to one exchange where they are not farther apart: 40 ppm make 40 us of it.
+# A way there and a way back within this time are one exchange: clocks that drift by 40 ppm move by 40 us meanwhile.
 APART_NS: Final = 1 * S_NS
-# Two crystals, each off by 50 ppm and pulled by chrony a little: what moves faster was set.
+# Two crystals, each off by 50 ppm and slewed a little by chrony. A clock that moves faster was set.
 FASTEST: Final = 200e-6
 SLACK_S: Final = 50e-6
 GAP_S: Final = 10.0
 WINDOW_S: Final = 60.0
 MIN_EXCHANGES: Final = 8
-# Of an exchange as quick as the quickest: stamps are taken by threads that wait for one another.
+# 1 sd of the quickest exchange: threads that wait for one another take the stamps.
 QUICKEST_SIGMA_S: Final = 20e-6
 NEXT_FEW: Final = 3
 MIN_DRIFT_SPAN_S: Final = 5.0

@@ -1,8 +1,8 @@
 """A magnetometer's hard and soft iron: the ellipsoid that its readings lie on, made a sphere.
 
-Readings of a rig turned every way lie on an ellipsoid: shifted by the rig's own magnetism, squeezed by its soft
-iron and by unequal axes. Nine numbers tell it. What the sphere does not tell, a turn of the whole, follows from
-the accelerometer: the Earth's field keeps its angle to gravity.
+The readings of a rig that is turned every way lie on an ellipsoid. The rig's own magnetism shifts it; soft iron and
+unequal axes squeeze it. Nine numbers describe it. The sphere leaves one rotation open; the accelerometer gives it,
+because the Earth's field keeps its angle to gravity.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Where a pair's four lights are on their rigs: both nodes look at each other, at rest, at taped distances.
 
-From each place of the pair come eight coordinates and a distance for six unknowns; what is left over determines the
-twelve coordinates of the lights, the better the more the places differ in distance, turn and tilt. Rulers come first:
-the entered positions count as measured to about a centimetre.
+Each place of the pair gives eight image coordinates and a distance, and has six unknowns. The rest determines the
+twelve coordinates of the lights; places that differ in distance, turn and tilt determine them best. The entered
+positions are measurements too, good to about a centimetre.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What does not fit: sights, field, depths and ranges of a leg, each named where it contradicts the others."""
+"""Alarms: which of a leg's sights, magnetic fields, depths and ranges contradict the others."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def off_fields(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> dict[st
 def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str]:
     """Return the nodes whose compasses are not to be believed.
 
-    A field beyond its limits condemns. Where the sights contradict each other, a smaller difference does as well, if
-    it is clearly larger than the other node's.
+    A field beyond its limits is enough. Where the sights contradict each other, so is a smaller difference from the
+    usual field, if it is clearly larger than the other node's.
     """
     off = off_fields(shot, usual, limits)
     found = [node for node, share in off.items() if share > 1]

@@ -1,4 +1,4 @@
-"""Means of readings that are neither independent nor free of outliers, with the standard deviations they deserve."""
+"""Means of readings that are correlated and contain outliers, with realistic standard deviations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Ints: TypeAlias = NDArray[np.int64]
 OUTLIER_SIGMAS: Final = 4.0
 # Median absolute deviation to standard deviation, of a normal distribution.
 MAD_TO_SIGMA: Final = 1.4826
-# However fast readings come, a held node and a filter's memory make those within this time err alike.
+# Readings within this time have the same error, whatever their rate: the node is held, and filters have a memory.
 CORRELATION_S: Final = 1.0
 
 
@@ -24,7 +24,7 @@ CORRELATION_S: Final = 1.0
 class Mean:
     """A value with its standard deviation, in one unit; count: how many readings it is of.
 
-    noise: the part of sigma that another series would have anew; what is slow stays the same for a while.
+    noise: the part of sigma that is new in each series of readings; the rest is slow and stays for a while.
     """
 
     value: float
@@ -34,9 +34,9 @@ class Mean:
 
 
 def inliers(values: Floats, least_sigma: float) -> Bools:
-    """Tell which of values (n,) or (n, k) lie with the others, in every column.
+    """Return which of values (n,) or (n, k) are no outliers in any column.
 
-    least_sigma: no scatter below it makes an outlier, so that equal readings but one do not condemn that one.
+    least_sigma: the least scatter that is assumed, so that one reading among equal ones is not an outlier.
     """
     table = values.reshape(len(values), -1)
     off = np.abs(table - np.median(table, axis=0))
@@ -67,9 +67,9 @@ def effective_count(stamps_s: Floats, values: Floats) -> float:
 
 
 def mean_of_white(stamps_s: Floats, values: Floats, stated_sigma: float, floor: float) -> Mean:
-    """Return the mean of readings whose stated noise is new in each of them; floor: what no averaging takes away.
+    """Return the mean of readings whose stated noise is new in each of them; floor: what averaging does not reduce.
 
-    Scatter above what is stated is believed, scatter below it is not.
+    The larger of scatter and stated noise counts.
     """
     scatter = float(values.std(ddof=1)) if len(values) > 1 else 0.0
     count = effective_count(stamps_s, values)
@@ -80,8 +80,8 @@ def mean_of_white(stamps_s: Floats, values: Floats, stated_sigma: float, floor: 
 def mean_of_slow(stamps_s: Floats, values: Floats, stated_sigma: float, floor: float) -> Mean:
     """Return the mean of readings whose stated error is partly slow: a compass, a tilt, a gauge.
 
-    What they scatter is the part that averages. What the stated standard deviation says beyond it has not been
-    seen to vary, so it stands for the whole series.
+    Averaging reduces the part that scatters. The rest of the stated variance did not vary during the series, so it
+    stays in full.
     """
     variance = float(values.var(ddof=1)) if len(values) > 1 else 0.0
     unseen = max(stated_sigma**2 - variance, 0.0)

@@ -1,4 +1,4 @@
-"""Which station each node of a pair stands at, rest after rest: by marks, by depths, by the procedure agreed on."""
+"""Which station each node of a pair stands at, rest after rest: by marks, depths, and the agreed procedure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From dives' readings to legs, points and stations: the whole of the pure core in one call."""
+"""From dives' readings to legs, points and stations: the pure core of the survey."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _station(name: str, depths: list[tuple[float, float]], notes: list[str]) -> 
     return Station(
         name=name,
         depth_m=round(float(weight @ depth_m / weight.sum()), 4),
-        # A gauge errs alike at each of its visits: averaging them gains little, so none is counted on.
+        # A gauge has the same error at each of its visits: averaging them gains little, so it is not counted.
         depth_sigma_m=round(float(sigma_m.min()), 4),
         readings=len(depths),
         notes=notes,

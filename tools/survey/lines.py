@@ -11,13 +11,13 @@ from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, UnsetType
 
-# Of two sights, the mean is worse than the better one alone where their sigmas differ by more than this.
+# Where the sigmas of two sights differ by more than this factor, the better sight alone is better than their mean.
 WORTH_BOTH: Final = math.sqrt(3)
-# Sights further apart than this many of their sigmas have sigmas that are wrong.
+# Where two sights are further apart than this many sigmas, their sigmas are too small.
 CONTRADICT: Final = 2.5
-# Above this the depths say little of the run along; the clinometers say more.
+# Above this slope the clinometers give the horizontal distance better than the depths do.
 STEEP_RAD: Final = math.radians(55.0)
-# Readings of absolute depth: what is left of them in a leg, so that no misclosure along it moves a depth.
+# Held depths are nearly exact in a leg, so that a horizontal misclosure moves no depth.
 ABSOLUTE_DEPTH_SIGMA_M: Final = 0.002
 
 

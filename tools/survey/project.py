@@ -1,7 +1,7 @@
-"""The project: one TOML file, of which a person writes the upper part and the dives give the lower.
+"""The project: one TOML file. A person writes the upper part, the lower part is derived from the dives.
 
-What stands above the line MARKER is kept to the letter; what stands below is made anew from the dives' logs,
-which nobody changes. The file as it was before is kept beside it.
+The text above the line MARKER is kept to the letter. The text below it is derived again from the dives' logs, which
+never change. The file as it was before is kept beside it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STATION_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,12}\Z")
 
 
 class About(Config, frozen=True, kw_only=True):
-    """[survey]: what heads every export. instruments: name of an instrument to what it is."""
+    """[survey]: the heading of every export. instruments: name of an instrument to what it is."""
 
     name: str = "survey"
     title: str = ""
@@ -107,7 +107,7 @@ class HandMark(Config, frozen=True, kw_only=True):
 
 
 class Edit(Config, frozen=True, kw_only=True):
-    """[[edit]]: a person's verdict on a leg, named "from-to" ("3-4"), or on its one repeat that began at start_ns."""
+    """[[edit]]: a person's decision on a leg, named "from-to" ("3-4"), or on the repeat that began at start_ns."""
 
     leg: str
     start_ns: int | UnsetType = UNSET
@@ -188,7 +188,7 @@ class Station(Config, frozen=True, kw_only=True):
 
 
 class Problem(Config, frozen=True, kw_only=True):
-    """[[problem]]: what the dives do not settle, in words."""
+    """[[problem]]: a question that the dives leave open, in words."""
 
     text: str
 
@@ -211,12 +211,12 @@ class Project(Config, frozen=True, kw_only=True):
     problem: list[Problem] = field(default_factory=list)
 
     def edit_of(self, leg: Leg) -> Edit | None:
-        """Return what a person said of a leg: of this very repeat, or of the leg."""
+        """Return a person's decision on this repeat of a leg, or on the leg."""
         found = [edit for edit in self.edit if edit.leg == leg.name and edit.start_ns in (UNSET, leg.start_ns)]
         return max(found, key=lambda edit: edit.start_ns is not UNSET, default=None)
 
     def used(self, legs: list[Leg]) -> list[Leg]:
-        """Return the legs that nobody has taken out."""
+        """Return the legs that no edit has taken out."""
         return [leg for leg in legs if (edit := self.edit_of(leg)) is None or edit.use]
 
 

@@ -102,9 +102,10 @@ class PairReadings:
 
 
 def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairReadings]:
-    """Return the readings of each pair with poses, by time of the first; of two alike (in two logs), the first counts.
+    """Return the readings of each pair that has poses, in the order of their first poses.
 
-    messages: in any order. name: what errors call the dive.
+    messages: in any order; of two for one instant (the same message in two logs), the first counts. name: of the dive,
+    for errors.
     """
     outcomes: dict[tuple[str, str], dict[int, RelativePose | Rejected]] = {}
     marks: dict[Mark, None] = {}

@@ -1,4 +1,4 @@
-"""Where in a dive both nodes rest: found from the fixes and from what the inertial sensors feel."""
+"""Where in a dive both nodes rest, by the fixes and by the inertial sensors."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from buddyline.tools.survey.readings import NodeReadings, PairReadings
 from buddyline.tools.survey.settings import SurveySettings
 from buddyline.tools.survey.sights import Sights
 
-# A speed is the slope over this long; headings wander within it, by a share of what they state, or by this.
+# A speed is the slope over this time. Headings drift meanwhile: by this share of their stated sigma, at least by this.
 SLOPE_NS: Final = 4_000_000_000
 WANDER_RADPS: Final = 0.006
 WANDER_SHARE_HZ: Final = 0.23
-# Fixes further apart than this are of two rests, unless the line between the nodes is still the same.
+# A gap between fixes longer than this ends a rest, unless the line between the nodes is still the same.
 PAUSE_NS: Final = 5_000_000_000
 # Two lines are the same if they differ by less than this, and this share of the range.
 SAME_M: Final = 0.25

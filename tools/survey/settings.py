@@ -1,4 +1,4 @@
-"""What the survey believes and tolerates: the project's [settings], every one with a default."""
+"""What the survey assumes and tolerates: the project's [settings] and [alarms], every value with a default."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from msgspec import Meta, field
 class SurveySettings(Config, frozen=True, kw_only=True):
     """How legs are made of a dive.
 
-    procedure: who moves where neither marks nor depths tell: the nodes pass one another in turn (leapfrog), or
-    node `first` stays. first: the node at the first station (default: the pair's first).
-    rest_s, rest_fixes: the least a leg is made of. rest_speed_mps: below it the pair counts as resting.
+    procedure: which node moves, where neither marks nor depths show it: the nodes pass one another in turn
+    (leapfrog), or node `first` stays. first: the node at the first station (default: the pair's first).
+    rest_s, rest_fixes: the minimum for a leg. rest_speed_mps: below it the pair counts as resting.
     turn_radps, jolt_mps2: gyroscope and accelerometer above which a node is handled, not held.
     centering_m: 1 sd, how well a node is held at its station, each axis. range_share: 1 sd, error of the ranges'
-    scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging a rest does not take away.
-    compass_common_deg: 1 sd, error of every azimuth alike (declination, mount): it turns the survey as a whole.
-    disturbed_deg: 1 sd of a compass in a disturbed field, where there is no other.
+    scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging over a rest does not reduce.
+    compass_common_deg: 1 sd, an error that all azimuths share (declination, mount): it turns the survey as a whole.
+    disturbed_deg: 1 sd of a compass in a disturbed field, used where there is no other compass.
     reference_m: node id to its station's point ([x, y, z], camera frame), where that is not the camera's centre.
     """
 
@@ -42,7 +42,7 @@ class SurveySettings(Config, frozen=True, kw_only=True):
 
 
 class AlarmSettings(Config, frozen=True, kw_only=True):
-    """When to speak up.
+    """The limits above which a leg gets an alarm.
 
     sights_deg: foresight against backsight. field_share: strength of the magnetic field against the dive's own;
     dip_deg likewise. heading_deg: the compasses' difference against what the nodes see of each other.

@@ -1,4 +1,4 @@
-"""One shot: all fixes while both nodes rest, as distance, sights both ways and depths, with honest sigmas."""
+"""One shot: all fixes of a rest, averaged to distance, sights both ways and depths, with realistic sigmas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Survex and Therion: the same readings in two languages that differ in little more than their signs."""
+"""Survex and Therion: the same readings in two languages that differ in details."""
 
 from __future__ import annotations
 
