@@ -47,12 +47,7 @@ def table(rows: Sequence[Sequence[str]], head: Sequence[str] = (), alarms: Seque
     return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
 
 
-def image(data: bytes, words: str, kind: str = "png") -> str:
-    """Return a picture inside the page, with its caption."""
-    source = f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-    return f'<figure><img alt="{escape(words)}" src="{source}"><figcaption>{escape(words)}</figcaption></figure>'
-
-
 def picture(path: Path, words: str) -> str:
     """Return a PNG file inside the page, with its caption."""
-    return image(path.read_bytes(), words)
+    source = f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}"
+    return f'<figure><img alt="{escape(words)}" src="{source}"><figcaption>{escape(words)}</figcaption></figure>'
