@@ -6,6 +6,7 @@ The pair's memory (motion prior, heading bias, clock alignment) lives here and n
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -63,7 +64,9 @@ class PairSolver:
         for _, same in itertools.groupby(matched, key=lambda one: (one.rig_a, one.rig_b)):
             alike = list(same)
             for start in range(0, len(alike), _BATCH):
-                results += self._solve_batch(alike[start : start + _BATCH])
+                # Absurd values end as rejections, not as warnings.
+                with np.errstate(all="ignore"):
+                    results += self._solve_batch(alike[start : start + _BATCH])
         return results
 
     def forget(self) -> None:
@@ -107,7 +110,7 @@ class PairSolver:
         return NoFix("degenerate", f"values from {nodes} are out of numeric range ({error})")
 
     def _remember(self, matched: Matched, fix: Fix, heading_offset: tuple[float, float] | None) -> None:
-        if not (np.isfinite(fix.t_a_b_m).all() and np.isfinite(fix.covariance).all()):
+        if not math.isfinite(fix.T_a_b.t_m.sum() + fix.covariance.sum()):
             raise ValueError("the pose is not finite")
         self._prior.update(matched.stamp_ns, fix)
         if heading_offset is not None and fix.method != "three_lights":

@@ -29,6 +29,8 @@ GATE_CHI2: Final = 38.0
 
 
 _DENSITY: Final = np.diag([ACCELERATION_DENSITY] * 3 + [TURN_DENSITY] * 3)
+# Where the density stands in the covariance of rates, of rates and pose, of the pose.
+_OF_POSE, _OF_BOTH, _OF_RATES = (np.kron(at, _DENSITY) for at in (np.diag((1, 0)), 1 - np.eye(2), np.diag((0, 1))))
 # Where the rates stand in the transition: the pose moves by them.
 _IDENTITY: Final = np.eye(12)
 _RATES: Final = np.eye(12, k=6)
@@ -62,7 +64,7 @@ class PosePrior:
             return
         T_a_b, P = self._predicted(self._stamp_ns, stamp_ns)
         innovation = fix.T_a_b.minus(T_a_b)
-        solved = np.linalg.solve(P[:6, :6] + fix.covariance, np.column_stack((P[:6], innovation)))
+        solved = np.linalg.solve(P[:6, :6] + fix.covariance, np.concatenate((P[:6], innovation[:, None]), axis=1))
         gain = solved[:, :12].T
         if innovation @ solved[:, 12] > GATE_CHI2:
             self._start(stamp_ns, fix)
@@ -89,9 +91,5 @@ class PosePrior:
     def _predict(self, dt_s: float) -> tuple[SE3, Floats]:
         """Move on at the present rates; P by the noise of a white acceleration."""
         F = _IDENTITY + dt_s * _RATES
-        P = F @ self._P @ F.T
-        P[:6, :6] += dt_s**3 / 3 * _DENSITY
-        P[:6, 6:] += dt_s**2 / 2 * _DENSITY
-        P[6:, :6] += dt_s**2 / 2 * _DENSITY
-        P[6:, 6:] += dt_s * _DENSITY
-        return self._T_a_b.retract(dt_s * self._rates), P
+        noise = dt_s * _OF_RATES + dt_s**2 / 2 * _OF_BOTH + dt_s**3 / 3 * _OF_POSE
+        return self._T_a_b.retract(dt_s * self._rates), F @ self._P @ F.T + noise

@@ -26,7 +26,7 @@ from buddyline.tools.newfile import new_dive_log
 log = logging.getLogger(__name__)
 
 # How many messages are matched before what they match is solved, all at once.
-TOGETHER: Final = 256
+TOGETHER: Final = 2048
 # What the output carries beside the poses, so that it can be evaluated and solved again on its own.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 

@@ -23,6 +23,9 @@ Variant: TypeAlias = Literal["exact", "paper", "paper_midpoint", "paper_literal"
 
 # A round of the split shrinks its error by about alpha^2 / 4, a round of the offset by its ratio to the range.
 _ROUNDS: Final = 9
+# The axes after each axis, and those after them.
+_YZX: Final = np.array((1, 2, 0))
+_ZXY: Final = np.array((2, 0, 1))
 # Left and right of a middle.
 _ENDS: Final[Floats] = np.array((-1.0, 1.0)).reshape(2, 1, 1, 1)
 
@@ -86,14 +89,14 @@ def wrap(angle_rad: Floats) -> Floats:
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar product over the axis before the last."""
-    total: Floats = (a * b).sum(-2)
+    total: Floats = np.einsum("...ik,...ik->...k", a, b)
     return total
 
 
 def cross(a: Floats, b: Floats) -> Floats:
     """Cross product over the axis before the last."""
-    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -2, 0), np.moveaxis(b, -2, 0)
-    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-2)
+    product: Floats = a[..., _YZX, :] * b[..., _ZXY, :] - a[..., _ZXY, :] * b[..., _YZX, :]
+    return product
 
 
 def eq1_range_m(cos_alpha: Floats, sin_alpha: Floats, sin_beta: Floats, length_m: Floats) -> Floats:

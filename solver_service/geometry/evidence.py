@@ -18,9 +18,9 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.observation import Settings
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats, Indices
+from buddyline.solver_service.geometry.rotation import Floats, Indices, inner
 from buddyline.solver_service.geometry.se3 import SE3
-from buddyline.solver_service.geometry.sensors import Sensors, Turn, turn_of
+from buddyline.solver_service.geometry.sensors import Sensors, off_rad, turn_of
 
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
@@ -46,10 +46,15 @@ AGREES: Final = 20.0
 
 @dataclass(eq=False, slots=True)
 class Support:
-    """What the sensors say of K poses: log likelihood ratios (K,), and chi^2 (K,) of tilt and depth by themselves."""
+    """What the sensors say of K poses.
+
+    log_ratio: (K,) of all together. turn: (3, K) against both headings, log_heading (K,) what it counts for.
+    tilt_chi2, depth_chi2: (K,).
+    """
 
     log_ratio: Floats
-    turn: Turn
+    turn: Floats
+    log_heading: Floats
     tilt_chi2: Floats
     depth_chi2: Floats
 
@@ -91,14 +96,15 @@ def weigh(
     """
     R_ned_a, R_ned_b = sensors.R_ned_bar[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
+    log_heading = np.zeros(len(variance))
     if "attitude" in checks:
         # The picture's own noise turns B about the line of sight by half the twist gap's.
         spread2 = sensors.tilt_variance.sum(1)[trigger] + 0.125 * variance
-        tilt_chi2 = 2.0 * (1.0 - turn.level) / spread2
+        tilt_chi2 = 2.0 * (1.0 - turn[0]) / spread2
         right = (1.0 - _TILT_BROKEN) * np.exp(-0.5 * tilt_chi2) / spread2
         log_ratio = np.log(PITCH_SPREAD / (2.0 * math.pi) * (right + 0.5 * _TILT_BROKEN))
-        heading = weigh_heading(turn.off_rad(), sensors.heading_variance[trigger] + 0.25 * variance)
-        log_ratio += np.where(sensors.both[trigger], heading, 0.0)
+        log_heading = weigh_heading(off_rad(turn), sensors.heading_variance[trigger] + 0.25 * variance)
+        log_ratio += np.where(sensors.both[trigger], log_heading, 0.0)
     else:
         # The reading is upright; of half a turn nothing is known.
         tilt_chi2 = np.zeros(len(variance))
@@ -110,19 +116,21 @@ def weigh(
         down_a, down_b = R_ned_a[:, 2], R_ned_b[:, 2]
         known_a = sensors.known[trigger, 0]
         down = np.where(known_a[:, None], down_a, (T_a_b.R @ down_b[:, :, None])[:, :, 0])
-        fall = (down * below).sum(1)
+        fall = inner(down, below)
         fall2 = fall * fall
         tilt_variance = np.where(known_a, *sensors.tilt_variance[trigger].T)
-        spread2 = sensors.depth_variance[trigger] + tilt_variance * ((below * below).sum(1) - fall2)
+        spread2 = sensors.depth_variance[trigger] + tilt_variance * (inner(below, below) - fall2)
         spread2 += 0.25 * variance * fall2
         depth_chi2 = np.where(measured, (fall - sensors.depth_m[trigger]) ** 2 / spread2, 0.0)
         density = DEPTH_SPREAD_M * np.exp(-0.5 * depth_chi2) / np.sqrt(2.0 * math.pi * spread2)
         log_ratio += np.where(measured, np.log((1.0 - _DEPTH_BROKEN) * density + _DEPTH_BROKEN), 0.0)
-    return Support(log_ratio, turn, tilt_chi2, depth_chi2)
+    return Support(log_ratio, turn, log_heading, tilt_chi2, depth_chi2)
 
 
-def weigh_heading(off_rad: Floats, variance: Floats) -> Floats:
+def weigh_heading(angle_rad: Floats, variance: Floats) -> Floats:
     """Weigh turns (K,) about the vertical between poses and attitudes; variance: (K,) of both headings' difference."""
-    right = (1.0 - _HEADING_BROKEN) * np.exp(-0.5 * off_rad * off_rad / variance) / np.sqrt(2.0 * math.pi * variance)
+    right = (
+        (1.0 - _HEADING_BROKEN) * np.exp(-0.5 * angle_rad * angle_rad / variance) / np.sqrt(2.0 * math.pi * variance)
+    )
     log_ratio: Floats = np.log(HEADING_SPREAD * (right + _HEADING_BROKEN / (2.0 * math.pi)))
     return log_ratio

@@ -21,10 +21,10 @@ from buddyline.solver_service.geometry.evidence import (
 from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.quads import Quads, find_quads
 from buddyline.solver_service.geometry.ragged import largest, rank, starts_of
-from buddyline.solver_service.geometry.readings import Poses, Readings
-from buddyline.solver_service.geometry.refinement import Refined, Rows, light_rows, refine
+from buddyline.solver_service.geometry.readings import Poses, Read, Readings
+from buddyline.solver_service.geometry.refinement import Refined, light_rows, refine
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats, Indices
+from buddyline.solver_service.geometry.rotation import Floats, Indices, inner
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
@@ -40,27 +40,28 @@ _SMALL_OFFSET: Final = 0.02
 
 @dataclass(eq=False, slots=True)
 class FourLights:
-    """The quads of T triggers, the likeliest first, of which the best are refined.
+    """The quads of T triggers, of which the best are read.
 
-    poses: of all quads, closed form; those of trigger i from starts[i] on. readings: of the best, those of trigger i
-    from refined_starts[i] on. why: where a trigger has no quad. doubtful: (T,) whether three of the
-    lights may tell more. by_method: the readings' poses by the closed form that is to be published, None where the
-    refined ones are.
+    why: where a trigger has no quad. chi2: of the readings. by_method: their poses by the closed form that is to be
+    published, None where the refined ones are.
     """
 
-    starts: Indices
-    poses: Poses
-    refined_starts: Indices
-    readings: Readings
+    read: Read
     why: list[tuple[Reason, str] | None]
-    doubtful: NDArray[np.bool_]
+    chi2: Floats
     by_method: ClosedForm | None
 
-    def of(self, trigger: int) -> tuple[Poses, Readings]:
-        """Give one trigger's; the poses of the readings come first."""
-        first, last = self.starts[trigger : trigger + 2]
-        first_refined, last_refined = self.refined_starts[trigger : trigger + 2]
-        return self.poses[first:last], self.readings[first_refined:last_refined]
+    def doubtful(self, batch: Batch) -> NDArray[np.bool_]:
+        """Tell in which triggers (T,) no reading is likely enough by pictures and sensors alone, or fits poorly."""
+        settings, triggers, readings = batch.settings, batch.triggers, self.read.readings
+        trigger = np.arange(triggers).repeat(self.read.starts[1:] - self.read.starts[:-1])
+        log_ratio = readings.log_ratio + log_gaps(self.chi2, settings.gaps)
+        log_ratio[~readings.sound] = -np.inf
+        best = largest(trigger, log_ratio, triggers, -np.inf)
+        total = np.bincount(trigger, np.exp(log_ratio), minlength=triggers)
+        poor = (log_ratio == best[trigger]) & (false_light_odds(self.chi2, readings.clutter) > POOR_FIT)
+        unlikely = ~(np.exp(best) > settings.min_probability * (CHANCE_ODDS + total))
+        return unlikely | (np.bincount(trigger[poor], minlength=triggers) > 0)
 
 
 def read_four_lights(batch: Batch) -> FourLights:
@@ -75,7 +76,7 @@ def read_four_lights(batch: Batch) -> FourLights:
     base = support.log_ratio + quads.log_weight + log_chance(rigs, batch.candidates.counts, settings)[quads.trigger]
     base -= 0.5 * settings.gaps * np.log(2.0 * math.pi * quads.variance)
     gap_chi2 = _gap_chi2(batch, solved, quads.variance)
-    range2 = (solved.T_a_b.t_m**2).sum(1)
+    range2 = inner(solved.T_a_b.t_m, solved.T_a_b.t_m)
     log_ratio = base + log_gaps(gap_chi2, settings.gaps)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(log_ratio)
     log_ratio[~inside] = -np.inf
@@ -86,29 +87,19 @@ def read_four_lights(batch: Batch) -> FourLights:
     refined = refine_lights(solved.T_a_b[best], batch.candidates.frames[quads.lights[:, best].T], rigs.lights_m)
     readings = _readings(batch, quads, solved, support, base, gap_chi2, best, refined)
     return FourLights(
-        starts=starts_of(np.bincount(trigger, minlength=batch.triggers)),
-        poses=_poses(batch, solved.T_a_b, log_ratio, support, quads)[order],
-        refined_starts=starts_of(np.bincount(quads.trigger[best], minlength=batch.triggers)),
-        readings=readings,
+        read=Read(
+            pose_starts=starts_of(np.bincount(trigger, minlength=batch.triggers)),
+            poses=_poses(batch, solved.T_a_b, log_ratio, support, quads)[order],
+            starts=starts_of(np.bincount(quads.trigger[best], minlength=batch.triggers)),
+            readings=readings,
+        ),
         why=[
             _why_none(batch, i, bool(near[i]), range2[quads.trigger == i]) if likeliest[i] == -np.inf else None
             for i in range(batch.triggers)
         ],
-        doubtful=_doubtful(batch, quads.trigger[best], readings, refined.solved.chi2),
+        chi2=refined.solved.chi2,
         by_method=_by_method(batch, quads.lights[:, best]),
     )
-
-
-def _doubtful(batch: Batch, trigger: Indices, readings: Readings, chi2: Floats) -> NDArray[np.bool_]:
-    """Tell in which triggers (T,) no reading is likely enough by pictures and sensors alone, or fits poorly."""
-    settings, triggers = batch.settings, batch.triggers
-    log_ratio = readings.log_ratio + log_gaps(chi2, settings.gaps)
-    log_ratio[~readings.sound] = -np.inf
-    best = largest(trigger, log_ratio, triggers, -np.inf)
-    total = np.bincount(trigger, np.exp(log_ratio), minlength=triggers)
-    poor = (log_ratio == best[trigger]) & (false_light_odds(chi2, readings.clutter) > POOR_FIT)
-    unlikely = ~(np.exp(best) > settings.min_probability * (CHANCE_ODDS + total))
-    return unlikely | (np.bincount(trigger[poor], minlength=triggers) > 0)
 
 
 def _why_none(batch: Batch, trigger: int, near: bool, range2: Floats) -> tuple[Reason, str]:
@@ -144,8 +135,8 @@ def _poses(batch: Batch, T_a_b: SE3, log_ratio: Floats, support: Support, quads:
         T_a_b=batch.rigs.between_cameras(T_a_b),
         log_ratio=log_ratio,
         turn=support.turn,
-        sensed_variance=batch.sensors.heading_variance[quads.trigger],
-        picture_variance=0.25 * quads.variance,
+        log_heading=support.log_heading,
+        turn_variance=0.25 * quads.variance,
     )
 
 
@@ -163,12 +154,11 @@ def _readings(
     seen, rigs = batch.candidates, batch.rigs
     lights = quads.lights[:, best].T
     counts = seen.counts[quads.trigger[best]].repeat(2, 1)
-    clutter = (seen.sigma_px[lights] ** 2 * counts / rigs.area_px2.repeat(2)).sum(1)
+    clutter = inner(seen.sigma_px[lights] ** 2, counts / rigs.area_px2.repeat(2))
     return Readings(
         lights=seen.index[lights],
         T_a_b=rigs.between_cameras(refined.T_a_b),
-        J=rigs.by_camera_step(refined.J),
-        r=refined.r,
+        rows=rigs.by_camera_step(refined.rows),
         dt_s=seen.dt_s[lights].repeat(2, 1),
         sound=refined.sound,
         log_ratio=base[best],
@@ -195,7 +185,7 @@ def _by_method(batch: Batch, lights: Indices) -> ClosedForm | None:
 def refine_lights(T_a_b: SE3, frames: Floats, lights_m: Floats) -> Refined:
     """Refine K poses by their lights alone; frames, lights_m: as `light_rows` takes them."""
 
-    def rows_at(T_a_b: SE3, chosen: Indices) -> Rows:
+    def rows_at(T_a_b: SE3, chosen: Indices) -> tuple[Floats, Floats]:
         return light_rows(T_a_b, frames[chosen], lights_m)
 
     return refine(T_a_b, rows_at)

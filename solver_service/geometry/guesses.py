@@ -83,13 +83,13 @@ def guess(batch: Batch, wanted: NDArray[np.bool_]) -> Guesses:
         sight[0] = c * np.cos(half) - w * np.sin(half)
         range_m = eq1_range_m(cos_alpha, sin_alpha, sin_beta, rigs.length_m[nodes[1]])
         axes = _axes(sight, down)
-    R = (axes[0][:, :, None] * axes[1][:, None]).sum(0)
-    t = middle[0] + sight[0] * range_m - (R * middle[1]).sum(1)
+    R = np.einsum("rak,rbk->abk", *axes)
+    t = middle[0] + sight[0] * range_m - dot(R, middle[1])
     # Both components of the tilt that remain: along the line of sight, and about it.
     rise = np.arcsin(dot(down[0], sight[0])) - np.arcsin(dot(down[1], sight[1]))
     bar = R[:, 0] - sight[0] * dot(sight[0], R[:, 0])
     about = dot(sight[0], cross(bar, w)) / np.sqrt(dot(bar, bar))
-    fall = dot(down[0], t - port[0] + (R * port[1]).sum(1))
+    fall = dot(down[0], t - port[0] + dot(R, port[1]))
     variance, tilt_variance = pairs.variance[tried.pair], sensors.tilt_variance.sum(1)[tried.trigger]
     depth_variance = sensors.depth_variance[tried.trigger] + 0.5 * tilt_variance * (dot(t, t) - fall * fall)
     depth_variance += variance * fall * fall
@@ -156,5 +156,5 @@ def _axes(sight: Floats, down: Floats) -> Floats:
 
 def _turned(of: Floats, to: Floats, v: Floats) -> Floats:
     """Turn vectors (3, M) from the rig that has the axes `of` (3, 3, M) to the rig that has the axes `to`."""
-    turned: Floats = (to * (of * v).sum(1)[:, None]).sum(0)
+    turned: Floats = np.einsum("rck,rk->ck", to, dot(of, v))
     return turned

@@ -13,15 +13,17 @@ import numpy as np
 from buddyline.solver_service.geometry.evidence import weigh_heading
 from buddyline.solver_service.geometry.observation import Heading, Prior, Settings
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, inner, skew
 from buddyline.solver_service.geometry.se3 import SE3
-from buddyline.solver_service.geometry.sensors import Turn
+from buddyline.solver_service.geometry.sensors import off_rad
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
 # A prediction from earlier fixes is wrong this often, and where it is right it is believed this much at most (log).
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
+# A matrix (9,) times this: half its antisymmetric part as a vector, and its trace.
+_SINES_AND_TRACE: Final = np.column_stack((0.5 * skew(np.eye(3)).reshape(3, 9).T, np.eye(3).ravel()))
 
 
 @dataclass(eq=False)
@@ -60,7 +62,7 @@ class Prediction:
         """Take a prediction; bearing_variance: rad^2, by which a pose found there scatters on top of it."""
         t = prior.T_a_b.t_m
         range2 = float(t @ t) + 1e-6
-        sight = np.outer(t, t) / range2
+        sight = t[:, None] * t / range2
         # Of ln range and of the twist, by both pictures.
         relative = bearing_variance * range2 * rigs.gap_per_bearing_m2
         total = prior.covariance + _LEAST_KNOWN
@@ -75,12 +77,11 @@ class Prediction:
 
     def weigh(self, T_a_b: SE3) -> Floats:
         """Weigh K poses: a bounded gain and a bounded loss (log)."""
-        turned = T_a_b.R @ self.T_a_b.R.T
-        # The sine of the turn about each axis; half a turn away it is short again, and the trace is not above 1.
-        lower, upper = turned[:, (2, 0, 1), (1, 2, 0)], turned[:, (1, 2, 0), (2, 0, 1)]
-        off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, 0.5 * (lower - upper)), axis=1)
-        chi2 = ((off @ self.information) * off).sum(1)
-        near = turned.trace(0, 1, 2) > 1.0
+        # Of the turn from there: the sine about each axis, and the trace; half a turn away the sine is short again.
+        turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE
+        off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, turned[:, :3]), axis=1)
+        chi2 = inner(off @ self.information, off)
+        near = turned[:, 3] > 1.0
         log_gain = np.where(near, np.minimum(self.log_gain - 0.5 * chi2, _MAX_LOG_PRIOR), -np.inf)
         gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
         return gain
@@ -98,9 +99,7 @@ class Past:
     def of(
         prior: Prior | None, heading: Heading | None, bearing_variance: float, rigs: RigPair, settings: Settings
     ) -> Past:
-        """Take a prediction, None or not finite where there is none, and what is learned of the headings."""
-        if prior is not None and not _sound(prior):
-            prior = None
+        """Take a sound prediction, None where there is none, and what is learned of the headings."""
         prediction = None if prior is None else Prediction.of(prior, bearing_variance, rigs, settings)
         return Past(prediction, heading, Motion.of(prior, settings))
 
@@ -108,19 +107,19 @@ class Past:
         """Weigh K poses between the cameras' frames by the prediction."""
         return np.zeros(len(T_a_b)) if self.prediction is None else self.prediction.weigh(T_a_b)
 
-    def weigh_turn(self, turn: Turn, sensed_variance: Floats, picture_variance: Floats) -> Floats:
-        """Give what the learned heading adds (K,), in place of the sensors' own word of their headings.
+    def weigh_heading(self, turn: Floats, log_heading: Floats, variance: Floats) -> Floats:
+        """Give what the learned heading adds (K,), in place of the sensors' own word of their headings, log_heading.
 
-        sensed_variance: of both headings, without what the picture adds (K,), picture_variance.
+        turn: (3, K) as `turn_of`'s. variance: (K,) of it by the pictures.
         """
         if self.heading is None:
-            return np.zeros(len(turn.level))
-        alone = weigh_heading(turn.off_rad(), sensed_variance + picture_variance)
-        learned = weigh_heading(turn.off_rad(self.heading.offset_rad), self.heading.variance + picture_variance)
-        return learned - alone
+            return np.zeros(len(log_heading))
+        angle_rad = off_rad(turn, self.heading.offset_rad)
+        return weigh_heading(angle_rad, self.heading.variance + variance) - log_heading
 
 
-def _sound(prior: Prior) -> bool:
+def is_sound(prior: Prior) -> bool:
+    """Tell whether a prediction has finite values of the right shape."""
     parts = prior.T_a_b.t_m, prior.T_a_b.R, prior.covariance, prior.rates, prior.rates_covariance
     finite = math.isfinite(sum(float(part.sum()) for part in parts if part is not None))
     return finite and prior.covariance.shape == (6, 6)

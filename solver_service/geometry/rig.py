@@ -115,11 +115,11 @@ class RigPair:
         turn_a, turn_b = self.R_bar_camera
         return SE3(turn_a.T @ T_a_b.R @ turn_b, T_a_b.t_m @ turn_a)
 
-    def by_camera_step(self, J: Floats) -> Floats:
-        """Turn derivatives (..., 6) by a step in A's bar frame into those by a step in its camera's."""
-        turn = np.zeros((6, 6))
-        turn[:3, :3] = turn[3:, 3:] = self.R_bar_camera[0]
-        by_step: Floats = J @ turn
+    def by_camera_step(self, rows: Floats) -> Floats:
+        """Turn rows (..., 7), derivatives by a step in A's bar frame, into those by a step in its camera's."""
+        turn = np.eye(7)
+        turn[:3, :3] = turn[3:6, 3:6] = self.R_bar_camera[0]
+        by_step: Floats = rows @ turn
         return by_step
 
 

@@ -22,6 +22,12 @@ _IDENTITY: Final[Floats] = np.eye(3)
 _TINY: Final = 1e-100
 
 
+def inner(a: Floats, b: Floats) -> Floats:
+    """Give the scalar products (...,) of vectors (..., n)."""
+    product: Floats = np.einsum("...i,...i->...", a, b)
+    return product
+
+
 def skew(v: Floats) -> Floats:
     """Give the (..., 3, 3) matrices of the cross products with v (..., 3)."""
     return (v @ _CROSS).reshape(*v.shape, 3)
@@ -30,7 +36,7 @@ def skew(v: Floats) -> Floats:
 def quat_to_matrix(q_xyzw: Floats) -> Floats:
     """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
     K = skew(q_xyzw[..., :3])
-    length2 = (q_xyzw * q_xyzw).sum(-1)[..., None, None]
+    length2 = inner(q_xyzw, q_xyzw)[..., None, None]
     R: Floats = _IDENTITY + (2.0 * q_xyzw[..., 3, None, None] * K + 2.0 * K @ K) / length2
     return R
 
@@ -60,7 +66,7 @@ def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
     if w_rad.size == 3:
         return _one_exp(*w_rad.ravel().tolist()).reshape(*w_rad.shape, 3)
-    half = np.maximum(0.5 * np.sqrt((w_rad * w_rad).sum(-1)), _TINY)[..., None, None]
+    half = np.maximum(0.5 * np.sqrt(inner(w_rad, w_rad)), _TINY)[..., None, None]
     # sin(x) / x and (1 - cos x) / x^2, without a division by zero.
     sine = np.sin(half) / half
     K = skew(w_rad)

@@ -9,6 +9,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import (
     Floats,
     Index,
+    inner,
     matrix_to_quat,
     quat_to_matrix,
     rotation_exp,
@@ -103,7 +104,7 @@ class SE3:
 
 def _left_jacobian(w_rad: Floats) -> Floats:
     """Give the (..., 3, 3) mean of the rotations exp(s w), s from 0 to 1 (Barfoot 2017, eq. 7.77b)."""
-    angle2 = (w_rad * w_rad).sum(-1)[..., None, None]
+    angle2 = inner(w_rad, w_rad)[..., None, None]
     angle = np.sqrt(angle2)
     safe = np.maximum(angle, _SERIES)
     first = np.where(angle < _SERIES, 0.5 - angle2 / 24.0, 2.0 * (np.sin(0.5 * safe) / safe) ** 2)

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.observation import Observation, Sensed
 from buddyline.solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, RigPair
-from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats, inner, quat_to_matrix, rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
@@ -52,33 +52,13 @@ class Sensors:
         return self.known[:, 0] & self.known[:, 1]
 
 
-@dataclass(eq=False, slots=True)
-class Turn:
-    """How B's heading by K poses stands to B's heading by the attitudes.
-
-    level: cosine between both downs. cosine, sine: of the turn about down, each (1 + level) long at most.
-    """
-
-    level: Floats
-    cosine: Floats
-    sine: Floats
-
-    def off_rad(self, offset_rad: Floats | float = 0.0) -> Floats:
-        """Give the turn (K,) about down where offset_rad is to be added to B's heading, loosely for tilted poses."""
-        cosine, sine = np.cos(offset_rad), np.sin(offset_rad)
-        across = cosine * self.sine - sine * self.cosine
-        along = 1.0 + self.level + cosine * self.cosine + sine * self.sine
-        turn: Floats = 2.0 * np.arctan2(across, along)
-        return turn
-
-
 def find_sensors(observations: Sequence[Observation], rigs: RigPair) -> Sensors:
     """Bring attitudes and depths into the bar frames; what is not finite is as good as not there."""
     sensed = [(seen.sensed_a, seen.sensed_b) for seen in observations]
     q = np.array([[_finite(one.q_ned_body_xyzw, 4) for one in two] for two in sensed])
     sigma = np.array([[_finite(one.sigma_rad, 3) for one in two] for two in sensed])
     depth = np.array([[_depth_of(one) for one in two] for two in sensed])
-    known = (q * q).sum(-1) > 0.25
+    known = inner(q, q) > 0.25
     q[~known] = (0.0, 0.0, 0.0, 1.0)
     sigma = np.where(np.isfinite(sigma).all(-1, keepdims=True), sigma, _DEFAULT_SIGMA_RAD)
     R_body_bar = np.array([rig.R_body_camera for rig in rigs.in_bar_frames])
@@ -119,14 +99,23 @@ def _depth_of(sensed: Sensed) -> tuple[float, float]:
     )
 
 
-def turn_of(R_a_b: Floats, R_ned_a: Floats, R_ned_b: Floats) -> Turn:
-    """Compare K poses R_a_b (K, 3, 3) with attitudes (K, 3, 3), frames as the poses'."""
+def turn_of(R_a_b: Floats, R_ned_a: Floats, R_ned_b: Floats) -> Floats:
+    """Compare K poses R_a_b (K, 3, 3) with attitudes (K, 3, 3), frames as the poses'.
+
+    Returns (3, K): the cosine between both downs, then cosine and sine of the turn about down from B's heading by the
+    attitudes to that by the pose, each (1 + level) long.
+    """
     between = R_ned_a @ R_a_b @ R_ned_b.swapaxes(-1, -2)
-    return Turn(
-        level=between[..., 2, 2],
-        cosine=between[..., 0, 0] + between[..., 1, 1],
-        sine=between[..., 1, 0] - between[..., 0, 1],
-    )
+    level, cosine = between[..., 2, 2], between[..., 0, 0] + between[..., 1, 1]
+    return np.array((level, cosine, between[..., 1, 0] - between[..., 0, 1]))
+
+
+def off_rad(turn: Floats, offset_rad: float = 0.0) -> Floats:
+    """Give the turn (K,) about down where offset_rad is to be added to B's heading; turn: (3, K) as `turn_of`'s."""
+    level, cosine, sine = turn
+    c, s = math.cos(offset_rad), math.sin(offset_rad)
+    angle: Floats = 2.0 * np.arctan2(c * sine - s * cosine, 1.0 + level + c * cosine + s * sine)
+    return angle
 
 
 def heading_offset(T_a_b: SE3, covariance: Floats, R_ned_a: Floats, R_ned_b: Floats) -> tuple[float, float]:
@@ -134,5 +123,5 @@ def heading_offset(T_a_b: SE3, covariance: Floats, R_ned_a: Floats, R_ned_b: Flo
 
     covariance: (6, 6) of the pose. R_ned_a, R_ned_b: (3, 3) from the cameras' frames.
     """
-    turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
-    return math.atan2(turn.sine, turn.cosine), float(R_ned_a[2] @ covariance[3:, 3:] @ R_ned_a[2])
+    _, cosine, sine = turn_of(T_a_b.R, R_ned_a, R_ned_b).tolist()
+    return math.atan2(sine, cosine), float(R_ned_a[2] @ covariance[3:, 3:] @ R_ned_a[2])

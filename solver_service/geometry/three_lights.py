@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,11 +18,11 @@ from buddyline.solver_service.geometry.evidence import (
 )
 from buddyline.solver_service.geometry.guesses import Guesses, guess
 from buddyline.solver_service.geometry.ragged import places, starts_of
-from buddyline.solver_service.geometry.readings import Poses, Readings
-from buddyline.solver_service.geometry.refinement import Refined, Rows, Solved, light_rows, refine
-from buddyline.solver_service.geometry.rotation import Floats, Indices, skew
+from buddyline.solver_service.geometry.readings import Poses, Read, Readings
+from buddyline.solver_service.geometry.refinement import Refined, Solved, light_rows, refine
+from buddyline.solver_service.geometry.rotation import Floats, Indices, inner, skew
 from buddyline.solver_service.geometry.se3 import SE3
-from buddyline.solver_service.geometry.sensors import Turn, turn_of
+from buddyline.solver_service.geometry.sensors import off_rad, turn_of
 from numpy.typing import NDArray
 
 # chi^2 of tilt and depth, three degrees of freedom, after the refinement.
@@ -33,21 +32,7 @@ _STEPS: Final = 4
 UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 
 
-@dataclass(eq=False, slots=True)
-class ThreeLights:
-    """Readings of three lights, those of trigger i from starts[i] on; poses: the same."""
-
-    starts: Indices
-    poses: Poses
-    readings: Readings
-
-    def of(self, trigger: int) -> tuple[Poses, Readings]:
-        """Give one trigger's."""
-        first, last = self.starts[trigger : trigger + 2]
-        return self.poses[first:last], self.readings[first:last]
-
-
-def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> ThreeLights:
+def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     """Give the best readings of three lights of the triggers wanted (T,), where the sensors support any."""
     if not batch.settings.checks >= {"attitude", "depth"}:
         wanted = np.zeros(batch.triggers, dtype=bool)
@@ -56,29 +41,28 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> ThreeLights:
     trigger, lights = guesses.trigger, guesses.lights
     refined = _refined(batch, guesses)
     T_a_b = refined.T_a_b.retract(refined.solved.step)
-    range2 = (T_a_b.t_m**2).sum(1)
+    range2 = inner(T_a_b.t_m, T_a_b.t_m)
     sound = refined.sound & (refined.solved.chi2 < _FITS_CHI2)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    log_ratio, turn, turn_variance, lone_odds = _log_ratio(batch, guesses, T_a_b, refined)
+    log_ratio, turn, log_heading, turn_variance, lone_odds = _log_ratio(batch, guesses, T_a_b, refined)
     sound &= np.isfinite(refined.solved.covariance.sum((1, 2)) + log_ratio)
     none, range_m = np.zeros(len(trigger)), np.sqrt(range2)
-    in_cameras = rigs.between_cameras(refined.T_a_b)
-    no_times = np.zeros((len(trigger), 3))
-    return ThreeLights(
-        starts=starts_of(np.bincount(trigger, minlength=batch.triggers)),
+    starts = starts_of(np.bincount(trigger, minlength=batch.triggers))
+    return Read(
+        pose_starts=starts,
         poses=Poses(
             T_a_b=rigs.between_cameras(T_a_b),
             log_ratio=np.where(sound, log_ratio + log_fit(refined.solved), -np.inf),
             turn=turn,
-            sensed_variance=batch.sensors.heading_variance[trigger],
-            picture_variance=turn_variance,
+            log_heading=log_heading,
+            turn_variance=turn_variance,
         ),
+        starts=starts,
         readings=Readings(
             lights=np.where(lights < 0, -1, seen.index[lights]),
-            T_a_b=in_cameras,
-            J=rigs.by_camera_step(refined.J),
-            r=refined.r,
-            dt_s=np.concatenate(((seen.dt_s[lights] * (lights >= 0)).repeat(2, 1), no_times), axis=1),
+            T_a_b=rigs.between_cameras(refined.T_a_b),
+            rows=rigs.by_camera_step(refined.rows),
+            dt_s=np.column_stack(((seen.dt_s[lights] * (lights >= 0)).repeat(2, 1), none, none, none)),
             sound=sound,
             log_ratio=log_ratio,
             tilt_chi2=none,
@@ -109,41 +93,41 @@ def _refined(batch: Batch, guesses: Guesses) -> Refined:
     q = np.concatenate((in_a, in_b), axis=1)
     frames = seen.frames[lights]
     frames[absent] = 0.0
-    frames[absent, 0] = (q / np.sqrt((q * q).sum(2, keepdims=True)))[absent]
+    frames[absent, 0] = (q / np.sqrt(inner(q, q))[..., None])[absent]
 
-    def rows_at(T_a_b: SE3, chosen: Indices) -> Rows:
-        by_light = light_rows(T_a_b, frames[chosen], rigs.lights_m)
-        J, r, _ = _sensor_rows(batch, guesses.trigger[chosen], T_a_b)
-        return Rows(np.concatenate((by_light.J, J), axis=1), np.concatenate((by_light.r, r), axis=1), by_light.depth)
+    across = _across(batch.sensors.down[guesses.trigger, 0])
+
+    def rows_at(T_a_b: SE3, chosen: Indices) -> tuple[Floats, Floats]:
+        of_lights, depth = light_rows(T_a_b, frames[chosen], rigs.lights_m)
+        of_sensors, _ = _sensor_rows(batch, guesses.trigger[chosen], across[chosen], T_a_b)
+        return np.concatenate((of_lights, of_sensors), axis=1), depth
 
     return refine(T_a_b, rows_at, _STEPS)
 
 
-def _sensor_rows(batch: Batch, trigger: Indices, T_a_b: SE3) -> tuple[Floats, Floats, Floats]:
-    """Give the derivatives of tilt and depth by a step (K, 3, 6), whitened, their residuals (K, 3).
+def _sensor_rows(batch: Batch, trigger: Indices, across: Floats, T_a_b: SE3) -> tuple[Floats, Floats]:
+    """Give rows (K, 3, 7) of tilt and depth as in `Refined`, and the product of their sds (K,).
 
-    And the product of their sds (K,).
+    across: (K, 2, 3) unit vectors across A's down.
     """
     sensors, (port_a, port_b) = batch.sensors, batch.rigs.port_m
     down_a, of_b = sensors.down[trigger].swapaxes(0, 1)
     down_b, port_b = (T_a_b.R @ of_b[:, :, None])[:, :, 0], T_a_b.R @ port_b
     below = T_a_b.t_m - port_a + port_b
     down = down_a + down_b
-    down /= np.sqrt((down * down).sum(1, keepdims=True))
-    fall = (down * below).sum(1)
+    down /= np.sqrt(inner(down, down))[:, None]
+    fall = inner(down, below)
     tilt_variance = sensors.tilt_variance.sum(1)[trigger]
-    sigma_rad = np.sqrt(tilt_variance)
-    sigma_m = np.sqrt(sensors.depth_variance[trigger] + 0.25 * tilt_variance * ((below * below).sum(1) - fall * fall))
-    across = _across(down_a) / sigma_rad[:, None, None]
+    sigma_m = np.sqrt(sensors.depth_variance[trigger] + 0.25 * tilt_variance * (inner(below, below) - fall * fall))
+    across = across / np.sqrt(tilt_variance)[:, None, None]
     down /= sigma_m[:, None]
-    J = np.zeros((len(trigger), 3, 6))
-    J[:, :2, 3:] = -across @ skew(down_b)
-    J[:, 2, :3] = down
-    J[:, 2, 3:] = np.cross(port_b, down)
-    r = np.empty((len(trigger), 3))
-    r[:, :2] = (across @ down_b[:, :, None])[:, :, 0]
-    r[:, 2] = (fall - sensors.depth_m[trigger]) / sigma_m
-    return J, r, tilt_variance * sigma_m
+    rows = np.zeros((len(trigger), 3, 7))
+    rows[:, :2, 3:6] = -across @ skew(down_b)
+    rows[:, :2, 6] = (across @ down_b[:, :, None])[:, :, 0]
+    rows[:, 2, :3] = down
+    rows[:, 2, 3:6] = -(down[:, None] @ skew(port_b))[:, 0]
+    rows[:, 2, 6] = (fall - sensors.depth_m[trigger]) / sigma_m
+    return rows, tilt_variance * sigma_m
 
 
 def _across(down: Floats) -> Floats:
@@ -151,19 +135,21 @@ def _across(down: Floats) -> Floats:
     x, y, z = down.T
     none = np.zeros(len(down))
     first = np.where(np.abs(x) < 0.9, (none, -z, y), (y, -x, none)).T
-    first = first / np.sqrt((first * first).sum(1, keepdims=True))
-    return np.stack((first, np.cross(down, first)), axis=1)
+    first = first / np.sqrt(inner(first, first))[:, None]
+    return np.stack((first, (skew(down) @ first[:, :, None])[:, :, 0]), axis=1)
 
 
-def _log_ratio(batch: Batch, guesses: Guesses, T_a_b: SE3, refined: Refined) -> tuple[Floats, Turn, Floats, Floats]:
+def _log_ratio(
+    batch: Batch, guesses: Guesses, T_a_b: SE3, refined: Refined
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Give the log likelihood ratio against chance (K,), but for the fit.
 
-    And the turn against the headings with its variance by the pictures, and the odds that the lone light is another
-    lamp.
+    And as in Poses the turn against the headings, what it counts for, and its variance; and the odds that the lone
+    light is another lamp.
     """
     settings, seen, rigs, sensors = batch.settings, batch.candidates, batch.rigs, batch.sensors
     trigger, lights = guesses.trigger, guesses.lights
-    range_m = np.sqrt((T_a_b.t_m**2).sum(1))
+    range_m = np.sqrt(inner(T_a_b.t_m, T_a_b.t_m))
     # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
     prior = -3.0 * np.log(range_m) - math.log(rigs.views_sr2 * math.log(settings.range_max_m / settings.range_min_m))
     # Chance puts candidates evenly on the pictures, per px^2.
@@ -173,7 +159,8 @@ def _log_ratio(batch: Batch, guesses: Guesses, T_a_b: SE3, refined: Refined) -> 
         both_seen, np.log(np.maximum(counts - 1, 1) / rigs.area_px2), 0.0
     )
     sigma_px = np.where(lights < 0, 1.0, seen.sigma_px[lights])
-    _, _, sigma = _sensor_rows(batch, trigger, refined.T_a_b)
+    across = _across(sensors.down[trigger, 0])
+    _, sigma = _sensor_rows(batch, trigger, across, refined.T_a_b)
     total = prior - chance.sum(1) - 2.0 * np.log(sigma_px).sum(1) - np.log(sigma)
     # Nine residuals and six unknowns leave three factors of a normal density.
     total += math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS) - 1.5 * math.log(2.0 * math.pi)
@@ -181,14 +168,15 @@ def _log_ratio(batch: Batch, guesses: Guesses, T_a_b: SE3, refined: Refined) -> 
     R_ned_a, R_ned_b = sensors.R_ned_bar[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
     u = T_a_b.t_m / range_m[:, None]
-    turn_variance = ((refined.solved.covariance[:, 3:, 3:] @ u[:, :, None])[:, :, 0] * u).sum(1)
-    heading = weigh_heading(turn.off_rad(), sensors.heading_variance[trigger] + turn_variance)
+    turn_variance = inner((refined.solved.covariance[:, 3:, 3:] @ u[:, :, None])[:, :, 0], u)
+    heading = weigh_heading(off_rad(turn), sensors.heading_variance[trigger] + turn_variance)
     # The pair and the attitudes predict where the lone light stands: across by the tilts, along by the headings.
-    rise = (((T_a_b.R @ R_ned_b[:, 2, :, None])[:, :, 0] - R_ned_a[:, 2]) * u).sum(1)
+    rise = inner((T_a_b.R @ R_ned_b[:, 2, :, None])[:, :, 0] - R_ned_a[:, 2], u)
     tilt_variance = sensors.tilt_variance.sum(1)[trigger]
     density = np.exp(heading - 0.5 * rise * rise / tilt_variance)
     density /= HEADING_SPREAD * np.sqrt(2.0 * math.pi * tilt_variance)
-    return total + heading, turn, turn_variance, MISSING_ODDS * _others_per_sr(batch, guesses) / density
+    lone_odds = MISSING_ODDS * _others_per_sr(batch, guesses) / density
+    return total + heading, turn, heading, turn_variance, lone_odds
 
 
 def _others_per_sr(batch: Batch, guesses: Guesses) -> Floats:

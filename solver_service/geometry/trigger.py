@@ -27,11 +27,12 @@ from buddyline.solver_service.geometry.observation import (
     Settings,
     View,
 )
-from buddyline.solver_service.geometry.past import Past
+from buddyline.solver_service.geometry.past import Past, is_sound
+from buddyline.solver_service.geometry.readings import Read, Readings
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.sensors import heading_offset
-from buddyline.solver_service.geometry.three_lights import ThreeLights, read_three_lights
+from buddyline.solver_service.geometry.three_lights import read_three_lights
 from buddyline.solver_service.geometry.weighing import Weighed, weigh_readings
 from numpy.typing import NDArray
 
@@ -83,7 +84,10 @@ def solve_trigger(
     prior, heading: what earlier fixes tell of this one, and of the headings.
     """
     observed = Observation(view_a, view_b, sensed_a, sensed_b)
-    return read_triggers([observed], rig_a, rig_b, settings).decide(0, prior, heading)
+    if prior is not None and not is_sound(prior):
+        prior = None
+    with np.errstate(all="ignore"):
+        return read_triggers([observed], rig_a, rig_b, settings).decide(0, prior, heading)
 
 
 def read_triggers(observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, settings: Settings) -> TriggerReadings:
@@ -91,8 +95,7 @@ def read_triggers(observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, s
     for name, rig in (("A", rig_a), ("B", rig_b)):
         if not rig.usable:
             return TriggerReadings(None, NoFix("degenerate", f"the lights of {name} are less than 1 mm apart"))
-    with np.errstate(all="ignore"):
-        return TriggerReadings(_Batched.of(Batch.of(observations, (rig_a, rig_b), settings)))
+    return TriggerReadings(_Batched.of(Batch.of(observations, (rig_a, rig_b), settings)))
 
 
 @dataclass(eq=False, slots=True)
@@ -102,14 +105,16 @@ class _Batched:
     batch: Batch
     bearing_variance: Floats
     four: FourLights
-    three: ThreeLights | None
+    three: Read | None
     tried: NDArray[np.bool_]
 
     @staticmethod
     def of(batch: Batch) -> _Batched:
         """Read all; of many triggers, with three lights where four may not be enough."""
         four = read_four_lights(batch)
-        tried = four.doubtful & (batch.settings.method == "refined") & (batch.triggers > 1)
+        tried = np.zeros(batch.triggers, dtype=bool)
+        if batch.triggers > 1 and batch.settings.method == "refined":
+            tried = four.doubtful(batch)
         seen, triggers = batch.candidates, batch.triggers
         total = np.bincount(seen.image >> 1, seen.variance, minlength=triggers)
         mean = total / np.maximum(seen.counts.sum(1), 1)
@@ -118,25 +123,24 @@ class _Batched:
     def decide(self, trigger: int, prior: Prior | None, heading: Heading | None) -> Fix | NoFix:
         """Apply the past to one trigger, and choose."""
         settings = self.batch.settings
-        if not self.batch.sensors.both[trigger]:
+        if not self.batch.sensors.known[trigger].all():
             heading = None
         past = Past.of(prior, heading, self.bearing_variance[trigger], self.batch.rigs, settings)
         four, why = None, self.four.why[trigger]
         found: Fix | NoFix
         if why is None:
-            four = weigh_readings(*self.four.of(trigger), past, settings, three=False)
+            four = weigh_readings(self.four.read, trigger, past, settings, three=False)
             found = self._choose(trigger, four)
         else:
             found = NoFix(*why)
         if settings.method != "refined" or not _is_doubtful(found, four):
             return found
-        three_lights = self.three
-        if three_lights is None or not self.tried[trigger]:
-            three_lights = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
-        poses, readings = three_lights.of(trigger)
-        if not readings.sound.any():
+        read = self.three
+        if read is None or not self.tried[trigger]:
+            read = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
+        if not read.readings.sound[read.places_of(trigger)].any():
             return found
-        three = weigh_readings(poses, readings, past, settings, three=True)
+        three = weigh_readings(read, trigger, past, settings, three=True)
         return self._choose(trigger, three if four is None else four.joined(three))
 
     def _choose(self, trigger: int, weighed: Weighed) -> Fix | NoFix:
@@ -150,10 +154,13 @@ class _Batched:
         if not settings.range_min_m <= range_m <= settings.range_max_m:
             return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {self.batch.range_limits}")
         same = _like(weighed, k, range_m)
-        ratios = np.exp(weighed.log_ratio)
-        ratio, agreeing = float(ratios[k]), float(ratios[same].sum())
-        others += float(ratios[~same].sum())
-        short = min(weighed.lights[k].tolist()) < 0
+        ratio = agreeing = math.exp(weighed.log_ratio[k])
+        if len(weighed) > 1:
+            ratios = np.exp(weighed.log_ratio)
+            agreeing = float(ratios[same].sum())
+            others += float(ratios[~same].sum())
+        readings, place = weighed.sources[k]
+        short = int(readings.lights[place].min()) < 0
         chi2 = float(weighed.chi2[k])
         # One of four lights may be off by more than its noise; which one, two residuals cannot tell.
         widened = 0.5 * chi2 if chi2 > _GROSS_CHI2 and not short else 1.0
@@ -162,16 +169,16 @@ class _Batched:
         if short and unsure:
             return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
         # A false candidate in a light's place is off by as much as the covariance has been widened for.
-        false_light = ratio * float(weighed.lone_odds[k])
+        false_light = ratio * float(readings.lone_odds[place]) * math.exp(-float(weighed.log_past[k]))
         if unsure:
-            false_light = ratio * float(false_light_odds(weighed.chi2[k], weighed.clutter[k]))
+            false_light = ratio * float(false_light_odds(weighed.chi2[k], readings.clutter[place]))
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         required = settings.min_probability
         if short:
             required = max(required, _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY)
         if probability >= required:
             return self._fix(trigger, weighed, k, widened * _spread(weighed, k, same), probability)
-        tilt_chi2, depth_chi2 = float(weighed.tilt_chi2[k]), float(weighed.depth_chi2[k])
+        tilt_chi2, depth_chi2 = float(readings.tilt_chi2[place]), float(readings.depth_chi2[place])
         what = f"the best of the hypotheses, at {range_m:.3g} m,"
         if tilt_chi2 > AGREES:
             return NoFix("attitude", f"{what} is {math.sqrt(tilt_chi2):.1f} sigma off the attitudes")
@@ -184,30 +191,30 @@ class _Batched:
             why = f"another stands at {math.hypot(*t[rival].tolist()):.3g} m"
         return NoFix("ambiguous", f"{what} is {probability:.0%} likely: {why} (chi2 {chi2:.1f})")
 
-    def _checks(self, trigger: int, weighed: Weighed, k: int) -> tuple[str, ...]:
+    def _checks(self, trigger: int, readings: Readings, place: int) -> tuple[str, ...]:
         """Name what speaks for the pose."""
         settings, sensors = self.batch.settings, self.batch.sensors
         checks: list[str] = []
-        if min(weighed.lights[k].tolist()) >= 0:
+        if int(readings.lights[place].min()) >= 0:
             checks += [name for name in ("range", "twist") if name in settings.checks]
-        if not sensors.both[trigger] or "attitude" not in settings.checks:
+        if not sensors.known[trigger].all() or "attitude" not in settings.checks:
             checks.append("upright_assumed")
-        elif weighed.tilt_chi2[k] <= AGREES:
+        elif readings.tilt_chi2[place] <= AGREES:
             checks.append("attitude")
         measured = "depth" in settings.checks and math.isfinite(sensors.depth_m[trigger])
-        if measured and weighed.depth_chi2[k] <= AGREES:
+        if measured and readings.depth_chi2[place] <= AGREES:
             checks.append("depth")
         return tuple(checks)
 
     def _fix(self, trigger: int, weighed: Weighed, k: int, covariance: Floats, probability: float) -> Fix:
         """Publish reading k."""
         method = self.batch.settings.method
-        T_a_b, twist_gap_rad = weighed.T_a_b[k], float(weighed.twist_gap_rad[k])
-        range_a_m, range_b_m = weighed.range_m[k].tolist()
-        b_left, b_right, a_left, a_right = weighed.lights[k].tolist()
+        readings, place = weighed.sources[k]
+        T_a_b, twist_gap_rad = weighed.T_a_b[k], float(readings.twist_gap_rad[place])
+        range_a_m, range_b_m = readings.range_m[place].tolist()
+        b_left, b_right, a_left, a_right = readings.lights[place].tolist()
         solved = self.four.by_method
         if solved is not None:
-            place = int(self.four.refined_starts[trigger]) + k
             T_a_b, twist_gap_rad = solved.T_a_b[place], float(solved.twist_gap_rad[place])
             range_a_m, range_b_m = solved.range_m[:, place].tolist()
         in_a, in_b = self.batch.candidates.counts[trigger].tolist()
@@ -223,7 +230,7 @@ class _Batched:
             pair_a=(b_left, b_right),
             pair_b=(a_left, a_right),
             method=method if min(b_left, b_right, a_left, a_right) >= 0 else "three_lights",
-            checks=self._checks(trigger, weighed, k),
+            checks=self._checks(trigger, readings, place),
             probability=probability,
         )
 
@@ -233,7 +240,8 @@ def _is_doubtful(found: Fix | NoFix, weighed: Weighed | None) -> bool:
     if weighed is None or isinstance(found, NoFix):
         return True
     k = int(weighed.log_ratio.argmax())
-    return bool(false_light_odds(weighed.chi2[k], weighed.clutter[k]) > POOR_FIT or weighed.log_prior[k] < 0.0)
+    readings, place = weighed.sources[k]
+    return bool(weighed.log_prior[k] < 0.0 or false_light_odds(weighed.chi2[k], readings.clutter[place]) > POOR_FIT)
 
 
 def _like(weighed: Weighed, k: int, range_m: float) -> NDArray[np.bool_]:
@@ -271,15 +279,14 @@ class TriggerReadings:
         """Solve one of the triggers with what earlier fixes tell of it, and of the headings."""
         if self.readings is None:
             return self.why or NoFix("degenerate", "")
-        with np.errstate(all="ignore"):
-            return self.readings.decide(trigger, prior, heading)
+        return self.readings.decide(trigger, prior, heading)
 
     def heading_offset(self, trigger: int, fix: Fix) -> tuple[float, float] | None:
         """Give what is to be added to B's heading to agree with a fix, and its variance; None without attitudes."""
         if self.readings is None:
             return None
         batch = self.readings.batch
-        if not batch.sensors.both[trigger]:
+        if not batch.sensors.known[trigger].all():
             return None
         R_ned_a, R_ned_b = batch.sensors.R_ned_bar[trigger] @ batch.rigs.R_bar_camera
         return heading_offset(fix.T_a_b, fix.covariance, R_ned_a, R_ned_b)

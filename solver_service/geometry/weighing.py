@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.evidence import log_gaps
 from buddyline.solver_service.geometry.observation import Settings
-from buddyline.solver_service.geometry.past import Past
-from buddyline.solver_service.geometry.readings import Poses, Readings
+from buddyline.solver_service.geometry.past import Motion, Past
+from buddyline.solver_service.geometry.readings import Read, Readings
+from buddyline.solver_service.geometry.refinement import Solved, at_one_instant, least_squares
 from buddyline.solver_service.geometry.rotation import Floats, Indices
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.three_lights import UNCHECKED, log_fit
@@ -17,6 +18,8 @@ from buddyline.solver_service.geometry.three_lights import UNCHECKED, log_fit
 # So many of the best are weighed against each other; what lies further below the best (log ratio) does not matter.
 _CHOSEN: Final = 6
 _NEGLIGIBLE: Final = 16.0
+# Which residuals a later clock of B moves, and where to: A's picture of B's lights, B's of A's, then the sensors.
+_SKEW_SIGN: Final = np.array((1.0,) * 4 + (-1.0,) * 4 + (0.0,) * 3)
 
 
 @dataclass(eq=False, slots=True)
@@ -24,7 +27,8 @@ class Weighed:
     """M readings of one trigger, poses between the cameras' frames.
 
     covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound. log_prior: (M,)
-    the prediction's part in it. others: the likelihood ratios of all that is not here, together. Else as in Readings.
+    the prediction's part in it, log_past (M,) all that the past says. others: the likelihood ratios of all that is not
+    here, together. sources: the readings that each is one of, and its place there.
     """
 
     T_a_b: SE3
@@ -32,79 +36,85 @@ class Weighed:
     chi2: Floats
     log_ratio: Floats
     log_prior: Floats
-    lights: Indices
-    tilt_chi2: Floats
-    depth_chi2: Floats
-    range_m: Floats
-    twist_gap_rad: Floats
-    clutter: Floats
-    lone_odds: Floats
+    log_past: Floats
     others: float
+    sources: list[tuple[Readings, int]]
 
     def __len__(self) -> int:
         """Count them."""
-        return len(self.log_ratio)
+        return len(self.sources)
 
     def joined(self, more: Weighed) -> Weighed:
         """Give both together, these first."""
 
-        def both(name: str) -> Floats:
-            return np.concatenate((getattr(self, name), getattr(more, name)))
+        def both(mine: Floats, others: Floats) -> Floats:
+            return np.concatenate((mine, others))
 
-        T_a_b = SE3(
-            np.concatenate((self.T_a_b.R, more.T_a_b.R)),
-            np.concatenate((self.T_a_b.t_m, more.T_a_b.t_m)),
+        return Weighed(
+            T_a_b=SE3(both(self.T_a_b.R, more.T_a_b.R), both(self.T_a_b.t_m, more.T_a_b.t_m)),
+            covariance=both(self.covariance, more.covariance),
+            chi2=both(self.chi2, more.chi2),
+            log_ratio=both(self.log_ratio, more.log_ratio),
+            log_prior=both(self.log_prior, more.log_prior),
+            log_past=both(self.log_past, more.log_past),
+            others=self.others + more.others,
+            sources=self.sources + more.sources,
         )
-        rest = {name: both(name) for name in self.__slots__ if name not in ("T_a_b", "others")}
-        return Weighed(T_a_b=T_a_b, others=self.others + more.others, **rest)  # type: ignore[arg-type]
 
 
-def weigh_readings(poses: Poses, readings: Readings, past: Past, settings: Settings, *, three: bool) -> Weighed:
-    """Apply the past to the readings of one trigger; poses: of these first, then of the quads that were not refined.
-
-    three: whether only three of the lights are seen, so that no gap is left.
-    """
+def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, three: bool) -> Weighed:
+    """Apply the past to the readings of one trigger; three: of three lights, so that no gap is left."""
+    poses, places = read.poses_of(trigger), read.places_of(trigger)
     log_prior = past.weigh(poses.T_a_b)
     log_past = log_prior
     if past.heading is not None and "attitude" in settings.checks:
-        log_past = log_prior + past.weigh_turn(poses.turn, poses.sensed_variance, poses.picture_variance)
+        log_past = log_prior + past.weigh_heading(poses.turn, poses.log_heading, poses.turn_variance)
     so_far = poses.log_ratio + log_past
-    chosen = _likeliest(so_far[: len(readings)], float(so_far.max()))
+    chosen = _likeliest(so_far, places.stop - places.start)
     others = 0.0
-    if not three:
+    if not three and len(chosen) < len(so_far):
         ratios = np.exp(so_far)
         ratios[chosen] = 0.0
         others = float(ratios.sum())
-    readings, log_prior, log_past = readings[chosen], log_prior[chosen], log_past[chosen]
-    solved = readings.solve(past.motion)
-    chi2, covariance, lone_odds = solved.chi2, solved.covariance, readings.lone_odds
+    log_prior, log_past, place = log_prior[chosen], log_past[chosen], places.start + chosen
+    readings = read.readings
+    solved = _solve(readings, place, past.motion)
+    chi2, covariance = solved.chi2, solved.covariance
     if three:
         fit = log_fit(solved)
         covariance = UNCHECKED * covariance
-        lone_odds = lone_odds * np.exp(-log_past)
     else:
         # Without both gaps the picture's chi2 would bring in what the settings leave out.
-        chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2
+        chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2[place]
         fit = log_gaps(chi2, settings.gaps)
-    log_ratio = readings.log_ratio + fit + log_past
+    log_ratio = readings.log_ratio[place] + fit + log_past
+    log_ratio[~(readings.sound[place] & np.isfinite(log_ratio))] = -np.inf
     return Weighed(
-        T_a_b=readings.T_a_b.retract(solved.step),
+        T_a_b=readings.T_a_b[place].retract(solved.step),
         covariance=covariance,
         chi2=chi2,
-        log_ratio=np.where(readings.sound & np.isfinite(log_ratio), log_ratio, -np.inf),
+        log_ratio=log_ratio,
         log_prior=log_prior,
-        lights=readings.lights,
-        tilt_chi2=readings.tilt_chi2,
-        depth_chi2=readings.depth_chi2,
-        range_m=readings.range_m,
-        twist_gap_rad=readings.twist_gap_rad,
-        clutter=readings.clutter,
-        lone_odds=lone_odds,
+        log_past=log_past,
         others=others,
+        sources=[(readings, k) for k in place.tolist()],
     )
 
 
-def _likeliest(log_ratio: Floats, likeliest: float) -> Indices:
-    """Give the readings, the likeliest first, that are worth solving for the motion."""
-    order = (-log_ratio).argsort(kind="stable")[:_CHOSEN]
-    return order[log_ratio[order] > likeliest - _NEGLIGIBLE]
+def _likeliest(log_ratio: Floats, count: int) -> Indices:
+    """Give the places of those of the first `count` that are worth solving for the motion, the likeliest first."""
+    if count == 1:
+        return np.zeros(1, dtype=np.intp)
+    order = (-log_ratio[:count]).argsort(kind="stable")[:_CHOSEN]
+    likely = log_ratio[order] > log_ratio.max() - _NEGLIGIBLE
+    likely[0] = True
+    chosen: Indices = order[likely]
+    return chosen
+
+
+def _solve(readings: Readings, place: Indices, motion: Motion) -> Solved:
+    """Take the last step, for what is known of the motion."""
+    rows, dt_s = readings.rows[place], readings.dt_s[place]
+    if motion.skew_sigma_s == 0.0 and not dt_s.any():
+        return least_squares(rows)
+    return at_one_instant(rows, dt_s, _SKEW_SIGN[: rows.shape[1]], motion)

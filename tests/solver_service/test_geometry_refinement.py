@@ -40,7 +40,7 @@ def refine(T_a_b, frames, rig_a, rig_b, motion=STILL, dt_s=(0.0, 0.0, 0.0, 0.0))
     """Refine by the pictures alone, then bring all sightings to one instant."""
     found = refine_lights(T_a_b, frames, np.array((rig_a.lights_m, rig_b.lights_m)))
     times_s = np.tile(np.repeat(dt_s, 2), (len(frames), 1))
-    solved = at_one_instant(found.J, found.r, times_s, np.repeat((1.0, -1.0), 4), motion)
+    solved = at_one_instant(found.rows, times_s, np.repeat((1.0, -1.0), 4), motion)
     return Estimate(found.T_a_b.retract(solved.step), solved.covariance, solved.chi2, found.sound)
 
 
