@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.protocol.security import PLAYER, ROS
@@ -17,6 +17,16 @@ from buddyline.tools.client import add_client_arguments
 from buddyline.tools.pairs import add_pair_argument
 
 DIVE: Final = "one dive: its log, or each node's own"
+
+
+if TYPE_CHECKING:
+    Subcommands: TypeAlias = argparse._SubParsersAction[argparse.ArgumentParser]
+
+
+def subcommand(parsers: Subcommands, name: str, text: str, example: str) -> argparse.ArgumentParser:
+    """Add the parser of a subcommand, with what it does and an example."""
+    description, epilog = f"{text[0].upper()}{text[1:]}.", f"example: buddyline {example}"
+    return parsers.add_parser(name, help=text, description=description, epilog=epilog)
 
 
 def _dives(parser: argparse.ArgumentParser, text: str = DIVE) -> None:

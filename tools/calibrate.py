@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.newfile import check_new, write_new
 
@@ -24,8 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="WHAT")
 
-    def add(name: str, text: str, runs: Callable[[argparse.Namespace], int | None]) -> argparse.ArgumentParser:
-        kind = kinds.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    def add(text: str, runs: Callable[[argparse.Namespace], int | None], example: str) -> argparse.ArgumentParser:
+        name = example.split(maxsplit=1)[0]
+        kind = subcommand(kinds, name, text, f"calibrate {example}")
         kind.set_defaults(calibrate=runs)
         if runs in (_board, _camera):
             kind.add_argument("--columns", type=int, default=9, help="squares across; default 9")
@@ -40,10 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
         return kind
 
-    board = add("board", "write the calibration board as a PDF to print", _board)
+    board = add("write the calibration board as a PDF to print", _board, "board -o board.pdf")
     board.add_argument("-o", "--output", required=True, metavar="BOARD.pdf")
 
-    camera = add("camera", "find the camera's intrinsics from pictures of the board, taken in water", _camera)
+    camera = add(
+        "find the camera's intrinsics from pictures of the board, taken in water",
+        _camera,
+        "camera pictures/ --square-mm 30",
+    )
     camera.add_argument(
         "pictures", nargs="+", metavar="PICTURES", help="folders, pictures, or a dive log with pictures"
     )
@@ -51,7 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--info", metavar="FILE", help="the node's description: its log, or JSON")
     camera.add_argument("--new-info", metavar="OUT.json", help="write it anew with this result, for solve --info")
 
-    lights = add("lights", "find the positions of both nodes' lights from a solved dive at taped distances", _lights)
+    lights = add(
+        "find the positions of two nodes' lights from a solved dive at taped distances",
+        _lights,
+        "lights solved.mcap --tape 10 40 3.00 --tape 60 90 6.00",
+    )
     lights.add_argument("dives", nargs="+", metavar="SOLVED.mcap", help="what `buddyline solve` wrote")
     lights.add_argument(
         "--tape",
@@ -73,14 +83,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write both nodes' descriptions anew, for solve --info",
     )
 
-    magnetometer = add("magnetometer", "find hard and soft iron from a log of the rig turned every way", _magnetometer)
+    magnetometer = add(
+        "find hard and soft iron from a log of the rig turned every way",
+        _magnetometer,
+        "magnetometer a.mcap --position 59.9 10.8",
+    )
     magnetometer.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="a log with the node's inertial samples")
     magnetometer.add_argument("--node", help="whose samples, of a log of several nodes")
     magnetometer.add_argument(
         "--position", nargs=2, type=float, metavar=("LAT", "LON"), help="where it was taken: sets the field's strength"
     )
 
-    clock = add("clock", "find offset and drift between the nodes' clocks, before and after a dive", _clock)
+    clock = add("find offset and drift between the nodes' clocks, before and after a dive", _clock, "clock")
     clock.add_argument(
         "dives", nargs="*", metavar="DIVE.mcap", help="a dive's logs, every node's; default: the nodes that run now"
     )

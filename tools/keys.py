@@ -12,6 +12,7 @@ from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import HUB, node_name
 from buddyline.protocol.topics import check_node_id
+from buddyline.tools.arguments import subcommand
 from buddyline.tools.newfile import write_new
 
 if TYPE_CHECKING:
@@ -40,12 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--days", type=int, metavar="N", help=f"how long it is valid; default: {DAYS}, the authority 10 years"
     )
     whose = parser.add_subparsers(dest="whose", required=True, metavar="|".join(("init", "node", *ROLES)))
-    first = whose.add_parser("init", help="make the authority and the hub's certificate")
+    first = subcommand(whose, "init", "make the authority and the hub's certificate", "keys init --hub 192.168.2.1")
     first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find it; default: %(default)s")
-    node = whose.add_parser("node", help="make a node's certificate; the hub then lets it publish its own keys")
+    node = subcommand(
+        whose, "node", "make a node's certificate; the hub then lets it publish its own keys", "keys node a"
+    )
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
     for role, text in ROLES.items():
-        whose.add_parser(role, help=text)
+        subcommand(whose, role, text, f"keys {role}")
 
 
 def run(args: argparse.Namespace) -> int:

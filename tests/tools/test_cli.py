@@ -1,5 +1,6 @@
 """The program as a person meets it: help, exit status, and errors of one line that say what to do."""
 
+import argparse
 import json
 import os
 import subprocess
@@ -48,6 +49,13 @@ def test_each_command_helps_with_examples(capsys, name):
         main([name, "--help"])
     assert ended.value.code == 0
     assert "examples:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_each_subcommand_has_an_example(command):
+    chosen = [action.choices for action in command.parser()._actions if isinstance(action, argparse._SubParsersAction)]
+    for name, parser in (item for choices in chosen for item in choices.items()):
+        assert f"example: buddyline {command.name} {name}" in parser.format_help().replace("\n", " ")
 
 
 def test_unknown_command_is_guessed(capsys):

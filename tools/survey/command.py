@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import SURVEYOR
+from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     does = parser.add_subparsers(dest="does", required=True, metavar="{legs,adjust,report,export,watch}")
 
-    def add(name: str, text: str, runs: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
-        one = does.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    def add(text: str, runs: Callable[[argparse.Namespace], int], example: str) -> argparse.ArgumentParser:
+        one = subcommand(does, example.split(maxsplit=1)[0], text, f"survey {example}")
         one.set_defaults(survey=runs)
         if runs is not _watch:
             one.add_argument("project", metavar="PROJECT.toml", type=Path)
@@ -51,16 +52,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
         return one
 
-    legs = add("legs", "make legs from the project's dives; with --dive, begin a new project", _legs)
+    legs = add(
+        "make legs from the project's dives; with --dive, begin a new project",
+        _legs,
+        "legs cave.toml --dive solved.mcap a.mcap b.mcap",
+    )
     legs.add_argument("--dive", nargs="+", metavar="LOG.mcap", help="new project: the solved log, and each node's own")
     legs.add_argument(
         "--marks", type=Path, metavar="TIMES.csv", help="columns: time, node, name, and optionally kind and note"
     )
-    adjust = add("adjust", "adjust the network and print loops, residuals and probable blunders", _adjust)
+    adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")
     adjust.add_argument("--json", action="store_true", help="print everything as one JSON object")
-    report = add("report", "write an HTML report", _report)
+    report = add("write an HTML report", _report, "report cave.toml -o cave.html")
     report.add_argument("-o", "--output", metavar="REPORT.html", help="default: beside the project")
-    export = add("export", "write the survey for other programs", _export)
+    export = add("write the survey for other programs", _export, "export cave.toml --format svx")
     export.add_argument("--format", choices=FORMATS, default="svx", help="default: svx (Survex)")
     export.add_argument(
         "--style",
@@ -70,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "legs in loops, because no Survex up to 1.4.22 adjusts loops of diving legs correctly",
     )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
-    watch = add("watch", "publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch)
+    watch = add("publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch, "watch")
     add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
 
