@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-# A node without a clock of its own may be behind by as much when it is switched on.
+# A node without a clock of its own may be this far behind when it is switched on.
 BACKDATED: Final = datetime.timedelta(days=7)
 
 
@@ -29,12 +29,12 @@ class Authority:
 
     @property
     def certificate_path(self) -> Path:
-        """What every process needs to know the others by."""
+        """The certificate that every process checks the others with."""
         return self.directory / "ca.crt"
 
     @property
     def key_path(self) -> Path:
-        """What makes certificates."""
+        """The key that signs certificates."""
         return self.directory / "ca.key"
 
     @classmethod

@@ -1,4 +1,4 @@
-"""`buddyline install-service`: systemd units for node, hub and solver, written and never overwritten in silence."""
+"""`buddyline install-service`: writes systemd units for node, hub and solver; replaces none without --force."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ AFTER: Final = {
     "hub": "network-online.target",
     "solver": "buddyline-hub.service",
 }
-# The kernel's own interfaces are out of reach of a service that has no business there. ProtectClock and PrivateDevices
-# are not for the node: both close /dev to it, camera and I2C bus included.
+# Keeps a service away from kernel interfaces that it does not need. The node goes without ProtectClock and
+# PrivateDevices: both close /dev to it, with camera and I2C bus.
 HARDENING: Final = """
 NoNewPrivileges=yes
 CapabilityBoundingSet=

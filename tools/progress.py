@@ -1,4 +1,4 @@
-"""A progress bar on stderr, for what takes longer than a person waits without wondering."""
+"""A progress bar on stderr, for long tasks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ WIDTH: Final = 30
 
 
 class Progress:
-    """Shows how far a task is; silent where stderr is no terminal or the task is short."""
+    """Shows how far a task is; shows nothing where stderr is no terminal or the task is short."""
 
     def __init__(self, what: str, total: float, stream: TextIO | None = None) -> None:
         self.what = what

@@ -1,4 +1,4 @@
-"""Alarms while the dive goes on: the survey's own checks over the last seconds, said on the bus as marks."""
+"""Alarms during a dive: the survey's checks over the last seconds, published as marks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The magnetic field at a node, as a witness for or against its compass."""
+"""The magnetic field at a node, which shows whether its compass can be trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`buddyline mark`: say where a node stands, on the bus, for all logs to keep."""
+"""`buddyline mark`: publish where a node stands, so that all logs record it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", default="", help="station or point: 1 to 12 of A-Z a-z 0-9 _ -")
     parser.add_argument("--node", required=True, metavar="NODE", help="the node that stands there")
     parser.add_argument("--kind", choices=KINDS, default="station", help="default: station")
-    parser.add_argument("--note", default="", metavar="TEXT")
+    parser.add_argument("--note", default="", metavar="TEXT", help="what there is to say of the place")
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
     add_client_arguments(parser, SURVEYOR)
     parser.add_argument(
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
-    """Return the message; raise BuddylineError where it says nothing, or in no name's form."""
+    """Return the message; raise BuddylineError where name, note or time cannot be used."""
     if args.kind != "note" and not STATION_NAME.match(args.name):
         raise BuddylineError(f"name {args.name!r}: use 1 to 12 of A-Z a-z 0-9 _ -")
     if args.kind == "note" and not args.note:
