@@ -4,3 +4,4 @@ from typing import Final
 
 METHODS: Final = ("refined", "exact", "paper", "paper_midpoint", "paper_literal")
 CHECKS: Final = ("range", "twist", "attitude", "depth")
+TRACKS: Final = ("smooth", "lag", "filter", "none")

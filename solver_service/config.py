@@ -13,6 +13,7 @@ from buddyline.protocol.security import SOLVER, Tls, check_identity
 from buddyline.protocol.topics import check_node_id
 from buddyline.solver_service.choices import CHECKS, METHODS
 from buddyline.solver_service.geometry.observation import Method, Settings
+from buddyline.solver_service.tracking import TrackSettings
 from msgspec import Meta, field
 from msgspec.structs import replace
 
@@ -45,6 +46,17 @@ class SolveConfig(Config, frozen=True, kw_only=True):
         )
 
 
+class TrackConfig(Config, frozen=True, kw_only=True):
+    """[track]: the live track's rows a second; 0: no track."""
+
+    rate_hz: Annotated[float, Meta(ge=0, le=200)] = 20.0
+
+    @property
+    def settings(self) -> TrackSettings | None:
+        """What the solver takes: the track as it goes, and a second later and better."""
+        return TrackSettings(frozenset(("filter", "lag")), self.rate_hz) if self.rate_hz else None
+
+
 class SolverConfig(Config, frozen=True, kw_only=True):
     """A whole solver. nodes: solve every pair of these; pairs: solve these, A first. Neither: every pair that appears.
 
@@ -58,6 +70,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     tls: Tls | None = None
     status_file: str = ""
     solve: SolveConfig = field(default_factory=SolveConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
 
     def __post_init__(self) -> None:
         """Check nodes and pairs."""

@@ -18,6 +18,7 @@ from buddyline.solver_service.health import Health
 from buddyline.solver_service.pair_core import PairCore, PairId
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
+from buddyline.solver_service.tracking import TrackSettings
 from msgspec.structs import replace
 
 NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu
@@ -35,7 +36,8 @@ class SolverCore:
 
     chosen: the pairs to solve; None: every two nodes that appear, A before B in the alphabet. clock_offsets_ns: a
     node's clock minus the common one, where it is known; its times are brought to the common clock. align: collect
-    what the fixes tell about each pair's clocks. unused: nodes that were heard and are in no pair, and how often.
+    what the fixes tell about each pair's clocks. track: the tracks to make; None: none. unused: nodes that were heard
+    and are in no pair, and how often.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class SolverCore:
         clock_offsets_ns: Mapping[str, int] | None = None,
         *,
         align: bool = False,
+        track: TrackSettings | None = None,
     ) -> None:
         self.settings = settings
         self.streams: dict[str, NodeStream] = {}
@@ -54,6 +57,7 @@ class SolverCore:
         self._chosen = chosen
         self._clock_offsets_ns = clock_offsets_ns or {}
         self._align = align
+        self._track = track
         self._pairs_of: dict[str, list[PairCore]] = {}
         self._now_ns = 0
         self._set_back_ns = 0
@@ -105,9 +109,7 @@ class SolverCore:
 
     def flush(self) -> list[Message]:
         """Resolve all that is pending with what there is: the dive has ended."""
-        for pair in self.pairs.values():
-            pair.resolve(None, everything=True)
-        return _settled(self.pairs.values())
+        return [message for pair in self.pairs.values() for message in pair.finish()]
 
     def report(self, stamp_ns: int, receive_ns: int, bad_messages: int, problems: list[str]) -> list[SolverStatus]:
         """Return each pair's status; bad_messages, problems: what was received and could not be used."""
@@ -190,7 +192,7 @@ class SolverCore:
 
     def _add_pair(self, nodes: PairId) -> PairCore:
         first, second = (self.streams[node] for node in nodes)
-        pair = self.pairs[nodes] = PairCore(first, second, self.settings, align=self._align)
+        pair = self.pairs[nodes] = PairCore(first, second, self.settings, self._track, align=self._align)
         for node in nodes:
             self._pairs_of.setdefault(node, []).append(pair)
         return pair

@@ -11,19 +11,20 @@ from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
 from buddyline.protocol.messages import Candidates, Message, Rejected, SolverStatus
-from buddyline.protocol.topics import POSE, REJECTED, SOLVER_STATUS
+from buddyline.protocol.topics import POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
 from buddyline.solver_service.matcher import PairMatcher, Unmatched
 from buddyline.solver_service.pair import Matched, PairSolver
 from buddyline.solver_service.results import relative_pose
 from buddyline.solver_service.streams import Arrival, NodeStream
+from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec import UNSET
 
 PairId: TypeAlias = tuple[str, str]
 
 # What a pair publishes.
-PUBLISHED: Final = (POSE, REJECTED, SOLVER_STATUS)
+PUBLISHED: Final = (POSE, REJECTED, TRACK, TRACK_LAG, SOLVER_STATUS)
 # The clocks' offset is reported once the dive tells it this well.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 ALIGN_EVERY_NS: Final = 10 * S_NS
@@ -33,16 +34,24 @@ class PairCore:
     """One pair: its matcher, its solver, and what became of its triggers.
 
     counts: "solved" and the reasons. latencies_s: from the middle of exposure to publication, since the last report.
-    A track of the pair belongs here: both streams hold frames and samples in the order of their stamps, also those
-    without a match, and `settle` makes the fixes; what it returns is published by its own topic and key.
+    tracker: makes the pair's track, None where none is wanted.
     """
 
-    def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: Settings, *, align: bool) -> None:
+    def __init__(
+        self,
+        stream_a: NodeStream,
+        stream_b: NodeStream,
+        settings: Settings,
+        track: TrackSettings | None,
+        *,
+        align: bool,
+    ) -> None:
         self.nodes: PairId = (stream_a.node, stream_b.node)
         self.streams = stream_a, stream_b
         self.matcher = PairMatcher(stream_a, stream_b)
         self.alignment = ClockAlignment() if align else None
         self.solver = PairSolver(settings, self.alignment)
+        self.tracker = PairTracker(stream_a, stream_b, track) if track is not None else None
         self.counts: Counter[str] = Counter()
         self.latencies_s: deque[float] = deque(maxlen=2000)
         self._offset: ClockOffset | None = None
@@ -56,6 +65,8 @@ class PairCore:
             self._unsettled += self.matcher.restart(frame.node)
             self._solve()
             self.solver.forget()
+            if self.tracker is not None:
+                self.tracker.forget()
         self._unsettled += self.matcher.take(frame, arrival, receive_ns, live=live)
 
     def resolve(self, receive_ns: int | None, *, everything: bool = False) -> None:
@@ -63,10 +74,15 @@ class PairCore:
         self._unsettled += self.matcher.resolve(receive_ns, everything=everything)
 
     def settle(self) -> list[Message]:
-        """Solve what is matched, all at once; return the outcomes in the order of the triggers."""
+        """Solve what is matched, all at once; return the outcomes in the order of the triggers, and the track."""
         self._solve()
         settled, self._settled = self._settled, []
-        return settled
+        return settled + (self.tracker.take(settled) if self.tracker is not None else [])
+
+    def finish(self) -> list[Message]:
+        """Return the outcomes and the rest of the track: the dive has ended."""
+        self.resolve(None, everything=True)
+        return self.settle() + (self.tracker.finish() if self.tracker is not None else [])
 
     def _solve(self) -> None:
         if not self._unsettled:
@@ -124,7 +140,7 @@ class PairCore:
             latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
             latency_p99_s=latencies_s[p99] if latencies_s else UNSET,
             clock_skew_s=UNSET if offset is None else offset.offset_s,
-            problem="; ".join(problems + self._disagreements(offset)),
+            problem="; ".join(problems + self._disagreements(offset) + (self.tracker.problems if self.tracker else [])),
             unused=unused or UNSET,
         )
 

@@ -121,9 +121,14 @@ class ImuWindow:
         """Count the samples."""
         return self._end - self._start
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample, None where there is none."""
+        return int(self._stamps[self._end - 1]) if len(self) else None
+
     def add(self, sample: Imu) -> None:
         """Take one sample, in any order."""
-        newest_ns = int(self._stamps[self._end - 1]) if len(self) else None
+        newest_ns = self.newest_ns
         verdict = self._jump.judge(sample.stamp_ns, newest_ns)
         if verdict == "drop":
             return

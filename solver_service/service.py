@@ -13,7 +13,7 @@ from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, INFO, POSE, REJECTED, key_of
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, key_of
 from buddyline.solver_service.answered import Answered
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-SOLVED_FROM: Final = (INFO, ATTITUDE, DEPTH, CANDIDATES)
+SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
 # Time is told to the core this often, and the status goes out every so many times.
 TICK_S: Final = 0.25
 TICKS_A_STATUS: Final = 4
@@ -40,7 +40,7 @@ class SolverService(Service):
         self.config = config
         self.clock = clock or SystemClock()
         self.refusals = Refusals("solver")
-        self.core = SolverCore(config.solve.settings(source), config.chosen, align=True)
+        self.core = SolverCore(config.solve.settings(source), config.chosen, align=True, track=config.track.settings)
         self._lock = threading.Lock()
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}

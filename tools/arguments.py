@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.protocol.security import PLAYER, ROS
-from buddyline.solver_service.choices import CHECKS, METHODS
+from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
 from buddyline.tools.pairs import add_pair_argument
 
@@ -129,6 +129,16 @@ def solve(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--clock-offset", type=float, default=0.0, metavar="S", help="B's clock minus A's, from `buddyline align`"
+    )
+    parser.add_argument(
+        "--track",
+        choices=TRACKS,
+        default=TRACKS[0],
+        help="the fused estimate over time: of the whole dive (smooth), a second late, causal, or none; "
+        "default: %(default)s",
+    )
+    parser.add_argument(
+        "--track-hz", type=float, default=50.0, metavar="HZ", help="rows a second; default: %(default)s"
     )
     _detector(parser)
     _json(parser, "print the summary as JSON")

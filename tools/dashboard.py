@@ -94,7 +94,7 @@ class Dashboard:
     def _errors(self, newest: int = 0) -> PoseErrors:
         """Return the errors of the newest poses (0: of all)."""
         poses, track = self._poses[-newest:], TruthTrack(self._truths[-newest:])
-        return pose_errors(poses, track, lambda _: None, None, {})
+        return pose_errors(poses, track, lambda _: None, None)
 
     def _newest(self) -> tuple[RelativePose, float, float, float]:
         """Return the newest pose, how far it is off, m, its range's error, m, and how far it is turned, deg."""

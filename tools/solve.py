@@ -10,16 +10,17 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations, islice
 from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, Message, NodeInfo
-from buddyline.protocol.topics import check_node_id
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Track, TrackMode
+from buddyline.protocol.topics import TRACK, check_node_id
 from buddyline.solver_service.config import SolveConfig, node_ids
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.tracking import TrackSettings
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 
@@ -42,7 +43,12 @@ def run(args: argparse.Namespace) -> int:
         nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
         if args.clock_offset and len(nodes) > 2:
             raise ConfigError(f"--clock-offset {args.clock_offset:g}: is of one pair; choose it with --nodes A B")
-        core = SolverCore(settings, list(combinations(nodes, 2)), {nodes[1]: round(args.clock_offset * 1e9)})
+        core = SolverCore(
+            settings,
+            list(combinations(nodes, 2)),
+            {nodes[1]: round(args.clock_offset * 1e9)},
+            track=_track(args.track, args.track_hz),
+        )
         began_s = time.monotonic()
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         with new_dive_log(args.output, metadata) as writer:
@@ -141,9 +147,17 @@ def messages_of(
                 yield found
 
 
+def _track(mode: str, rate_hz: float) -> TrackSettings | None:
+    if not 0.1 <= rate_hz <= 1000.0:
+        raise ConfigError(f"--track-hz {rate_hz:g}: give 0.1 to 1000")
+    return None if mode == "none" else TrackSettings(frozenset((cast(TrackMode, mode),)), rate_hz)
+
+
 def _write(writer: DiveLogWriter, results: Iterable[Message]) -> None:
+    """Write outcomes and track; of a track, the one that was asked for is the dive's."""
     for result in results:
-        writer.write_message(result)
+        key = TRACK.key(result.node_a, result.node_b) if isinstance(result, Track) else None
+        writer.write_message(result, key=key)
 
 
 def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: float) -> None:

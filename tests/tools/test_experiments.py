@@ -20,7 +20,7 @@ def _errors(offsets_m, range_m=3.0):
     truths = [truth(k, (0.0, 0.0, range_m)) for k in range(len(offsets_m))]
     poses: list[RelativePose] = [pose(k, (0.0, 0.0, range_m + off)) for k, off in enumerate(offsets_m)]
     track = TruthTrack(truths)
-    return pose_errors(poses, track, lambda _: None, None, INFOS), track
+    return pose_errors(poses, track, lambda _: None, None), track
 
 
 def test_errors_go_into_their_range_bin():

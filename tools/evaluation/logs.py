@@ -13,8 +13,10 @@ from buddyline.protocol.messages import (
     LightTruth,
     Message,
     NodeInfo,
+    NodePose,
     Rejected,
     RelativePose,
+    Track,
     Truth,
 )
 from buddyline.protocol.topics import (
@@ -23,8 +25,11 @@ from buddyline.protocol.topics import (
     CANDIDATES,
     INFO,
     LIGHT_TRUTH,
+    NET_TRUTH,
     POSE,
     REJECTED,
+    TRACK,
+    TRACK_LAG,
     TRUTH,
     Topic,
 )
@@ -36,7 +41,7 @@ from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.
 _TAGS: Final = (ARTAG,)
-_TRUTHS: Final = (TRUTH, LIGHT_TRUTH)
+_TRUTHS: Final = (TRUTH, LIGHT_TRUTH, NET_TRUTH)
 
 
 def _names(dives: Sequence[Dive]) -> str:
@@ -73,8 +78,13 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
             recorded.truths.append(message)
         elif ids == nodes[::-1]:
             recorded.truths.append(inverted(message))
+    elif isinstance(message, NodePose):
+        if message.node == nodes[0]:
+            recorded.ned_truths_a.append(message)
     elif len(ids) == 2 and ids != nodes:
         return
+    elif isinstance(message, Track):
+        recorded.tracks.append(message)
     elif isinstance(message, RelativePose):
         recorded.poses.append(message)
     elif isinstance(message, Rejected):
@@ -110,7 +120,7 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
         for log in [*logs, *truth_logs]:
             topics: list[Topic] = [INFO, CANDIDATES]
             if log in answering[:1]:
-                topics += results
+                topics += [*results, TRACK, TRACK_LAG]
             if answering:
                 topics += [ATTITUDE]
             topics += [topic for topic in _TRUTHS if log in truth_logs or topic.name not in sighted]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import NodeInfo, RelativePose, Track
+from buddyline.protocol.messages import RelativePose, Track
 from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
 from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 from msgspec import UNSET
@@ -22,8 +22,9 @@ class PoseErrors:
     """Poses that have truth, in order of time; N values each, NaN where one cannot be known.
 
     t_m, true_t_m: (N, 3), in A's camera frame. range_m, azimuth_rad, inclination_rad: published minus true.
-    bearing_rad: angle between the published and the true direction to B. azimuth and inclination: the truth is
-    turned to NED by A's attitude as it was measured, so the compass's own error is in neither.
+    bearing_rad: angle between the published and the true direction to B. azimuth and inclination: against true NED
+    where the dive has A's true poses in it, else against the truth turned by A's measured attitude, so that the
+    compass's own error is in neither.
     nees6, nees3: squared error in units of the published covariance, of all six and of the position;
     an honest covariance makes their means 6 and 3. right_pair: 1, 0 or NaN.
     """
@@ -117,16 +118,13 @@ def _published(values: Sequence[object]) -> Floats:
     return np.array([np.nan if value is UNSET else value for value in values], dtype=float)
 
 
-def _ned_of_a(poses: Sequence[RelativePose], attitude_a: PoseHistory | None, info_a: NodeInfo | None) -> Floats:
+def _ned_of_a(poses: Sequence[RelativePose], ned_camera_a: PoseHistory | None) -> Floats:
     """Return q_ned_camera (N, 4) of node a at each pose, NaN where unknown."""
     q_ned_camera = np.full((len(poses), 4), np.nan)
-    if info_a is None or attitude_a is None:
-        return q_ned_camera
-    q_body_camera = normalized(np.array(info_a.q_body_camera_xyzw))
-    for i, pose in enumerate(poses):
-        measured = attitude_a.at(pose.stamp_ns + pose.skew_ns // 2)
-        if measured is not None:
-            q_ned_camera[i] = multiply(measured[1], q_body_camera)
+    for i, pose in enumerate(poses if ned_camera_a is not None else ()):
+        known = ned_camera_a.at(pose.stamp_ns + pose.skew_ns // 2) if ned_camera_a is not None else None
+        if known is not None:
+            q_ned_camera[i] = known[1]
     return q_ned_camera
 
 
@@ -134,17 +132,18 @@ def pose_errors(
     poses: Sequence[RelativePose],
     track: TruthTrack,
     is_right: Callable[[RelativePose], bool | None],
-    attitude_a: PoseHistory | None,
-    infos: Mapping[str, NodeInfo],
+    ned_camera_a: PoseHistory | None,
 ) -> PoseErrors:
-    """Compare the poses of one pair with truth; poses without truth are left out."""
+    """Compare the poses of one pair with truth; poses without truth are left out.
+
+    ned_camera_a: node a's camera in NED, for azimuth and inclination.
+    """
     found = [(pose, known) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
     found.sort(key=lambda pair: pair[0].stamp_ns)
     known_poses = [pose for pose, _ in found]
     off = differences(found)
 
-    info_a = infos.get(known_poses[0].node_a) if known_poses else None
-    north, east, down = rotate(_ned_of_a(known_poses, attitude_a, info_a), off.true_t_m).T
+    north, east, down = rotate(_ned_of_a(known_poses, ned_camera_a), off.true_t_m).T
     true_inclination_rad = np.arctan2(-down, np.hypot(north, east))
     right = (is_right(pose) for pose in known_poses)
     return PoseErrors(

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from buddyline.protocol.messages import Attitude, Candidates, LightTruth, NodeInfo, Rejected, RelativePose, Truth
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    LightTruth,
+    NodeInfo,
+    NodePose,
+    Rejected,
+    RelativePose,
+    Track,
+    Truth,
+)
 from buddyline.tools.pairs import Pair
 
 
@@ -12,7 +22,8 @@ from buddyline.tools.pairs import Pair
 class Recorded:
     """One pair's messages; truths are of T_a_b whichever way the log has them.
 
-    nodes: a and b. attitudes_a: node a's, for azimuth and inclination. problems: for a person, a line each.
+    nodes: a and b. ned_truths_a: node a's true poses in NED, for azimuth and inclination; attitudes_a: its attitudes,
+    where these are not known. problems: for a person, a line each.
     doubled: second outcomes of a trigger, which the logs hold and this does not.
     environment: the water, where a log names it.
     """
@@ -23,7 +34,9 @@ class Recorded:
     truths: list[Truth] = field(default_factory=list)
     candidates: list[Candidates] = field(default_factory=list)
     light_truths: list[LightTruth] = field(default_factory=list)
+    tracks: list[Track] = field(default_factory=list)
     attitudes_a: list[Attitude] = field(default_factory=list)
+    ned_truths_a: list[NodePose] = field(default_factory=list)
     infos: dict[str, NodeInfo] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     doubled: int = 0

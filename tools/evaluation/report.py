@@ -12,6 +12,7 @@ from buddyline.tools.evaluation.pairing import Pairing
 from buddyline.tools.evaluation.poses import WRONG_SHARE
 from buddyline.tools.evaluation.result import Accuracy, RangeBin, Result
 from buddyline.tools.evaluation.statistics import Stats
+from buddyline.tools.evaluation.tracks import GAP_S, TrackFigures
 from buddyline.tools.measure.tables import number, percent, text_table
 
 _DEGREES = 180.0 / math.pi
@@ -44,6 +45,7 @@ def as_text(result: Result) -> str:
         parts.append(_pairing_text(result.pairing))
     if result.accuracy.poses:
         parts += [_accuracy_text(result.accuracy), _bins_text(result.bins)]
+    parts += [_track_text(track) for track in result.tracks if track.samples]
     if result.detection is not None:
         parts.append(_detection_text(result.detection))
     return "\n\n".join(parts)
@@ -122,6 +124,22 @@ def _accuracy_text(accuracy: Accuracy) -> str:
         f"wrong poses (position off by more than {WRONG_SHARE:.0%} of the range): {accuracy.wrong} of {accuracy.poses}"
     )
     return f"{wrong}, {percent(accuracy.wrong_share)}\n{text_table(rows)}\n{inside}"
+
+
+def _track_text(track: TrackFigures) -> str:
+    rows = [
+        ["error", "samples", "median", "p95", "RMSE", "mean"],
+        _stats_row("position, m", track.position_m, 4),
+        _stats_row(f"  in gaps (no light for {GAP_S:g} s)", track.in_gaps_m, 4),
+        _stats_row("  outside gaps", track.outside_m, 4),
+        _stats_row("rotation, deg", track.rotation_rad, 3, _DEGREES),
+        _stats_row("NEES, pose (honest: mean 6)", track.nees6, 2),
+        _stats_row("NEES, position (honest: mean 3)", track.nees3, 2),
+    ]
+    return (
+        f"track ({track.mode}): covers {percent(track.covered)} of the time from the first to the last pose;"
+        f" wrong: {track.wrong} of {track.samples}, in gaps {track.wrong_in_gaps}\n{text_table(rows)}"
+    )
 
 
 def _bins_text(bins: Sequence[RangeBin]) -> str:

@@ -15,8 +15,9 @@ from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.evaluation.statistics import Stats, in_bins, share
+from buddyline.tools.evaluation.tracks import TrackFigures, tracks_figures
 from buddyline.tools.evaluation.triggers import Skew, Triggers, skew_figures, trigger_figures
-from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
+from buddyline.tools.evaluation.truth import TruthTrack, ned_of_camera
 
 RANGE_EDGES_M: Final = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 15.0, 20.0, float("inf"))
 # The 95 % points of chi-square with 6 and 3 degrees of freedom.
@@ -76,7 +77,7 @@ class RangeBin:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that is measured of one pair. without_truth: poses that could not be compared.
+    """All that is measured of one pair. without_truth: poses that could not be compared. tracks: one a mode.
 
     environment: the water, empty where the logs do not name it.
     """
@@ -91,6 +92,7 @@ class Result:
     bins: list[RangeBin]
     pairing: Pairing | None
     detection: DetectionFigures | None
+    tracks: list[TrackFigures]
     errors: PoseErrors
     environment: str = ""
 
@@ -121,8 +123,7 @@ def evaluate(recorded: Recorded) -> Result:
         poses,
         track,
         lambda pose: is_right_pair(pose, blobs, lights),
-        PoseHistory.of_attitudes(recorded.attitudes_a),
-        infos,
+        ned_of_camera(recorded.ned_truths_a, recorded.attitudes_a, infos.get(nodes[0])),
     )
     seen = visible_triggers(nodes, poses, rejected, lights, blobs, set(errors.trigger[errors.wrong].tolist()))
     return Result(
@@ -136,6 +137,7 @@ def evaluate(recorded: Recorded) -> Result:
         bins=_bins(errors, seen),
         pairing=pairing_figures(seen),
         detection=detection_figures(lights, blobs),
+        tracks=tracks_figures(recorded.tracks, poses, track),
         errors=errors,
         environment=recorded.environment,
     )

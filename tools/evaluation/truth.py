@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import Attitude, Truth
-from buddyline.tools.evaluation.rotation import Floats, conjugate, interpolate, normalized, rotate
+from buddyline.protocol.messages import Attitude, NodeInfo, NodePose, Truth
+from buddyline.tools.evaluation.rotation import Floats, conjugate, interpolate, multiply, normalized, rotate
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -55,6 +55,23 @@ class PoseHistory:
         if best is None or abs(self.stamps_ns[best] - stamp_ns) > NEAREST_NS:
             return None
         return self.t_m[best], self.q_xyzw[best]
+
+
+def ned_of_camera(
+    truths: Sequence[NodePose], attitudes: Sequence[Attitude], info: NodeInfo | None
+) -> PoseHistory | None:
+    """Return a camera in NED over time: truly where truths has it, else by attitudes, with their errors."""
+    if truths:
+        return PoseHistory(
+            [truth.stamp_ns for truth in truths],
+            np.array([truth.p_m for truth in truths]),
+            np.array([truth.q_xyzw for truth in truths]),
+        )
+    if info is None or not attitudes:
+        return None
+    body = PoseHistory.of_attitudes(attitudes)
+    q_body_camera = normalized(np.array(info.q_body_camera_xyzw))
+    return PoseHistory(body.stamps_ns, body.t_m, multiply(body.q_xyzw, q_body_camera))
 
 
 class TruthTrack:

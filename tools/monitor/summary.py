@@ -57,7 +57,7 @@ class Summary:
 
     def errors(self) -> PoseErrors:
         """Compare the poses with the truth, where the logs hold it."""
-        return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, None, {})
+        return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, None)
 
 
 def summarize(dive: Dive, pair: Pair | None) -> Summary:

@@ -1,0 +1,289 @@
+"""One pair's track out of both nodes' streams: what the estimator is given, when, and the messages that it makes.
+
+The estimator is in `track/`. Everything here is a function of the messages so far: a live dive and its log give the
+same track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Attitude, Message, NodeInfo, Rejected, RelativePose, Track, TrackMode
+from buddyline.solver_service.geometry.observation import View
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
+from buddyline.solver_service.results import view_of
+from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.track.dive import NodeRecord, smooth
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
+from buddyline.solver_service.track.output import TrackRow
+from msgspec import UNSET
+from msgspec.structs import replace
+
+# An inertial unit this far behind the frames has stopped: the track goes on without it.
+IMU_STOPPED_NS: Final = S_NS
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """modes: the tracks to make, at rate_hz rows a second."""
+
+    modes: frozenset[TrackMode]
+    rate_hz: float = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """What one node's stream holds of a stretch of time. imu_values: (N, 6) accelerometer, gyroscope."""
+
+    frames: list[Frame]
+    imu_stamps_ns: Stamps
+    imu_values: Floats
+    attitudes: list[AttitudeSeen]
+    depths: list[DepthSeen]
+
+
+class PairTracker:
+    """Follows a pair. The past up to a trigger is taken once its outcome is known; what comes later is left out."""
+
+    def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
+        self.problems: list[str] = []
+        self._streams = stream_a, stream_b
+        self._settings = settings
+        self._period_ns = round(S_NS / settings.rate_hz)
+        self.forget()
+
+    def forget(self) -> None:
+        """Start anew: a clock was set."""
+        self._infos: tuple[NodeInfo, NodeInfo] | None = None
+        self._nodes: tuple[TrackNode, TrackNode] | None = None
+        self._filter: TrackFilter | None = None
+        self._lag: TrackLag | None = None
+        self._pieces: tuple[list[Piece], list[Piece]] = ([], [])
+        self._fixes: list[FixSeen] = []
+        self._first_ns: int | None = None
+        self._taken_ns = -1
+        self._told_ns = -1
+        self._settled_ns = -1
+        self._oriented = False
+
+    def take(self, outcomes: Sequence[Message]) -> list[Message]:
+        """Go on to the newest of these outcomes; return the live tracks' messages up to there."""
+        with np.errstate(all="ignore"):
+            try:
+                return self._take(outcomes)
+            except (ArithmeticError, ValueError) as error:
+                self._start_anew(str(error))
+                return []
+
+    def _start_anew(self, why: str) -> None:
+        """Drop a track that absurd but finite values have spoiled, such as a depth of 1e308 m."""
+        node_a, node_b = (stream.node for stream in self._streams)
+        self._note([f"values from {node_a} or {node_b} are out of numeric range ({why}): the track starts anew"])
+        self.forget()
+
+    def _take(self, outcomes: Sequence[Message]) -> list[Message]:
+        stamps_ns = [one.stamp_ns for one in outcomes if isinstance(one, RelativePose | Rejected)]
+        if not stamps_ns or not self._describe(max(stamps_ns)):
+            return []
+        self._settled_ns = max(self._settled_ns, *stamps_ns)
+        fixes = [_fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
+        if self._filter is not None:
+            for fix in fixes:
+                self._filter.add_fix(fix)
+        if "smooth" in self._settings.modes:
+            self._fixes += fixes
+        return self._advance(self._frontier_ns())
+
+    def finish(self) -> list[Message]:
+        """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one."""
+        if self._nodes is None or self._settled_ns < 0:
+            return []
+        end_ns = self._settled_ns + S_NS
+        with np.errstate(all="ignore"):
+            try:
+                messages = self._advance(end_ns)
+                if "smooth" not in self._settings.modes:
+                    return messages
+                found = smooth((self._record(0), self._record(1)), self._fixes, self._due(self._first_ns or 0, end_ns))
+            except (ArithmeticError, ValueError) as error:
+                self._start_anew(str(error))
+                return []
+        self._note(found.problems)
+        return messages + self._messages(found.rows, "smooth")
+
+    def _describe(self, stamp_ns: int) -> bool:
+        """Take both calibrations as of stamp_ns; a changed one starts the track anew. False where one is missing."""
+        known = [stream.calibration(stamp_ns) for stream in self._streams]
+        if known[0] is None or known[1] is None:
+            return False
+        infos = known[0][0], known[1][0]
+        if self._infos is not None and all(map(_same_rig, infos, self._infos)):
+            return True
+        if self._infos is not None:
+            self.forget()
+        self._infos = infos
+        self._nodes = _node_of(*known[0]), _node_of(*known[1])
+        live = self._settings.modes & {"filter", "lag"}
+        if live:
+            self._filter = TrackFilter(*self._nodes, keep_s=LAG_S + 2 * EVERY_S if "lag" in live else 0.0)
+            self._lag = TrackLag(self._filter) if "lag" in live else None
+        return True
+
+    def _frontier_ns(self) -> int:
+        """Return up to when everything has come: outcomes, and the samples of inertial units that have not stopped."""
+        newest = [stream.imu.newest_ns for stream in self._streams]
+        running = [ns for ns in newest if ns is not None and ns > self._settled_ns - IMU_STOPPED_NS]
+        return min([self._settled_ns, *running])
+
+    def _advance(self, to_ns: int) -> list[Message]:
+        if to_ns <= self._taken_ns:
+            return []
+        if self._first_ns is None:
+            self._first_ns = to_ns
+            self._taken_ns = to_ns - S_NS
+            self._told_ns = to_ns
+        for node, stream in enumerate(self._streams):
+            piece = self._piece(stream, node, self._taken_ns + 1, to_ns)
+            self._oriented |= bool(piece.attitudes)
+            if "smooth" in self._settings.modes:
+                self._pieces[node].append(piece)
+            if self._filter is not None:
+                _feed(self._filter, node, piece)
+        self._taken_ns = to_ns
+        return self._live(to_ns)
+
+    def _live(self, to_ns: int) -> list[Message]:
+        if self._filter is None:
+            return []
+        due = self._due(self._told_ns + 1, to_ns)
+        self._told_ns = to_ns
+        rows = self._filter.advance(to_ns, due)
+        if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
+            raise ArithmeticError("no finite covariance")
+        self._note(self._filter.problems)
+        messages = self._messages(rows, "filter") if "filter" in self._settings.modes else []
+        if self._lag is not None:
+            self._lag.ask(due)
+            messages += self._messages(self._lag.rows(), "lag")
+        return messages
+
+    def _due(self, start_ns: int, end_ns: int) -> list[int]:
+        """Return the instants of the rows from start_ns to end_ns."""
+        first = -(-start_ns // self._period_ns)
+        return [k * self._period_ns for k in range(first, end_ns // self._period_ns + 1)]
+
+    def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> Piece:
+        stamps_ns, values = stream.imu.between(start_ns, end_ns)
+        return Piece(
+            frames=[_frame_of(frame) for frame in map(view_of, stream.frames.between(start_ns, end_ns))],
+            imu_stamps_ns=stamps_ns,
+            imu_values=values,
+            attitudes=[self._attitude(each, node) for each in stream.attitude.between(start_ns, end_ns)],
+            depths=[
+                DepthSeen(each.stamp_ns, each.depth_m, each.sigma_m) for each in stream.depth.between(start_ns, end_ns)
+            ],
+        )
+
+    def _attitude(self, message: Attitude, node: int) -> AttitudeSeen:
+        """Return an attitude from the north of A's attitudes, which B's may have another declination for."""
+        R = quat_to_matrix(np.array(message.q_ned_body_xyzw))
+        if node == 1 and self._nodes is not None:
+            a, b = (each.rig.declination_rad for each in self._nodes)
+            if a != b:
+                R = rotation_exp(np.array([0.0, 0.0, a - b])) @ R
+        return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
+
+    def _record(self, node: int) -> NodeRecord:
+        pieces = self._pieces[node]
+        values = np.concatenate([piece.imu_values for piece in pieces] or [np.zeros((0, 6))])
+        if self._nodes is None:
+            raise RuntimeError("no calibration yet")
+        return NodeRecord(
+            node=self._nodes[node],
+            frames=[frame for piece in pieces for frame in piece.frames],
+            imu_stamps_ns=np.concatenate([piece.imu_stamps_ns for piece in pieces] or [np.zeros(0, np.int64)]),
+            accel_mps2=values[:, :3],
+            gyro_radps=values[:, 3:],
+            attitudes=[each for piece in pieces for each in piece.attitudes],
+            depths=[each for piece in pieces for each in piece.depths],
+        )
+
+    def _note(self, problems: Iterable[str]) -> None:
+        self.problems += [problem for problem in problems if problem not in self.problems]
+
+    def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> list[Message]:
+        node_a, node_b = (stream.node for stream in self._streams)
+        return [track_message(row, node_a, node_b, mode, oriented=self._oriented) for row in rows]
+
+
+def track_message(row: TrackRow, node_a: str, node_b: str, mode: TrackMode, *, oriented: bool) -> Track:
+    """Return the message for a row; oriented: whether an attitude says where north is."""
+    return Track(
+        node_a=node_a,
+        node_b=node_b,
+        stamp_ns=row.stamp_ns,
+        t_a_b_m=_triple(row.t_a_b_m),
+        q_a_b_xyzw=tuple(row.q_a_b_xyzw.tolist()),
+        covariance=row.covariance.ravel().tolist(),
+        v_a_b_mps=_triple(row.v_a_b_mps),
+        v_covariance=row.v_covariance.ravel().tolist(),
+        mode=mode,
+        lights=row.lights,
+        age_s=max(row.age_s, 0.0),
+        range_m=row.range_m,
+        t_ned_m=_triple(row.t_ned_m) if oriented else UNSET,
+        sigma_ned_m=_triple(row.sigma_ned_m) if oriented else UNSET,
+        azimuth_rad=row.azimuth_rad if oriented else UNSET,
+        sigma_azimuth_rad=row.sigma_azimuth_rad if oriented else UNSET,
+        inclination_rad=row.inclination_rad if oriented else UNSET,
+        sigma_inclination_rad=row.sigma_inclination_rad if oriented else UNSET,
+    )
+
+
+def _feed(track: TrackFilter, node: int, piece: Piece) -> None:
+    track.add_imu(node, piece.imu_stamps_ns, piece.imu_values[:, :3], piece.imu_values[:, 3:])
+    for attitude in piece.attitudes:
+        track.add_attitude(node, attitude)
+    for depth in piece.depths:
+        track.add_depth(node, depth)
+    for frame in piece.frames:
+        track.add_frame(node, frame)
+
+
+def _node_of(info: NodeInfo, rig: Rig) -> TrackNode:
+    return TrackNode(
+        rig=rig,
+        imu_m=None if info.imu_m is UNSET else np.array(info.imu_m),
+        imu_delay_ns=None if info.imu_delay_ns is UNSET else info.imu_delay_ns,
+    )
+
+
+def _same_rig(info: NodeInfo, other: NodeInfo) -> bool:
+    """Whether two calibrations are one, whenever each was stated."""
+    return info is other or info == replace(other, stamp_ns=info.stamp_ns)
+
+
+def _frame_of(view: View) -> Frame:
+    dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
+    return Frame(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score)
+
+
+def _fix_of(pose: RelativePose) -> FixSeen:
+    return FixSeen(
+        stamp_ns=pose.stamp_ns,
+        t_a_b_m=np.array(pose.t_a_b_m),
+        R_a_b=quat_to_matrix(np.array(pose.q_a_b_xyzw)),
+        covariance=np.array(pose.covariance).reshape(6, 6),
+    )
+
+
+def _triple(values: Floats) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
