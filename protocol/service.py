@@ -87,7 +87,8 @@ class Service:
 
         def interrupt(number: int, _frame: object) -> None:
             self.interrupted = number == signal.SIGINT
-            self.stop.set()
+            # Not in this thread: it may be inside `stop.wait`, which holds the lock that `set` takes.
+            threading.Thread(target=self.stop.set, name="stop").start()
 
         signal.signal(signal.SIGINT, interrupt)
         signal.signal(signal.SIGTERM, interrupt)

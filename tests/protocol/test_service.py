@@ -91,3 +91,20 @@ def test_a_process_that_was_frozen_is_not_stuck(watched):
     assert watched.failure is None
     watched._look_for_stuck(1002.0 + STUCK_S, 0.0)
     assert watched.failure is not None
+
+
+def test_a_signal_within_a_wait_for_the_stop_ends_the_service():
+    """The signal comes while the main thread holds the lock of the event that the handler is to set."""
+    program = """
+import os, signal
+from buddyline.protocol.service import Service
+service = Service("test")
+service.handle_signals()
+with service.stop._cond:
+    os.kill(os.getpid(), signal.SIGTERM)
+    for _ in range(1000):
+        pass
+service.wait()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    assert ended.returncode == 0
