@@ -68,6 +68,11 @@ class SampleStream(Generic[S]):
         self._samples: list[S] = []
         self._jump = BackwardJump()
 
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample, None where there is none."""
+        return self._stamps[-1] if self._stamps else None
+
     def add(self, sample: S) -> None:
         """Take one sample, in any order."""
         verdict = self._jump.judge(sample.stamp_ns, self._stamps[-1] if self._stamps else None)

@@ -26,8 +26,8 @@ from buddyline.solver_service.track.output import TrackRow
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# An inertial unit this far behind the frames has stopped: the track goes on without it.
-IMU_STOPPED_NS: Final = S_NS
+# A sensor this far behind the frames has stopped: the track goes on without it.
+STOPPED_NS: Final = S_NS
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,10 @@ class PairTracker:
         return True
 
     def _frontier_ns(self) -> int:
-        """Return up to when everything has come: outcomes, and the samples of inertial units that have not stopped."""
-        newest = [stream.imu.newest_ns for stream in self._streams]
-        running = [ns for ns in newest if ns is not None and ns > self._settled_ns - IMU_STOPPED_NS]
+        """Return up to when everything has come: outcomes, and the samples of the sensors that have not stopped."""
+        sensors = [sensor for stream in self._streams for sensor in (stream.imu, stream.attitude, stream.depth)]
+        newest = [sensor.newest_ns for sensor in sensors]
+        running = [ns for ns in newest if ns is not None and ns > self._settled_ns - STOPPED_NS]
         return min([self._settled_ns, *running])
 
     def _advance(self, to_ns: int) -> list[Message]:

@@ -10,7 +10,7 @@ START_NS = 1_764_000_000_000_000_000
 PERIOD_NS = 100_000_000
 
 
-def dive_messages(seconds=6.0, seed=3, sensors=True, period_ns=PERIOD_NS, **changes):
+def dive_messages(seconds=6.0, seed=3, sensors=True, period_ns=PERIOD_NS, imu=False, **changes):
     world = World(Scenario(environment="basin", seed=seed, start_ns=START_NS, interruptions=False, **changes))
     timed = []
     for node in ("a", "b"):
@@ -25,6 +25,10 @@ def dive_messages(seconds=6.0, seed=3, sensors=True, period_ns=PERIOD_NS, **chan
                 timed.append((stamp_ns, 1, world.attitude(node, stamp_ns)))
                 if i % 5 == 0:
                     timed.append((stamp_ns, 1, world.depth(node, stamp_ns)))
+        if imu:
+            for i in range(int(seconds * 100)):
+                stamp_ns = START_NS + i * 10_000_000
+                timed.append((stamp_ns, 1, world.imu(node, stamp_ns)))
     timed.sort(key=lambda item: item[:2])
     return [message for _, _, message in timed], world
 

@@ -1,0 +1,101 @@
+"""The track as messages: the same in any order of arrival, honest against truth, none where nothing is known."""
+
+import random
+
+import numpy as np
+import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Track
+from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.tracking import TrackSettings
+from msgspec.structs import replace
+
+from tests.solver_service.conftest import dive_messages
+
+
+def tracks_of(messages, *modes, rate_hz=20.0, receive=False):
+    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(modes), rate_hz))
+    results = []
+    for message in messages:
+        results += core.handle(message, message.stamp_ns + S_NS // 50 if receive else None)
+    results += core.flush()
+    return [one for one in results if isinstance(one, Track)], core
+
+
+@pytest.fixture(scope="module")
+def inertial_dive():
+    return dive_messages(seconds=12.0, imu=True)
+
+
+def errors_m(tracks, world):
+    return [np.linalg.norm(np.subtract(one.t_a_b_m, world.truth(one.stamp_ns, 0).t_a_b_m)) for one in tracks]
+
+
+def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(inertial_dive):
+    messages, _ = inertial_dive
+    expected, _ = tracks_of(messages, "filter")
+    rng = random.Random(1)
+    late_ns = {kind: rng.randrange(0, S_NS // 5) for kind in ("a", "b", Imu, Depth, Candidates)}
+    shuffled = sorted(messages, key=lambda m: m.stamp_ns + late_ns.get(type(m), 0) + late_ns[m.node])
+    # All calibrations first: without one there is no track yet.
+    shuffled.sort(key=lambda message: not isinstance(message, NodeInfo))
+    found, _ = tracks_of(shuffled, "filter", receive=True)
+    assert len(found) == len(expected) > 100
+    for one, other in zip(found, expected, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_each_mode_is_better_than_the_one_before_it_and_says_how_good_it_is(inertial_dive):
+    messages, world = inertial_dive
+    medians_m = []
+    for mode in ("filter", "lag", "smooth"):
+        tracks, _ = tracks_of(messages, mode)
+        assert {one.mode for one in tracks} == {mode}
+        off_m = np.array(errors_m(tracks, world))
+        sigma_m = np.sqrt([one.covariance[0] + one.covariance[7] + one.covariance[14] for one in tracks])
+        assert (off_m < 4.0 * sigma_m + 0.002).mean() > 0.98
+        medians_m.append(float(np.median(off_m)))
+    assert medians_m[2] < medians_m[0]
+    assert medians_m[1] < 1.1 * medians_m[0]
+
+
+def test_live_tracks_go_by_their_own_topics_on_a_grid_of_their_rate(inertial_dive):
+    tracks, _ = tracks_of(inertial_dive[0], "filter", "lag", rate_hz=25.0)
+    assert {key_of(one) for one in tracks} == {TRACK.key("a", "b"), TRACK_LAG.key("a", "b")}
+    for mode in ("filter", "lag"):
+        stamps_ns = [one.stamp_ns for one in tracks if one.mode == mode]
+        assert {stamp_ns % 40_000_000 for stamp_ns in stamps_ns} == {0}
+        assert stamps_ns == sorted(set(stamps_ns))
+
+
+def test_angles_to_north_need_an_attitude():
+    with_attitude, _ = dive_messages(seconds=4.0, imu=True)
+    without = [message for message in with_attitude if type(message).__name__ not in ("Attitude", "Depth")]
+    for messages, known in ((with_attitude, True), (without, False)):
+        tracks, _ = tracks_of(messages, "smooth")
+        assert tracks
+        assert all(isinstance(one.azimuth_rad, float) is known for one in tracks)
+
+
+def test_without_a_pose_there_is_no_track():
+    messages, _ = dive_messages(seconds=3.0, imu=True)
+    blind = [replace(m, blobs=[]) if isinstance(m, Candidates) else m for m in messages]
+    assert tracks_of(blind, "filter", "lag", "smooth")[0] == []
+
+
+def test_absurd_values_start_the_track_anew_and_are_named(inertial_dive):
+    messages, _ = inertial_dive
+    half = len(messages) // 2
+    broken = [
+        replace(m, depth_m=1e308) if isinstance(m, Depth) and half < i < half + 60 else m
+        for i, m in enumerate(messages)
+    ]
+    tracks, core = tracks_of(broken, "filter")
+    (pair,) = core.pairs.values()
+    assert all(np.isfinite(one.covariance).all() for one in tracks)
+    assert tracks[-1].stamp_ns > messages[-1].stamp_ns - 2 * S_NS
+    assert not pair.tracker.problems or "out of numeric range" in pair.tracker.problems[0]
