@@ -5,9 +5,8 @@ The pair's memory (motion prior, heading bias, clock alignment) lives here and n
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,8 +22,10 @@ from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.results import view_of
 
-# Triggers whose pictures are solved at once: beyond, arrays outgrow the processor's caches.
-_BATCH: Final = 128
+# Triggers that are solved at once, and their combinations of pairs of candidates: beyond, arrays outgrow the caches,
+# and in crowded pictures the memory.
+_MAX_TOGETHER: Final = 128
+_MAX_COMBINATIONS: Final = 250_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,22 @@ class Matched:
     sensed_b: Sensed
 
 
+def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
+    """Split triggers into runs of one calibration that are solved at once."""
+    batch: list[Matched] = []
+    total = 0
+    for one in matched:
+        combinations = (len(one.frame_a.blobs) * len(one.frame_b.blobs)) ** 2 // 4
+        total += combinations
+        full = len(batch) == _MAX_TOGETHER or total > _MAX_COMBINATIONS
+        if batch and (full or one.rig_a is not batch[0].rig_a or one.rig_b is not batch[0].rig_b):
+            yield batch
+            batch, total = [], combinations
+        batch.append(one)
+    if batch:
+        yield batch
+
+
 class PairSolver:
     """Solves the triggers of one pair; alignment: collects what the fixes tell about the clocks' offset."""
 
@@ -60,14 +77,9 @@ class PairSolver:
 
         The triggers come in increasing order, also from call to call. How they are split into calls changes nothing.
         """
-        results: list[Fix | NoFix] = []
-        for _, same in itertools.groupby(matched, key=lambda one: (one.rig_a, one.rig_b)):
-            alike = list(same)
-            for start in range(0, len(alike), _BATCH):
-                # Absurd values end as rejections, not as warnings.
-                with np.errstate(all="ignore"):
-                    results += self._solve_batch(alike[start : start + _BATCH])
-        return results
+        # Absurd values end as rejections, not as warnings.
+        with np.errstate(all="ignore"):
+            return [fix for batch in _batches(matched) for fix in self._solve_batch(batch)]
 
     def forget(self) -> None:
         """Forget what earlier fixes told: a clock was set, or the values make no sense."""

@@ -49,6 +49,7 @@ __all__ = [
     "View",
     "read_triggers",
     "solve_trigger",
+    "solve_triggers",
 ]
 
 # Poses nearer than this, relative to the range, and turned by less than 0.1 rad (their trace) are one pose.
@@ -88,6 +89,15 @@ def solve_trigger(
         prior = None
     with np.errstate(all="ignore"):
         return read_triggers([observed], rig_a, rig_b, settings).decide(0, prior, heading)
+
+
+def solve_triggers(
+    observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, settings: Settings
+) -> list[Fix | NoFix]:
+    """Solve triggers without a past, all at once."""
+    with np.errstate(all="ignore"):
+        readings = read_triggers(observations, rig_a, rig_b, settings)
+        return [readings.decide(k, None, None) for k in range(len(observations))]
 
 
 def read_triggers(observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, settings: Settings) -> TriggerReadings:

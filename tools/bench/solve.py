@@ -1,4 +1,4 @@
-"""How fast the solver is: milliseconds per trigger, nanoseconds per hypothesis, growth with the candidates.
+"""How fast the solver is: milliseconds per trigger, alone and of many, ns per hypothesis, growth with the candidates.
 
 A hypothesis is an assignment of two candidates in A's picture to B's left and right light, and of two in B's to A's.
 The column beside it counts combinations of pairs, whichever of a pair is left: a quarter as many. In the same run:
@@ -21,8 +21,8 @@ from typing import Any, Final
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.geometry.closed_form import eq1_range_m
-from buddyline.solver_service.geometry.trigger import Fix, Settings
-from buddyline.tools.bench.triggers import simulate
+from buddyline.solver_service.geometry.trigger import Fix, Settings, solve_triggers
+from buddyline.tools.bench.triggers import RIG, simulate
 from buddyline.tools.measure.tables import cells_of, text_table
 from buddyline.tools.measure.turns import fastest_s
 from numpy.typing import NDArray
@@ -73,6 +73,8 @@ def solved(count: int, repeats: int) -> dict[str, Any]:
         works = [partial(trigger.solve, SETTINGS, sensors=sensors) for trigger in triggers]
         row[f"{name}_ms"] = 1e3 * float(np.median([fastest_s(work, repeats) for work in works]))
         row[f"{name}_solved"] = sum(isinstance(work(), Fix) for work in works) / TRIGGERS
+    together = [trigger.observed(sensors=True) for trigger in triggers]
+    row["together_ms"] = 1e3 / TRIGGERS * fastest_s(lambda: solve_triggers(together, RIG, RIG, SETTINGS), repeats)
     row["ns_per_hypothesis"] = 1e6 * row["sensors_ms"] / row["hypotheses"]
     row["ns_per_combination"] = 4.0 * row["ns_per_hypothesis"]
     return row
@@ -85,6 +87,7 @@ def table(figures: dict[str, Any]) -> str:
         "hypotheses": "{hypotheses}",
         "ms alone (solved)": "{alone_ms:.3f} ({alone_solved:4.0%})",
         "ms with sensors (solved)": "{sensors_ms:.3f} ({sensors_solved:4.0%})",
+        "ms of many": "{together_ms:.3f}",
         "ns/hypothesis": "{ns_per_hypothesis:.1f}",
         "ns/combination": "{ns_per_combination:.1f}",
     }

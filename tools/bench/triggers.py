@@ -10,7 +10,7 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat
-from buddyline.solver_service.geometry.trigger import Fix, NoFix, Sensed, Settings, View, solve_trigger
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, Observation, Sensed, Settings, View, solve_triggers
 from buddyline.solver_service.results import rig_of
 from numpy.typing import NDArray
 
@@ -46,10 +46,13 @@ class Trigger:
     pair_a: tuple[int, int]
     pair_b: tuple[int, int]
 
+    def observed(self, *, sensors: bool) -> Observation:
+        """What is seen, with what is sensed or without."""
+        return Observation(*self.views, *(self.sensed if sensors else (Sensed(), Sensed())))
+
     def solve(self, settings: Settings, *, sensors: bool) -> Fix | NoFix:
-        """Solve it, with what is sensed or without."""
-        sensed = self.sensed if sensors else (Sensed(), Sensed())
-        return solve_trigger(*self.views, RIG, RIG, *sensed, settings)
+        """Solve it."""
+        return solve_triggers([self.observed(sensors=sensors)], RIG, RIG, settings)[0]
 
     def right(self, fix: Fix) -> bool:
         """Whether all four lights are the true ones."""
