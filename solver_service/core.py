@@ -90,14 +90,15 @@ class SolverCore:
 
         receive_ns: receive time; None when read from a log.
         """
-        return self.handle_many((message,), receive_ns)
+        return _settled(self._take(message, self._steady(receive_ns), receive_ns))
 
     def handle_many(self, messages: Iterable[Message], receive_ns: int | None = None) -> list[Message]:
         """Take several messages as if one by one; what they match is solved together."""
         now_ns = self._steady(receive_ns)
         touched: dict[PairId, PairCore] = {}
         for message in messages:
-            touched |= {pair.nodes: pair for pair in self._take(message, now_ns, receive_ns)}
+            for pair in self._take(message, now_ns, receive_ns):
+                touched[pair.nodes] = pair
         return _settled(touched.values())
 
     def advance(self, receive_ns: int) -> list[Message]:
