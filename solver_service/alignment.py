@@ -1,4 +1,4 @@
-"""The offset between two nodes' clocks, out of the dive itself.
+"""The offset between two nodes' clocks, estimated from the dive itself.
 
 A pair that moves is seen by A and by B at two instants if their clocks disagree: the range gap and the twist gap
 then follow the motion. Each fix gives two linear equations for the offset, by the motion of the fixes around it; a
@@ -28,11 +28,11 @@ HALF_WINDOW_S: Final = 1.0
 MIN_NEIGHBOURS: Final = 2
 # A diver sways within the window: a straight line through it is a tenth too slow, a cubic is not, and needs more fixes.
 MIN_FOR_CUBIC: Final = 8
-# Beyond this many standard deviations a gap says something else than the time.
+# A gap further off than this many standard deviations has another cause than the clocks, and counts less.
 HUBER: Final = 2.0
 ROUNDS: Final = 8
 MAX_EQUATIONS: Final = 20_000
-# Fixes are turned into equations so many at a time: arrays cost little more than one of them.
+# Fixes are turned into equations in batches of this size: a batch costs little more than one fix.
 BATCH: Final = 256
 
 
@@ -57,7 +57,7 @@ class _Sighting:
 
 
 class ClockAlignment:
-    """Collects the equations of a dive; bounded, the oldest are forgotten."""
+    """Collects the equations of a dive. Memory is bounded: the oldest equations are dropped."""
 
     def __init__(self) -> None:
         self._rows: deque[Floats] = deque()  # batches (4, N) of gap kind, slope, value, sd

@@ -12,9 +12,9 @@ from buddyline.protocol.messages import Message, Rejected, RelativePose
 Outcome = RelativePose | Rejected
 
 MAX_WITHHELD: Final = 8192
-# More than a prediction lives and a sensor is waited for.
+# Longer than a prediction lives and than a sensor is waited for.
 WARM_UP_NS: Final = 10 * S_NS
-# Two dives can have the same triggers where one is stored: of now, there is one.
+# Stored dives can have the same triggers; of live dives there is one at a time.
 LIVE_WITHIN_NS: Final = 600 * S_NS
 
 
@@ -36,7 +36,7 @@ class Answered:
         ]
 
     def is_over(self, pairs: Iterable[tuple[str, str]], stamp_ns: int, now_ns: int) -> bool:
-        """Whether a frame out of a cache need not be solved: of a dive that goes on now, and answered long before.
+        """Whether a frame from a cache need not be solved: the dive is live, and was answered well beyond it.
 
         pairs: of the frame's node.
         """
@@ -57,9 +57,9 @@ class Answered:
 class AnsweredPair:
     """Triggers up to one were answered; what the nodes' caches hold of them is solved again and not said again.
 
-    It is solved again as far as later poses are judged by earlier ones. A frame that is new cannot have been answered:
-    where its trigger was, it is of another dive, or a clock was set back, and what was withheld so far is due after
-    all.
+    The last seconds are solved again because later poses are judged by earlier ones. A new frame cannot have been
+    answered. Where its trigger was, the frame is of another dive, or a clock was set back: then what was withheld so
+    far is published after all.
     """
 
     def __init__(self, said: Iterable[Outcome] = ()) -> None:

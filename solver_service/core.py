@@ -37,7 +37,8 @@ class SolverCore:
     chosen: the pairs to solve; None: every two nodes that appear, A before B in the alphabet. clock_offsets_ns: a
     node's clock minus the common one, where it is known; its times are brought to the common clock. align: collect
     what the fixes tell about each pair's clocks. track: the tracks to make; None: none. unused: nodes that were heard
-    and are in no pair, and how often.
+    and are in no pair, and how often. What needs several pairs, such as a network of all nodes, belongs here, after the
+    pairs have settled.
     """
 
     def __init__(

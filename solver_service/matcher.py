@@ -25,7 +25,7 @@ SILENCE_WINDOW_NS: Final = 2 * S_NS
 LONGEST_WAIT_NS: Final = 3 * S_NS
 MAX_PENDING: Final = 512
 MAX_PENDING_BYTES: Final = 16 << 20
-MAX_RESOLVED_MEMORY: Final = 4096
+MAX_RESOLVED_MEMORY: Final = 2048
 
 TWO_FRAMES: Final = "two different frames claim this trigger: two nodes of one id?"
 
@@ -95,7 +95,7 @@ class PairMatcher:
     ) -> list[Matched | Unmatched]:
         """Take a frame that its node's stream has judged; return what is resolved by that alone.
 
-        After a CLOCK_SET, what was learned from earlier triggers is void: see `restart`.
+        On CLOCK_SET, call `restart` first.
         """
         if receive_ns is not None:
             self._now_ns = receive_ns
@@ -139,7 +139,7 @@ class PairMatcher:
     def restart(self, node: str) -> list[Matched | Unmatched]:
         """Begin a new time line of a node whose clock was set; return what waited with a frame of the old one.
 
-        The node's triggers may come again, as in a dive played twice; but not those that told of the new time.
+        The node's triggers may come again, as in a dive played twice, but not those whose frames showed the new time.
         """
         side = 0 if self.streams[0].node == node else 1
         results = [
@@ -153,7 +153,7 @@ class PairMatcher:
         return results
 
     def resolve(self, receive_ns: int | None, *, everything: bool = False) -> list[Matched | Unmatched]:
-        """Resolve, in the order of the triggers, all that waits for nothing more; everything: whatever it waits for."""
+        """Resolve in the order of the triggers what need not wait any longer; everything: also what should."""
         if receive_ns is not None:
             self._now_ns = receive_ns
         if not self._order:
@@ -174,7 +174,7 @@ class PairMatcher:
         return 0 if frame.node == self.streams[0].node else 1
 
     def _newest_overdue(self) -> int:
-        """Return the last trigger that has waited for too long; none before it waits any longer either."""
+        """Return the newest trigger that has waited too long; those before it do not wait any longer either."""
         overdue = -1
         while self._arrivals:
             first = self._arrivals[0]

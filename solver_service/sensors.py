@@ -1,4 +1,4 @@
-"""Attitude and depth of a node at the instant of a frame, from the samples around or before it."""
+"""A node's sensor samples by time; its attitude and depth at the instant of a frame."""
 
 from __future__ import annotations
 
