@@ -19,8 +19,10 @@ from buddyline.solver_service.track.state import CLOCK, PHI, R_, State
 
 _BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 # How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
-UNTOLD_CLOCK_S: Final = 0.3
+UNTOLD_CLOCK_S: Final = 0.1
 CLOCK_LEFT_S: Final = 0.003
+FAR_CLOCK_S: Final = 0.06
+CLOCK_ROUNDS: Final = 3
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
 BROAD_R_M: Final = 0.5
 BROAD_TURN_RAD: Final = 0.15
@@ -76,12 +78,17 @@ def smooth(
     records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
 ) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    first = filter_of(records, fixes, clock_ns, UNTOLD_CLOCK_S)
     end_ns = last_ns(records)
-    first.advance(end_ns)
-    parts = parts_of(first)
-    if not parts:
-        return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
+    for _ in range(CLOCK_ROUNDS):
+        first = filter_of(records, fixes, clock_ns, UNTOLD_CLOCK_S)
+        first.advance(end_ns)
+        parts = parts_of(first)
+        if not parts:
+            return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
+        if abs(parts[-1].state.clock_s) < FAR_CLOCK_S:
+            break
+        # So far off, the pass was not linear: once more, from there.
+        clock_ns += round(parts[-1].state.clock_s * 1e9)
     # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
     learned = parts[-1]
     shift_s = learned.state.clock_s

@@ -16,6 +16,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals, sight_of
 from buddyline.solver_service.track.output import TrackRow, at_one_time, pose_of, row_of
 from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
@@ -31,7 +32,21 @@ ATTITUDE_EVERY_S: Final = 0.5
 # Log odds by which a track must explain its pictures better than clutter, or a challenger better than the track.
 CONFIRMED: Final = 25.0
 REPLACED: Final = 20.0
+MUTUAL: Final = 7.0
+BARS: Final = 4
 CHALLENGE_S: Final = 4.0
+GIVEN_UP: Final = -15.0
+# A confirmed track is given up when no light has told of it for so long and its place is this share of the range off.
+LOST_S: Final = 3.0
+LOST_SHARE: Final = 0.3
+LOST_RANGE_M: Final = 10.0
+# A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
+SEARCH_EVERY_S: Final = 0.45
+SEARCH_AFTER_S: Final = 3.0
+SEARCH_PATIENCE_S: Final = 8.0
+MAX_TENTATIVE: Final = 12
+# The noise of the lights that a start is made of: one in thirty is off by many pixels.
+START_PX: Final = 2.5
 # What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a start is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
@@ -93,6 +108,8 @@ class Guide:
 class Estimate:
     """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
 
+    evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
+
     detection (2, 2): by observer and light, how likely the light is found where it is in the picture.
     """
 
@@ -101,6 +118,7 @@ class Estimate:
     covariance: Floats
     start_s: float
     evidence: float = 0.0
+    evidence_by: list[float] = field(default_factory=lambda: [0.0, 0.0])
     baseline: float = 0.0
     detection: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
     rates_radps: Floats = field(default_factory=lambda: np.zeros((2, 3)))
@@ -114,6 +132,11 @@ class Estimate:
     told: int = 0
     end_s: float = np.inf
     skip_s: float = 0.02
+    patience_s: float = CHALLENGE_S
+    unseen_by: int | None = None
+    searched: bool = False
+    bars: int = 0
+    told_by: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
 
 
@@ -135,6 +158,8 @@ class TrackFilter:
         self.clock_ns = 0
         self.finished: list[Estimate] = []
         self._count = 0
+        self._searched_s = -np.inf
+        self._fix_s = -np.inf
         self._waiting: list[Estimate] = []
         self.restarts = True
         self.unrest = 1.0
@@ -341,12 +366,17 @@ class TrackFilter:
         else:
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
         estimate.evidence += found.evidence
+        estimate.evidence_by[observer] += found.evidence
         for light in (0, 1):
             if inside[light]:
                 old = estimate.detection[observer, light]
                 estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
         if found.chosen:
             self._update_lights(estimate, found, y, H, sight)
+            if estimate.unseen_by == observer:
+                estimate.unseen_by = None
+            estimate.bars += len(found.chosen) == 2
+            estimate.told_by[observer] += 1
         return Look(sight, found.chosen)
 
     def _expected(self, estimate: Estimate, observer: int) -> Floats:
@@ -460,12 +490,16 @@ class TrackFilter:
             self.main = self._waiting.pop(0)
         for estimate in self._estimates():
             if t_s >= estimate.t_s and t_s > estimate.start_s + estimate.skip_s and t_s < estimate.end_s:
+                if estimate.unseen_by == sight.node and not estimate.confirmed:
+                    self._fork(estimate, t_s, sight)
                 self._step(estimate, t_s, sight)
         self._judge(t_s)
+        self._search(t_s, sight)
 
     def _take_fix(self, t_s: float, fix: FixSeen) -> None:
         if not self.restarts:
             return
+        self._fix_s = t_s
         agreed = False
         for estimate in self._estimates():
             if self._agrees(estimate, t_s, fix):
@@ -532,25 +566,124 @@ class TrackFilter:
         self._waiting.append(estimate)
 
     def _judge(self, t_s: float) -> None:
+        """Confirm, replace or give up, by how well each estimate has explained the pictures."""
         main = self.main
-        if main is None:
-            return
-        if main.evidence > CONFIRMED:
-            main.confirmed = True
-        for challenger in self.challengers:
-            gained = main.evidence - challenger.baseline
-            if challenger.evidence > max(gained, 0.0) + REPLACED:
-                if main.confirmed:
+        if main is not None and main.confirmed and t_s - main.light_s > LOST_S and self.restarts:
+            range_m = float(np.linalg.norm(main.state.r_m))
+            sigma_m = math.sqrt(float(np.trace(main.covariance[:3, :3])))
+            if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
+                # Nothing is told of it any more: another start is as good.
+                main.end_s = main.light_s + 1.0
+                main.steps = [step for step in main.steps if step.t_s < main.end_s]
+                self.finished.append(main)
+                self.main = main = None
+        if main is not None and main.confirmed:
+            for challenger in self.challengers:
+                gained = main.evidence - challenger.baseline
+                if challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL:
                     main.end_s = challenger.start_s
                     main.steps = [step for step in main.steps if step.t_s < main.end_s]
                     self.finished.append(main)
-                self.main = challenger
-                self.challengers = []
-                challenger.confirmed = challenger.evidence > CONFIRMED
-                return
-        self.challengers = [c for c in self.challengers if t_s - c.start_s < CHALLENGE_S and c.evidence > -15.0]
-        if self.restarts and not main.confirmed and (main.evidence < -15.0 or t_s - main.start_s > CHALLENGE_S):
-            self.main = self.challengers.pop() if self.challengers else None
+                    self.main = challenger
+                    self.challengers = []
+                    challenger.confirmed = True
+                    return
+            self.challengers = [c for c in self.challengers if t_s - c.start_s < CHALLENGE_S and c.evidence > GIVEN_UP]
+            return
+        if not self.restarts:
+            return
+        pool = sorted(self._estimates(), key=lambda estimate: -estimate.evidence)
+        alive: list[Estimate] = []
+        for estimate in pool:
+            over = t_s - estimate.start_s > estimate.patience_s and (alive or estimate.evidence < CONFIRMED)
+            if estimate.evidence < GIVEN_UP or over:
+                continue
+            if not any(_alike(estimate, better) for better in alive):
+                alive.append(estimate)
+        alive = alive[:MAX_TENTATIVE]
+        self.main, self.challengers = (alive[0], alive[1:]) if alive else (None, [])
+        rival = max((c.evidence for c in self.challengers), default=0.0)
+        # Both must see each other: who sees a third's bar alone is in front of nobody.
+        best = self.main
+        if best and best.evidence > max(rival, 0.0) + CONFIRMED and min(best.evidence_by) > MUTUAL:
+            # A start without a fix may be of chance lights; whole bars, and lights in both pictures, are no chance.
+            best.confirmed = not best.searched or (best.bars >= BARS and min(best.told_by) >= BARS)
+
+    def _search(self, t_s: float, sight: Sight) -> None:
+        """Start from this picture alone, where nothing is confirmed."""
+        if not self.restarts or (self.main and self.main.confirmed) or t_s - self._searched_s < SEARCH_EVERY_S:
+            return
+        if self._fix_s == -np.inf:
+            self._fix_s = t_s - SEARCH_AFTER_S + 0.5
+        if t_s - self._fix_s < SEARCH_AFTER_S:
+            return
+        of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes)
+        if of_a is None or of_b is None or max(t_s - of_a[0], t_s - of_b[0]) > 0.2:
+            return
+        self._searched_s = t_s
+        for state, P, lights in starts(self.nodes, sight, (of_a[1], of_b[1]), self.clock_sigma_s):
+            estimate = Estimate(t_s, state, P, t_s, skip_s=0.006, patience_s=SEARCH_PATIENCE_S)
+            estimate.unseen_by = 1 - sight.node
+            estimate.searched = True
+            estimate.attitude_s = [t_s, t_s]
+            estimate.rates_radps = np.zeros((2, 3))
+            self._force(estimate, sight, lights)
+            self._open(estimate)
+            self.challengers.append(estimate)
+
+    def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
+        """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""
+        if len(self.challengers) > 3 * MAX_TENTATIVE:
+            return
+        base = replace(
+            estimate,
+            detection=estimate.detection.copy(),
+            trigger=list(estimate.trigger),
+            attitude_s=list(estimate.attitude_s),
+            without=list(estimate.without),
+            evidence_by=list(estimate.evidence_by),
+            told_by=list(estimate.told_by),
+            steps=list(estimate.steps),
+            unseen_by=None,
+        )
+        self._step(base, t_s, None)
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        offset_s = sight.dt_s + (t_s - base.t_s)
+        X, D = light_positions(base.state, sight.node, lights_m, base.rates_radps, offset_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        log_clutter = math.log(max(len(y) - 1.0, 1.0) / self.nodes[sight.node].rig.camera.area_px2)
+        for k in range(len(y)):
+            for light in (0, 1):
+                if not np.isfinite(y[k, light]).all():
+                    continue
+                S = H[k, light] @ base.covariance[_BLOCK] @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
+                chi2 = float(y[k, light] @ np.linalg.solve(S, y[k, light]))
+                if chi2 > 12.0:
+                    continue
+                child = replace(
+                    base,
+                    detection=base.detection.copy(),
+                    trigger=list(base.trigger),
+                    attitude_s=list(base.attitude_s),
+                    without=list(base.without),
+                    steps=list(base.steps),
+                )
+                gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
+                child.evidence += gain + math.log(0.2)
+                child.evidence_by = list(base.evidence_by)
+                child.told_by = list(base.told_by)
+                chosen = ((k, light, START_PX**2),)
+                self._update_lights(child, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+                if child.steps:
+                    child.steps[-1] = replace(child.steps[-1], after=child.state, covariance=child.covariance)
+                self.challengers.append(child)
+
+    def _force(self, estimate: Estimate, sight: Sight, lights: tuple[int, int]) -> None:
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, sight.dt_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        chosen = tuple((k, light, START_PX**2) for light, k in enumerate(lights))
+        self._update_lights(estimate, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
 
     # -- what goes out
 
@@ -573,6 +706,18 @@ class TrackFilter:
         return row_of(
             stamp_ns, state, P, main.rates_radps, len({(n, i) for _, n, i in main.trigger}), t_s - main.light_s
         )
+
+
+def _alike(one: Estimate, other: Estimate) -> bool:
+    """Whether two estimates are of one pose: a twentieth of the range and 0.06 rad."""
+    if one.unseen_by != other.unseen_by:
+        return False
+    range_m = float(np.linalg.norm(other.state.r_m))
+    first, second = (e.state.R[0].T @ e.state.r_m for e in (one, other))
+    if np.linalg.norm(first - second) > 0.05 * range_m:
+        return False
+    turned, meant = (e.state.R[0].T @ e.state.R[1] for e in (one, other))
+    return float(np.linalg.norm(rotation_log(turned @ meant.T))) < 0.06
 
 
 def _time_of(item: tuple[float, object]) -> float:

@@ -129,6 +129,10 @@ def make(seed: int, setting: Setting) -> Dive:
     ]
     stamps = [EPOCH_NS + round(t * 1e9) for t in np.arange(0.2, setting.seconds - 0.2, 0.05)]
     times = np.array([(stamp - EPOCH_NS) * 1e-9 for stamp in stamps])
+    # Fixes and truth are stamped between both clocks.
+    between_ns = round(0.5e9 * setting.clock_s)
+    fixes = [replace(fix, stamp_ns=fix.stamp_ns + between_ns) for fix in fixes]
+    stamps = [stamp + between_ns for stamp in stamps]
     R_a, R_b = motion.attitudes(0, times), motion.attitudes(1, times)
     apart = motion.places(1, times) - motion.places(0, times)
     toward = np.swapaxes(R_a, 1, 2)

@@ -50,10 +50,11 @@ def test_filter_covers_the_dive(dive: Dive) -> None:
     assert 0.4 < judged.nees < 2.0
 
 
-def test_no_row_before_the_first_fix(dive: Dive) -> None:
-    rows = filter_of(dive.records, dive.fixes[5:]).advance(last_ns(dive.records), dive.stamps_ns)
+def test_without_attitudes_a_track_starts_with_the_first_fix(dive: Dive) -> None:
+    a, b = (replace(record, attitudes=()) for record in dive.records)
+    rows = filter_of((a, b), dive.fixes[5:]).advance(last_ns(dive.records), dive.stamps_ns)
     assert rows[0].stamp_ns >= dive.fixes[5].stamp_ns
-    assert not filter_of(dive.records, []).advance(last_ns(dive.records), dive.stamps_ns)
+    assert not filter_of((a, b), []).advance(last_ns(dive.records), dive.stamps_ns)
 
 
 def fed(dive: Dive, order: random.Random | None, chunk_ns: int, window_ns: int = 400_000_000) -> list[TrackRow]:
@@ -194,3 +195,29 @@ def test_many_dives(poor: bool) -> None:
     assert wrong == 0
     assert ((np.mean(nees, axis=0) > 0.75) & (np.mean(nees, axis=0) < 1.3)).all()
     assert (np.median(ratios, axis=0) < (0.35, 0.28)).all()
+
+
+def test_a_dead_lamp_and_no_fix_at_all() -> None:
+    dive = make(6, replace(SHORT, seconds=16.0, dead=((1, 0),)))
+    whole = make(6, replace(SHORT, seconds=16.0))
+    result = smooth(dive.records, [], dive.stamps_ns)
+    judged = score(replace(dive, fixes=whole.fixes), result.rows)
+    assert judged.covered >= 0.8
+    assert judged.wrong == 0
+
+
+def test_nodes_that_do_not_face_each_other_get_no_track(dive: Dive) -> None:
+    """Both look at a third's bar: the lights fit, the headings do not."""
+    about = np.diag((-1.0, 1.0, -1.0))
+    facing = [FixSeen(fix.stamp_ns, fix.t_a_b_m, fix.R_a_b @ about, fix.covariance) for fix in dive.fixes]
+    assert not filter_of(dive.records, facing[:3]).advance(facing[3].stamp_ns + 1_000_000_000, dive.stamps_ns)
+
+
+def test_clock_and_depth_offset_nobody_told_of() -> None:
+    dive = make(2, replace(SHORT, seconds=20.0, clock_s=0.3, depth_offset_m=0.5))
+    result = smooth(dive.records, dive.fixes, dive.stamps_ns)
+    judged = score(dive, result.rows)
+    assert abs(result.clock_offset_s - 0.3) < 4.0 * result.clock_sigma_s < 0.05
+    assert judged.wrong == 0
+    assert judged.covered >= 0.98
+    assert judged.nees < 2.0
