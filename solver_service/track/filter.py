@@ -21,6 +21,7 @@ from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
 from buddyline.solver_service.track.turning import Turning
+from buddyline.solver_service.track.units import clipped, fault_of
 
 # How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
 HOLD_S: Final = 0.05
@@ -52,6 +53,9 @@ IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
 CONTRADICTS: Final = 33.0
 MAX_DELAY_S: Final = 0.03
+CHECK_EVERY_S: Final = 2.0
+REJECTED_TO_SAY: Final = 10
+REFUSED_TO_SAY: Final = 10
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
 WITHOUT_RAD: Final = 0.03
@@ -159,6 +163,8 @@ class TrackFilter:
         self.finished: list[Estimate] = []
         self._count = 0
         self._searched_s = -np.inf
+        self._checked_s = -np.inf
+        self._refused = 0
         self._fix_s = -np.inf
         self._waiting: list[Estimate] = []
         self.restarts = True
@@ -195,6 +201,7 @@ class TrackFilter:
         R_body_camera = self.nodes[node].rig.R_body_camera
         with np.errstate(invalid="ignore", over="ignore"):
             values = np.hstack((accel_mps2 @ R_body_camera, gyro_radps @ R_body_camera))
+            values[clipped(gyro_radps), 3:] = np.nan
         self.samples[node].add(times_s, values)
 
     def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
@@ -483,7 +490,33 @@ class TrackFilter:
 
     # -- start, confirmation, restart
 
+    def _check_units(self, t_s: float) -> None:
+        """Every seconds, say what is wrong with a unit; it is not used until it is well again."""
+        if t_s - self._checked_s < CHECK_EVERY_S:
+            return
+        # At the dive's start there is little to judge by: at every picture, until there is enough.
+        if min(len(samples.last(t_s, CHECK_EVERY_S)) for samples in self.samples) > 100:
+            self._checked_s = t_s
+        for node, samples in enumerate(self.samples):
+            seen = newest_before(self._attitudes[node], t_s)
+            down = None
+            if seen is not None and t_s - seen[0] < 0.5:
+                down = self.level_camera(node, seen[1])[2]
+            fault = fault_of("ab"[node], samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
+            samples.trusted = fault is None
+            if fault is not None:
+                self._report(fault)
+            if samples.rejected > REJECTED_TO_SAY:
+                self._report(f"node {'ab'[node]}: inertial samples not finite, clipped or sent twice are left out")
+
+    def _report(self, problem: str) -> None:
+        """Add a problem, each kind once."""
+        kind = problem.split(":")[0:1] + problem.split(":")[-1:]
+        if all(known.split(":")[0:1] + known.split(":")[-1:] != kind for known in self.problems):
+            self.problems.append(problem)
+
     def _take_sight(self, t_s: float, sight: Sight) -> None:
+        self._check_units(t_s)
         if self._waiting and t_s >= self._waiting[0].t_s:
             if self.main is not None:
                 self.finished.append(self.main)
@@ -533,6 +566,11 @@ class TrackFilter:
             return None
         state, covariance = made
         if attitudes[1] is not None and not self._faces(state, covariance, attitudes[1][1]):
+            self._refused += 1
+            if self._refused == REFUSED_TO_SAY:
+                self._report(
+                    "nodes a and b: attitudes and fixes contradict each other: another's lights, or a wrong mount"
+                )
             return None
         estimate = Estimate(t_s, state, covariance, t_s)
         if attitudes[0] is not None:

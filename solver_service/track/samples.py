@@ -20,7 +20,7 @@ ACCEL_FLOOR: Final = 4e-3
 class Samples:
     """Inertial samples in camera axes, by stamp in s since an epoch.
 
-    `rejected` counts samples that were not finite, or came twice.
+    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used.
     """
 
     def __init__(self) -> None:
@@ -30,6 +30,7 @@ class Samples:
         self._noise_s = -np.inf
         self._noise = Noise(GYRO_FLOOR, ACCEL_FLOOR)
         self.rejected = 0
+        self.trusted = True
 
     def __len__(self) -> int:
         return self._count
@@ -83,10 +84,10 @@ class Samples:
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
         t, values = self._t[:last], self._values[:last]
         first, stop = int(np.searchsorted(t, start_s, side="right")), int(np.searchsorted(t, end_s, side="left"))
-        grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
-        if last == 0:
-            return grid, np.zeros((2, 6)), np.zeros(1, dtype=bool)
         ends = np.array((start_s, end_s))
+        if last == 0 or not self.trusted:
+            return ends, np.zeros((2, 6)), np.zeros(1, dtype=bool)
+        grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
         right = np.clip(np.searchsorted(t, ends), 1, max(last - 1, 1))
         if last == 1:
             edge = np.stack((values[0], values[0]))
@@ -105,7 +106,12 @@ class Samples:
     def near(self, time_s: float, known_s: float) -> bool:
         """Whether there is a sample within a second before time_s, nothing later than known_s looked at."""
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
-        return last > 0 and self._t[last - 1] > time_s - 1.0
+        return self.trusted and last > 0 and bool(self._t[last - 1] > time_s - 1.0)
+
+    def last(self, time_s: float, span_s: float) -> Floats:
+        """Give the values (N, 6) of the last span_s up to time_s."""
+        first, stop = np.searchsorted(self.times_s, (time_s - span_s, time_s))
+        return self._values[first:stop]
 
     def noise(self, time_s: float) -> Noise:
         """Give the samples' noise as densities, from their third differences over the last seconds.

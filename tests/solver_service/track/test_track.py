@@ -221,3 +221,23 @@ def test_clock_and_depth_offset_nobody_told_of() -> None:
     assert judged.wrong == 0
     assert judged.covered >= 0.98
     assert judged.nees < 2.0
+
+
+@pytest.mark.parametrize("fault", ["g", "mount", "clipped"])
+def test_a_faulty_unit_is_named_and_left_out(dive: Dive, fault: str) -> None:
+    a, b = dive.records
+    about = np.array(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)))
+    if fault == "g":
+        b = replace(b, accel_mps2=b.accel_mps2 / 9.80665)
+    elif fault == "mount":
+        b = replace(b, accel_mps2=b.accel_mps2 @ about, gyro_radps=b.gyro_radps @ about)
+    else:
+        gyro = b.gyro_radps.copy()
+        gyro[400:420, 1] = np.radians(250.0)
+        b = replace(b, gyro_radps=gyro)
+    result = smooth((a, b), dive.fixes, dive.stamps_ns)
+    said = {"g": "g in place of m/s^2", "mount": "mounted otherwise", "clipped": "clipped"}[fault]
+    assert any(said in problem and "node b" in problem for problem in result.problems)
+    judged = score(dive, result.rows)
+    assert judged.wrong == 0
+    assert judged.covered >= 0.95

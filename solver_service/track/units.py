@@ -1,0 +1,49 @@
+"""Whether an inertial unit says what its node says of it: units, axes, saturation."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.strapdown import Bools
+
+# Full scales of common gyroscopes: 125, 245, 250, 500, 1000 and 2000 deg/s. A value this near to one is clipped.
+FULL_SCALES_RADPS: Final = np.radians((125.0, 245.0, 250.0, 500.0, 1000.0, 2000.0))
+CLIPPED_SHARE: Final = 0.003
+# A diver's accelerometer shows gravity within this over seconds.
+LIGHTEST_MPS2: Final = 7.0
+HEAVIEST_MPS2: Final = 13.0
+# Beyond this angle between its gravity and the attitude's the unit stands otherwise than stated.
+MISMOUNTED_RAD: Final = math.radians(30.0)
+
+
+def clipped(rate_radps: Floats) -> Bools:
+    """Which samples (N, 3) have an axis at the end of a gyroscope's scale (N,)."""
+    size = np.abs(rate_radps)[..., None]
+    at_end: Bools = (np.abs(size - FULL_SCALES_RADPS) < CLIPPED_SHARE * FULL_SCALES_RADPS).any(-1).any(-1)
+    return at_end
+
+
+def fault_of(node: str, force_mps2: Floats, down_camera: Floats | None) -> str | None:
+    """Say what is wrong with seconds of samples (N, 3), camera axes; None where nothing is, or too little is there.
+
+    down_camera (3,): where the node's attitude says down is.
+    """
+    if len(force_mps2) < 8:
+        return None
+    mean = force_mps2.mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    if LIGHTEST_MPS2 / 9.80665 < size < HEAVIEST_MPS2 / 9.80665:
+        return f"node {node}: the accelerometer shows {size:.2f} m/s^2 over seconds: g in place of m/s^2; not used"
+    if not LIGHTEST_MPS2 < size < HEAVIEST_MPS2:
+        return f"node {node}: the accelerometer shows {size:.2f} m/s^2 over seconds, not gravity; not used"
+    if down_camera is not None:
+        angle = math.acos(max(-1.0, min(1.0, float(-mean @ down_camera) / size)))
+        if angle > MISMOUNTED_RAD:
+            return (
+                f"node {node}: the accelerometer's gravity is {math.degrees(angle):.0f} deg off the attitude's: "
+                "the unit is mounted otherwise than stated; not used"
+            )
+    return None
