@@ -1,8 +1,8 @@
-"""Attitude to NED out of inertial samples: a start at rest, VQF for the tilt, a gated compass for the heading.
+"""Attitude in NED from inertial samples: VQF gives tilt and gyroscope bias, a gated compass gives the heading.
 
 Laidig and Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation and magnetic disturbance
-rejection", Information Fusion 91 (2023). Its own disturbance rejection goes by the field's strength and dip
-alone; the heading is therefore ours (node.heading).
+rejection", Information Fusion 91 (2023). VQF's own disturbance rejection uses only the field's strength and dip.
+The heading therefore comes from node.heading.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
 
 SAMPLE_S: Final = 0.01
-# Swell averages out over more than its period, where the bias is known well enough to wait for it.
+# Longer than a swell's period, so that swell averages out. Only a well known bias allows the longer one.
 RESTED_TILT_TAU_S: Final = 6.0
 MOVING_TILT_TAU_S: Final = 3.0
 
@@ -32,11 +32,15 @@ GIVE_UP_REST_S: Final = 20.0
 REST_BIAS_SIGMA_DPS: Final = 0.03
 MOVING_BIAS_SIGMA_DPS: Final = 1.0
 MAX_BIAS_DPS: Final = 5.0
+# VQF caps the bias's sigma at its initial value. A cap at the rest's value would freeze the bias.
+MAX_BIAS_SIGMA_DPS: Final = 0.5
+# Time in which the bias moves by 0.1 deg/s: 0.05 deg/s per K, 25 K from deck to water, time constant 120 s.
+BIAS_FORGETTING_S: Final = 10.0
 GAP_S: Final = 0.2
 LONG_GAP_S: Final = 5.0
 GAP_TURN_RADPS: Final = math.radians(10.0)
 
-# An accelerometer's offset of 20 mg tilts the horizon by this much, and so does its mount.
+# The tilt that an accelerometer offset of 20 mg causes; the mount adds as much.
 TILT_SIGMA_RAD: Final = math.radians(1.4)
 SWELL_SIGMA_RAD: Final = math.radians(0.5)
 RESTED_TILT_SIGMA_RAD: Final = math.radians(1.0)
@@ -47,7 +51,10 @@ R_NED_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 @dataclass(frozen=True, slots=True)
 class AttitudeEstimate:
-    """Body to NED, true north. sigma_rad: roll, pitch, yaw. problem: why the heading is not trusted, or ""."""
+    """Rotation from body to NED, true north. sigma_rad: of roll, pitch, yaw.
+
+    problem: why the heading is not trusted, "" where it is.
+    """
 
     stamp_ns: int
     q_ned_body_xyzw: tuple[float, float, float, float]
@@ -56,10 +63,10 @@ class AttitudeEstimate:
 
 
 class AttitudeEstimator(Protocol):
-    """Turns samples into attitudes, in order of time."""
+    """Estimates attitudes from samples given in order of time."""
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
-        """Take a sample; None while it starts up, at rest if it can be."""
+        """Take a sample; return None during the start."""
         ...
 
 
@@ -88,7 +95,7 @@ def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[f
 
 
 class _RestWatch:
-    """Watches for a time at rest, which tells the gyroscope's bias."""
+    """Detects a rest at the start and measures the gyroscope's bias in it."""
 
     def __init__(self) -> None:
         self._window: deque[ImuSample] = deque()
@@ -96,7 +103,7 @@ class _RestWatch:
         self._count = 0
 
     def update(self, sample: ImuSample) -> tuple[Vector, float] | None:
-        """Return the bias in rad/s, (3,), and its sigma in deg/s, once they are known or waiting is no use."""
+        """Return the bias in rad/s, (3,), and its sigma in deg/s; None while still waiting for a rest."""
         self._window.append(sample)
         self._count += 1
         if self._began_ns is None:
@@ -104,7 +111,7 @@ class _RestWatch:
         while sample.stamp_ns - self._window[0].stamp_ns > REST_S * S_NS:
             self._window.popleft()
         waited_s = (sample.stamp_ns - self._began_ns) / S_NS
-        # Ten times a second is often enough to look at three seconds.
+        # Every tenth sample is enough for a window of three seconds.
         if waited_s < REST_S or self._count % 10:
             return None
         gyro = np.array([s.gyro_radps for s in self._window])
@@ -117,11 +124,11 @@ class _RestWatch:
 
 
 class VqfAttitude:
-    """Tilt and gyroscope bias by VQF, heading by the gated compass.
+    """Estimates tilt and gyroscope bias with VQF, and heading with the gated compass.
 
-    calibration: of the magnetometer. field: of the place, with its declination; None: headings are magnetic and
-    the field's strength is learned. declination_rad: used where no field is given. A gap in the samples widens
-    the standard deviations; a long one starts the tilt anew, with the bias that was known.
+    calibration: of the magnetometer. field: the Earth's field at the dive site, with its declination; None: the
+    field's strength and dip are learned. declination_rad: used without a field. A gap in the samples increases
+    sigma_rad; a gap longer than LONG_GAP_S restarts the tilt with the bias known so far.
     """
 
     def __init__(
@@ -147,12 +154,15 @@ class VqfAttitude:
         self._yaw_rad = 0.0
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
-        """Take a sample; None while it starts up."""
+        """Take a sample; return None during the start."""
         if self._rest is not None:
             found = self._rest.update(sample)
             if found is None:
                 return None
             self._rest = None
+            rested = found[1] <= REST_BIAS_SIGMA_DPS
+            self._tilt_tau_s = RESTED_TILT_TAU_S if rested else MOVING_TILT_TAU_S
+            self._transient_rad = RESTED_TILT_SIGMA_RAD if rested else MOVING_TILT_SIGMA_RAD
             self._begin(sample, *found)
         dt_s = (sample.stamp_ns - self._last_ns) / S_NS
         if dt_s == 0:
@@ -164,21 +174,20 @@ class VqfAttitude:
         return self._advance(sample, dt_s)
 
     def _begin(self, sample: ImuSample, bias_radps: Vector, bias_sigma_dps: float) -> None:
-        rested = bias_sigma_dps <= REST_BIAS_SIGMA_DPS
         self._bias_radps = bias_radps
-        self._tilt_tau_s = RESTED_TILT_TAU_S if rested else MOVING_TILT_TAU_S
-        self._transient_rad = RESTED_TILT_SIGMA_RAD if rested else MOVING_TILT_SIGMA_RAD
         self._vqf = self._new_filter(
             SAMPLE_S,
             tauAcc=self._tilt_tau_s,
-            biasSigmaInit=bias_sigma_dps,
+            biasSigmaInit=MAX_BIAS_SIGMA_DPS,
+            biasForgettingTime=BIAS_FORGETTING_S,
             biasClip=MAX_BIAS_DPS,
             magDistRejectionEnabled=False,
         )
+        self._vqf.setBiasEstimate(np.zeros(3), math.radians(bias_sigma_dps))
         self._last_ns = sample.stamp_ns - round(SAMPLE_S * S_NS)
 
     def _bridge(self, sample: ImuSample, gap_s: float) -> None:
-        """Go on over samples that are missing, or a clock that was set: the turn meanwhile is not known."""
+        """Continue after missing samples or a clock step; the rotation in between is unknown."""
         turned_rad = gap_s * GAP_TURN_RADPS
         if gap_s < LONG_GAP_S:
             self._transient_rad = math.hypot(self._transient_rad, turned_rad)
@@ -190,7 +199,7 @@ class VqfAttitude:
 
     def _advance(self, sample: ImuSample, dt_s: float) -> AttitudeEstimate | None:
         vqf = self._vqf
-        # VQF counts in samples; the turn between two of them is what matters.
+        # VQF assumes a fixed sample time; scaling the rate keeps the rotation between two samples right.
         vqf.update((sample.gyro_radps - self._bias_radps) * (dt_s / SAMPLE_S), np.asarray(sample.accel_mps2))
         q_level_body = vqf.getQuat6D()
         R_level_body = quaternion_to_matrix(q_level_body)

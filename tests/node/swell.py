@@ -13,6 +13,7 @@ START_NS = 1_764_000_000_000_000_000
 FIELD_T = 48e-6
 DIP_RAD = np.radians(62.0)
 GRAVITY_MPS2 = 9.81
+COOLING_TAU_S = 120.0  # of a closed housing in water; 0.04 to 0.05 deg/s per K, 5 to 25 K
 
 Array = NDArray[np.float64]
 
@@ -62,10 +63,12 @@ def simulate(
     gyro_bias_radps: float = np.radians(0.8),
     accel_bias_mps2: float = 0.0,
     calibrated: bool = True,
+    cooling_radps: Array | None = None,
 ) -> Dive:
     """A node that lies still for rest_s, then sways.
 
     disturbances: (begin s, end s, T) of a foreign field that comes and goes smoothly, fixed in the body's frame.
+    cooling_radps: (3,), by how much the gyroscope's bias moves as the housing cools from the deck to the water.
     """
     rng = np.random.default_rng(seed)
     n = int(seconds * RATE_HZ)
@@ -90,6 +93,8 @@ def simulate(
     gyro = np.vstack([turned[:1], turned]) + rng.normal(0, gyro_bias_radps, 3)
     gyro += np.cumsum(rng.normal(0, np.radians(0.002), (n, 3)) / np.sqrt(RATE_HZ), axis=0)
     gyro += rng.normal(0, np.radians(0.06), (n, 3))
+    if cooling_radps is not None:
+        gyro += (1 - np.exp(-np.clip(t - rest_s, 0.0, None) / COOLING_TAU_S))[:, None] * cooling_radps
     accel = np.einsum("nji,nj->ni", R, force_ned) + rng.normal(0, 0.015, (n, 3))
     accel += rng.normal(0, 1.0, 3) * accel_bias_mps2
     mag = np.einsum("nji,j->ni", R, field_ned_t()) + rng.normal(0, 0.4e-6, (n, 3))

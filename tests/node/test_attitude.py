@@ -169,6 +169,20 @@ def test_a_gyroscope_bias_of_five_degrees_a_second_is_taken_off():
     assert run.tilt_rms_deg() < 0.5
 
 
+@pytest.mark.parametrize("cooling_dps", [0.25, 1.25])
+def test_a_gyroscope_that_cools_after_a_rested_start_is_followed(cooling_dps):
+    """0.05 deg/s per K and 5 or 25 K, with a time constant of two minutes, on all three axes.
+
+    A bias frozen at its value at rest gives a heading that is 72 deg off at 1.25 deg/s, with a stated 4 deg.
+    """
+    cooling_radps = np.radians(cooling_dps) * np.array([1.0, -1.0, 1.0])
+    run = estimate(swell.simulate(150.0, cooling_radps=cooling_radps), VqfAttitude(SOUND, HERE))
+    assert run.tilt_rms_deg() < 1.0
+    assert run.heading_rms_deg(run.times_s > 10) < 3.0
+    assert (np.abs(run.errors_rad) < 1.5 * run.sigmas_rad).all()
+    assert not any(run.problems)
+
+
 def test_without_rest_it_starts_late_and_says_how_bad_it_is():
     run = estimate(swell.simulate(30.0, rest_s=0.0), VqfAttitude(SOUND, HERE))
     assert 20 < run.times_s[0] < 21
