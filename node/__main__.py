@@ -12,8 +12,8 @@ from buddyline.protocol.service import start_logging
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--config", required=True, metavar="FILE.toml", help="this node's configuration")
-    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, tcp/host:7447, in place of the configured one")
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, as tcp/host:7447; replaces the configured one")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
 
 def run(args: argparse.Namespace) -> int:

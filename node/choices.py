@@ -1,4 +1,4 @@
-"""What can be chosen of a node: known without loading what it names."""
+"""The names that a node's configuration can choose from, without importing what they name."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""The Earth's field where one dives, and the rig's own field taken off what the magnetometer reads."""
+"""The Earth's magnetic field at the dive's place, and the calibration that removes the rig's own field."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class EarthField:
-    """declination_rad: of magnetic north, east of true north positive. dip_rad: below the horizon positive."""
+    """The Earth's magnetic field at one place and time.
+
+    declination_rad: from true north to magnetic north, east positive. dip_rad: below the horizontal, down positive.
+    norm_t: its strength.
+    """
 
     declination_rad: float
     dip_rad: float
@@ -27,8 +31,8 @@ class EarthField:
 def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> EarthField:
     """Return the World Magnetic Model's field at sea level.
 
-    Past its last model's five years the newest one is carried on: declination then errs by tenths of a degree
-    a year. Raises BuddylineError where pygeomag is missing or the position is none.
+    After the newest model's five years it is extrapolated: the declination then errs by tenths of a degree a year.
+    Raises BuddylineError where pygeomag is missing, or the position is out of range.
     """
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180):
         raise BuddylineError(f"position {latitude_deg:g}, {longitude_deg:g}: latitude and longitude in degrees")
@@ -52,7 +56,7 @@ def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> Ear
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MagnetometerCalibration:
-    """What the rig adds and distorts: field = matrix @ (reading - offset_t), body frame.
+    """What the rig adds to the field and distorts of it: field = matrix @ (reading - offset_t), body frame.
 
     offset_t: (3,), hard iron. matrix: (3, 3), soft iron, scale and misalignment.
     """
@@ -62,15 +66,15 @@ class MagnetometerCalibration:
 
     @classmethod
     def none(cls) -> MagnetometerCalibration:
-        """Return the one that changes nothing."""
+        """Return the calibration that changes nothing."""
         return cls(np.zeros(3), np.eye(3))
 
     @property
     def is_none(self) -> bool:
-        """Whether it changes nothing, so that nobody has calibrated."""
+        """Whether it changes nothing: the magnetometer is not calibrated."""
         return not self.offset_t.any() and np.array_equal(self.matrix, np.eye(3))
 
     def apply(self, mag_t: Vector) -> Vector:
-        """Return the Earth's field, (3,) or (n, 3), of a reading."""
+        """Return the Earth's field of readings, (3,) or (n, 3), tesla, body frame."""
         field_t: Vector = (mag_t - self.offset_t) @ self.matrix.T
         return field_t

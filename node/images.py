@@ -1,4 +1,4 @@
-"""Which frames go out as pictures: some of them recorded as they are, some published small."""
+"""Send a node's pictures: some frames are recorded at full size, some are published as small previews."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 
 class RateLimiter:
-    """Picks at most rate_hz of the frames, whatever the clock does meanwhile; none where that is 0."""
+    """Allows frames at rate_hz or less, also where the clock jumps; allows none where rate_hz is 0."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period_ns = round(0.99e9 / rate_hz) if rate_hz > 0 else 0
         self._next_ns = 0
 
     def allow(self, stamp_ns: int) -> bool:
-        """Return whether the frame of this stamp is to be taken."""
-        # A clock that is set back must not make pictures wait until it is there again.
+        """Return whether the frame with this stamp is allowed."""
+        # After the clock is set back, the next frame is allowed at once.
         if self._period_ns == 0 or 0 < self._next_ns - stamp_ns <= self._period_ns:
             return False
         self._next_ns = stamp_ns + self._period_ns
@@ -29,7 +29,7 @@ class RateLimiter:
 
 
 class Images:
-    """Sends a node's pictures."""
+    """Records and publishes a node's pictures as JPEG, each at its configured rate."""
 
     def __init__(self, config: NodeConfig, outlet: Outlet) -> None:
         self._frame_id = f"{config.node}_camera"
@@ -40,7 +40,7 @@ class Images:
         self._preview_limit = RateLimiter(config.preview.rate_hz)
 
     def send(self, frame: Frame) -> None:
-        """Record or publish a frame's picture where its turn has come."""
+        """Record or publish a frame's picture if its rate limit allows it."""
         if self._record_limit.allow(frame.stamp_ns):
             image = self._encoded(frame.image, frame.stamp_ns, self._record.image_quality)
             self._outlet.send(image, publish=False)

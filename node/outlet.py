@@ -1,4 +1,4 @@
-"""Where a node's messages go: its own log, always, and the bus once there is one."""
+"""The output of a node's messages: always to its own log, and to the bus while connected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class Outlet:
     """Records and publishes; safe to use from several threads.
 
-    Messages from before the bus was there are in the log alone; info and status are sent again when it comes.
+    Messages sent while there is no bus are in the log only. When the bus connects, the last message of each
+    latest-only topic (info, status) is published again.
     """
 
     def __init__(self, node: str, recorder: Recorder, clock: Clock) -> None:
@@ -51,14 +52,14 @@ class Outlet:
         return self._bus is not None
 
     def connect(self, bus: Bus) -> None:
-        """Publish from now on."""
+        """Publish on this bus from now on, beginning with the last message of each latest-only topic."""
         with self._lock:
             self._bus = bus
             for message in self._latest.values():
                 self._publisher(topic_of(message)).put_bytes(encode(message))
 
     def disconnect(self) -> None:
-        """Publish no longer; the publishers are closed with their bus."""
+        """Stop publishing; the bus closes the publishers when it is closed."""
         with self._lock:
             self._bus = None
             self._publishers.clear()

@@ -1,4 +1,4 @@
-"""From a frame to the message: the pure part of a node."""
+"""Turn a frame into its Candidates message: the part of a node without devices, bus or clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Pipeline", "blobs_of"]
 
 
 def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int]:
-    """Return at most 64 blobs inside the picture, with their rows' times, and how many were left out."""
+    """Return the first MAX_BLOBS blobs inside the picture, with dt_ns of their rows, and how many were left out."""
     height, width = frame.image.shape[:2]
     middle_row = (height - 1) / 2
     blobs = [
@@ -27,7 +27,7 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
 
 
 class Pipeline:
-    """Detects, and numbers the result; one a camera."""
+    """Detects the candidates of one camera's frames, and numbers the messages."""
 
     def __init__(self, node: str, boot: str, trigger_period_ns: int, detector: Detector) -> None:
         self.node = node
@@ -35,13 +35,13 @@ class Pipeline:
         self.trigger_period_ns = trigger_period_ns
         self.residuals_s: deque[float] = deque(maxlen=100)
         self.repeated = 0
-        self.detections: list[Detection] = []  # of the last frame, for whoever draws them
+        self.detections: list[Detection] = []  # of the last frame, for drawings
         self._detector = detector
         self._seq = 0
         self._last_trigger = -1
 
     def candidates(self, frame: Frame) -> Candidates | None:
-        """Return the frame's candidates; None where its trigger has had a frame already."""
+        """Return the frame's candidates; None where the previous frame had the same trigger."""
         trigger = trigger_index(frame.stamp_ns, self.trigger_period_ns)
         if trigger == self._last_trigger:
             self.repeated += 1
@@ -67,5 +67,5 @@ class Pipeline:
 
     @property
     def residual_s(self) -> float | None:
-        """Median distance of late exposures from their trigger instants."""
+        """Median of exposure time minus trigger instant, s, over the last 100 frames."""
         return statistics.median(self.residuals_s) if self.residuals_s else None

@@ -20,7 +20,7 @@ __all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "ma
 
 
 def presets(method: str) -> Mapping[str, Mapping[str, float]]:
-    """Give a method's values for each environment; raise BuddylineError where there is no such method."""
+    """Return a method's preset values for each environment; raise BuddylineError for an unknown method."""
     if method == "source":
         return source.PRESETS
     if method == "paper":
@@ -33,8 +33,8 @@ def make_detector(
 ) -> Detector:
     """Make the detector of one camera.
 
-    overrides: values that replace the environment's own, by the names that `presets` gives. Raises BuddylineError
-    for an unknown method, environment or name, and for a negative or non-finite value.
+    overrides: replace values of the environment's preset, under the names that `presets` returns. Raises
+    BuddylineError for an unknown method, environment or name, and for a negative or non-finite value.
     """
     known = presets(method)
     if environment not in ENVIRONMENTS:

@@ -1,16 +1,18 @@
-"""Where the source of a light is, although its core is clipped and its glow leans along the beam.
+"""Locate the source of a light whose core is clipped and whose glow leans along the beam.
 
-Scattered light along the beam adds a dipole to a light's rings of equal brightness, so that the centre of what is
-clipped is not the source. Outside the clipped core, the logarithm of the brightness around a point near the source is
+Light that the water scatters along the beam makes the glow asymmetric. The centre of the clipped core is therefore
+not the source. Outside the clipped core, the logarithm of the brightness around a point near the source is modelled as
 
     Y(rho, phi) = Y0(rho) - Y0'(rho) s.n(phi) + w(rho) k.n(phi)
 
-s: from the point to the source, n: the ray's direction, k: the lean of the glow. w is the glow's share in the light:
-it grows outward, the faster the steeper the profile falls (the core's own light falls steeply, and does not lean):
-d ln w / d ln rho = growth + steepness * p, p = -d Y0 / d ln rho. s and k follow by weighted least squares over all
-unclipped samples, with a prior that keeps s inside the core. This is the extrapolation of the centres of iso-intensity
-regions to radius 0, with every pixel used and the core's profile accounted for; how far it carries depends on the
-growth, whose own uncertainty goes into sigma.
+rho, phi: polar coordinates around the point. s: vector from the point to the source. n: direction of the ray at phi.
+k: the lean, the direction and size of the glow's asymmetry. w: the glow's share of the light. The core's own light
+falls steeply outward and does not lean, so w grows outward, and it grows faster where the profile is steeper:
+d ln w / d ln rho = growth + steepness * p, with p = -d Y0 / d ln rho. Weighted least squares over all unclipped
+samples gives s and k; a prior keeps s inside the core.
+
+In effect this extrapolates the centres of iso-intensity regions to radius 0. It uses every pixel and accounts for the
+core's profile. The result depends on `growth`; the uncertainty of `growth` is part of the sigma.
 """
 
 from __future__ import annotations
@@ -30,16 +32,17 @@ _CLIPPED = 249.0
 _WIDTH_OF_MODEL_PX = 820
 _ROBUST_SD = 3.0
 
-# Sigma: what the errors on pictures rendered in many waters (this project's simulator, and dives kept for tuning)
-# were, by what they follow from; a little more than they were on average, as other waters will be different.
+# The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
+# kept for tuning). They are a little larger than those errors, because other waters will differ.
 _FLOOR_PX: Final = 0.045
-# Of the core's radius: the rim of what is clipped is no perfect circle.
+# Share of the core's radius: the rim of the clipped core is not a perfect circle.
 _RIM_SHARE: Final = 0.008
 _NOISE_SCALE: Final = 0.155
 _GROWTH_SCALE: Final = 0.45
-# Of the way from the region's centre to the source; where nothing is clipped, the way itself is in doubt.
+# Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
+# core, whose estimate is less certain.
 _MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
-# Of the core's radius, times by how much it is longer than wide: something stands before it, or another light beside.
+# Share of the core's radius, per unit of elongation above 1. A long core is partly hidden, or two lights merge in it.
 _ELONGATED_SHARE: Final = 0.15
 _SCATTERED_PX: Final = 2.0
 
@@ -63,7 +66,7 @@ MODEL: Mapping[str, float] = {
 
 @dataclass(slots=True, eq=False)
 class Centres:
-    """Sources of N lights: centre_px (N, 2), sigma_px (N,) per axis, lean (N, 2): the glow's, towards the beam."""
+    """Sources of N lights: centre_px (N, 2), sigma_px (N,) per axis, lean (N, 2) of the glow, towards the beam."""
 
     centre_px: Floats
     sigma_px: Floats
@@ -77,7 +80,7 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
     growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), lights.ground, model)
     equations = _Equations(image, lights, growth, model)
     step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px)
-    # Where the model does not hold, the centre of the region stands with the prior's uncertainty.
+    # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px
     square = moved * moved
     moved_px2 = square[:, 0] + square[:, 1]
@@ -92,10 +95,10 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
 
 
 def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
-    """Give d ln w / d ln rho of a plain glow, (N,): less in veiled water, and less for larger discs.
+    """Return the growth d ln w / d ln rho of a flat profile, (N,): smaller in veiled water and for large discs.
 
-    radius_px: at a picture 820 px wide. A veil (bright ground in the weakest channel) tells turbid water, where
-    light scattered far from the beam hides the core's own, and large discs are mostly glow already.
+    radius_px: (N,), scaled to a picture 820 px wide. ground: (N,), grey levels. A veil (bright ground in the weakest
+    channel) shows turbid water: light scattered far from the beam hides the core. Large discs are mostly glow already.
     """
     veil = np.minimum(ground / 40.0, 1.0)
     growth = (
@@ -105,7 +108,7 @@ def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Fl
 
 
 def _one_channel(pixels: NDArray[np.uint8], weakest: NDArray[np.bool_]) -> Floats:
-    """Give (N, M, K) levels: the weakest channel where asked for, else the luminance."""
+    """Return (N, M, K) levels: the weakest channel for the lights in `weakest` (N,), the luminance for the others."""
     level = luminance(pixels)
     if pixels.ndim > 3 and weakest.any():
         level[weakest] = weakest_channel(pixels[weakest])
@@ -113,9 +116,9 @@ def _one_channel(pixels: NDArray[np.uint8], weakest: NDArray[np.bool_]) -> Float
 
 
 class _Equations:
-    """The linear equations of N lights, from levels on rings around where their sources may be.
+    """The linear equations of N lights, from grey levels on rings around the first guesses of their sources.
 
-    M: the rings between the innermost and the outermost, which only serve to tell how the profile falls.
+    M: number of rings without the innermost and the outermost. These two serve only for the slope of the profile.
     """
 
     def __init__(self, image: NDArray[np.uint8], lights: Lights, growth: Floats, model: Mapping[str, float]) -> None:
@@ -149,7 +152,7 @@ class _Equations:
         self._log_step = log_step
         self.solvable = np.add.reduce(seen, axis=1) >= 4.0
         noise = model["noise"] / above
-        # Each sample's weight, and that times y.
+        # For each sample: its weight, and its weight times y.
         self._weighted = np.empty((*seen.shape, 2, RAYS), np.float32)
         weight = self._weighted[:, :, 0]
         np.divide(used * seen[:, :, None], noise * noise + model["model_noise"] ** 2, out=weight)
@@ -158,9 +161,9 @@ class _Equations:
     def solve(self, prior_px2: Floats, prior_px: Floats) -> tuple[Floats, Floats, Floats]:
         """Solve for the step to the source (N, 2), the lean (N, 2) and the step's variance (N,) per axis.
 
-        The prior on the step has the mean prior_px (N, 2), that on the lean none. What the model does not explain,
-        something in front or another light, has less weight the second time. The variance contains the growth's own
-        uncertainty.
+        The prior on the step has the mean prior_px (N, 2) and the variance prior_px2 (N,); the prior on the lean has
+        the mean 0. The equations are solved twice: samples that the first solution does not explain (an obstacle,
+        another light) have less weight in the second. The variance contains the uncertainty of the growth.
         """
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2
@@ -185,10 +188,10 @@ class _Equations:
         return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
 
     def _rows(self) -> Floats:
-        """Give what the rings' sums are multiplied by: (3, N, 5, M), ss, sw, ww, s, w.
+        """Return the factors of the rings' sums, (3, N, 5, M): the products ss, sw, ww, then s, w.
 
-        s: the profile's shift. w: the glow's share, d ln w / d ln rho integrated along the rings, 1 at the outermost
-        ring seen; for the growth as expected, and for less and more of it.
+        s: slope of the profile, -Y0'. w: the glow's share, from d ln w / d ln rho integrated along the rings; it is 1
+        at the outermost usable ring. The first axis: the expected growth, 1 sd less, 1 sd more.
         """
         sd = self._model["growth_sd"]
         growth = np.maximum(self._growth + np.array([[[0.0]], [[-sd]], [[sd]]], np.float32), -0.3)
@@ -205,7 +208,7 @@ class _Equations:
         return rows
 
     def _least_squares(self, rows: Floats, prior: Floats) -> tuple[Floats, Floats]:
-        """Solve for (s, k), each ring's mean eliminated, for S shares of the glow.
+        """Solve for (s, k) with each ring's mean eliminated, for S assumed growths.
 
         rows: (S, N, 5, M), see _rows. prior: (N, 4, 7), see _PRIOR. Returns (S, N, 4, 3), the
         solution and the first two columns of its covariance; and the rings' means (N, M).
@@ -214,7 +217,7 @@ class _Equations:
         sums = (self._weighted.reshape(n * m, 2 * RAYS) @ _SUMS).reshape(n, m, 10)
         means = sums[..., 1:4] / np.maximum(sums[..., :1], 1e-6)
         spread = sums[..., 4:].reshape(n, m, 3, 2) - sums[..., 1:4, None] * means[..., None, :2]
-        # Neighbouring samples are correlated: the information is less than their number says.
+        # Neighbouring samples are correlated: they hold less information than as many independent samples.
         products = (rows @ spread.reshape(n, m, 6)).reshape(len(rows), n, 30) * (1.0 / self._model["inflation"])
         system = np.repeat(prior[None], len(rows), axis=0)
         system[..., :5] += products.take(_SYSTEM, axis=-1)
@@ -229,18 +232,18 @@ _RAYS_TWICE[0, :, 4:8] = (RAY_UV[:, :, None] * RAY_UV[:, None]).reshape(-1, 4)
 _RAYS_TWICE[1, :, 3] = 1.0
 _RAYS_TWICE[1, :, 8:] = RAY_UV
 _SUMS = _RAYS_TWICE.reshape(-1, 10)
-"""What is summed up over a ring's rays: 1, c, s, y, then (c, s, y) times (c, s); c and s: the ray's direction."""
+"""The sums over a ring's rays: of 1, c, s, y, then of (c, s, y) times (c, s). c, s: the ray's cosine and sine."""
 
 _TRAPEZOIDS = np.triu(np.ones((_RINGS - 2, _RINGS - 2), np.float32))
 _TRAPEZOIDS[0] = 0.0
 _TRAPEZOIDS = 0.5 * (_TRAPEZOIDS + np.triu(np.ones_like(_TRAPEZOIDS), 1))
-"""Integrates along the rings, of step 1, from the first on."""
+"""Integrates along the rings from the first one, by the trapezoidal rule with step 1."""
 
 _SYSTEM = np.array([[0, 1, 6, 7, 22], [2, 3, 8, 9, 23], [6, 7, 12, 13, 28], [8, 9, 14, 15, 29]])
-"""Where the normal equations of (s_u, s_v, k_u, k_v), the right side last, find their entries in (ss, sw, ww, s, w)
-times (cc, cs, sc, ss, yc, ys)."""
+"""Indices of the normal equations of (s_u, s_v, k_u, k_v), with the right side as the last column, in the products
+(ss, sw, ww, s, w) times (cc, cs, sc, ss, yc, ys)."""
 
 _PRIOR = np.zeros((4, 7))
 _PRIOR[0, 5] = _PRIOR[1, 6] = 1.0
-"""Of the normal equations: 4x4 on the left, then the right side, then two columns of the identity, for the covariance.
-"""
+"""Layout of the prior's normal equations: a 4x4 matrix, the right side, then two columns of the identity matrix, which
+give the covariance."""

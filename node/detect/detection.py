@@ -1,4 +1,4 @@
-"""What a detector takes and gives."""
+"""The interface of a detector: its input and its output."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One light candidate, and what a person needs to see why it was found.
+    """One light candidate, with drawings and words that explain it to a person.
 
-    outline_px: (N, 2) corners of the region it was found in. axis_px: (2, 2), the region's axis as [chosen end,
+    outline_px: (N, 2) corners of the candidate's region. axis_px: (2, 2), the region's axis as [end at the light,
     other end]. Both in px, pixel centres at integers. why: the figures behind the score, in words.
     """
 
@@ -26,25 +26,25 @@ class Detection:
 
 
 class Detector(Protocol):
-    """Finds light candidates; one instance a camera, used from one thread.
+    """Finds light candidates. Each camera has its own instance, used from one thread.
 
-    It keeps nothing but what it adapted to and its working memory.
+    Its only state is what it has adapted to, and working memory.
     """
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Find the candidates of one picture, the likeliest lights first.
 
-        image: (H, W, 3) BGR, or (H, W) grey (a Y plane). Raises ImageError where it is neither.
+        image: (H, W, 3) BGR, or (H, W) grey (a Y plane), uint8. Raises ImageError for anything else.
         """
         ...
 
 
 class ImageError(BuddylineError):
-    """A picture that no detector can work on."""
+    """An array that is not a picture of 8-bit grey or BGR pixels."""
 
 
 def check_image(image: NDArray[np.uint8]) -> None:
-    """Refuse what is not an 8-bit BGR or grey picture of at least one pixel; raise ImageError."""
+    """Raise ImageError unless `image` is an 8-bit BGR or grey picture of at least one pixel."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"picture: {type(image).__name__} is not an array; was it decoded?")
     if image.dtype != np.uint8:

@@ -1,4 +1,4 @@
-"""What the rings around a place tell: outlines, rim, the channel that locates best, and the figures for the score."""
+"""Measure proposed places on rings: outlines, rim, the channel that locates best, and the figures for the score."""
 
 from __future__ import annotations
 
@@ -26,21 +26,22 @@ _LEVELS: Final = np.array([0.9, 0.7, 0.5, 0.3], np.float32)
 _CORE, _HALF = 1, 2
 _UNCLIPPED, _UNCLIPPED_OVER = 240.0, 40.0
 VEIL: Final = 40.0
-"""Level of the weakest channel from which on the water counts as veiled."""
+"""The water counts as veiled from this grey level of the weakest channel upward."""
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 _GUESS, _GUESS_MOST = 0.5, 0.4
 _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
 
 
 class Lights(NamedTuple):
-    """N bright regions.
+    """N bright regions. All fields have length N; positions are (N, 2), in px.
 
-    centre_px (N, 2), core_px (N,): the rim, in the channel that locates. guess_px: (N, 2) about where the source is.
-    ground: (N,) what the water itself shows in that channel. weakest: (N,) whether it is the weakest one, else the
-    luminance. core_elongation: (N,) in it, near the top. unclipped: (N,) 0-1. scattered: (N,) 0-1, see _scattered;
-    the centre of those is where their glow begins. peak, height: (N,) luminance. edge_px: (N, K) outline at half
-    height around edge_at_px (N, 2), of area_px, elongation and open_share (of rays that find no edge). outstanding:
-    (N,) as proposed.
+    Each light is located in one channel: the weakest colour channel where `weakest` is set, else the luminance.
+    In that channel: centre_px and core_px, centre and radius of the rim; guess_px, a first guess of the source;
+    ground, the grey level of the water around it; core_elongation, long over short axis near the top.
+    unclipped: 0 (clipped) to 1. scattered: 0 to 1, see _scattered; for such a light centre_px is where its glow begins.
+    In luminance: peak; height, the peak above the ground; edge_px (N, K), distances along the rays from edge_at_px to
+    the outline at half height; area_px and elongation of that outline; open_share, share of rays without an edge.
+    outstanding: as in Proposals.
     """
 
     centre_px: Floats
@@ -61,12 +62,12 @@ class Lights(NamedTuple):
     outstanding: Floats
 
     def at(self, index: NDArray[np.intp]) -> Lights:
-        """Give some of them."""
+        """Return the lights at these indices."""
         return Lights._make(values[index] for values in self)
 
 
 def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
-    """Measure what was proposed in a BGR (H, W, 3) or grey (H, W) picture."""
+    """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture."""
     kept = distinct(proposals.centre_px, proposals.radius_px, _MAX_MEASURED)
     kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR)))]
     centre, radius_px, outstanding = proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept]
@@ -87,7 +88,7 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
     circle = own_circle = shapes.circle_px[0]
     own_edge, own_ground, weakest = shapes.edge_px[0, _CORE], ground[0], np.zeros(len(radius), bool)
     if colour:
-        # The weakest channel clips last; the luminance is sharper, as JPEG halves the resolution of colour.
+        # The weakest channel clips last. The luminance is sharper, because JPEG halves the resolution of colour.
         weakest = shapes.circle_px[1, 0, :, 2] + shapes.circle_px[1, 1, :, 2] >= 2.0 * _WEAKEST_FROM_PX
         own_circle = np.where(weakest[:, None], shapes.circle_px[1], circle)
         own_edge = np.where(weakest[:, None], shapes.edge_px[1, _CORE], own_edge)
@@ -124,9 +125,9 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
 
 
 def distinct(centre_px: Floats, radius_px: Floats, at_most: int) -> list[int]:
-    """Leave out what lies inside an earlier one; give the indices of the first of the rest.
+    """Return the indices of at most `at_most` places, in order; skip each place that overlaps an earlier one.
 
-    centre_px: (N, 2); radius_px: (N,).
+    centre_px: (N, 2); radius_px: (N,). Two places overlap where one's centre is within 0.7 radii of the other's.
     """
     kept: list[tuple[float, float, float]] = []
     indices: list[int] = []
@@ -145,16 +146,16 @@ def distinct(centre_px: Floats, radius_px: Floats, at_most: int) -> list[int]:
 
 
 def _low(level: Floats, share: float) -> Floats:
-    """Give the level that a share of each place's samples lies below: (C, N) from (C, N, M, K)."""
+    """Return the quantile `share` of each place's samples: (C, N) from (C, N, M, K)."""
     flat = level.reshape(*level.shape[:2], -1)
     k = int(share * flat.shape[2])
     return np.partition(flat, k, axis=2)[:, :, k]
 
 
 def _rims(circle_px: Floats) -> tuple[Floats, Floats]:
-    """Give each light's rim, where its profile falls the fastest: centres (N, 2), radii (N,), from (S, N, 3).
+    """Return each light's rim, where its profile is steepest: centres (N, 2), radii (N,), from (S, N, 3).
 
-    It is the lamp's own face where that shows, and the edge of what is clipped where the glow is all there is.
+    The rim is the edge of the lamp's face where the face is visible, and else the edge of the clipped glow.
     """
     k = np.maximum(circle_px[1:, :, 2] - circle_px[:-1, :, 2], 0.15).argmin(axis=0)
     rim = (0.5 * (circle_px[1:] + circle_px[:-1]))[k, np.arange(len(k))]
@@ -162,9 +163,10 @@ def _rims(circle_px: Floats) -> tuple[Floats, Floats]:
 
 
 def _scattered(circle_px: Floats, unclipped: Floats, water: float) -> Floats:
-    """Tell lights in veiled water that show only what the water scatters, (N,) 0-1: not clipped, and with a halo.
+    """Return how surely a light in veiled water shows only scattered light, (N,), 0 to 1.
 
-    A core's own profile falls as steeply below half its height as above it; a glow flattens out. circle_px: (S, N, 3).
+    Such a light is not clipped and has a halo. The profile of a core is as steep below half its height as above; the
+    profile of a glow flattens out. circle_px: (S, N, 3).
     """
     flattening = circle_px[_HALF + 1, :, 2] / circle_px[_HALF, :, 2]
     halo = np.minimum(np.maximum((flattening - 1.35) / 0.2, 0.0), 1.0)
@@ -172,9 +174,9 @@ def _scattered(circle_px: Floats, unclipped: Floats, water: float) -> Floats:
 
 
 def _where_glow_begins(circle_px: Floats) -> Floats:
-    """Give where a glow without a core comes from, (N, 2): against the way in which its fainter parts lie.
+    """Return where a glow without a core begins, (N, 2): on the side away from its fainter parts.
 
-    A beam that passes the camera by shines where it has spread; its source lies behind the brightest part.
+    A beam that passes beside the camera shows as glow along its way; its source is behind the brightest part.
     circle_px: (S, N, 3).
     """
     top, low = circle_px[0, :, :2], circle_px[-1, :, :2]
@@ -182,14 +184,14 @@ def _where_glow_begins(circle_px: Floats) -> Floats:
 
 
 def _at_most(step_px: Floats, length_px: Floats) -> Floats:
-    """Shorten steps (N, 2) to lengths (N,) where they are longer."""
+    """Limit steps (N, 2) to the lengths (N,)."""
     own_px = np.maximum(np.hypot(step_px[:, 0], step_px[:, 1]), 1e-6)
     return np.asarray(step_px * np.minimum(length_px / own_px, 1.0)[:, None], np.float32)
 
 
 def _water_level(image: NDArray[np.uint8]) -> float:
-    """Give what a fifth of a picture lies below, in the weakest channel."""
-    # Few rows and more of each: pixels of one row come from memory together.
+    """Return the 20 % quantile of a picture's weakest channel, in grey levels."""
+    # Few rows, but many pixels of each: the pixels of one row are adjacent in memory.
     some = image[::32, ::16]
     weak = (some if image.ndim == 2 else weakest_channel(some)).ravel()
     k = len(weak) // 5

@@ -1,7 +1,7 @@
 """The paper's detector: a fixed HSV threshold, closing, contours, the brighter end of each region.
 
 Damron, Quattrini Li, Rekleitis, "Underwater Surveying via Bearing only Cooperative Localization", IROS 2018. It is
-the baseline that the project's own detector is measured against.
+the baseline for the project's own detector.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "basin": {"value_min": 200, "saturation_max": 255, "close_px": 5, "area_min_px": 4},
     }
 )
-"""One set of thresholds a site, as the paper set them by hand; px at a picture 820 px wide.
+"""One set of thresholds for each site, set by hand as in the paper. Sizes in px of a picture 820 px wide.
 
-In a sunlit basin generous: the solver tells glitter from lights better than a threshold does.
+The thresholds of the sunlit basin let glitter through: the solver rejects it better than a threshold does.
 """
 
 _WIDTH_OF_PRESETS_PX: Final = 820
@@ -35,7 +35,7 @@ _TURBID_MEDIAN_SHARE: Final = 0.8
 
 
 class PaperDetector:
-    """Thresholds of one site. `auto` picks a site's set by how light the picture's background is."""
+    """Detects with the thresholds of one site. `auto` chooses the site for each picture by its background."""
 
     def __init__(self, environment: str, overrides: Mapping[str, float]) -> None:
         self._environment = environment
@@ -69,7 +69,7 @@ class PaperDetector:
 
 
 def _choose_site(value: NDArray[np.uint8]) -> str:
-    """Pick a site's thresholds: dark background, turbid (light everywhere) or sunlit."""
+    """Return the site whose background matches: dark, turbid (evenly bright) or sunlit. value: (H, W), HSV's V."""
     coarse = value[::8, ::8]
     median = float(np.median(coarse))
     if median < _DARK_MEDIAN:
@@ -83,7 +83,8 @@ def _brighter_end(
 ) -> Detection:
     """Put the light at the brighter end of the region's rotated rectangle: the centroid of its brightest pixels.
 
-    contour: (N, 2) px. value: (H, W), HSV's V; mask: what passed the thresholds.
+    contour: (N, 2) px. value: (H, W), HSV's V. mask: (H, W), 255 where a pixel passed the thresholds. scale: picture
+    width over 820 px.
     """
     u0, v0 = contour.min(axis=0)
     u1, v1 = contour.max(axis=0) + 1
@@ -117,7 +118,7 @@ def _brighter_end(
     area = float(len(levels))
     radius = np.sqrt(area / np.pi)
     elongation = float((long_px + 1.0) / (short_px + 1.0))
-    # A region that fills a quarter of the picture is the water or the sun, not a lamp.
+    # A region that covers a quarter of the picture is water or sun, not a lamp.
     filled = 4.0 * area / value.size
     score = peak / 255.0 * min(1.0, radius / (3.0 * scale)) / elongation * max(0.0, 1.0 - filled)
     return Detection(

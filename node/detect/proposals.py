@@ -1,4 +1,4 @@
-"""Where a light may be: small things brighter than their surround, over scales, and alone in being so."""
+"""Propose where a light may be: spots of any size that are brighter than their surround and stand alone."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _WITHIN_WORD = np.arange(_WORD)
 _CLUTTER_CELLS = 7
 _NOISE = 4.0
 CLEAR: Final = 5.0
-"""How outstanding a place is that clearly stands out of its neighbourhood."""
+"""From this value of `outstanding` upward, a place clearly stands out of its neighbourhood."""
 _ALWAYS, _AT_MOST = 16, 64
 _MEAN_OF_LOWER_HALF = 0.46
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 _WINDOW = 5
-"""Side of the window around a place, in px of its octave: no other light stands higher in it."""
+"""Side of the window around a place, in px of its octave. The place is the maximum of its window."""
 _BRIGHT = 0.5
-"""Of a place's contrast: what lies no more than this below it is of its light."""
+"""Share of a place's contrast: pixels no further than this below the place's level belong to its light."""
 _CLIPPED = 249.0
 _ACROSS = np.arange(_WINDOW)
 _ROW, _COLUMN = np.divmod(np.arange(_WINDOW**2), _WINDOW)
@@ -35,10 +35,10 @@ _MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.floa
 
 @dataclass(slots=True, eq=False)
 class Proposals:
-    """Places to look at, the most outstanding first; arrays of length N.
+    """Places where a light may be, the most outstanding first; arrays of length N.
 
-    centre_px: (N, 2) in the whole picture, and radius_px of what is bright around them.
-    outstanding: centre minus surround over what noise and the neighbourhood (its mean contrast) explain.
+    centre_px: (N, 2), px of the whole picture. radius_px: of the bright area around each centre.
+    outstanding: contrast (centre minus surround) over noise plus the mean contrast of the neighbourhood.
     """
 
     centre_px: NDArray[np.float32]
@@ -48,7 +48,7 @@ class Proposals:
 
 @dataclass(frozen=True, slots=True)
 class _Octave:
-    """Working memory of one octave; all but quarter are parts of arrays that hold all octaves, end to end."""
+    """Working memory of one octave. All fields but `quarter` are views into arrays that hold all octaves in a row."""
 
     level: NDArray[np.uint8]
     contrast: NDArray[np.uint8]
@@ -57,9 +57,9 @@ class _Octave:
     clutter: NDArray[np.uint8]
 
     def measure(self, below: NDArray[np.uint8] | None) -> None:
-        """Measure centre minus surround, its highest value around each place, and the neighbourhoods' mean.
+        """Compute the contrast (centre minus surround), its local maximum, and its mean over each neighbourhood.
 
-        below: the level of the next octave, of which the surround is made.
+        below: the grey levels of the next coarser octave, from which the surround is computed; None for the last.
         """
         surround = self.highest
         if below is None:
@@ -74,10 +74,10 @@ class _Octave:
 
 
 class ProposalFinder:
-    """Local maxima of centre minus surround in a pyramid of the grey picture.
+    """Finds local maxima of contrast (centre minus surround) in a pyramid of the grey picture.
 
-    A lamp stands alone, while caustics, glitter and texture come in fields: what the neighbourhood's mean contrast
-    explains does not count.
+    A lamp stands alone; caustics, glitter and texture come in fields. So a place's contrast is compared with the mean
+    contrast of its neighbourhood, the clutter.
     """
 
     def __init__(self) -> None:
@@ -96,7 +96,7 @@ class ProposalFinder:
         self._base_step_px = 1.0
 
     def load(self, image: NDArray[np.uint8]) -> None:
-        """Make the pyramid of a (H, W, 3) BGR or (H, W) grey picture."""
+        """Build the pyramid of a (H, W, 3) BGR or (H, W) grey picture."""
         if image.shape != self._shape:
             self._allocate(image.shape)
         for i, octave in enumerate(self._octaves):
@@ -111,14 +111,14 @@ class ProposalFinder:
             return 0.0
         some = self._octaves[0].level[::48]
         steps = np.sort(cv2.absdiff(some[:, 1:], some[:, :-1]), axis=None, kind="stable")
-        # What is not noise (edges, texture) stands in the upper half; below it, noise is as good as normal.
+        # Edges and texture are in the upper half of the differences; the lower half is nearly normal noise.
         lower = steps[: len(steps) // 2 + 1]
         return float(cv2.mean(lower)[0]) / _MEAN_OF_LOWER_HALF
 
     def find(self, contrast_min: float, clutter_gain: float) -> Proposals:
-        """Find places in the picture that was loaded: the most outstanding 16, and up to 64 that clearly stand out.
+        """Find the 16 most outstanding places of the loaded picture, or up to 64 where that many clearly stand out.
 
-        A place counts from a contrast of contrast_min grey levels, plus clutter_gain times the mean contrast of its
+        A place needs a contrast of contrast_min grey levels plus clutter_gain times the mean contrast of its
         neighbourhood.
         """
         below: NDArray[np.uint8] | None = None
@@ -126,14 +126,14 @@ class ProposalFinder:
             octave.measure(below)
             below = octave.level
         if self._octaves:
-            # As one row of a picture, which OpenCV compares many times faster than numpy.
+            # One long row for OpenCV, which compares it many times faster than numpy does.
             contrast_row, highest, marks = self._contrast[None], self._highest[None], self._marks[None]
             cv2.compare(contrast_row, highest, cv2.CMP_EQ, dst=marks)
-            # The highest values have served: in their place, whether the contrast is enough.
+            # The local maxima are no longer needed: their array now says whether the contrast is enough.
             cv2.threshold(contrast_row, max(math.ceil(contrast_min), 1) - 1, 255, cv2.THRESH_BINARY, dst=highest)
             cv2.bitwise_and(marks, highest, dst=marks)
 
-        # Empty places are passed over a machine word at a time.
+        # Eight pixels are tested at once: nearly all of them are no maxima.
         places = (np.flatnonzero(self._marks.view(np.uint64) != 0)[:, None] * _WORD + _WITHIN_WORD).ravel()
         places = places[self._marks[places] != 0]
         contrast = self._contrast[places].astype(np.float32)
@@ -200,10 +200,10 @@ class ProposalFinder:
             self._halves[-1] = self._octaves[0].level
 
     def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
-        """Halve down to the pyramid's base.
+        """Halve the picture down to the pyramid's base.
 
-        Where the picture is to be quartered or less, every other row will do: the blur of a lens that resolves so
-        many pixels is wider than two of them.
+        A picture that is halved at least twice is read on every other row only: at such a resolution the lens blurs
+        over more than two rows.
         """
         level = image
         halves = self._halves
@@ -222,9 +222,9 @@ class ProposalFinder:
 def _settle(
     level: NDArray[np.float32], peak: NDArray[np.float32], contrast: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Give the middle (N, 2) of what is bright in windows around N places, from the corner, and its radius (N,).
+    """Return the centroid (N, 2) of the bright pixels in N windows, from the window's corner, and their radius (N,).
 
-    level: (N, window), row by row; peak, contrast: (N,), the places' own. In px of the octave.
+    level: (N, window), row by row; peak, contrast: (N,), of the places. Results in px of the octave.
     """
     peak = np.minimum(peak, _CLIPPED)
     bright = np.minimum(level, peak[:, None]) - (peak - _BRIGHT * contrast)[:, None]
@@ -238,7 +238,7 @@ def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def halve(image: NDArray[np.uint8], into: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average 2x2 pixels; what is left over at the right and below is left out: that keeps to OpenCV's fast path."""
+    """Average 2x2 pixels. An odd last row or column is dropped, because OpenCV's fast path needs even sizes."""
     height, width = into.shape
     even = image[: 2 * height, : 2 * width]
     return np.asarray(cv2.resize(even, (width, height), dst=into, interpolation=cv2.INTER_AREA), np.uint8)

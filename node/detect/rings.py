@@ -1,6 +1,6 @@
-"""A picture sampled on rings around places, many places at once.
+"""Sample a picture on rings around many places at once.
 
-Rings grow geometrically, so that a light is seen alike at every size. N places, M rings, K rays.
+The radii grow geometrically, so that lights of all sizes are sampled alike. N places, M rings, K rays.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _DOUBLED = np.stack([np.ones(RAYS), np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)
 _SECOND = (_DOUBLED / (2.0 * RAYS)).astype(np.float32)
 _CENTROID = RAY_UV / np.float32(1.5 * RAYS)
 MEAN: Final = np.full(RAYS, 1.0 / RAYS, np.float32)
-"""Sums over rays are products with this or the like: many times faster than sums along the last axis."""
+"""Sums over rays are matrix products with vectors such as this: many times faster than sums along the last axis."""
 
 
 @dataclass(slots=True, eq=False)
 class Rings:
     """Samples around N places. radius_px: (N, M). pixels: (N, M, K) grey or (N, M, K, 3) blue green red.
 
-    inside: (N, M, K), which lie in the picture; None where all do.
+    inside: (N, M, K), whether a sample lies in the picture; None if all do.
     """
 
     radius_px: Floats
@@ -41,7 +41,7 @@ class Rings:
 
 
 def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats) -> Rings:
-    """Sample a picture bilinearly. centre_px: (N, 2); radius_px: (N, M), growing, both in px."""
+    """Sample a picture by bilinear interpolation. centre_px: (N, 2) px; radius_px: (N, M) px, ascending."""
     n, m = radius_px.shape
     uv = radius_px[:, :, None] * RAY_UV.ravel()
     uv += (centre_px @ _AT_ALL_RAYS)[:, None]
@@ -61,7 +61,7 @@ def sample_rings(image: NDArray[np.uint8], centre_px: Floats, radius_px: Floats)
 
 
 def geometric_radii(first_px: Floats, last_px: Floats, share: Floats) -> Floats:
-    """Give (N, M) float32 radii that grow by a constant factor from first_px (N,) to last_px (N,), at shares (M,)."""
+    """Return (N, M) radii, float32, from first_px (N,) to last_px (N,): log-spaced at share (M,), 0-1."""
     return np.asarray(first_px[:, None] * (last_px / first_px)[:, None] ** share, np.float32)
 
 
@@ -69,8 +69,9 @@ def geometric_radii(first_px: Floats, last_px: Floats, share: Floats) -> Floats:
 class Shapes:
     """Outlines and moments of star-shaped regions around N places, in C channels at S levels.
 
-    edge_px: (C, S, N, K) distance to the outline along each ray; is_open: (C, S, N, K), rays without one.
-    circle_px: (C, S, N, 3), the centroid relative to the place and the radius of the circle of equal area.
+    edge_px: (C, S, N, K), distance from the place to the outline along each ray. is_open: (C, S, N, K), set for rays
+    that do not meet the outline. circle_px: (C, S, N, 3), the centroid relative to the place, and the radius of the
+    circle of equal area.
     """
 
     edge_px: Floats
@@ -79,7 +80,7 @@ class Shapes:
 
 
 def elongation(edge_px: Floats, circle_px: Floats) -> Floats:
-    """Measure the long over the short axis of outlines: (N,) from (N, K) and (N, 3) as in Shapes."""
+    """Return the long over the short axis of outlines, (N,). edge_px: (N, K), circle_px: (N, 3), as in Shapes."""
     square = edge_px * edge_px
     second = (square * square) @ _SECOND
     u, v, radius = circle_px.T
@@ -92,13 +93,13 @@ def elongation(edge_px: Floats, circle_px: Floats) -> Floats:
 
 
 def find_shapes(level: Floats, rings: Rings, threshold: Floats) -> Shapes:
-    """Follow each ray outward to where it first falls below a threshold, or leaves the picture.
+    """Follow each ray outward to the outline: where the level first falls below a threshold or the picture ends.
 
-    level: (C, N, M, K) grey levels on the rings; threshold: (C, S, N).
+    level: (C, N, M, K), grey levels on the rings. threshold: (C, S, N), grey levels.
     """
     channels, places, many = level.shape[:3]
     radius_px = rings.radius_px
-    # Rings last: what follows runs along them.
+    # The rings become the last axis: all that follows runs along a ray.
     outward = np.ascontiguousarray(level.swapaxes(2, 3))
     threshold = threshold[..., None]
     below = outward[:, None] < threshold[..., None]
@@ -127,11 +128,11 @@ def find_shapes(level: Floats, rings: Rings, threshold: Floats) -> Shapes:
 
 
 def luminance(pixels: NDArray[np.uint8]) -> Floats:
-    """Give (N, M, K) levels from (N, M, K) grey or (N, M, K, 3) blue green red."""
+    """Return the luminance (N, M, K), grey levels, of (N, M, K) grey or (N, M, K, 3) blue green red."""
     level: Floats = pixels.astype(np.float32)
     return level if pixels.ndim == 3 else level @ LUMA_BGR
 
 
 def weakest_channel(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Give (...,) the lowest of three channels: a core is white, and the water colours the glow."""
+    """Return (...,) the lowest of three channels (..., 3). A core is white and keeps it high; the glow is coloured."""
     return np.minimum(np.minimum(pixels[..., 0], pixels[..., 1]), pixels[..., 2])

@@ -1,7 +1,7 @@
-"""The project's own detector: find the sources of light, not just what is bright.
+"""The project's own detector: find the sources of light, not only bright areas.
 
-Proposals from the grey pyramid (proposals.py), their outlines on rings (lights.py), a score from what tells a lamp
-from a caustic, a particle or texture, and the source inside each likely one (centre.py).
+It proposes places in a grey pyramid (proposals.py), measures their outlines on rings (lights.py), scores how likely
+each is a lamp and not a caustic, a particle or texture, and locates the source of the likely ones (centre.py).
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ _CONTRAST_MIN: Final = (4.0, 16.0)
 _CONTRAST_TO_NOISE: Final = 2.0
 _MEMORY: Final = 0.8
 _KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.5))
-"""How many candidates are kept, from which score on: some always, more where they are likely."""
+"""(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.5 or more."""
 
 _SCORE_AT_ZERO: Final = -5.2
 _SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
 _SCORE_LIMIT: Final = np.array([9.0, 9.0, 2.0, 1.0], np.float32)
-"""Log odds of a lamp: for standing out of its neighbourhood, for its height, against being long, against having no
-edge. Fitted to the places found in rendered dives of five environments, in colour and grey, and in real caustics."""
+"""Weights of the log odds of a lamp. For: standing out of its neighbourhood, height above the ground. Against: being
+elongated, having an open outline. Fitted to the places found in rendered dives of five environments, in colour and
+grey, and in real caustics."""
 
 
 class SourceDetector:
-    """The default detector; adapts to the picture and its predecessors where the environment is `auto`."""
+    """The default detector. With the environment `auto` it adapts to the noise of this picture and those before."""
 
     def __init__(self, environment: str, overrides: Mapping[str, float]) -> None:
         self._values = {**PRESETS.get(environment, {}), **overrides}
@@ -50,7 +51,7 @@ class SourceDetector:
         self._noise: float | None = None
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
-        """Find the candidates of one picture, the likeliest first."""
+        """Find the candidates of one picture, the most likely first."""
         check_image(image)
         self._finder.load(image)
         contrast_min = self._values.get("contrast_min")
@@ -69,14 +70,14 @@ class SourceDetector:
         return _detections(likely, locate_sources(image, likely), score[chosen], image.shape)
 
     def _adapt(self) -> float:
-        """Give the contrast that counts as one: above this picture's noise and that of those before it."""
+        """Return the least contrast of a place, in grey levels: from the noise of this picture and those before."""
         noise = self._finder.noise()
         self._noise = noise if self._noise is None else _MEMORY * self._noise + (1.0 - _MEMORY) * noise
         return min(max(_CONTRAST_TO_NOISE * self._noise, _CONTRAST_MIN[0]), _CONTRAST_MIN[1])
 
 
 def _score(lights: Lights) -> Floats:
-    """Give each light's probability of being a lamp, (N,)."""
+    """Return each light's probability of being a lamp, (N,)."""
     features = np.empty((len(lights.peak), len(_SCORE_WEIGHTS)), np.float32)
     features[:, 0] = np.log(lights.outstanding)
     features[:, 1] = np.log(np.maximum(lights.height, 1.0) / 50.0)
@@ -87,7 +88,7 @@ def _score(lights: Lights) -> Floats:
 
 
 def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:
-    """Put the findings into words and figures; what lies outside the picture is dropped."""
+    """Make the Detections of N lights. shape: of the picture; sources outside of it are dropped."""
     outline = lights.edge_px.astype(np.float64)[..., None] * RAY_UV
     outline += lights.edge_at_px[:, None]
     ahead = (outline @ found.lean[:, :, None])[:, :, 0]

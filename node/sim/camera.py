@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 def project(points_c_m: Array, camera: CameraModel) -> Array:
     """Project (n, 3) points to (n, 2) pixels, pixel centres at integers; NaN behind the camera.
 
-    A pinhole's polynomial folds back far outside its calibrated field: points beyond the fold are NaN too.
+    The distortion polynomial folds back far outside its calibrated field; points beyond the fold are NaN too.
     """
     points = np.asarray(points_c_m, dtype=np.float64)
     ahead = points[:, 2] > 1e-6
@@ -62,7 +62,10 @@ def _fisheye(normalized: Array, distortion: list[float]) -> tuple[Array, NDArray
 
 @lru_cache(maxsize=16)
 def _fold_squared(slope: tuple[float, ...]) -> float:
-    """Return the smallest square of the field at which d(distorted)/d(undistorted) falls to 0."""
+    """Return the smallest squared field (r or theta) at which d(distorted)/d(undistorted) is 0; inf for none.
+
+    slope: coefficients of that derivative in powers of the squared field, from the power 0 up.
+    """
     if not any(slope[1:]):
         return math.inf
     roots = np.roots(slope[::-1])
@@ -71,7 +74,7 @@ def _fold_squared(slope: tuple[float, ...]) -> float:
 
 
 def pinhole(width_px: int, height_px: int) -> CameraModel:
-    """Return the default camera in water: 48.8 degrees across, no distortion, the principal point central."""
+    """Return the default camera in water: 48.8 degrees across, no distortion, principal point in the centre."""
     f_px = 904.0 / 820.0 * width_px
     return CameraModel(
         model="pinhole",

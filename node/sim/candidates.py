@@ -1,4 +1,4 @@
-"""Light candidates without pictures: what a detector of stated noise would publish, and what it would get wrong."""
+"""Light candidates without pictures: what a detector with given noise and given errors would publish."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from buddyline.protocol.messages import MAX_BLOBS, Blob
 
 
 def visible(scene: Scene, index: int, view: SceneView, lamp: Lamp) -> bool:
-    """Tell whether a lamp is in the picture, nothing stands before it, and it is bright enough to be seen."""
+    """Return whether a lamp is inside the picture, not hidden, and bright enough to be seen.
+
+    index: of the observer, A (0) or B (1).
+    """
     u, v = lamp.pixel
     scenario, camera = scene.scenario, scene.rigs[index].camera
     inside = -0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5
@@ -20,10 +23,10 @@ def visible(scene: Scene, index: int, view: SceneView, lamp: Lamp) -> bool:
 
 
 def blobs(scene: Scene, index: int, view: SceneView, stamp_ns: int) -> tuple[list[Blob], int]:
-    """Return the candidates of one picture in no order, and how many of them were too many for a message.
+    """Return the candidates of one picture in random order, and how many did not fit into a message.
 
-    Lights in view are seen with noise sigma_px, some grossly off, some missed; other lamps and reflections are
-    seen as well as lights are; false_lights more stand anywhere.
+    Lights in view have the noise sigma_px; some are off by gross_px more, some are missed. Other lamps and reflections
+    are treated as lights are. `false_lights` more are at random places.
     """
     scenario = scene.scenario
     rng = generator(scenario.seed, "candidates", index, stamp_ns)
@@ -44,7 +47,7 @@ def blobs(scene: Scene, index: int, view: SceneView, stamp_ns: int) -> tuple[lis
 
 
 def _blob(scene: Scene, pixel: np.ndarray[tuple[int], np.dtype[np.float64]], area_px: float) -> list[Blob]:
-    """Return a candidate, or none where noise has put it outside the picture."""
+    """Return one candidate, or an empty list where it is outside the picture."""
     scenario = scene.scenario
     u, v = float(pixel[0]), float(pixel[1])
     if not (-0.5 <= u <= scenario.width_px - 0.5 and -0.5 <= v <= scenario.height_px - 0.5):

@@ -1,4 +1,4 @@
-"""The simulated world as a node's camera and sensors, in real time."""
+"""A node's camera and sensors, served from the simulated world in real time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DEPTH_HZ = 10
 
 
 def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> Scenario:
-    """Return the world that a configuration describes; raise ConfigError for an unknown environment."""
+    """Return the scenario that a configuration describes; raise ConfigError for an unknown environment."""
     if simulation.environment not in ENVIRONMENTS:
         raise ConfigError(f"simulation.environment = {simulation.environment!r}: known are {', '.join(ENVIRONMENTS)}")
     return Scenario(
@@ -61,7 +61,7 @@ class SimulatedCamera:
         return self._info
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
-        """Wait for the next trigger instant and render it; instants that went by meanwhile are skipped."""
+        """Wait for the next trigger instant and render it; skip instants that passed since the last call."""
         instant_ns = next_instant_ns(max(self._clock.now_ns() - self._period_ns // 2, self._last_ns), self._period_ns)
         if self._clock.wait_until_ns(instant_ns, stop):
             return None
@@ -86,7 +86,7 @@ class SimulatedSensor:
         self._last_ns = clock.now_ns()
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
-        """Wait for the next sample's instant."""
+        """Wait for the next sample's instant; return the sample, or None if stopped."""
         instant_ns = next_instant_ns(max(self._clock.now_ns() - S_NS, self._last_ns), self._period_ns)
         if self._clock.wait_until_ns(instant_ns, stop):
             return None

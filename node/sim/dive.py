@@ -1,4 +1,4 @@
-"""A simulated dive as a stream of messages in order of time, as two nodes would log it, and its truth."""
+"""A simulated dive as messages in time order: what two nodes would log, and the truth."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def _samples(sample: Callable[[str, int], Message], node: str, key: str, stamps_
 
 
 def _triggers(world: World, plan: DivePlan, end_ns: int) -> Iterator[int]:
-    """Yield the indices of the triggers of a dive; none so early that its exposure might precede the start."""
+    """Yield the trigger numbers of a dive, from the first whose exposure cannot be before the dive's start."""
     lead_ns = 5 * plan.exposure_sigma_ns + MS_NS
     yield from range(-(-(world.scenario.start_ns + lead_ns) // plan.period_ns), -(-end_ns // plan.period_ns))
 
 
 def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
-    """Yield the truth at the nominal instant of every trigger, whether or not its frames were lost."""
+    """Yield the truth at the nominal instant of every trigger, also where its frames are lost."""
     nodes = (world.scenario.node_a, world.scenario.node_b)
     key = topics.TRUTH.key(*nodes)
     for trigger in _triggers(world, plan, end_ns):
@@ -67,7 +67,7 @@ def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
 
 
 def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[Entry]:
-    """Yield each frame that was not lost, as picture or candidates, and where its lights truly are."""
+    """Yield each frame that is not lost, as a picture or as candidates, and its LightTruth."""
     index, seq = world.scenario.index(node), 0
     light_truth = topics.LIGHT_TRUTH.key(node)
     for instant in _triggers(world, plan, end_ns):

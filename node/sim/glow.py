@@ -1,8 +1,12 @@
-"""Light of a lamp in water: its disc, its scattered halo and beam, and the lens's own glare.
+"""Light of a lamp in water: its disc, its halo and beam of scattered light, and the glare of the lens.
 
-Single scattering along the sight rays, integrated over the scattering angle: at perpendicular distance D from the
-lamp, L = b / D * integral of p(phi) I(beam) exp(-k (d1 + d2)) d(phi), with d1, d2 from the law of sines. The
-1 / D is smooth in (azimuth, log distance) once multiplied out, so a small polar table of L * rho gives every pixel.
+The scattered light is single scattering along each sight ray, integrated over the scattering angle phi:
+
+    L = b / D * integral of p(phi) I(beam) exp(-k (d1 + d2)) d(phi)
+
+D: perpendicular distance of the ray from the lamp. b: scattering coefficient. p: phase function. I: the lamp's
+intensity towards the scattering point. d1, d2: path lengths before and after it, from the law of sines. L * rho, with
+rho the distance from the lamp in the picture, is smooth in (azimuth, log rho), so a small polar table gives all pixels.
 """
 
 from __future__ import annotations
@@ -28,17 +32,17 @@ STEPS: Final = 30
 NODES: Final = 8
 RHO_MIN_PX: Final = 0.5
 FORWARD_SHARE: Final = 0.7
-"""Share of scattered light that goes on so nearly straight that it is as good as not scattered."""
+"""Share of scattered light that goes on nearly straight, and counts as not scattered."""
 SCALE_PX: Final = 900.0
-"""Focal length that the lengths here in pixels belong to; they grow with it."""
+"""Focal length, px, for which the pixel lengths of this module are given; they scale with it."""
 PEAK_FORWARDNESS: Final = 0.97
 SEEN_SD: Final = 5.0
 GLARE: Final = 0.04
-"""Share of a lamp's light that the lens spreads widely."""
+"""Share of a lamp's light that the lens spreads over a wide area."""
 
 
 def phase(cos_angle: Image, water: Water) -> Image:
-    """Return the share of scattered light per steradian at an angle from straight on: two of Henyey-Greenstein's."""
+    """Return the phase function, 1/sr, at an angle from the forward direction: the sum of two Henyey-Greenstein's."""
     peak, rest = (
         (1 - g * g) / (4 * math.pi) * (1 + g * g - 2 * g * cos_angle) ** -1.5
         for g in (PEAK_FORWARDNESS, water.forwardness)
@@ -47,18 +51,18 @@ def phase(cos_angle: Image, water: Water) -> Image:
 
 
 def through_water(water: Water) -> NDArray[np.float64]:
-    """Return the attenuation of direct light, (3,), 1/m: what is scattered straight on still arrives."""
+    """Return the attenuation of direct light, (3,), 1/m. Light that is scattered nearly forward still arrives."""
     return np.array(water.absorption_per_m) + (1 - FORWARD_SHARE) * np.array(water.scattering_per_m)
 
 
 def flux_px(lamp: Lamp, water: Water, f_px: float) -> NDArray[np.float64]:
-    """Return the light that reaches the picture directly, (3,): full scales times square pixels."""
+    """Return a lamp's direct (unscattered) light in the picture, (3,), in full scales times square pixels."""
     direct = np.exp(-through_water(water) * lamp.range_m) * lamp.towards_camera / lamp.range_m**2
     return np.asarray(water.lamp_gain * direct * f_px**2)
 
 
 def core_px(lamp: Lamp, water: Water, f_px: float) -> float:
-    """Return about the radius within which a lamp clips the green channel: its disc's or its glare's."""
+    """Return the approximate radius, px, within which a lamp clips green: that of its disc or of its glare."""
     scale = f_px / SCALE_PX
     flux = float(flux_px(lamp, water, f_px)[1]) / scale**2
     glare_px: float = scale * (GLARE / (2 * math.pi) * flux) ** 0.4
@@ -66,7 +70,7 @@ def core_px(lamp: Lamp, water: Water, f_px: float) -> float:
 
 
 def stands_out(lamp: Lamp, water: Water, f_px: float) -> bool:
-    """Tell whether a lamp's disc is brighter than the water by more than noise makes a pixel."""
+    """Return whether a lamp's disc is brighter than the water by more than SEEN_SD times the pixel noise."""
     size_px, edge_px = _disc_px(lamp, f_px)
     area_px = math.pi * (size_px**2 + (math.pi * edge_px) ** 2 / 3)
     light = float(flux_px(lamp, water, f_px).max()) / area_px
@@ -75,12 +79,12 @@ def stands_out(lamp: Lamp, water: Water, f_px: float) -> bool:
 
 
 def _disc_px(lamp: Lamp, f_px: float) -> tuple[float, float]:
-    """Return a lamp's radius in the picture and the length over which its edge is blurred."""
+    """Return a lamp's radius in the picture, and the width of its blurred edge, both in px."""
     return LAMP_RADIUS_M * f_px / lamp.range_m * math.sqrt(lamp.stretch), BLUR_PX / 1.702 * lamp.stretch
 
 
 class GlowRenderer:
-    """Adds lamps to a picture of one size: their wide glow on a coarse grid, what is near on the full one."""
+    """Adds lamps to pictures of one size: their wide glow on a coarse grid, disc and near glow on the full one."""
 
     def __init__(self, water: Water, width_px: int, height_px: int, f_px: float) -> None:
         self._water = water
@@ -102,7 +106,7 @@ class GlowRenderer:
         self._node_x, self._node_w = ((x + 1) / 2).astype(np.float32), (w / 2).astype(np.float32)
 
     def table(self, lamp: Lamp) -> Image:
-        """Return L * rho, (STEPS, AZIMUTHS, 3), of a lamp's scattered light; rho in px, L in full scales."""
+        """Return L * rho of a lamp's scattered light and glare, (STEPS, AZIMUTHS, 3); rho in px, L in full scales."""
         r = lamp.range_m
         source = lamp.position_m / r
         centre = lamp.position_m[:2] / lamp.position_m[2]

@@ -1,4 +1,4 @@
-"""Simulated inertial units: where they stand, how they are mounted, and how they err."""
+"""Simulated inertial units: their place on the rig, their mounting, and their errors."""
 
 from __future__ import annotations
 
@@ -22,17 +22,19 @@ ACCEL_SIGMA_MPS2: Final = 0.03
 GYRO_SIGMA_RADPS: Final = 0.004
 MAG_SIGMA_T: Final = 0.3e-6
 WALK_S: Final = (20.0, 200.0)
-"""Shortest and longest period in which a bias walks."""
+"""Shortest and longest period of a bias's wandering part, s."""
 SHAKE_S: Final = (0.1, 0.6)
-"""The same of the shaking by fins, which turns and pushes the unit in its mount."""
+"""Shortest and longest period of the shaking by fin kicks, which turns and pushes the unit in its mount, s."""
 
 
 @dataclass(frozen=True)
 class Grade:
-    """How far a unit is off, 1 sd or the most. lever_sigma_m: of each coordinate that NodeInfo states.
+    """The errors of a unit, 1 sd if not said otherwise.
 
-    misalignment_rad: angle between the true mount and the stated one. delay_ns: least and most of what NodeInfo does
-    not state. gyro_bias_radps, accel_bias_mps2: constant; ..._walk: of what wanders. shake_mps2, shake_radps: by fins.
+    lever_sigma_m: of each coordinate of the stated lever arm. misalignment_rad: the angle between the true and the
+    stated mounting. delay_ns: least and greatest delay of the stamps, which NodeInfo does not state.
+    gyro_bias_radps, accel_bias_mps2: constant biases. gyro_walk_radps, accel_walk_mps2: their wandering parts.
+    shake_mps2, shake_radps: shaking by fin kicks.
     """
 
     lever_sigma_m: float
@@ -55,7 +57,7 @@ GRADES: Final[dict[InertialGrade, Grade]] = {
 class InertialUnit:
     """The inertial unit of one node. Times in seconds since the start, on the node's own clock.
 
-    lever_m, stated_lever_m: its true place and what NodeInfo says of it, in the camera's frame.
+    lever_m, stated_lever_m: (3,), its true place and the one in NodeInfo, in the camera frame.
     """
 
     def __init__(self, seed: int, index: int, motion: PairMotion, grade: InertialGrade, heading_off_rad: float) -> None:
@@ -76,7 +78,7 @@ class InertialUnit:
     def sample(self, stamp_ns: int, t_s: float) -> tuple[Vector, Vector, Vector]:
         """Return specific force (m/s^2), turn rate (rad/s) and field (T), (3,) each, in the stated body frame.
 
-        t_s: what the sample is stamped with; stamp_ns names the sample's own noise.
+        t_s: the sample's time by its stamp. stamp_ns: the same stamp, which seeds the sample's noise.
         """
         rng = generator(self._seed, "imu", self._index, stamp_ns)
         true_s = t_s - self._delay_s

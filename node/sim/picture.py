@@ -1,4 +1,4 @@
-"""Pictures of a simulated camera: scenery, glow, lamps, what passes by, snow, noise."""
+"""Pictures of a simulated camera: scenery, glow, lamps, passing obstacles, snow, noise."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ NOISE_MARGIN_PX = 64
 
 
 class Painter:
-    """Renders the pictures of one node. Linear light throughout; the camera's tone curve is a square root.
+    """Renders the pictures of one node, in linear light. The camera's tone curve is a square root.
 
-    Under a square root shot noise has one size at every brightness, so that one tile of noise, shifted at random
-    for every frame, serves. Its buffers serve one caller at a time.
+    After a square root, shot noise has the same size at every brightness. So all frames use one tile of noise,
+    shifted at random. Not safe for several threads: the buffers are reused.
     """
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
@@ -35,7 +35,7 @@ class Painter:
         self._full: Image = np.empty((scenario.height_px, scenario.width_px, 3), np.float32)
 
     def paint(self, view: SceneView, t_s: float, frame: int) -> NDArray[np.uint8]:
-        """Return the picture, (H, W, 3) uint8, blue green red. frame: names the frame's own noise."""
+        """Return the picture, (H, W, 3) uint8, blue green red. frame: seeds the frame's noise."""
         rng = generator(self._seed, "frame", self._index, frame)
         lamps = [lamp for lamp in (*view.lights, *view.others) if self._matters(lamp)]
         tables = [self._glow.table(lamp) for lamp in lamps]
@@ -58,7 +58,7 @@ class Painter:
         return np.asarray(cv2.addWeighted(full, 255.0, noise, 1.0, 0.0, dtype=cv2.CV_8U), np.uint8)
 
     def _matters(self, lamp: Lamp) -> bool:
-        """Tell whether a lamp stands near enough to the picture to be seen or to light the water in it."""
+        """Return whether a lamp is in the picture, or near enough to light the water in it."""
         if np.isnan(lamp.pixel).any() or lamp.position_m[2] < 0.1:
             return False
         beyond = np.abs(lamp.pixel / self._size_px - 0.5) - 0.5
@@ -66,7 +66,7 @@ class Painter:
 
 
 def _noise_tile(scenario: Scenario, index: int) -> Image:
-    """Return a tile of sensor noise in grey levels, smeared a little as demosaicing does."""
+    """Return a tile of sensor noise in grey levels, slightly blurred as by demosaicing."""
     rng = generator(scenario.seed, "noise", index)
     shape = scenario.height_px + NOISE_MARGIN_PX, scenario.width_px + NOISE_MARGIN_PX, 3
     tile = cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (3, 3), 0.6)
@@ -75,7 +75,7 @@ def _noise_tile(scenario: Scenario, index: int) -> Image:
 
 
 def _darken(full: Image, passer: Passer, radiance: Image) -> None:
-    """Put a dark body with a soft edge over the picture."""
+    """Paint a dark body with a soft edge over the picture. radiance: (3,)."""
     reach = int(passer.radii_px.max()) + 3
     u, v = passer.centre_px
     height_px, width_px = full.shape[:2]

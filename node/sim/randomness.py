@@ -1,4 +1,4 @@
-"""Random numbers that can be asked for at any time, in any order, by any process, and agree."""
+"""Random numbers that depend on their arguments only, so that all processes get the same ones in any order."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 
 def generator(seed: int, stream: str, node: int = 0, index: int = 0) -> np.random.Generator:
-    """Return the generator that belongs to (seed, stream, node, time index) alone."""
+    """Return the generator of (seed, stream, node, time index): the same arguments give the same numbers."""
     return np.random.default_rng((seed, zlib.crc32(stream.encode()), node, index))
 
 
 class Sway:
     """A smooth wandering value: a sum of sinusoids with random periods and phases.
 
-    Peak 1 or less, standard deviation `sd`. Defined at every time, so that two processes agree on it.
+    It is at most 1 in size, with the standard deviation `sd`. It is a function of time, so two processes agree on it.
     """
 
     def __init__(self, rng: np.random.Generator, shortest_s: float, longest_s: float, components: int = 3) -> None:

@@ -1,4 +1,4 @@
-"""What stands on a node: two lamps on a bar, their aims, the pressure port, the camera's mount."""
+"""The rig of a simulated node: two lights on a bar, their aims, the pressure port, the camera's mount."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPILL: Final = 0.015
 class SimulatedRig:
     """One node as built. lights_m, aims: (2, 3), left and right, in its camera frame; aims are unit vectors.
 
-    beams_rad, intensities: (2,), of the lamps: 1 sd of the beam, and how bright on its axis.
+    beams_rad: (2,), 1 sd of each light's beam. intensities: (2,), on the beam's axis. depth_port_m: (3,), camera frame.
     """
 
     camera: CameraModel
@@ -34,7 +34,7 @@ class SimulatedRig:
 
 
 def build(scenario: Scenario, index: int) -> SimulatedRig:
-    """Return the rig of A (0) or B (1): lamps toed out by 3 to 8 degrees, a few millimetres off the bar."""
+    """Return the rig of A (0) or B (1): lights toed out by 3 to 8 degrees, a few millimetres off the bar."""
     rng = generator(scenario.seed, "rig", index)
     half_m = scenario.baseline_m(index) / 2
     lights_m = np.array([[-half_m, 0.0, 0.0], [half_m, 0.0, 0.0]])
@@ -49,6 +49,6 @@ def build(scenario: Scenario, index: int) -> SimulatedRig:
 
 
 def beam(cos_off_axis: Vector, beam_rad: float) -> Vector:
-    """Return a lamp's intensity against its axis (1): a Gaussian beam and some spill all around."""
+    """Return a lamp's intensity relative to its axis: a Gaussian beam, and some light in all directions."""
     off_axis_rad2 = 2.0 * (1.0 - cos_off_axis)
     return np.asarray(SPILL + (1.0 - SPILL) * np.exp(-0.5 * off_axis_rad2 / beam_rad**2))

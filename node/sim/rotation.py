@@ -13,7 +13,7 @@ Matrix: TypeAlias = NDArray[np.float64]
 
 
 def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Matrix:
-    """Return R_ned_body for aerospace angles: yaw about down, then pitch, then roll."""
+    """Return R_ned_body, (3, 3), for aerospace angles: yaw about down, then pitch, then roll."""
     sr, cr = math.sin(roll_rad), math.cos(roll_rad)
     sp, cp = math.sin(pitch_rad), math.cos(pitch_rad)
     sy, cy = math.sin(yaw_rad), math.cos(yaw_rad)
@@ -59,7 +59,7 @@ def to_quaternion(R: Matrix) -> tuple[float, float, float, float]:
 
 
 def to_vector(R: Matrix) -> Vector:
-    """Return the rotation vector of R (rad); accurate near the identity, which is where it serves."""
+    """Return the rotation vector of R, (3,), rad. Accurate near the identity, where it is used."""
     x, y, z, w = to_quaternion(R)
     norm = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-12 else 2.0 * math.atan2(norm, w) / norm

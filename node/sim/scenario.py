@@ -1,4 +1,4 @@
-"""What is simulated: one frozen description from which everything else follows."""
+"""The description of a simulated dive: with its seed, it determines everything."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ Bgr: TypeAlias = tuple[float, float, float]
 class Water:
     """Optics and layout of an environment; colours in the order of OpenCV: blue, green, red.
 
-    absorption_per_m, scattering_per_m: coefficients by colour. peak_share: of scattered light that keeps to a
-    narrow peak (turbid water widens it); forwardness: Henyey-Greenstein's g of the rest.
-    ambient: radiance of the open water as a share of full scale (0: dark); lamp_gain: exposure, as the radiance
-    (share of full scale) that a lamp's light of unit intensity has per steradian. noise: sd in grey levels.
-    depth_m: of A; floor_depth_m: of the sea floor, 0 where none is in view. density_kgpm3: for pressure.
-    snow: particles in view. caustics, surface: contrast of both, 0 without sun. range_max_m: how far B goes.
+    absorption_per_m, scattering_per_m: coefficients of each colour. peak_share: share of scattered light in a narrow
+    forward peak (small in turbid water); forwardness: Henyey-Greenstein's g of the rest.
+    ambient: radiance of the open water as a share of full scale (0: dark). lamp_gain: exposure, as the radiance
+    (share of full scale) per steradian of a lamp of unit intensity. noise: sd in grey levels.
+    depth_m: of A. floor_depth_m: of the sea floor, 0 where none is in view. density_kgpm3: for pressure.
+    snow: particles in view. caustics, surface: contrast of both, 0 without sun. range_max_m: B's greatest range.
     """
 
     absorption_per_m: Bgr
@@ -71,16 +71,16 @@ WATERS: Final[dict[str, Water]] = {
 
 @dataclass(frozen=True)
 class Scenario:
-    """Two nodes in some water: with its seed, all there is to know of a simulated dive.
+    """Two nodes in some water: the complete description of a simulated dive.
 
-    start_ns: epoch of t = 0. camera_a, camera_b: None for the default pinhole. rig_sigma_m: how far the lights are
-    off the ideal bar (NodeInfo states where they truly are). range_max_m: 0 for the environment's own.
-    sigma_px: noise of synthetic candidates; gross_share of them off by gross_px; miss_share are missing;
-    false_lights are put in at random places of each picture. other_lamps: other divers' lamps in the water.
-    tags: whether each node carries two AR tags.
+    start_ns: epoch of t = 0. camera_a, camera_b: None for the default pinhole. rig_sigma_m: 1 sd of the lights'
+    distance from the ideal bar (NodeInfo has their true places). range_max_m: 0 for the environment's own.
+    sigma_px: noise of synthetic candidates. gross_share: share of them with a gross error, gross_px (1 sd per axis).
+    miss_share: share of lights that give no candidate. false_lights: false candidates in each picture.
+    other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
-    magnetometer_off_rad: constant error of B's heading, outside what its sigma says. inertial: how good the inertial
-    units are.
+    magnetometer_off_rad: constant error of B's heading that its sigma does not include. inertial: quality of the
+    inertial units.
     """
 
     environment: Environment = "cavern"
@@ -112,11 +112,11 @@ class Scenario:
     inertial: InertialGrade = "good"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be simulated, naming the field."""
+        """Raise BuddylineError, naming the field, for what cannot be simulated."""
         check_node_id(self.node_a)
         check_node_id(self.node_b)
         if self.node_a == self.node_b:
-            raise BuddylineError(f"node_b: {self.node_b!r} is node_a's name as well")
+            raise BuddylineError(f"node_b: {self.node_b!r} is also node_a; the nodes need different names")
         for name, known in (
             ("environment", ENVIRONMENTS),
             ("trajectory", TRAJECTORIES),
@@ -154,13 +154,13 @@ class Scenario:
         own = (self.camera_a, self.camera_b)[index]
         if own is not None:
             return own
-        # Commands name the environments in their help: it shall not take the time to import numpy.
+        # Imported here: commands name the environments in their help, which must not take the time to load numpy.
         from buddyline.node.sim.camera import pinhole
 
         return pinhole(self.width_px, self.height_px)
 
     def baseline_m(self, index: int) -> float:
-        """Return the spacing of the lights of A (0) or B (1)."""
+        """Return the baseline of A (0) or B (1), metres."""
         return (self.baseline_a_m, self.baseline_b_m)[index]
 
 
@@ -186,9 +186,9 @@ _LOWEST: Final = {
 
 @dataclass(frozen=True)
 class DivePlan:
-    """What of a dive is logged. images: pictures in place of synthetic candidates.
+    """Which messages of a dive are logged. images: pictures in place of synthetic candidates. imu: inertial samples.
 
-    exposure_sigma_ns: how far exposures stray from their trigger, 1 sd. lost_share: of the frames.
+    exposure_sigma_ns: distance of exposures from their trigger instants, 1 sd. lost_share: share of lost frames.
     """
 
     seconds: float = 60.0
@@ -199,7 +199,7 @@ class DivePlan:
     lost_share: float = 0.03
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be logged, naming the field."""
+        """Raise BuddylineError, naming the field, for a value out of range."""
         if not 0 < self.seconds < 1e6:
             raise BuddylineError(f"seconds: {self.seconds} is not above 0 and below 1e6")
         if not 0 < self.rate_hz <= 200:

@@ -1,4 +1,4 @@
-"""What stands before a camera at one time: lamps, in its frame and in its picture, and what hides them."""
+"""What a camera sees at one time: lamps in its frame and in its picture, and what hides them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PASSING_SHARE = 0.6
 class LightSource:
     """A lamp in the water, in NED. intensity: on its axis; beam_rad: 1 sd of its beam.
 
-    stretch: how much ripples draw its image out, up and down (a reflection), 1 for none.
+    stretch: factor by which ripples lengthen its image vertically (a reflection); 1 for a direct view.
     """
 
     position_ned_m: Vector
@@ -37,7 +37,7 @@ class LightSource:
 
 @dataclass(frozen=True)
 class Lamp:
-    """A LightSource before a camera. position_m, aim: camera frame; pixel: (2,) in the distorted picture."""
+    """A LightSource as one camera sees it. position_m, aim: camera frame; pixel: (2,) in the distorted picture."""
 
     position_m: Vector
     aim: Vector
@@ -59,14 +59,14 @@ class Lamp:
 
 @dataclass(frozen=True)
 class Passer:
-    """Something dark that passes before a lamp: an ellipse in the picture, pixels and radians."""
+    """A dark thing that passes before a lamp: an ellipse in the picture, pixels and radians."""
 
     centre_px: Vector
     radii_px: Vector
     angle_rad: float
 
     def hides(self, pixel: Vector) -> bool:
-        """Tell whether a pixel lies behind it."""
+        """Return whether a pixel is covered by it."""
         c, s = math.cos(self.angle_rad), math.sin(self.angle_rad)
         along, across = np.array([[c, s], [-s, c]]) @ (pixel - self.centre_px) / self.radii_px
         return bool(along**2 + across**2 < 1.0)
@@ -74,7 +74,7 @@ class Passer:
 
 @dataclass(frozen=True)
 class SceneView:
-    """All that one camera sees at one time. lights: the other node's, left and right."""
+    """All that one camera sees at one time. lights: the other node's left and right. others: lamps and reflections."""
 
     placement: Placement
     lights: tuple[Lamp, Lamp]
@@ -84,16 +84,16 @@ class SceneView:
 
     @property
     def R_ned_camera(self) -> Matrix:
-        """Camera to NED."""
+        """Rotation from the camera frame to NED."""
         return self.placement.R_ned_body @ R_BODY_CAMERA
 
     def hidden(self, pixel: Vector) -> bool:
-        """Tell whether something stands before a pixel."""
+        """Return whether a passing thing covers a pixel."""
         return any(passer.hides(pixel) for passer in self.passers)
 
 
 class Scene:
-    """Both rigs, other divers, the surface, and what passes by. Times in seconds since the start."""
+    """Both rigs, other divers, the surface, and passing things. Times in seconds since the start."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -101,12 +101,12 @@ class Scene:
         self.rigs: tuple[SimulatedRig, SimulatedRig] = (build(scenario, 0), build(scenario, 1))
         rng = generator(scenario.seed, "divers")
         self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
-        # Pictures, candidates and truth of a frame all ask for the same view.
+        # The picture, the candidates and the truth of a frame need the same view.
         self.view = lru_cache(maxsize=4)(self._view)
         self._ripple = [[Sway(rng, 0.4, 3.0) for _ in range(2)] for _ in range(2)]
 
     def _view(self, index: int, t_s: float) -> SceneView:
-        """Return what A (0) or B (1) sees at t_s, with every lamp where its row of the picture has it."""
+        """Return what A (0) or B (1) sees at t_s; each light's pixel is the one at its own row's exposure."""
         placement = self.motion.placement(index, t_s)
         lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))
         other_a_b = self.motion.placement(0, t_s), self.motion.placement(1, t_s)
@@ -128,11 +128,11 @@ class Scene:
         return lamp
 
     def row_delay_s(self, v_px: float) -> float:
-        """Return when a row is exposed, against the middle row."""
+        """Return the exposure time of a row minus that of the middle row, s."""
         return (v_px - (self.scenario.height_px - 1) / 2) * self.scenario.row_time_ns * 1e-9
 
     def _source(self, index: int, side: int, t_s: float) -> LightSource:
-        """Return a node's own light."""
+        """Return one light of node A (0) or B (1)."""
         placement, rig = self.motion.placement(index, t_s), self.rigs[index]
         R_ned_camera = placement.R_ned_body @ R_BODY_CAMERA
         return LightSource(
@@ -143,7 +143,7 @@ class Scene:
         )
 
     def _reflection(self, index: int, side: int, t_s: float) -> LightSource:
-        """Return a light's mirror image in the surface; ripples move it and draw it out."""
+        """Return a light's mirror image in the surface; ripples move it and lengthen it."""
         source = self._source(index, side, t_s)
         mirror = np.array([1.0, 1.0, -1.0])
         across_m, up_m = (0.05 * ripple(t_s) for ripple in self._ripple[side])
@@ -163,7 +163,7 @@ class Scene:
         return Lamp(position_m, R_camera_ned @ source.aim_ned, pixel, source.intensity, source.beam_rad, source.stretch)
 
     def _tags(self, index: int, placement: Placement, t_s: float) -> tuple[SeenTag, ...]:
-        """Return the other node's tags, lit by the sun and by the lamps of the node that looks."""
+        """Return the other node's tags, lit by the sun and by the observer's lights."""
         water, rig, other = self.scenario.water, self.rigs[index], self.motion.placement(1 - index, t_s)
         R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
         R_camera_other = R_camera_ned @ other.R_ned_body @ R_BODY_CAMERA
@@ -215,7 +215,7 @@ class _Passing:
 
 @lru_cache(maxsize=64)
 def _passing(seed: int, index: int, window: int) -> _Passing | None:
-    """Return what passes in a window of time before one light, if anything does."""
+    """Return the thing that passes before one light in a window of time; None if nothing does."""
     if window < 0:
         return None
     rng = generator(seed, "passing", index, window)
@@ -233,7 +233,7 @@ def _passing(seed: int, index: int, window: int) -> _Passing | None:
 
 
 class _Diver:
-    """Another diver with one lamp, who swims to and fro beside the line between the nodes."""
+    """Another diver with one lamp, who swims back and forth beside the line between the nodes."""
 
     def __init__(self, scenario: Scenario, rng: np.random.Generator) -> None:
         self._intensity = float(rng.uniform(0.3, 1.0))

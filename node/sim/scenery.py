@@ -1,4 +1,4 @@
-"""What the sun lights: open water, a floor with caustics, the surface from below, the other node's body."""
+"""The background of a picture: open water, a floor with caustics, the surface from below, the other node's body."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Texture = NDArray[np.uint8]
 
 GRID_PX: Final = 8
 TEXTURED_PX: Final = 2
-"""Textures are looked up for every second pixel; they hold nothing finer."""
+"""Textures are computed for every second pixel; they have no finer detail."""
 TEXTURE_PX: Final = 256
 TILES: Final = 8
 FLOOR_TILE_M: Final = 6.0
@@ -26,14 +26,14 @@ FADING_M: Final = 12.0
 """Range at which textures blur into their mean."""
 FARTHEST_M: Final = 40.0
 DARK_WATER: Final = 0.0006
-"""Radiance of unlit water: what the lamps' light, scattered many times, leaves everywhere."""
+"""Radiance of unlit water, from the lamps' light that is scattered many times."""
 
 
 class Scenery:
-    """The background of one camera. Its directions are a pinhole's: a background need not be distorted.
+    """The background of one camera, projected as by a pinhole: a background needs no lens distortion.
 
-    All that changes slowly over the picture (directions, distances, veiling light) is worked out on a coarse
-    grid; only textures are looked up for every pixel.
+    What changes slowly over the picture (directions, distances, veiling light) is computed on a coarse grid. Only
+    textures are computed at a finer resolution.
     """
 
     def __init__(self, scenario: Scenario, camera: CameraModel) -> None:
@@ -55,7 +55,7 @@ class Scenery:
         self.passer_radiance: Image = 0.5 * self._ambient
 
     def paint(self, view: SceneView, t_s: float, coarse: Image, full: Image) -> None:
-        """Paint the background over full, (H, W, 3), and the glow that stands in coarse, (h, w, 3), onto it."""
+        """Write the background plus the glow in `coarse`, (h, w, 3), into `full`, (H, W, 3)."""
         if not self._sunlit:
             coarse += DARK_WATER
             cv2.resize(coarse, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
@@ -87,7 +87,7 @@ class Scenery:
         cv2.resize(middle, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
 
     def _add_body(self, view: SceneView) -> None:
-        """Add the other node's bar and housing to the middle picture, before sunlit water."""
+        """Add the other node's bar and housing to the half-size picture; they show against sunlit water."""
         left, right = view.lights
         if min(left.position_m[2], right.position_m[2]) < 0.3 or np.isnan([left.pixel, right.pixel]).any():
             return
@@ -121,7 +121,7 @@ class Scenery:
         cv2.circle(mask, (round(16 * u), round(16 * v)), round(16 * 0.1 * scale), 255, -1, cv2.LINE_AA, 4)
 
     def _drifting(self, tiles: list[Texture], t_s: float, drifts: NDArray[np.float64]) -> Texture:
-        """Return the darker of two tiles that drift apart: light that dances without repeating soon."""
+        """Return the darker of two tiles that drift apart: moving light that does not repeat soon."""
         shifted = [
             np.roll(tile, (round(dy * t_s) % TEXTURE_PX, round(dx * t_s) % TEXTURE_PX), (0, 1))
             for tile, (dx, dy) in zip(tiles, drifts, strict=True)
@@ -131,7 +131,7 @@ class Scenery:
     def _add_texture(
         self, plane: _Plane, position_m: NDArray[np.float64], tile: Texture, tile_m: float, colour: Image
     ) -> None:
-        """Add a plane's texture to the middle picture, on those of its rows that see the plane."""
+        """Add a plane's texture to the half-size picture, in the rows that see the plane."""
         rows = np.flatnonzero(plane.seen.any(axis=1))
         if rows.size == 0:
             return
@@ -139,7 +139,7 @@ class Scenery:
         cell = GRID_PX // TEXTURED_PX
         top, bottom = first * cell, min(last * cell, self._middle.shape[0])
         size = self._middle.shape[1], (last - first) * cell
-        # Whole tiles more or less change nothing: the middle of the sheet lies below the camera.
+        # The texture repeats, so any whole number of tiles may be added: this one keeps the look-up inside the sheet.
         corner_m = position_m % tile_m + tile_m * (TILES // 2)
         where = ((plane.hits_m[first:last] + corner_m) * (TEXTURE_PX / tile_m)).astype(np.float32)
         columns, lines = (
@@ -153,10 +153,10 @@ class Scenery:
 
 
 class _Plane:
-    """A horizontal plane below (or, with rays turned over, above) the camera, on a grid of rays.
+    """A horizontal plane below the camera (above it, with negated rays), on a grid of rays.
 
-    hits_m: (h, w, 2) where the rays meet it, from the camera. range_m, seen: (h, w). through: (h, w, 3) of its
-    light that arrives.
+    hits_m: (h, w, 2), where the rays meet it, relative to the camera. range_m: (h, w). seen: (h, w), whether a ray
+    meets it within FARTHEST_M. through: (h, w, 3), the share of its light that reaches the camera.
     """
 
     def __init__(self, rays: NDArray[np.float64], distance_m: float, k: NDArray[np.float64]) -> None:
@@ -168,7 +168,7 @@ class _Plane:
 
 
 def _rays(camera: CameraModel, size_px: tuple[int, int], grid: tuple[int, int]) -> NDArray[np.float64]:
-    """Return unit rays in the camera frame through the cells' middles, (h, w, 3)."""
+    """Return unit rays in the camera frame through the centres of the grid's cells, (h, w, 3)."""
     height, width = grid
     rays = np.empty((height, width, 3))
     rays[..., 0] = ((np.arange(width) + 0.5) * GRID_PX - 0.5 - camera.cx_px) / camera.fx_px
@@ -178,7 +178,7 @@ def _rays(camera: CameraModel, size_px: tuple[int, int], grid: tuple[int, int]) 
 
 
 def _field(rng: np.random.Generator, waves: float, spread: float) -> NDArray[np.float64]:
-    """Return a random smooth field that wraps around, sd 1, of so many waves across the tile."""
+    """Return a random smooth field that wraps around, with sd 1 and about `waves` waves across the tile."""
     frequency = np.fft.fftfreq(TEXTURE_PX, 1 / TEXTURE_PX)
     radius = np.hypot(frequency[:, None], frequency[None])
     band = np.exp(-(((radius - waves) / spread) ** 2))
@@ -187,7 +187,7 @@ def _field(rng: np.random.Generator, waves: float, spread: float) -> NDArray[np.
 
 
 def _caustics(rng: np.random.Generator) -> Texture:
-    """Return a tile of caustics: bright curves, where a random field passes 0, of uneven strength."""
+    """Return a tile of caustics: bright curves of uneven strength, where a random field is 0."""
     ridge = np.exp(-np.abs(_field(rng, 9.0, 4.5)) * 2.4) * np.clip(0.8 + 0.35 * _field(rng, 3.0, 2.0), 0.2, 1.3)
     return np.asarray(np.clip(250 * ridge, 0, 255), np.uint8)
 

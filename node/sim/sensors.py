@@ -25,7 +25,7 @@ SLOW_SHARE: Final = 0.8
 
 
 class SensorModel:
-    """The sensors of one node. Times in seconds since the start; stamps name the samples' own noise."""
+    """The sensors of one node. t_s: seconds since the start. stamp_ns: the sample's stamp, which seeds its noise."""
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
         rng = generator(scenario.seed, "sensors", index)
@@ -38,7 +38,7 @@ class SensorModel:
         self.unit = InertialUnit(scenario.seed, index, scene.motion, scenario.inertial, self._off_rad)
 
     def attitude(self, stamp_ns: int, t_s: float) -> Attitude:
-        """Return what an attitude filter would say; its sigmas are true, but for a magnetometer that is off."""
+        """Return an attitude filter's output. Its sigmas are true except for the error magnetometer_off_rad."""
         rng = generator(self._scenario.seed, "attitude", self._index, stamp_ns)
         fresh = rng.standard_normal(3)
         R = self._scene.motion.placement(self._index, t_s).R_ned_body
@@ -50,7 +50,7 @@ class SensorModel:
         return Attitude(node=self._node, stamp_ns=stamp_ns, q_ned_body_xyzw=q_xyzw, sigma_rad=self._sigma_rad)
 
     def depth(self, stamp_ns: int, t_s: float) -> Depth:
-        """Return the depth of the pressure port, with the noise and the steps of a cheap gauge."""
+        """Return the depth of the pressure port, with the noise and resolution of a cheap gauge."""
         rng = generator(self._scenario.seed, "depth", self._index, stamp_ns)
         placement = self._scene.motion.placement(self._index, t_s)
         port_m = R_BODY_CAMERA @ self._scene.rigs[self._index].depth_port_m

@@ -1,4 +1,4 @@
-"""Marine snow: particles that drift past and shine in the lamps' light."""
+"""Marine snow: drifting particles that reflect the lamps' light."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ BOX_M = 2.4
 NEAREST_M = 0.15
 SHINE = 0.05
 FAINTEST = 0.002
-"""Radiance below which noise hides a particle."""
+"""A particle of lower radiance is hidden in noise, and is not drawn."""
 
 
 class Snow:
-    """Particles at rest in drifting water: a box of them that repeats, and that the camera swims through."""
+    """Slowly drifting particles that fill the water: one box of them, repeated in all directions."""
 
     def __init__(self, scenario: Scenario, camera: CameraModel, index: int) -> None:
         rng = generator(scenario.seed, "snow")

@@ -1,4 +1,4 @@
-"""AR tags on a node's bar, as a yardstick beside the lights: where they are, and how a picture shows them."""
+"""AR tags on a node's bar, to compare poses from tags with poses from lights: their places and their rendering."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Image = NDArray[np.float32]
 FAMILY: Final = "36h11"
 SIDE_M: Final = 0.16
 CELLS: Final = 8
-"""Cells along the black square's side; a white margin of one cell stands around it."""
+"""Cells along the side of the black square; a white margin of one cell surrounds it."""
 TEXTURE_CELL_PX: Final = 16
 WHITE: Final = 0.85
 BLACK: Final = 0.04
@@ -28,7 +28,7 @@ PLACES_M: Final = ((-0.2, 0.14, 0.0), (0.2, 0.14, 0.0))
 class Tag:
     """One tag of a node. corners_m: (4, 3) of the black square in the node's camera frame.
 
-    As one who faces the node sees it upright: top left, top right, bottom right, bottom left.
+    Their order, as seen by an observer who faces the node: top left, top right, bottom right, bottom left.
     """
 
     id: int
@@ -37,9 +37,9 @@ class Tag:
 
 @dataclass(frozen=True)
 class SeenTag:
-    """A tag before a camera. board_px: (4, 2), corners of the white margin; light, through: (3,).
+    """A tag as one camera sees it. board_px: (4, 2), corners of the white margin.
 
-    light: radiance of a white tag; through: the share of it that arrives.
+    light: (3,), radiance of a white tag at the tag. through: (3,), the share of it that reaches the camera.
     """
 
     id: int
@@ -55,7 +55,7 @@ def layout(index: int) -> tuple[Tag, ...]:
 
 
 def board(corners_m: Vector) -> Vector:
-    """Return the corners of the white margin about a tag's black square, (4, 3)."""
+    """Return the outer corners of the white margin around a tag's black square, (4, 3)."""
     centre_m = corners_m.mean(axis=0)
     return np.asarray(centre_m + (corners_m - centre_m) * (CELLS + 2) / CELLS)
 
@@ -70,7 +70,7 @@ def paint(full: Image, tag: SeenTag) -> None:
     ) * (tag.board_px[2, 0] - tag.board_px[1, 0]) <= 0
     if u0 >= u1 or v0 >= v1 or away:
         return
-    # Texels not much finer than pixels: what the picture cannot hold would alias.
+    # Texels about as large as pixels: much finer ones would alias.
     side_px = float(np.linalg.norm(np.roll(tag.board_px, -1, axis=0) - tag.board_px, axis=1).max())
     texture = _texture(tag.id, int(np.clip(np.ceil(2 * side_px / (CELLS + 2)), 2, TEXTURE_CELL_PX)))
     edge = texture.shape[0] - 0.5
@@ -88,7 +88,7 @@ def paint(full: Image, tag: SeenTag) -> None:
 
 @lru_cache(maxsize=64)
 def _texture(tag_id: int, cell_px: int) -> Image:
-    """Return a tag's reflectance with its margin, so many pixels a cell."""
+    """Return a tag's reflectance with its margin, cell_px pixels for each cell."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     marker = np.asarray(cv2.aruco.generateImageMarker(dictionary, tag_id, CELLS))
     cells = np.pad(marker, 1, constant_values=255) > 127

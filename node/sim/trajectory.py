@@ -1,4 +1,4 @@
-"""How the two nodes move: smooth, and known at every time."""
+"""The motion of the two nodes: a smooth function of time."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ CLEARANCE_M = 0.5
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a node is: R_ned_body, and its camera's centre in NED (down is depth), metres."""
+    """A node's pose: R_ned_body, and its camera's centre in NED (down is depth), metres."""
 
     R_ned_body: Matrix
     position_ned_m: Vector
 
 
 class PairMotion:
-    """The two nodes' motion: A rests and sways, B backs off and circles before it.
+    """The two nodes' motion: A stays and sways; B moves away and back, and circles in front of A.
 
-    The angles are shares of the room that the bar leaves in the picture at the present range, so that the lights
-    are mostly, and not always, in view. Times in seconds since the start.
+    At each range the angles scale with the free space that the bar leaves in the picture. So the lights are in view
+    most of the time, but not always. Times in seconds since the start.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         rng = generator(scenario.seed, "motion")
-        # All that is asked about one instant needs the same two placements.
+        # All messages of one instant need the same two placements.
         self.placement = lru_cache(maxsize=16)(self._placement)
         self._scenario = scenario
         self._heading_rad = float(rng.uniform(-math.pi, math.pi))
@@ -46,7 +46,7 @@ class PairMotion:
         self._cycle_s = max(math.pi * span_m / SPEED_MPS, 20.0)
         self._turn = [[Sway(rng, 4.0, 14.0) for _ in range(3)] for _ in range(2)]
         self._drift = [[Sway(rng, 5.0, 16.0) for _ in range(3)] for _ in range(2)]
-        self._level = Sway(rng, 25.0, 60.0)
+        self._elevation = Sway(rng, 25.0, 60.0)
         cameras = [scenario.camera(i) for i in range(2)]
         self._half_h_rad = min(math.atan(scenario.width_px / 2 / c.fx_px) for c in cameras)
         self._half_v_rad = min(math.atan(scenario.height_px / 2 / c.fy_px) for c in cameras)
@@ -68,7 +68,7 @@ class PairMotion:
         return s.range_min_m + (s.far_m - s.range_min_m) * cycle * shape
 
     def _room_rad(self, t_s: float) -> tuple[float, float]:
-        """Return how far, across and up, the other node may stand from the middle of the picture."""
+        """Return how far (across, up) the other node may be from the picture's centre, rad."""
         range_m = self.range_m(t_s)
         across = self._half_h_rad - math.atan(self._half_bar_m / range_m) - MARGIN_RAD
         up = self._half_v_rad - math.atan(0.35 * self._half_bar_m / range_m) - MARGIN_RAD
@@ -91,7 +91,7 @@ class PairMotion:
         range_m = self.range_m(t_s)
         turn = 2 * math.pi * t_s / self._circle_s
         azimuth = 0.55 * across_rad * math.sin(turn + self._phases[1])
-        elevation = up_rad * (0.45 * math.cos(turn + self._phases[1]) + 0.2 * self._level(t_s))
+        elevation = up_rad * (0.45 * math.cos(turn + self._phases[1]) + 0.2 * self._elevation(t_s))
         climb_m = _within(
             range_m * math.sin(elevation),
             water.depth_m - CLEARANCE_M,
@@ -120,7 +120,7 @@ class PairMotion:
 
 @lru_cache(maxsize=64)
 def _look_away(seed: int, index: int, window: int) -> tuple[float, float, float]:
-    """Return begin, length and angle of the look away that falls into a window; an angle of 0 for none."""
+    """Return begin (s), length (s) and angle (rad) of a window's one look away; the angle is 0 for none."""
     if window < 0:
         return 0.0, 1.0, 0.0
     rng = generator(seed, "look_away", index, window)
@@ -131,12 +131,12 @@ def _look_away(seed: int, index: int, window: int) -> tuple[float, float, float]
 
 
 def _soft_positive(angle_rad: float) -> float:
-    """Keep an angle above 0 without a corner in its course."""
+    """Keep an angle above 0 by a smooth function."""
     scale = math.radians(1.5)
     return scale * math.log1p(math.exp(angle_rad / scale)) if angle_rad < 30 * scale else angle_rad
 
 
 def _within(climb_m: float, up_m: float, down_m: float) -> float:
-    """Keep a climb below the surface and above the floor without a corner in its course."""
+    """Keep a climb between up_m and -down_m by a smooth function; inf for no limit."""
     room_m = up_m if climb_m > 0 else down_m
     return climb_m if math.isinf(room_m) else room_m * math.tanh(climb_m / room_m)

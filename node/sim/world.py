@@ -1,7 +1,7 @@
-"""The simulated world of two nodes: everything in it follows from (scenario, node, time).
+"""The simulated world of two nodes: a function of (scenario, node, time).
 
-Two processes that hold the same Scenario see the same world; any time can be asked for, in any order.
-Stamps are on the asking node's own clock (B's may be off by Scenario.clock_offset_ns); truth is on A's.
+Two processes with the same Scenario see the same world, at any time and in any order.
+Stamps are on the given node's own clock (B's is off by Scenario.clock_offset_ns). Stamps of the truth are on A's.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class World:
         self._painters: dict[int, Painter] = {}
 
     def info(self, node: str, stamp_ns: int, trigger_period_ns: int) -> NodeInfo:
-        """Return a node's description; its lights are where they truly are."""
+        """Return a node's description, with the true places of its lights."""
         s, index = self.scenario, self.scenario.index(node)
         rig = self._scene.rigs[index]
         carried = [ArTag(id=tag.id, corners_m=_corners(tag.corners_m), family=tags.FAMILY) for tag in self.tags(node)]
@@ -72,7 +72,7 @@ class World:
         )
 
     def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:
-        """Return R (3, 3) and t (3,), metres: a node's camera frame to NED, down from the surface."""
+        """Return R (3, 3) and t (3,), metres: from a node's camera frame to NED, with its origin at the surface."""
         index = self.scenario.index(node)
         placement = self._scene.motion.placement(index, self._seconds(index, stamp_ns))
         return placement.R_ned_body @ R_BODY_CAMERA, placement.position_ned_m
@@ -92,7 +92,7 @@ class World:
         )
 
     def node_truth(self, node: str, stamp_ns: int, net: str) -> NodePose:
-        """Return a node's true pose in north-east-down at stamp_ns on A's clock, down from the surface."""
+        """Return a node's true pose in NED, with its origin at the surface, at stamp_ns on A's clock."""
         index, t_s = self.scenario.index(node), self._seconds(0, stamp_ns)
         before, now, after = (self._scene.motion.placement(index, t_s + step) for step in (-STEP_S, 0.0, STEP_S))
         return NodePose(
@@ -109,9 +109,9 @@ class World:
         )
 
     def light_truth(self, node: str, stamp_ns: int, trigger: int) -> LightTruth:
-        """Return where the other node's lights truly are in the picture taken at stamp_ns.
+        """Return the true places of the other node's lights in the picture taken at stamp_ns.
 
-        A light behind the camera, which has no place in the picture, is left out.
+        A light without a projection, such as one behind the camera, is left out.
         """
         index = self.scenario.index(node)
         view = self._scene.view(index, self._seconds(index, stamp_ns))
@@ -137,7 +137,7 @@ class World:
         return self._painter(index).paint(self._scene.view(index, t_s), t_s, stamp_ns)
 
     def tags(self, node: str) -> tuple[Tag, ...]:
-        """Return the AR tags that a node carries, none where the scenario has none."""
+        """Return the AR tags that a node carries; empty where the scenario has no tags."""
         return tags.layout(self.scenario.index(node)) if self.scenario.tags else ()
 
     def imu(self, node: str, stamp_ns: int) -> Imu:
@@ -173,12 +173,12 @@ class World:
         )
 
     def _seconds(self, index: int, stamp_ns: int) -> float:
-        """Return the time since the start of a stamp on a node's clock."""
+        """Return seconds since the start for a stamp on a node's clock."""
         offset_ns = self.scenario.clock_offset_ns if index == 1 else 0
         return (stamp_ns - offset_ns - self.scenario.start_ns) * 1e-9
 
     def _merged(self, index: int, left: Lamp, right: Lamp) -> bool:
-        """Tell whether the clipped cores of two lights are one."""
+        """Return whether the clipped cores of two lights overlap."""
         f_px = self._scene.rigs[index].camera.fx_px
         cores_px = [core_px(lamp, self.scenario.water, f_px) for lamp in (left, right)]
         return bool(np.linalg.norm(left.pixel - right.pixel) < sum(cores_px))
