@@ -550,7 +550,7 @@ class TrackFilter:
             self.challengers = self.challengers[-3:]
 
     def _agrees(self, estimate: Estimate, t_s: float, fix: FixSeen) -> bool:
-        row = self._predict(estimate, max(t_s, estimate.t_s))
+        row = self._predict(estimate, t_s, TOGETHER_S)
         t_a_b, covariance, _, _ = pose_of(*row, estimate.rates_radps)
         R_a_b = at_one_time(row[0], estimate.rates_radps).R
         R_a_b = R_a_b[0].T @ R_a_b[1]
@@ -725,9 +725,9 @@ class TrackFilter:
 
     # -- what goes out
 
-    def _predict(self, estimate: Estimate, t_s: float) -> tuple[State, Floats]:
+    def _predict(self, estimate: Estimate, t_s: float, least_s: float = 0.0) -> tuple[State, Floats]:
         span_s = t_s - estimate.t_s
-        if span_s <= 0.0:
+        if span_s <= least_s:
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)

@@ -47,54 +47,62 @@ def at_one_time_jacobian(state: State, rates_radps: Floats) -> Floats:
     J = np.zeros((NAV, SIZE))
     J[:, :NAV] = np.eye(NAV)
     J[R_, V_] = 0.5 * state.clock_s * np.eye(3)
-    turned_a = -0.5 * state.R[0] @ rates_radps[0]
+    turned_a = -0.5 * (state.R[0] @ rates_radps[0])
     J[PHI[0], CLOCK] = turned_a
-    J[PHI[1], CLOCK] = 0.5 * state.R[1] @ rates_radps[1]
+    J[PHI[1], CLOCK] = 0.5 * (state.R[1] @ rates_radps[1])
     # The errors are those of plus: r turns with phi_A, which the clock turns here.
-    J[R_, CLOCK] = 0.5 * state.v_mps - np.cross(turned_a, state.r_m)
-    J[V_, CLOCK] = -np.cross(turned_a, state.v_mps)
+    across = skew(turned_a)
+    J[R_, CLOCK] = 0.5 * state.v_mps - across @ state.r_m
+    J[V_, CLOCK] = -across @ state.v_mps
     return J
 
 
-def pose_of(state: State, P: Floats, rates_radps: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Give t_a_b_m (3,), its and the rotation's covariance (6, 6), v_a_b_mps (3,) and its covariance (3, 3).
+def pose_jacobian(now: State) -> Floats:
+    """Give the errors (9, NAV) of t_a_b, of the rotation and of v_a_b by those of a state at one time.
 
     t = R_A^T r with r = exp(phi_A) r + dr, so dt = R_A^T dr whatever phi_A is, and w = R_A^T (phi_B - phi_A).
     """
-    now = at_one_time(state, rates_radps)
     toward = now.R[0].T
     J = np.zeros((9, NAV))
     J[0:3, R_] = toward
     J[3:6, PHI[0]], J[3:6, PHI[1]] = -toward, toward
     J[6:9, V_] = toward
-    J = J @ at_one_time_jacobian(state, rates_radps)
+    return J
+
+
+def pose_of(state: State, P: Floats, rates_radps: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Give t_a_b_m (3,), its and the rotation's covariance (6, 6), v_a_b_mps (3,) and its covariance (3, 3)."""
+    now = at_one_time(state, rates_radps)
+    toward = now.R[0].T
+    J = pose_jacobian(now) @ at_one_time_jacobian(state, rates_radps)
     whole = J @ P @ J.T
     return toward @ now.r_m, whole[:6, :6], toward @ now.v_mps, whole[6:, 6:]
 
 
 def row_of(stamp_ns: int, state: State, P: Floats, rates_radps: Floats, lights: int, age_s: float) -> TrackRow | None:
     """Give the row of a state, None where its position is no better than WORST_SHARE of the range."""
-    t_a_b, covariance, v_a_b, v_covariance = pose_of(state, P, rates_radps)
-    range_m = float(np.linalg.norm(t_a_b))
-    if not np.isfinite(covariance).all() or math.sqrt(float(np.trace(covariance[:3, :3]))) > WORST_SHARE * range_m:
-        return None
     now = at_one_time(state, rates_radps)
-    r = now.r_m
-    J = np.zeros((3, NAV))
-    J[:, R_] = np.eye(3)
-    J[:, PHI[0]] = -skew(r)
+    r, toward = now.r_m, now.R[0].T
+    range_m = math.sqrt(float(r @ r))
+    J = np.zeros((12, NAV))
+    J[:9] = pose_jacobian(now)
+    J[9:, R_] = np.eye(3)
+    J[9:, PHI[0]] = -skew(r)
     J = J @ at_one_time_jacobian(state, rates_radps)
-    of_ned = J @ P @ J.T
+    whole = J @ P @ J.T
+    covariance, v_covariance, of_ned = whole[:6, :6], whole[6:9, 6:9], whole[9:, 9:]
+    if not np.isfinite(whole).all() or math.sqrt(float(np.trace(covariance[:3, :3]))) > WORST_SHARE * range_m:
+        return None
     flat2 = max(float(r[0] ** 2 + r[1] ** 2), 1e-12)
     flat = math.sqrt(flat2)
     by_azimuth = np.array((-r[1], r[0], 0.0)) / flat2
     by_inclination = np.array((r[0] * r[2] / flat, r[1] * r[2] / flat, -flat)) / (flat2 + float(r[2]) ** 2)
     return TrackRow(
         stamp_ns=stamp_ns,
-        t_a_b_m=t_a_b,
+        t_a_b_m=toward @ r,
         q_a_b_xyzw=matrix_to_quat(now.R[0].T @ now.R[1]),
         covariance=covariance,
-        v_a_b_mps=v_a_b,
+        v_a_b_mps=toward @ now.v_mps,
         v_covariance=v_covariance,
         lights=lights,
         age_s=age_s,
