@@ -13,8 +13,8 @@ GAP_S: Final = 0.06
 STANDARD_GRAVITY: Final = 9.80665
 _NOISE_SPAN_S: Final = 2.0
 # Below these densities what the model leaves out rules: scale, cross-axis, interpolation, shake.
-GYRO_FLOOR: Final = 2e-4
-ACCEL_FLOOR: Final = 4e-3
+GYRO_FLOOR: Final = 1e-4
+ACCEL_FLOOR: Final = 2e-3
 
 
 class Samples:
