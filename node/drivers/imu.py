@@ -1,4 +1,4 @@
-"""One inertial unit out of several chips: body frame, recovery, and readings that cannot be true."""
+"""One inertial unit made of several chips: body frame, recovery, and rejection of impossible readings."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from buddyline.node.drivers.lis3mdl import Lis3mdl
 from buddyline.node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
 from buddyline.node.drivers.lsm303d import Lsm303d
 from buddyline.node.drivers.samples import DeviceError, ImuSample, Vector
+from buddyline.node.drivers.st_chip import WHO_AM_I
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
 
-# Noise moves the last bits of six axes all the time. Readings may repeat while the chip is slower than the
-# loop; ten in a row mean that it has stopped, as after a brown-out.
+# Noise always moves the last bits. A few readings may repeat while the chip is slower than the loop;
+# ten in a row mean that the chip has stopped, as after a brown-out.
 FROZEN_READINGS: Final = 10
 MAG_RETRY_NS: Final = S_NS
 
 
 class MotionSensor(Protocol):
-    """What gives acceleration and angular rate, in its own frame."""
+    """Accelerometer and gyroscope, in the board's frame."""
 
     def start(self) -> None:
-        """Check and set up the chips."""
+        """Check the identities and write the settings."""
         ...
 
     def read_motion(self) -> tuple[Vector, Vector]:
@@ -34,10 +35,10 @@ class MotionSensor(Protocol):
 
 
 class Magnetometer(Protocol):
-    """What gives the magnetic field, in the same frame."""
+    """Magnetometer, in the board's frame."""
 
     def start(self) -> None:
-        """Check and set up the chip."""
+        """Check the identity and write the settings."""
         ...
 
     def read_mag(self) -> Vector:
@@ -46,14 +47,14 @@ class Magnetometer(Protocol):
 
 
 class Lsm303dL3gd20h:
-    """The two chips of the MinIMU-9 v3 that give motion; their axes are parallel on the board."""
+    """The two motion chips of the MinIMU-9 v3; their axes are parallel on the board."""
 
     def __init__(self, lsm303d: Lsm303d, l3gd20h: L3gd20h) -> None:
         self._lsm303d = lsm303d
         self._l3gd20h = l3gd20h
 
     def start(self) -> None:
-        """Check and set up both chips."""
+        """Check the identities and write the settings."""
         self._lsm303d.start()
         self._l3gd20h.start()
 
@@ -62,12 +63,38 @@ class Lsm303dL3gd20h:
         return self._lsm303d.read_accel(), self._l3gd20h.read_gyro()
 
 
+class SoughtLis3mdl:
+    """A LIS3MDL that is searched for at each start, because it may be absent when the node starts."""
+
+    def __init__(self, bus: I2cBus) -> None:
+        self._bus = bus
+        self._chip: Lis3mdl | None = None
+
+    def start(self) -> None:
+        """Find the chip and write its settings; raise DeviceError where it does not answer."""
+        self._chip = self._chip or Lis3mdl.find(self._bus)
+        if self._chip is None:
+            raise self._bus.error(
+                Lis3mdl.ADDRESSES[0],
+                WHO_AM_I,
+                f"no magnetometer ({Lis3mdl.NAME}) answers: no heading; has the board none, set sensors.imu = 'lsm6ds'",
+            )
+        self._chip.start()
+
+    def read_mag(self) -> Vector:
+        """Return the magnetic field in T, (3,)."""
+        if self._chip is None:
+            raise self._bus.error(Lis3mdl.ADDRESSES[0], WHO_AM_I, f"{Lis3mdl.NAME}: not started")
+        return self._chip.read_mag()
+
+
 class ChipImu:
-    """Chips as one device in the body frame.
+    """Several chips as one device in the body frame.
 
     R_body_chip: (3, 3), maps the board's axes to the body's (x forward, y right, z down). After any failure
-    the chips are identified and set up anew before the next reading is believed, since a chip that comes back
-    from a brown-out comes back asleep. A magnetometer that fails leaves the rest going.
+    the chips are identified and set up again before the next reading counts, because a chip sleeps after a
+    brown-out. A magnetometer that fails, or is absent at the start, is named in `problem` and tried again once a
+    second; motion goes on without it.
     """
 
     def __init__(
@@ -91,12 +118,15 @@ class ChipImu:
         self._repeats = 0
 
     def start(self) -> None:
-        """Check and set up all chips; raise DeviceError where one is not there."""
+        """Check and set up the chips; raise DeviceError where motion is absent, name an absent magnetometer."""
         self._motion.start()
         self._motion_ready = True
         if self._magnetometer is not None:
-            self._magnetometer.start()
-            self._mag_ready = True
+            try:
+                self._magnetometer.start()
+                self._mag_ready = True
+            except DeviceError as error:
+                self._lose_mag(self._clock.now_ns(), error)
 
     def read(self) -> ImuSample:
         """Return the newest sample; raise DeviceError where there is none. The next call tries again."""
@@ -108,7 +138,7 @@ class ChipImu:
             accel_mps2, gyro_radps = self._motion.read_motion()
             self._check_alive(np.concatenate((accel_mps2, gyro_radps)))
         except DeviceError:
-            # What silenced one chip of a board may have reset the others.
+            # The cause may have reset the board's other chips as well.
             self._motion_ready = self._mag_ready = False
             self._mag_retry_ns = 0
             raise
@@ -126,26 +156,26 @@ class ChipImu:
             raise DeviceError(f"{self.name}: the same reading {FROZEN_READINGS} times over: the chip has stopped")
 
     def _read_mag(self, now_ns: int) -> Vector | None:
-        magnetometer = self._magnetometer
-        if magnetometer is None:
-            return None
         waiting = self._mag_retry_ns - MAG_RETRY_NS <= now_ns < self._mag_retry_ns
-        if not self._mag_ready and waiting:
+        if self._magnetometer is None or (not self._mag_ready and waiting):
             return None
         try:
             if not self._mag_ready:
-                magnetometer.start()
+                self._magnetometer.start()
                 self._mag_ready = True
-            mag_t = magnetometer.read_mag()
+            mag_t = self._magnetometer.read_mag()
             if not mag_t.any():
                 raise DeviceError(f"{self.name}: the magnetometer reads zero on all axes")
         except DeviceError as error:
-            self._mag_ready = False
-            self._mag_retry_ns = now_ns + MAG_RETRY_NS
-            self.problem = str(error)
+            self._lose_mag(now_ns, error)
             return None
         self.problem = ""
         return mag_t
+
+    def _lose_mag(self, now_ns: int, error: DeviceError) -> None:
+        self._mag_ready = False
+        self._mag_retry_ns = now_ns + MAG_RETRY_NS
+        self.problem = str(error)
 
 
 class MinImu9V3(ChipImu):
@@ -153,7 +183,7 @@ class MinImu9V3(ChipImu):
 
     @classmethod
     def find(cls, name: str, bus: I2cBus, R_body_chip: NDArray[np.float64], clock: Clock) -> Self | None:
-        """Return the unit where both chips are on the bus, else None."""
+        """Return the unit where both chips answer, else None."""
         lsm303d, l3gd20h = Lsm303d.find(bus), L3gd20h.find(bus)
         if lsm303d is None or l3gd20h is None:
             return None
@@ -161,19 +191,18 @@ class MinImu9V3(ChipImu):
 
 
 class Lsm6dsImu(ChipImu):
-    """An LSM6DS chip, with a LIS3MDL beside it where MAGNETOMETER says so."""
+    """An LSM6DS chip, with a LIS3MDL beside it where MAGNETOMETER is set."""
 
     CHIP: type[Lsm6ds] = Lsm6ds
     MAGNETOMETER = True
 
     @classmethod
     def find(cls, name: str, bus: I2cBus, R_body_chip: NDArray[np.float64], clock: Clock) -> Self | None:
-        """Return the unit where its chips are on the bus, else None."""
+        """Return the unit where its motion chip answers, else None; the magnetometer may answer later."""
         motion = cls.CHIP.find(bus)
-        magnetometer = Lis3mdl.find(bus) if cls.MAGNETOMETER else None
-        if motion is None or (cls.MAGNETOMETER and magnetometer is None):
+        if motion is None:
             return None
-        return cls(name, motion, magnetometer, R_body_chip, clock)
+        return cls(name, motion, SoughtLis3mdl(bus) if cls.MAGNETOMETER else None, R_body_chip, clock)
 
 
 class MinImu9V5(Lsm6dsImu):

@@ -1,4 +1,4 @@
-"""Sensors by name, and finding out which are on the bus."""
+"""Sensors by name, and the search for those on the bus."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 AUTO: Final = "auto"
 NONE: Final = "none"
 
-# In the order in which `auto` looks: nine axes before six.
 IMUS: Final[Mapping[str, str]] = {
     "minimu9_v3": "buddyline.node.drivers.imu:MinImu9V3",
     "minimu9_v5": "buddyline.node.drivers.imu:MinImu9V5",
     "minimu9_v6": "buddyline.node.drivers.imu:MinImu9V6",
     "lsm6ds": "buddyline.node.drivers.imu:Lsm6dsAlone",
 }
+
+# A board without a magnetometer is used only where it is named: `auto` would take a silent magnetometer for none.
+SEARCHED_IMUS: Final = ("minimu9_v3", "minimu9_v5", "minimu9_v6")
 
 DEPTHS: Final[Mapping[str, tuple[str, str | None]]] = {
     AUTO: ("buddyline.node.drivers.ms5837:Ms5837", None),
@@ -37,25 +39,28 @@ def open_imu(
     R_body_chip: NDArray[np.float64] | None = None,
     clock: Clock | None = None,
 ) -> ImuDevice:
-    """Open the IMU of that name, or the first that `auto` finds by identity.
+    """Open the IMU of that name, or the first of SEARCHED_IMUS that `auto` finds by identity.
 
-    R_body_chip: (3, 3), maps the board's axes to the body's; default: they are the same.
-    Raises DeviceError where it is not on the bus.
+    R_body_chip: (3, 3), maps the board's axes to the body's; default: identity.
+    Raises DeviceError where no motion chip answers. A magnetometer may be absent (ImuDevice.problem names it).
     """
     _check_name("sensors.imu", name, (AUTO, *IMUS))
     R = np.eye(3) if R_body_chip is None else R_body_chip
-    for candidate in IMUS if name == AUTO else [name]:
+    candidates = SEARCHED_IMUS if name == AUTO else (name,)
+    for candidate in candidates:
         device: Any = _load(IMUS[candidate]).find(candidate, bus, R, clock or SystemClock())
         if device is not None:
             device.start()
             found: ImuDevice = device
             return found
-    wanted = " or ".join(IMUS) if name == AUTO else name
-    raise DeviceError(f"I2C bus {bus.number}: no {wanted} answers: check power and wiring (i2cdetect -y {bus.number})")
+    raise DeviceError(
+        f"I2C bus {bus.number}: no {' or '.join(candidates)} answers: "
+        f"check power and wiring (i2cdetect -y {bus.number})"
+    )
 
 
 def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> DepthDevice:
-    """Open the depth sensor of that name; `auto` tells the model by its PROM.
+    """Open the depth sensor of that name; `auto` reads the model from its PROM.
 
     Returns once the PROM has been read, after 10 ms. Raises DeviceError where it cannot be.
     """
@@ -66,7 +71,7 @@ def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> Dep
 
 
 def check_names(imu: str, depth: str) -> None:
-    """Raise BuddylineError where a configured name is none; NONE leaves the sensor out."""
+    """Raise BuddylineError for an unknown name; NONE leaves the sensor out."""
     _check_name("sensors.imu", imu, (AUTO, *IMUS, NONE))
     _check_name("sensors.depth", depth, (*DEPTHS, NONE))
 

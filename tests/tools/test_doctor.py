@@ -21,6 +21,7 @@ from buddyline.tools.doctor import bus, diagnosis, machine, rig
 from buddyline.tools.health import machine as judge_machine
 from buddyline.tools.health import rig as judge_rig
 from buddyline.tools.health.finding import Finding, status_of
+from msgspec import UNSET
 
 from tests.node.test_chrony import FOLLOWS, LOST, SERVES
 from tests.processes import REPOSITORY
@@ -150,6 +151,30 @@ REST = Imu(**NODE, accel_mps2=(0.0, 0.1, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_
 def test_sensor(messages, problem, level, word):
     found = judge_rig.sensor("imu", messages, problem)
     assert (found.level, word in found.text) == (level, True), found
+
+
+class Chips:
+    """An inertial unit that says nothing is wrong."""
+
+    name, problem, retries = "imu", "", 0
+
+    def __init__(self, message):
+        self._message = message
+
+    def next_messages(self, stop):
+        return None if stop.wait(0.01) else [self._message]
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(("mag_t", "level"), [(UNSET, "problem"), (REST.mag_t, "ok")])
+def test_a_calibrated_magnetometer_that_is_silent_is_a_problem(mag_t, level, monkeypatch):
+    monkeypatch.setattr(rig, "LISTEN_S", 0.1)
+    monkeypatch.setattr(rig, "open_sensors", lambda *_: [Chips(msgspec.structs.replace(REST, mag_t=mag_t))])
+    sensors = msgspec.structs.replace(CALIBRATION.sensors, magnetometer_offset_t=(1e-6, 0.0, 0.0))
+    found = rig.check_sensors(msgspec.structs.replace(CALIBRATION, sensors=sensors))
+    assert levels(found) == {"imu": "ok", "compass": level}
 
 
 def test_the_files_of_a_pi(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Camera and sensors of a node, tried for a few seconds by the node's own drivers."""
+"""Tries a node's camera and sensors for a few seconds, with the node's own drivers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from buddyline.node.detect import make_detector
 from buddyline.node.devices import Frame, Source, open_camera, open_sensors
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Message, NodeInfo
+from buddyline.protocol.messages import Imu, Message, NodeInfo
 from buddyline.tools.health import rig as judge
 from buddyline.tools.health.finding import Finding
+from msgspec import UNSET
 from msgspec.structs import replace
 
 FRAMES: Final = 3
 FRAMES_WITHIN_S: Final = 5.0
 LISTEN_S: Final = 3.0
-# Chips of the bus find themselves within this; a surface zero takes two seconds of samples.
+# Longer than the search for the chips and the two seconds of samples that a surface zero takes.
 SENSE_S: Final = 4.0
 
 
@@ -88,8 +89,13 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
         for source in sources:
             source.close()
     sensors = config.sensors
-    calibrated = any(sensors.magnetometer_offset_t)
-    return [*findings, judge.magnetometer(calibrated, sensors.name == "i2c" and sensors.imu != "none")]
+    given = [message for messages in heard.values() for message in messages if isinstance(message, Imu)]
+    compass = judge.magnetometer(
+        calibrated=any(sensors.magnetometer_offset_t),
+        chips=sensors.name == "i2c" and sensors.imu != "none",
+        heard=any(message.mag_t is not UNSET for message in given),
+    )
+    return [*findings, compass]
 
 
 def _listen(sources: list[Source]) -> dict[str, list[Message]]:

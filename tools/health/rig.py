@@ -115,10 +115,15 @@ def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
     return f"attitude within {sigma_deg:.0f} degrees", ""
 
 
-def magnetometer(calibrated: bool, chips: bool) -> Finding:
-    """Judge whether headings can be trusted; chips: real ones, not simulated."""
-    if calibrated or not chips:
-        return Finding("compass", "ok" if chips else "skipped", "calibrated" if chips else "not a real one")
+def magnetometer(calibrated: bool, chips: bool, heard: bool) -> Finding:
+    """Judge whether headings can be trusted. chips: real ones, not simulated. heard: the magnetometer gave a field."""
+    if not chips:
+        return Finding("compass", "skipped", "not a real one")
+    if calibrated and not heard:
+        advice = "check the magnetometer's wiring: i2cdetect -y 1 shows 1d (v3) or 1e (v5, v6)"
+        return Finding("compass", "problem", "is calibrated, and no magnetometer answers: no heading", advice)
+    if calibrated:
+        return Finding("compass", "ok", "calibrated")
     return Finding(
         "compass", "warning", "not calibrated: headings are off by the rig's iron", "buddyline calibrate magnetometer"
     )

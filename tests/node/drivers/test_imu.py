@@ -57,8 +57,32 @@ def sky() -> Sky:
 def test_auto_finds_each_unit(unit, adapter, bus, clock, sky):
     plug(adapter, unit, sky)
     device = open_imu(bus, "auto", clock=clock)
-    assert device.name == unit
+    assert device.name == ("minimu9_v6" if unit == "lsm6ds" else unit)
     assert open_imu(bus, unit, clock=clock).name == unit
+
+
+@pytest.mark.parametrize("choice", ["auto", "named"])
+@pytest.mark.parametrize("name", ["minimu9_v5", "minimu9_v6"])
+def test_a_magnetometer_that_is_silent_at_the_start_is_named_and_found_later(name, choice, adapter, bus, clock, sky):
+    chips = plug(adapter, name, sky)
+    chips[0x1E].absent = True
+    device = open_imu(bus, "auto" if choice == "auto" else name, clock=clock)
+    for _ in range(5):
+        assert device.read().mag_t is None
+        assert "no magnetometer" in device.problem
+        assert "address 0x1e" in device.problem
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+    chips[0x1E].absent = False
+    clock.set_ns(clock.now_ns() + S_NS)
+    assert device.read().mag_t is not None
+    assert device.problem == ""
+
+
+def test_a_board_named_without_a_magnetometer_has_no_problem(adapter, bus, clock, sky):
+    plug(adapter, "lsm6ds", sky)
+    device = open_imu(bus, "lsm6ds", clock=clock)
+    assert device.read().mag_t is None
+    assert device.problem == ""
 
 
 def test_a_sample_is_in_si_units_and_stamped(unit, adapter, bus, clock, sky):
@@ -98,7 +122,7 @@ def test_a_mount_that_is_no_rotation_is_refused(R, adapter, bus, clock, sky):
 
 
 def test_nothing_on_the_bus(adapter, bus, clock):
-    with pytest.raises(DeviceError, match=r"bus 1: no minimu9_v3 or .*lsm6ds answers.*i2cdetect"):
+    with pytest.raises(DeviceError, match=r"bus 1: no minimu9_v3 or .*minimu9_v6 answers.*i2cdetect"):
         open_imu(bus, "auto", clock=clock)
 
 
