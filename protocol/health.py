@@ -14,6 +14,10 @@ SILENT_S: Final = 1.5 / NODE_STATUS.rate_hz
 # A pair whose nodes are well, without a pose for this long, is told why; over these last seconds the reasons count.
 NO_POSE_S: Final = 2.0
 REASONS_S: Final = 10.0
+# A track covers an instant where its position's sigma is below this share of the range; else it is uncertain.
+TRACK_SIGMA_SHARE: Final = 0.05
+# A track that has used no light for longer than this is told to be without: several triggers.
+NO_LIGHT_S: Final = 0.5
 # Frames of one instant arrive within the matching window; with stamps further apart nothing of two nodes matches.
 FRAMES_APART_S: Final = 1.0
 # Two nodes' clocks. At 1 m/s, 5 ms are 5 mm.

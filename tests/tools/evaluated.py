@@ -12,6 +12,7 @@ from buddyline.protocol.messages import (
     NodeInfo,
     Rejected,
     RelativePose,
+    Track,
     TrueLight,
     Truth,
 )
@@ -76,6 +77,24 @@ def pose(k: int, t_m: tuple[float, float, float] = (0.0, 0.0, 3.0), **changes: o
         "skew_ns": 1_000_000,
     }
     return RelativePose(**(values | changes))  # type: ignore[arg-type]
+
+
+def track(k: int, t_m: tuple[float, float, float] = (0.0, 0.0, 3.0), sigma_m: float = 0.01, **changes: object) -> Track:
+    values: dict[str, object] = {
+        "node_a": "a",
+        "node_b": "b",
+        "stamp_ns": (FIRST + k) * PERIOD_NS,
+        "t_a_b_m": t_m,
+        "q_a_b_xyzw": FACING,
+        "covariance": np.diag([sigma_m**2 / 3] * 3 + [1e-6] * 3).ravel().tolist(),
+        "v_a_b_mps": (0.0, 0.0, 0.0),
+        "v_covariance": np.eye(3).ravel().tolist(),
+        "mode": "filter",
+        "lights": 4,
+        "age_s": 0.0,
+        "range_m": float(np.linalg.norm(t_m)),
+    }
+    return Track(**(values | changes))  # type: ignore[arg-type]
 
 
 def rejection(k: int, reason: str = "ambiguous") -> Rejected:

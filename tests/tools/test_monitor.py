@@ -16,7 +16,7 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Message
-from buddyline.protocol.topics import ATTITUDE, INFO, POSE
+from buddyline.protocol.topics import ATTITUDE, INFO, POSE, TRACK
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
@@ -27,7 +27,7 @@ from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, columns
 from buddyline.tools.monitor.scene import R_LEVEL, Floats, age_colours, ellipsoid, fit, frame_of, holds
 from msgspec.structs import replace
 
-from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection
+from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection, track
 from tests.tools.watched import at, attitude, feed, image, solver_status, status, take, watched
 
 HALF = math.sqrt(0.5)
@@ -182,6 +182,88 @@ class TestHealth:
         assert "buddyline solve" in words(picture, at(39), live=False)
 
 
+class TestTrack:
+    def test_the_track_stands_for_b_and_says_how_long_it_saw_no_light(self) -> None:
+        picture = watched()
+        take(picture, track(29, (0.0, 0.0, 3.5), age_s=1.0), at(29))
+        shown = picture.shown(at(31))
+        assert shown is not None
+        assert (shown.estimate.range_m, shown.stale, shown.note) == (3.5, False, "no light for 1.2 s")
+        drawn = panel.headline(picture, at(31))
+        assert "3.50 m" in drawn
+        assert "No light for 1.2 s." in drawn
+
+    def test_a_stale_track_gives_way_to_the_last_pose_and_says_so(self) -> None:
+        picture = watched(20)
+        take(picture, track(19, (0.0, 0.0, 3.5)), at(19))
+        for k in range(20, 31):
+            feed(picture, k)
+        shown = picture.shown(at(30))
+        assert shown is not None
+        assert (shown.estimate.range_m, shown.stale) == (3.0, False)
+        assert shown.note == "no track for 1.1 s, the last pose"
+        assert "The track has ended, for 1.1 s." in words(picture, at(30))
+
+    def test_without_any_track_the_last_pose_stands_for_b(self) -> None:
+        shown = watched().shown(at(29))
+        assert shown is not None
+        assert (shown.estimate, shown.note) == (pose(29), "no track, the last pose")
+        assert "track" not in words(watched(), at(29))
+
+    def test_both_stale_the_newest_is_shown_as_old(self) -> None:
+        picture = watched(20)
+        take(picture, track(25, (0.0, 0.0, 3.5)), at(25))
+        shown = picture.shown(at(45))
+        assert shown is not None
+        assert (shown.estimate.range_m, shown.stale, shown.note) == (3.5, True, "STALE: 2.0 s old")
+
+    def test_a_track_before_the_first_pose_is_shown(self) -> None:
+        picture = PairPicture()
+        take(picture, track(0), at(0))
+        assert not picture.is_stale(at(1))
+
+    def test_sigmas_stand_beside_what_is_shown(self) -> None:
+        picture = watched()
+        angles = {"azimuth_rad": 1.0, "sigma_azimuth_rad": 0.05, "inclination_rad": 0.1, "sigma_inclination_rad": 0.01}
+        take(picture, track(29, t_ned_m=(1.5, 2.5, 0.3), sigma_ned_m=(0.11, 0.08, 0.02), **angles), at(29))
+        drawn = panel.headline(picture, at(29))
+        for text in ("± 5.8 mm", "57.3°", "± 2.9°", "± 0.6°", "north +1.50 ± 0.11 m, east +2.50 ± 0.08 m, down +0.30"):
+            assert text in drawn
+
+    def test_an_uncertain_track_is_judged_by_its_share_of_the_range(self) -> None:
+        picture = watched()
+        take(picture, track(29, sigma_m=0.149), at(29))
+        assert "uncertain" not in words(picture, at(29))
+        take(picture, track(29, sigma_m=0.16), at(29))
+        assert "The track is uncertain: by 0.16 m (1 sd) at 3.00 m." in words(picture, at(29))
+
+    def test_no_pose_is_a_warning_while_the_track_goes_on(self) -> None:
+        picture = watched()
+        for k in range(30, 60):
+            for message in (frame("a", k), frame("b", k), rejection(k), track(k)):
+                take(picture, message, at(k))
+            take(picture, solver_status(at(k)), at(k))
+        (said,) = [finding for finding in findings(picture, at(59)) if finding.name == "pair"]
+        assert (said.level, said.text.endswith("The track goes on without.")) == ("warning", True)
+        assert panel.headline(picture, at(59)).count("3.00 m") == 1
+
+    @pytest.mark.parametrize("live", [True, False])
+    def test_what_the_solver_names_is_passed_on(self, live: bool) -> None:
+        picture = watched()
+        take(picture, solver_status(at(29), "the inertial unit of a is mounted otherwise"), at(29))
+        assert "The solver reports: the inertial unit of a" in words(picture, at(29), live=live)
+
+    def test_poses_and_track_are_columns_of_one_plot(self) -> None:
+        picture, gui = watched(), PlotFolder()
+        for k in range(30):
+            take(picture, track(k, (0.0, 0.0, 3.5)), at(k))
+        TimePlots(gui).draw(picture, at(30))  # type: ignore[arg-type]
+        _, poses_m, track_m = gui.plots["Range, m"].data
+        assert np.nanmax(poses_m) == np.nanmin(poses_m) == 3.0
+        assert np.nanmax(track_m) == np.nanmin(track_m) == 3.5
+        assert np.isfinite(track_m).sum() == 15
+
+
 def _unsolved() -> PairPicture:
     picture = watched(11)
     for k in range(11, 61):
@@ -201,10 +283,12 @@ class TestLive:
             poses.put(pose(0))
             poses.put_bytes(b'{"range_m": "far"}')
             poses.put(pose(1))
+            nodes.publisher(TRACK, "a", "b").put(track(1))
             nodes.publisher(ATTITUDE, "a").put(attitude("a", at(1)))
             # All subscriptions have handed on what they hold when they are closed.
             topside.close()
         assert (picture.pose, picture.solved) == (pose(1), 2)
+        assert picture.track == track(1)
         assert picture.nodes["a"].info == INFOS["a"]
         assert picture.nodes["a"].attitude == attitude("a", at(1))
         assert refusals.count == 1
@@ -260,12 +344,16 @@ class TestPanel:
             azimuth_rad = math.radians((350 + k) % 360)
             take(picture, pose(k, azimuth_rad=azimuth_rad, inclination_rad=0.0), at(k))
         found = columns(list(picture.points), at(0))
-        (drawn,) = (values for title, (_, values) in found.items() if title.startswith("Azimuth"))
+        (drawn,) = (column.values for title, column in found.items() if title.startswith("Azimuth"))
         np.testing.assert_allclose(np.diff(drawn), 2.0, atol=1e-9)
 
     def test_what_is_not_known_is_not_plotted(self) -> None:
         found = columns(list(watched(9).points), at(0))
-        assert {title.split(",")[0] for title in found} == {"Range", "Gap between both nodes' ranges"}
+        assert {title.split(",")[0] for title in found} == {
+            "Range",
+            "Uncertainty of the position (1 sd)",
+            "Gap between both nodes' ranges",
+        }
 
     @pytest.mark.parametrize("draw", [panel.headline, panel.health])
     def test_every_state_can_be_drawn(self, draw: Callable[[PairPicture, int], str]) -> None:
@@ -300,7 +388,9 @@ class TestTimePlots:
         TimePlots(gui).draw(picture, at(50))  # type: ignore[arg-type]
         assert {title.split(",")[0] for title in gui.plots} >= {"Range", "Azimuth", "Triggers without a pose"}
         for plot in gui.plots.values():
-            assert all(np.isfinite(column).all() for column in plot.data)
+            assert np.isfinite(plot.data[0]).all()
+            # Each instant has one value: the pose's or the track's.
+            assert (np.isfinite(plot.data[1:]).sum(axis=0) == 1).all()
             assert (np.diff(plot.data[0]) > 0).all()
             assert len(plot.data[0]) == len(plot.data[1])
         # The azimuth was known once.

@@ -22,7 +22,7 @@ from buddyline.tools.monitor.summary import summarize
 from buddyline.tools.pairs import solved_pair
 from mcap.reader import make_reader
 
-from tests.tools.evaluated import INFOS, frame, info, pose, rejection, truth, write_log
+from tests.tools.evaluated import INFOS, frame, info, pose, rejection, track, truth, write_log
 from tests.tools.watched import at, image, tick, watched
 
 TICKS = 600
@@ -138,6 +138,34 @@ class TestReport:
         np.testing.assert_allclose(frames[0][1], (3.0, 0.0, 0.0), atol=1e-4)
         assert times[-1] == pytest.approx((TICKS - 2) / 10, abs=0.2)
         assert [keyframe[4] for keyframe in frames].count(False) == 2
+
+    def test_the_track_is_told_beside_the_poses(self, tmp_path: Path) -> None:
+        messages: list[Message] = [*INFOS.values(), pose(0), pose(99), *map(truth, range(100))]
+        # Without a light from 3 s to 5 s; the track is too uncertain to count from 4 s on.
+        for k in range(100):
+            age_s, sigma_m = (k - 30) / 10 if 30 <= k < 50 else 0.0, 0.3 if 40 <= k < 50 else 0.01
+            messages.append(track(k, (0.0, 0.0, 3.01), sigma_m, age_s=age_s))
+        with Dive([write_log(tmp_path / "t.mcap", *messages)]) as opened:
+            summary = summarize(opened, ("a", "b"))
+            page = report_html(opened, ("a", "b"))
+        assert summary.dark_s == pytest.approx(2.0, abs=0.11)
+        assert summary.covered() == pytest.approx(0.9, abs=0.03)
+        (figures,) = summary.track_figures()
+        assert (figures.wrong, figures.samples) == (0, 50)
+        for text in (
+            "longest time without a light",
+            "position of the track",
+            "Line: the track",
+            '"what": "track"',
+        ):
+            assert text in page
+        frames = json.loads(re.search(r"FRAMES=(\[.*?\]);\n", page).group(1))  # type: ignore[union-attr]
+        assert len(frames) == 50
+
+    def test_another_pair_s_track_is_not_drawn(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "t.mcap", *INFOS.values(), pose(0), track(0, (0.0, 0.0, 9.0), node_b="c"))
+        with Dive([path]) as opened:
+            assert summarize(opened, ("a", "b")).tracks == []
 
     def test_figures_against_truth(self, tmp_path: Path) -> None:
         messages = [*INFOS.values(), *(pose(k, (0.0, 0.0, 3.02)) for k in range(5)), *(truth(k) for k in range(5))]

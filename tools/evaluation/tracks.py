@@ -8,16 +8,17 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import RelativePose, Track, TrackMode
 from buddyline.tools.evaluation.poses import WRONG_SHARE, differences
 from buddyline.tools.evaluation.statistics import Stats, share
 from buddyline.tools.evaluation.truth import TruthTrack
 
-COVERED_SHARE: Final = 0.05
+COVERED_SHARE: Final = TRACK_SIGMA_SHARE
 """A track covers an instant where its position's sigma is below this share of the range."""
 WRONG_SIGMAS: Final = 3.0
 """A track is wrong where it is off by more than WRONG_SHARE of the range and by more than this many sigma."""
-GAP_S: Final = 0.5
+GAP_S: Final = NO_LIGHT_S
 """A track is in a gap where it has used no light for longer than this."""
 
 

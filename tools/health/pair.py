@@ -6,9 +6,18 @@ from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.health import CLOCK_OFF_S, HOT_DEGC, NO_POSE_S, REASONS_S, SILENT_S, stale_after_s
+from buddyline.protocol.health import (
+    CLOCK_OFF_S,
+    HOT_DEGC,
+    NO_POSE_S,
+    REASONS_S,
+    SILENT_S,
+    TRACK_SIGMA_SHARE,
+    stale_after_s,
+)
 from buddyline.protocol.messages import NodeStatus
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, SOLVER_STATUS
+from buddyline.tools.estimate import sigma_m
 from buddyline.tools.health.finding import Finding, worst_first
 from buddyline.tools.health.words import REASONS, reason_words
 from msgspec import UNSET
@@ -32,7 +41,8 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
         said += _node(picture.nodes[node], now_ns, live)
     if live:
         said += _missing(picture)
-        said += _solver(picture, now_ns)
+    said += (_solver(picture, now_ns) if live else []) or _reported_by_solver(picture)
+    said += _track(picture, now_ns)
     said += _pair(picture, now_ns, live)
     if not said:
         said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose."))
@@ -114,10 +124,30 @@ def _solver(picture: PairPicture, now_ns: int) -> list[Finding]:
         return [absent] if picture.pose is None else []
     if now_ns - picture.solver_ns > stale_after_s(SOLVER_STATUS) * S_NS:
         return [Finding("solver", "problem", "The solver is silent.", START_SOLVER, picture.solver_ns)]
-    if picture.solver.problem:
-        text = f"The solver reports: {picture.solver.problem}"
-        return [Finding("solver", "warning", text, "", picture.solver_problem_since_ns)]
     return []
+
+
+def _reported_by_solver(picture: PairPicture) -> list[Finding]:
+    """Say what the solver names as wrong: with the nodes, their clocks, their inertial units, the track."""
+    if picture.solver is None or not picture.solver.problem:
+        return []
+    text = f"The solver reports: {picture.solver.problem}"
+    return [Finding("solver", "warning", text, "", picture.solver_problem_since_ns)]
+
+
+def _track(picture: PairPicture, now_ns: int) -> list[Finding]:
+    """Say that the track has ended, or is uncertain."""
+    track = picture.track
+    if track is None:
+        return []
+    if not picture.track_is_fresh(now_ns):
+        advice = "turn the nodes toward each other: the next pose starts it again"
+        return [Finding("track", "warning", "The track has ended.", advice, picture.track_ns)]
+    off_m = sigma_m(track)
+    if off_m <= TRACK_SIGMA_SHARE * track.range_m:
+        return []
+    text = f"The track is uncertain: by {off_m:.2f} m (1 sd) at {track.range_m:.2f} m."
+    return [Finding("track", "warning", text, "turn the nodes toward each other: each light that is seen helps")]
 
 
 def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
@@ -129,8 +159,10 @@ def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
     if recent:
         reason, count = recent.most_common(1)[0]
         share = "" if len(recent) == 1 else f" ({count} of {recent.total()})"
-        text = f"No pose: {reason_words(reason)}{share}."
-        return [Finding("pair", "problem", text, REASONS.get(reason, ("", ""))[1], picture.pose_ns)]
+        tracked = picture.track_is_fresh(now_ns)
+        text = f"No pose: {reason_words(reason)}{share}.{' The track goes on without.' if tracked else ''}"
+        advice = REASONS.get(reason, ("", ""))[1]
+        return [Finding("pair", "warning" if tracked else "problem", text, advice, picture.pose_ns)]
     if live or picture.pose is not None or picture.first_ns is None or now_ns - picture.first_ns <= NO_POSE_S * S_NS:
         return []
     return [Finding("pair", "warning", "No pose yet in this log.", "solve it first: buddyline solve")]

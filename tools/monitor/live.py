@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
 STATES: Final = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
-STREAMS: Final = (topics.POSE, topics.REJECTED, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH)
+STREAMS: Final = (topics.POSE, topics.TRACK, topics.REJECTED, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

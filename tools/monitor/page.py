@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.topics import TRACK
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.picture import PairPicture, columns
 from buddyline.tools.monitor.scene import Floats
@@ -22,13 +23,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TICK_S: Final = 0.1
-TEXTS_EVERY: Final = 3
-PLOTS_EVERY: Final = 10
+# As often as the track comes.
+TICK_S: Final = 1.0 / TRACK.rate_hz
+TEXTS_EVERY: Final = 6
+PLOTS_EVERY: Final = 20
 PLOTTED_S: Final = 120.0
 PLOT_PX: Final = 120
 MISSES: Final = "Triggers without a pose, a second"
 POSE_COLOUR: Final = "#f2a93b"
+TRACK_COLOUR: Final = "#5aa0ff"
 NO_POSE_COLOUR: Final = "#e0574f"
 
 
@@ -59,17 +62,20 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
 
 
 class TimePlots:
-    """The last two minutes of each quantity, and how many triggers of each second ended without a pose."""
+    """The last two minutes of poses and track, and how many triggers of each second ended without a pose."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
-        self._folder = gui.add_folder("Last two minutes")
+        self._folder = gui.add_folder("Last two minutes: poses (amber), track (blue)")
         self._plots: dict[str, viser.GuiUplotHandle] = {}
 
     def draw(self, picture: PairPicture, now_ns: int) -> None:
         """Draw each quantity that is known; a plot is there while it has values."""
         points = [point for point in picture.points if 0 <= now_ns - point.at_ns <= PLOTTED_S * S_NS]
-        plots = columns(points, now_ns)
+        plots: dict[str, tuple[Floats, ...]] = {
+            title: (t_s, np.where(tracked, np.nan, values), np.where(tracked, values, np.nan))
+            for title, (t_s, values, tracked) in columns(points, now_ns).items()
+        }
         if picture.misses:
             missed_s = [(miss.at_ns - now_ns) / S_NS for miss in picture.misses]
             counts, edges_s = np.histogram(missed_s, int(PLOTTED_S), (-PLOTTED_S, 0.0))
@@ -83,11 +89,12 @@ class TimePlots:
             if plot.visible != (title in plots):
                 plot.visible = title in plots
 
-    def _add(self, title: str, data: tuple[Floats, Floats]) -> viser.GuiUplotHandle:
-        # Poses are points without a line between them: nothing is known where there is none.
-        line, colour = (1, NO_POSE_COLOUR) if title == MISSES else (0, POSE_COLOUR)
-        points = {"show": not line, "size": 3, "fill": colour, "stroke": colour}
-        series: Any = ({"label": "s before now"}, {"label": title, "stroke": colour, "width": line, "points": points})
+    def _add(self, title: str, data: tuple[Floats, ...]) -> viser.GuiUplotHandle:
+        drawn = [_series(title, NO_POSE_COLOUR, 0, 1)] if title == MISSES else [
+            _series("pose", POSE_COLOUR, 4, 0),
+            _series("track", TRACK_COLOUR, 2, 0),
+        ]  # fmt: skip
+        series: Any = ({"label": "s before now"}, *drawn)
         x_scale: Any = {"time": False, "range": (-PLOTTED_S, 0.0)}
         with self._folder:
             return self._gui.add_uplot(
@@ -99,6 +106,16 @@ class TimePlots:
                 legend={"show": False},
                 height=PLOT_PX,
             )
+
+
+def _series(label: str, colour: str, dot_px: int, line_px: int) -> dict[str, Any]:
+    """Return how a series is drawn.
+
+    Poses and track are dots, those of the track small and close together: a line would cross the gaps, since the page
+    knows no missing value but NaN, which it leaves out.
+    """
+    points = {"show": dot_px > 0, "size": dot_px, "fill": colour, "stroke": colour}
+    return {"label": label, "stroke": colour, "width": line_px, "points": points}
 
 
 class Page:
@@ -129,7 +146,7 @@ class Page:
         step: Callable[[bool], tuple[PairPicture, int, bool]],
         lock: AbstractContextManager[Any],
     ) -> None:
-        """Draw what step returns, ten times a second, until stop is set; lock: held while the picture is read.
+        """Draw what step returns, 20 times a second, until stop is set; lock: held while the picture is read.
 
         step(watched): the picture, its present time (ns), and whether all is to be drawn at once; watched: whether
         anyone looks at the page.

@@ -7,15 +7,21 @@ from html import escape
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Rejected, RelativePose
+from buddyline.protocol.messages import Rejected, RelativePose, Track, TrackMode
 from buddyline.protocol.topics import CANDIDATES, IMAGE, NODE_STATUS
 from buddyline.tools.draw.marks import marked_svg
+from buddyline.tools.estimate import Estimate, known, range_sigma_m, sigma_m
 from buddyline.tools.health.finding import Finding
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import duration_words, reason_words, sentence
-from buddyline.tools.monitor.picture import NodePicture, PairPicture, sigma_m
-from msgspec import UNSET, UnsetType
+from buddyline.tools.monitor.picture import NodePicture, PairPicture
+from msgspec import UNSET
 
+TRACK_WORDS: Final[dict[TrackMode, str]] = {
+    "filter": "from what came before",
+    "lag": "from what came up to a second later",
+    "smooth": "from the whole dive",
+}
 CSS: Final = (
     "<style>"
     ".bl{font:13px/1.4 system-ui,sans-serif;padding:2px 12px;container-type:inline-size}"
@@ -42,41 +48,62 @@ def block(*parts: str) -> str:
 
 
 def headline(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
-    """Return the worst thing to say, and the newest pose in large figures, struck through once it is stale."""
+    """Return the worst thing to say, and where B is, in large figures that are struck through once they are stale."""
     worst = findings(picture, now_ns, live=live)[0]
     banner = f'<div class="banner {worst.level}">{escape(sentence(worst, now_ns))}</div>'
     return block(banner, _figures(picture, now_ns))
 
 
 def _figures(picture: PairPicture, now_ns: int) -> str:
-    pose, age_ns = picture.pose, picture.pose_age_ns(now_ns)
-    if pose is None or age_ns is None:
+    shown = picture.shown(now_ns)
+    if shown is None:
         return '<div class="dim">No pose yet.</div>'
-    stale = picture.is_stale(now_ns)
+    estimate = shown.estimate
     cells = "".join(
-        f'<div><div class="dim">{name}</div><div class="big">{value}</div></div>'
-        for name, value in (
-            ("range", f"{pose.range_m:.2f} m"),
-            ("azimuth", _angle(pose.azimuth_rad, ".1f")),
-            ("inclination", _angle(pose.inclination_rad, "+.1f")),
+        f'<div><div class="dim">{name}</div><div class="big">{value}</div><div class="dim">{sigma}</div></div>'
+        for name, value, sigma in (
+            ("range", f"{estimate.range_m:.2f} m", f"± {length_words(range_sigma_m(estimate))}"),
+            ("azimuth", *_angle(estimate, "azimuth_rad", ".1f")),
+            ("inclination", *_angle(estimate, "inclination_rad", "+.1f")),
         )
     )
-    age = f"<b>STALE: {duration_words(age_ns / S_NS)} old.</b> " if stale else ""
-    depths = ", ".join(
-        f"{node.node} {node.depth.depth_m:.2f} m deep" for node in picture.end_nodes() if node and node.depth
+    note = f"<b>{escape(shown.note[0].upper() + shown.note[1:])}.</b> " if shown.note else ""
+    facts = f"From {estimate.node_a} to {estimate.node_b}{_ned_words(estimate)}. ± is 1 sd. {_origin(estimate)}"
+    facts += "".join(
+        f" {node.node} is {node.depth.depth_m:.2f} m deep." for node in picture.end_nodes() if node and node.depth
     )
-    upright = " Upright assumed." if "upright_assumed" in pose.checks else ""
-    checks = ", ".join(check.replace("_", " ") for check in pose.checks if check != "upright_assumed") or "none"
-    note = escape(
-        f"From {pose.node_a} to {pose.node_b}, position ± {length_words(sigma_m(pose))} (1 sd)"
-        f"{'; ' + depths if depths else ''}. Checked by {checks}.{upright}"
-    )
-    return f'<div class="grid{" old" if stale else ""}">{cells}</div><div class="dim">{age}{note}</div>'
+    return f'<div class="grid{" old" if shown.stale else ""}">{cells}</div><div class="dim">{note}{escape(facts)}</div>'
 
 
-def _angle(angle_rad: float | UnsetType, digits: str) -> str:
-    # Smaller than a figure, which it is not.
-    return "<span class='dim'>unknown</span>" if angle_rad is UNSET else f"{math.degrees(angle_rad):{digits}}°"
+def _angle(estimate: Estimate, field: str, digits: str) -> tuple[str, str]:
+    """Return an angle and its uncertainty, "" where that is not known."""
+    angle_rad, sigma_rad = known(estimate, field), known(estimate, f"sigma_{field}")
+    if angle_rad is None:
+        # Smaller than a figure, which it is not.
+        return "<span class='dim'>unknown</span>", ""
+    sigma = "" if sigma_rad is None else f"± {math.degrees(sigma_rad):.1f}°"
+    return f"{math.degrees(angle_rad):{digits}}°", sigma
+
+
+def _ned_words(estimate: Estimate) -> str:
+    """Return B from A north, east and down, with the compass's error where it is known; else how sure it is."""
+    if estimate.t_ned_m is UNSET:
+        return f", position ± {length_words(sigma_m(estimate))}"
+    sigmas_m = getattr(estimate, "sigma_ned_m", UNSET)
+    named = zip(("north", "east", "down"), estimate.t_ned_m, strict=True)
+    if sigmas_m is UNSET:
+        return ": " + ", ".join(f"{name} {x:+.2f} m" for name, x in named) + f", ± {length_words(sigma_m(estimate))}"
+    both = zip(named, sigmas_m, strict=True)
+    return ": " + ", ".join(f"{name} {x:+.2f} ± {sigma:.2f} m" for (name, x), sigma in both)
+
+
+def _origin(estimate: Estimate) -> str:
+    """Return what an estimate is from."""
+    if isinstance(estimate, Track):
+        return f"Track ({TRACK_WORDS[estimate.mode]}), {estimate.lights} of 4 lights in the last pictures."
+    upright = " Upright assumed." if "upright_assumed" in estimate.checks else ""
+    checks = ", ".join(check.replace("_", " ") for check in estimate.checks if check != "upright_assumed") or "none"
+    return f"One trigger's pose, checked by {checks}.{upright}"
 
 
 def length_words(metres: float) -> str:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope
-from buddyline.protocol.health import stale_after_s
+from buddyline.protocol.health import NO_LIGHT_S, stale_after_s
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -27,14 +27,18 @@ from buddyline.protocol.messages import (
     Rejected,
     RelativePose,
     SolverStatus,
+    Track,
 )
-from buddyline.protocol.topics import INFO, POSE, Topic
+from buddyline.protocol.topics import INFO, POSE, TRACK, Topic
+from buddyline.tools.estimate import Estimate, sigma_m
+from buddyline.tools.health.words import duration_words
 from buddyline.tools.monitor.scene import Floats, SceneFrame, frame_of
 from buddyline.tools.pairs import Pair
 from msgspec import UNSET, UnsetType
+from numpy.typing import NDArray
 
 KEPT_NS: Final = 150 * S_NS
-# Poses closer together than this are one point of trail and plots.
+# Of poses, and of the track, closer together than this there is one point on trail and plots.
 POINT_SPACING_NS: Final = S_NS // 5
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
@@ -43,54 +47,88 @@ LIVE_WITHIN_NS: Final = 60 * S_NS
 
 @dataclass(frozen=True)
 class Point:
-    """One pose on trail and plots. at_ns: when it came; t_m: B in the scene, (north, east, down) from A."""
+    """A pose, or the track at one time, on trail and plots.
+
+    at_ns: when it came; t_m: B in the scene, (north, east, down) from A.
+    """
 
     at_ns: int
-    pose: RelativePose
+    estimate: Estimate
     t_m: tuple[float, float, float]
     frame: SceneFrame = field(compare=False)
 
     @property
+    def tracked(self) -> bool:
+        """Whether it is of the track."""
+        return isinstance(self.estimate, Track)
+
+    @property
     def latency_s(self) -> float:
-        """From exposure to here; NaN for a log solved offline, whose poses have log times of their own stamps."""
-        latency_ns = self.at_ns - self.pose.stamp_ns
-        return latency_ns / S_NS if 0 < latency_ns < LIVE_WITHIN_NS else math.nan
+        """From a pose's exposure to here; NaN for a log solved offline, where it came at its stamp, and for a track."""
+        latency_ns = self.at_ns - self.estimate.stamp_ns
+        return latency_ns / S_NS if 0 < latency_ns < LIVE_WITHIN_NS and not self.tracked else math.nan
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What stands for B at an instant: the track, else the newest of pose and track.
+
+    estimate: came at came_ns. stale: older than its topic allows. note: how old it is, "" where that goes without
+    saying, and that there is no track where that is so.
+    """
+
+    estimate: Estimate
+    came_ns: int
+    stale: bool
+    note: str
+
+
+class Column(NamedTuple):
+    """A quantity over time: t_s (n,), values (n,), and which of them are the track's (n,)."""
+
+    t_s: Floats
+    values: Floats
+    tracked: NDArray[np.bool_]
+
+
+UNCERTAINTY: Final = "Uncertainty of the position (1 sd), mm"
 # What is plotted over time: the title, the value of a point (NaN where it is not known).
 QUANTITIES: Final = (
-    ("Range, m", lambda point: point.pose.range_m),
-    ("Azimuth, deg from north, clockwise", lambda point: _degrees(point.pose.azimuth_rad)),
-    ("Inclination, deg, up positive", lambda point: _degrees(point.pose.inclination_rad)),
-    ("Gap between both nodes' ranges, mm", lambda point: point.pose.range_gap_m * 1e3),
+    ("Range, m", lambda point: point.estimate.range_m),
+    ("Azimuth, deg from north, clockwise", lambda point: _degrees(point.estimate.azimuth_rad)),
+    ("Inclination, deg, up positive", lambda point: _degrees(point.estimate.inclination_rad)),
+    (UNCERTAINTY, lambda point: sigma_m(point.estimate) * 1e3),
+    ("Gap between both nodes' ranges, mm", lambda point: _gap_m(point.estimate) * 1e3),
     ("Latency from exposure to here, ms", lambda point: point.latency_s * 1e3),
 )
 
 
-def columns(points: Sequence[Point], zero_ns: int) -> dict[str, tuple[Floats, Floats]]:
-    """Return, by title, the times from zero_ns (s) at which each quantity is known, and its values there.
+def columns(points: Iterable[Point], zero_ns: int) -> dict[str, Column]:
+    """Return, by title, each quantity where it is known, over the time from zero_ns.
 
     Azimuths are continued past 360 deg, so that no line jumps where north is crossed. A quantity that is never known
     is left out.
     """
-    t_s = np.array([(point.at_ns - zero_ns) / S_NS for point in points], float)
+    ordered = sorted(points, key=lambda point: point.at_ns)
+    t_s = np.array([(point.at_ns - zero_ns) / S_NS for point in ordered], float)
+    tracked = np.array([point.tracked for point in ordered], bool)
     found = {}
     for title, value in QUANTITIES:
-        values = np.array([value(point) for point in points], float)
+        values = np.array([value(point) for point in ordered], float)
         known = np.isfinite(values)
         if known.any():
             column = values[known]
-            found[title] = t_s[known], np.unwrap(column, period=360.0) if title.startswith("Azimuth") else column
+            column = np.unwrap(column, period=360.0) if title.startswith("Azimuth") else column
+            found[title] = Column(t_s[known], column, tracked[known])
     return found
+
+
+def _gap_m(estimate: Estimate) -> float:
+    return estimate.range_gap_m if isinstance(estimate, RelativePose) else math.nan
 
 
 def _degrees(angle_rad: float | UnsetType) -> float:
     return math.nan if angle_rad is UNSET else math.degrees(angle_rad)
-
-
-def sigma_m(pose: RelativePose) -> float:
-    """Return a position's uncertainty: the root of the sum of its three variances."""
-    return math.sqrt(sum(max(pose.covariance[i], 0.0) for i in (0, 7, 14)))
 
 
 @dataclass(frozen=True)
@@ -169,7 +207,10 @@ class PairPicture:
         self.pair = pair
         self.pose: RelativePose | None = None
         self.pose_ns: int | None = None
+        self.track: Track | None = None
+        self.track_ns: int | None = None
         self.points: deque[Point] = deque()
+        self._kept_ns: dict[type, int] = {}
         self.misses: deque[Miss] = deque(maxlen=MAX_REJECTED)
         self.rejected: Counter[str] = Counter()
         self.solved = 0
@@ -198,6 +239,9 @@ class PairPicture:
             if _is_new_problem(self.solver, message):
                 self.solver_problem_since_ns = at_ns
             self.solver, self.solver_ns = message, at_ns
+        elif isinstance(message, Track):
+            self.track, self.track_ns = message, at_ns
+            self._keep(message, at_ns)
         elif isinstance(message, RelativePose | Rejected):
             self._take_result(message, at_ns)
 
@@ -226,11 +270,40 @@ class PairPicture:
         """Return how old the newest pose is, None where there is none."""
         return None if self.pose_ns is None else max(now_ns - self.pose_ns, 0)
 
+    def shown(self, now_ns: int) -> Shown | None:
+        """Return what stands for B now: the track unless it is stale, else the newest of pose and track."""
+        came = [
+            (at_ns, topic, estimate)
+            for at_ns, topic, estimate in ((self.track_ns, TRACK, self.track), (self.pose_ns, POSE, self.pose))
+            if at_ns is not None and estimate is not None
+        ]
+        if not came:
+            return None
+        fresh = [each for each in came if now_ns - each[0] < self._stale_after_ns(each[1])]
+        at_ns, _, estimate = fresh[0] if fresh else max(came, key=lambda each: each[0])
+        age_s = max(now_ns - at_ns, 0) / S_NS
+        notes = [] if fresh else [f"STALE: {duration_words(age_s)} old"]
+        if isinstance(estimate, Track):
+            dark_s = age_s + estimate.age_s
+            notes += [f"no light for {duration_words(dark_s)}"] if fresh and dark_s > NO_LIGHT_S else []
+        elif self.track_ns is None:
+            notes.append("no track, the last pose")
+        else:
+            notes.append(f"no track for {duration_words((now_ns - self.track_ns) / S_NS)}, the last pose")
+        return Shown(estimate, at_ns, not fresh, ", ".join(notes))
+
     def is_stale(self, now_ns: int) -> bool:
         """Return whether what the scene shows of B is no longer so."""
-        age_ns, a = self.pose_age_ns(now_ns), self.end_nodes()[0]
-        stale_ns = round(stale_after_s(POSE) * S_NS) if a is None else a.stale_after_ns(POSE)
-        return age_ns is None or age_ns >= stale_ns
+        shown = self.shown(now_ns)
+        return shown is None or shown.stale
+
+    def track_is_fresh(self, now_ns: int) -> bool:
+        """Return whether there is a track, not stale."""
+        return self.track_ns is not None and now_ns - self.track_ns < self._stale_after_ns(TRACK)
+
+    def _stale_after_ns(self, topic: Topic) -> int:
+        a = self.end_nodes()[0]
+        return round(stale_after_s(topic) * S_NS) if a is None else a.stale_after_ns(topic)
 
     def frame(self) -> SceneFrame:
         """Return how A's camera stands in the scene, by A's newest attitude."""
@@ -247,10 +320,16 @@ class PairPicture:
             return
         self.solved += 1
         self.pose, self.pose_ns = result, at_ns
-        if self.points and 0 <= at_ns - self.points[-1].at_ns < POINT_SPACING_NS:
+        self._keep(result, at_ns)
+
+    def _keep(self, estimate: Estimate, at_ns: int) -> None:
+        """Keep a point of trail and plots, unless the last of its kind is close."""
+        last_ns = self._kept_ns.get(type(estimate))
+        if last_ns is not None and 0 <= at_ns - last_ns < POINT_SPACING_NS:
             return
+        self._kept_ns[type(estimate)] = at_ns
         frame = self.frame()
-        self.points.append(Point(at_ns, result, frame.place(result), frame))
+        self.points.append(Point(at_ns, estimate, frame.place(estimate), frame))
         while self.points and self.points[0].at_ns < at_ns - KEPT_NS:
             self.points.popleft()
 

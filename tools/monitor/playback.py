@@ -16,7 +16,7 @@ from buddyline.tools.pairs import Pair
 
 SHOWN: Final = (
     *("info", "candidates", "attitude", "depth", "image", "node_status"),
-    *("pose", "rejected", "solver_status"),
+    *("pose", "track", "rejected", "solver_status"),
 )
 # Before an instant that was jumped to, this much of the dive is read for trail and plots.
 LEAD_NS: Final = 30 * S_NS

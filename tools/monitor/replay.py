@@ -29,7 +29,7 @@ def keyframes(points: Sequence[Point], begin_ns: int, joined_ns: int) -> list[Ke
     before_ns: int | None = None
     for point in points:
         joined = before_ns is not None and point.at_ns - before_ns <= joined_ns
-        R_s_a, R_s_b = point.frame.R_s_a, point.frame.turn_b(point.pose)
+        R_s_a, R_s_b = point.frame.R_s_a, point.frame.turn_b(point.estimate)
         t, a, b = (
             [round(x, 4) for x in numbers] for numbers in (point.t_m, R_s_a.ravel().tolist(), R_s_b.ravel().tolist())
         )
@@ -50,14 +50,16 @@ def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
     }
 
 
-def replay_html(frames: Sequence[Keyframe], picture: PairPicture, *, levelled: bool) -> str:
-    """Return the replay as an HTML fragment."""
+def replay_html(frames: Sequence[Keyframe], picture: PairPicture, *, levelled: bool, what: str, stale_s: float) -> str:
+    """Return the replay as an HTML fragment; what: "track" or "pose", without which for stale_s B is grey."""
     names = [name or default for name, default in zip(picture.ends(), "AB", strict=True)]
     rigs = [rig_outline(node.info if node else None) for node in picture.end_nodes()]
     # Inside a script only `</` could end it early.
-    head = json.dumps({"names": names, "rigs": rigs, "levelled": levelled}).replace("</", "<\\/")
+    head = json.dumps({"names": names, "rigs": rigs, "levelled": levelled, "what": what, "stale_s": stale_s}).replace(
+        "</", "<\\/"
+    )
     encoded = msgspec.json.encode(list(frames)).decode("ascii")
-    return _HTML + f"<script>const PAIR={head},FRAMES={encoded};\n{_SCRIPT}</script>"
+    return _HTML.replace("WHAT", what) + f"<script>const PAIR={head},FRAMES={encoded};\n{_SCRIPT}</script>"
 
 
 _HTML: Final = """<div class="replay"><canvas id="replay" aria-label="3-D replay of the dive"></canvas>
@@ -65,7 +67,7 @@ _HTML: Final = """<div class="replay"><canvas id="replay" aria-label="3-D replay
 aria-label="time"><select id="speed" aria-label="speed"><option value="0.25">0.25x</option><option value="1">1x</option>
 <option value="4" selected>4x</option><option value="16">16x</option></select><output id="said"></output></div>
 <p class="dim">Drag to turn, wheel or pinch to come closer. Grid of 1 m at A's depth; red arrow: north; light balls:
-red left, green right. B is grey where there was no pose.</p></div>"""
+red left, green right. B is grey where there was no WHAT.</p></div>"""
 
 _SCRIPT: Final = r"""
 (() => {
@@ -127,8 +129,8 @@ function draw() {
     const colour = i % 5 ? "#1d2a35" : "#31475a";
     line([i,-n,0], [i,n,0], colour, 1); line([-n,i,0], [n,i,0], colour, 1);
   }
-  if (!FRAMES.length) { text(target, "no pose", "#fff"); return; }
-  const k = index(), f = FRAMES[k], stale = at - f[0] > 1.0;
+  if (!FRAMES.length) { text(target, "no " + PAIR.what, "#fff"); return; }
+  const k = index(), f = FRAMES[k], stale = at - f[0] > PAIR.stale_s;
   for (let i = 1; i <= k; i++) {
     if (!FRAMES[i][4]) continue;
     const age = Math.min((at - FRAMES[i][0]) / Math.max((last-first)/3, 20), 1), fade = Math.sqrt(age);
@@ -140,9 +142,10 @@ function draw() {
   line([0,0,0], f[1], stale ? "#5f6269" : "#ffffff", 1);
   line(f[1], [f[1][0],f[1][1],0], "#5aa0ff", 1);
   node(PAIR.rigs[0], f[2], [0,0,0], "#ebebf0", PAIR.names[0], false);
-  node(PAIR.rigs[1], f[3], f[1], stale ? "#5f6269" : "#ffaa3c", PAIR.names[1] + (stale ? " (no pose)" : ""), stale);
+  const name = PAIR.names[1] + (stale ? ` (no ${PAIR.what})` : "");
+  node(PAIR.rigs[1], f[3], f[1], stale ? "#5f6269" : "#ffaa3c", name, stale);
   const min = Math.floor(at/60), sec = (at - 60*min).toFixed(1).padStart(4, "0");
-  said.value = `${min}:${sec}  range ${Math.hypot(...f[1]).toFixed(2)} m${stale ? ", no pose" : ""}`;
+  said.value = `${min}:${sec}  range ${Math.hypot(...f[1]).toFixed(2)} m${stale ? ", no " + PAIR.what : ""}`;
   slider.value = last > first ? Math.round(1000*(at-first)/(last-first)) : 0;
 }
 function tick(now) {

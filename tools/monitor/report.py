@@ -13,19 +13,20 @@ from typing import Final
 import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw import dive as dive_figures
 from buddyline.tools.draw import figures
 from buddyline.tools.draw.figures import inline_svg
 from buddyline.tools.draw.page import page, section, table
+from buddyline.tools.estimate import known, sigma_m
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.triggers import trigger_figures
 from buddyline.tools.health.words import duration_words, reason_words
 from buddyline.tools.monitor.coverage import CSS as STRIP_CSS
 from buddyline.tools.monitor.coverage import LEGEND, clock_words
 from buddyline.tools.monitor.panel import length_words
-from buddyline.tools.monitor.picture import sigma_m
 from buddyline.tools.monitor.replay import keyframes, replay_html
 from buddyline.tools.monitor.summary import Summary, summarize
 from buddyline.tools.newfile import check_new, write_new
@@ -91,21 +92,39 @@ def _figures(summary: Summary) -> str:
     rows = [("triggers", f"{triggers.total}")]
     if triggers.total:
         rows.append(("with a pose", f"{len(summary.poses)} ({len(summary.poses) / triggers.total:.0%})"))
+    covered = summary.covered()
+    if summary.tracks and covered is not None:
+        rows.append((f"covered by the track (1 sd below {TRACK_SIGMA_SHARE:.0%} of the range)", f"{covered:.0%}"))
+        rows.append(("longest time without a light", duration_words(summary.dark_s)))
     if triggers.gap_s is not None:
         rows.append(("longest time between two poses", duration_words(triggers.gap_s)))
     if summary.poses:
         ranges_m = [pose.range_m for pose in summary.poses]
         rows.append(("range", f"{min(ranges_m):.2f} to {max(ranges_m):.2f} m"))
         sigmas_m = [sigma_m(pose) for pose in summary.poses]
-        rows.append(("position's uncertainty (1 sd), median", length_words(float(np.median(sigmas_m)))))
+        rows.append(("position's uncertainty (1 sd) of a pose, median", length_words(float(np.median(sigmas_m)))))
+    if summary.tracks:
+        sigmas_m = [sigma_m(point.estimate) for point in summary.tracks]
+        rows.append(("position's uncertainty (1 sd) of the track, median", length_words(float(np.median(sigmas_m)))))
+    if summary.poses:
         gaps_m = [abs(pose.range_gap_m) for pose in summary.poses]
         rows.append(("range gap between both nodes, median", length_words(float(np.median(gaps_m)))))
     for node, line in sorted(summary.depths.items()):
         depths_m = [depth_m for _, depth_m in line]
         rows.append((f"depth of {node}", f"{min(depths_m):.2f} to {max(depths_m):.2f} m"))
     errors = summary.errors()
-    for name, values in (("position", errors.translation_m), ("range", abs(errors.range_m))):
-        stats = Stats.of(values)
+    against = [
+        ("position of the poses", Stats.of(errors.translation_m)),
+        ("range of the poses", Stats.of(abs(errors.range_m))),
+    ]
+    for track in summary.track_figures():
+        if track.samples:
+            rows.append(("wrong samples of the track", f"{track.wrong} of {track.samples}"))
+        against += [
+            ("position of the track", track.position_m),
+            (f"position of the track without a light for {NO_LIGHT_S:g} s", track.in_gaps_m),
+        ]
+    for name, stats in against:
         if stats.median is not None and stats.p95 is not None:
             rows.append(
                 (f"against truth, {name}", f"{length_words(stats.median)} median, {length_words(stats.p95)} p95")
@@ -114,22 +133,34 @@ def _figures(summary: Summary) -> str:
 
 
 def _replay(summary: Summary) -> str:
-    frames = keyframes(summary.points, summary.coverage.begin_ns, max(JOINED_NS, 2 * summary.spacing_ns))
-    return replay_html(frames, summary.picture, levelled=any(point.frame.levelled for point in summary.points))
+    points, joined_ns = summary.drawn(), max(JOINED_NS, 2 * summary.spacing_ns)
+    return replay_html(
+        keyframes(points, summary.coverage.begin_ns, joined_ns),
+        summary.picture,
+        levelled=any(point.frame.levelled for point in points),
+        what="track" if summary.tracks else "pose",
+        stale_s=max(1.0, 2 * summary.spacing_ns / S_NS),
+    )
 
 
 def _maps(summary: Summary) -> str:
     """Return plan (from above, north up) and profile (distance and depth) of B as seen from A."""
     depths_a = summary.depths.get(summary.picture.ends()[0] or "", [])
-    plan = inline_svg(dive_figures.plan(summary.points), "plan")
-    return f'<div class="two">{plan}{inline_svg(dive_figures.profile(summary.points, depths_a), "profile")}</div>'
+    plan = inline_svg(dive_figures.plan(summary.points, summary.tracks), "plan")
+    profile = inline_svg(dive_figures.profile(summary.points, summary.tracks, depths_a), "profile")
+    said = "Dots: poses. Line: the track, with 95 % ellipses now and then" if summary.tracks else "Line: poses"
+    by_compass = any(known(point.estimate, "sigma_azimuth_rad") for point in summary.tracks)
+    compass = ", the compass's error in them" if by_compass else ""
+    return f'<div class="two">{plan}{profile}</div><p class="dim">{said}{compass}.</p>'
 
 
 def _over_time(summary: Summary) -> str:
     coverage = summary.coverage
     span_ns = coverage.begin_ns, coverage.end_ns
     without_ns = [(begin_ns, end_ns) for begin_ns, end_ns, _ in coverage.without()]
-    return inline_svg(dive_figures.over_time(summary.points, summary.depths, span_ns, without_ns), "over time")
+    return inline_svg(
+        dive_figures.over_time([*summary.points, *summary.tracks], summary.depths, span_ns, without_ns), "over time"
+    )
 
 
 def _coverage(summary: Summary) -> str:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-from buddyline.protocol.messages import Attitude, NodeInfo, RelativePose
+from buddyline.protocol.messages import Attitude, NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
+from buddyline.tools.estimate import Estimate
 from msgspec import UNSET
 from numpy.typing import NDArray
 
@@ -39,16 +40,16 @@ class SceneFrame:
         """Return A level and looking north, for want of an attitude."""
         return SceneFrame(R_LEVEL, False)
 
-    def place(self, pose: RelativePose) -> tuple[float, float, float]:
+    def place(self, estimate: Estimate) -> tuple[float, float, float]:
         """Return B's position in the scene (m)."""
-        if self.levelled and pose.t_ned_m is not UNSET:
-            return pose.t_ned_m
-        x, y, z = (self.R_s_a @ np.array(pose.t_a_b_m)).tolist()
+        if self.levelled and estimate.t_ned_m is not UNSET:
+            return estimate.t_ned_m
+        x, y, z = (self.R_s_a @ np.array(estimate.t_a_b_m)).tolist()
         return x, y, z
 
-    def turn_b(self, pose: RelativePose) -> Floats:
+    def turn_b(self, estimate: Estimate) -> Floats:
         """Return R_s_b: B's camera in the scene."""
-        R_s_b: Floats = self.R_s_a @ quat_to_matrix(np.array(pose.q_a_b_xyzw))
+        R_s_b: Floats = self.R_s_a @ quat_to_matrix(np.array(estimate.q_a_b_xyzw))
         return R_s_b
 
 
@@ -60,9 +61,9 @@ def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> SceneFrame:
     return SceneFrame(R_s_body @ quat_to_matrix(np.array(info.q_body_camera_xyzw)), True)
 
 
-def ellipsoid(pose: RelativePose, frame: SceneFrame) -> tuple[Floats, Floats]:
+def ellipsoid(estimate: Estimate, frame: SceneFrame) -> tuple[Floats, Floats]:
     """Return the half axes (3,) in m and R_s_axes (3, 3) of the ellipsoid that holds B with 95 %."""
-    covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
+    covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0:
         axes[:, 0] = -axes[:, 0]

@@ -29,7 +29,7 @@ LIGHT_RADIUS_M: Final = 0.035
 CHOSEN: Final = 0.02
 # The view follows the pair only where a better eye is further away than this share of its distance.
 WORTH_A_TURN: Final = 0.2
-# Trail segments longer than this in time are not drawn: between the poses nothing is known.
+# Trail segments longer than this in time are not drawn: where the track has a gap nothing is known.
 TRAIL_BREAK_NS: Final = 3 * S_NS // 2
 
 
@@ -100,7 +100,7 @@ def _segments(*points: Any) -> Any:
 
 
 class SceneDrawing:
-    """Both nodes, the line of sight, the trail, the uncertainty, and what tells where up and north are."""
+    """Both nodes, the line of sight, the trail, the poses, the uncertainty, and what tells where up and north are."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -169,7 +169,7 @@ class SceneDrawing:
     def draw(self, picture: PairPicture, now_ns: int) -> None:
         """Move everything to where it is now."""
         (name_a, name_b), (node_a, node_b) = picture.ends(), picture.end_nodes()
-        frame, pose, stale = picture.frame(), picture.pose, picture.is_stale(now_ns)
+        frame, shown = picture.frame(), picture.shown(now_ns)
         with self._server.atomic():
             self._north.visible = frame.levelled
             if name_a is not None:
@@ -180,18 +180,18 @@ class SceneDrawing:
             self._surface.visible = self._surface_name.visible = depth_m is not None
             if depth_m is not None:
                 self._surface.position = (0.0, 0.0, -depth_m)
-            if pose is None or name_b is None:
+            if shown is None or name_b is None:
                 self._b.hide()
                 return
-            t_m = np.array(frame.place(pose))
-            age_s = (picture.pose_age_ns(now_ns) or 0) / S_NS
-            text = f"{name_b}{_depth_words(node_b)}{f', STALE {age_s:.0f} s' if stale else ''}"
-            self._b.show(node_b, frame.turn_b(pose), t_m, text, stale)
+            estimate, stale = shown.estimate, shown.stale
+            t_m = np.array(frame.place(estimate))
+            text = f"{name_b}{_depth_words(node_b)}{f', {shown.note}' if shown.note else ''}"
+            self._b.show(node_b, frame.turn_b(estimate), t_m, text, stale)
             self._sight.points = _segments(np.zeros(3), t_m)
             self._sight.colors = np.array(STALE_COLOUR if stale else WHITE, np.uint8)
             self._plumb.points = _segments(t_m, (t_m[0], t_m[1], 0.0))
             self._sight.visible = self._plumb.visible = True
-            half_m, R_s_axes = ellipsoid(pose, frame)
+            half_m, R_s_axes = ellipsoid(estimate, frame)
             self._ellipsoid.visible = not stale
             self._ellipsoid.position = tuple(t_m.tolist())
             self._ellipsoid.wxyz = wxyz(R_s_axes)
@@ -204,24 +204,36 @@ class SceneDrawing:
             self.fit_all()
 
     def draw_trail(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw where B was, by age; at most once a second, since all of it is sent anew."""
+        """Draw where B was, by age: the track as a line, poses as dots, joined where there is no track at all.
+
+        At most once a second, since all of it is sent anew.
+        """
         key = (len(picture.points), now_ns // S_NS)
         if key == self._trail_key:
             return
         self._trail_key = key
+        poses = [point for point in picture.points if not point.tracked]
+        track = [point for point in picture.points if point.tracked] or poses
         segments = [
             (one, other)
-            for one, other in pairwise(picture.points)
+            for one, other in pairwise(track)
             if other.at_ns - one.at_ns <= TRAIL_BREAK_NS and one.frame.levelled == other.frame.levelled
         ]
+        scene = self._server.scene
+        # The same name replaces the one before: colours of points that change in number cannot be set alone.
+        if poses:
+            spots_m = np.array([point.t_m for point in poses], np.float32)
+            colours = age_colours(np.array([now_ns - point.at_ns for point in poses]) / S_NS, KEPT_NS / S_NS)
+            scene.add_point_cloud("/poses", spots_m, colours, point_size=0.03, point_shape="circle")
+        else:
+            scene.remove_by_name("/poses")
         if not segments:
-            self._server.scene.remove_by_name("/trail")
+            scene.remove_by_name("/trail")
             return
         ends_m = np.array([[one.t_m, other.t_m] for one, other in segments], np.float32)
         ages_s = np.array([[now_ns - one.at_ns, now_ns - other.at_ns] for one, other in segments]) / S_NS
         colours = age_colours(ages_s.ravel(), KEPT_NS / S_NS).reshape(-1, 2, 3)
-        # The same name replaces the one before: colours of points that change in number cannot be set alone.
-        self._server.scene.add_line_segments("/trail", ends_m, colours, thickness=0.015)
+        scene.add_line_segments("/trail", ends_m, colours, thickness=0.015)
 
 
 def _depth_words(node: NodePicture | None) -> str:

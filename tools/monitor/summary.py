@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Truth
+from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Track, Truth
 from buddyline.tools.dives import Dive
+from buddyline.tools.estimate import Estimate
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
+from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.panel import judged_picture
@@ -18,7 +20,7 @@ from buddyline.tools.pairs import Pair
 
 TOPICS: Final = (
     *("info", "candidates", "attitude", "depth", "image", "node_status"),
-    *("pose", "rejected", "truth", "solver_status"),
+    *("pose", "track", "rejected", "truth", "solver_status"),
 )
 MAX_POINTS: Final = 3000
 MIN_SPACING_NS: Final = S_NS // 5
@@ -38,8 +40,10 @@ class JudgedPicture:
 
 @dataclass
 class Summary:
-    """What the report shows of one pair. points: of a long dive only some; spacing_ns: how far apart they are at least.
+    """What the report shows of one pair.
 
+    points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
+    which the track used no light.
     depths: by node, (ns, m). infos: by node, one for each calibration that it had. counts: messages by key.
     """
 
@@ -47,6 +51,8 @@ class Summary:
     coverage: Coverage
     spacing_ns: int
     points: list[Point] = field(default_factory=list)
+    tracks: list[Point] = field(default_factory=list)
+    dark_s: float = 0.0
     poses: list[RelativePose] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     truths: list[Truth] = field(default_factory=list)
@@ -59,11 +65,27 @@ class Summary:
         """Compare the poses with the truth, where the logs hold it."""
         return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, None)
 
+    def track_figures(self) -> list[TrackFigures]:
+        """Compare the track with the truth, at those points that are kept."""
+        return tracks_figures(self._samples(), self.poses, TruthTrack(self.truths))
+
+    def covered(self) -> float | None:
+        """Return the share of the time from the first to the last pose that the track covers."""
+        return covered_share(self._samples(), self.poses)
+
+    def drawn(self) -> list[Point]:
+        """Return where B swam: the track, without one the poses."""
+        return self.tracks or self.points
+
+    def _samples(self) -> list[Track]:
+        return [point.estimate for point in self.tracks if isinstance(point.estimate, Track)]
+
 
 def summarize(dive: Dive, pair: Pair | None) -> Summary:
     """Read a dive once, from its first message to its last; pair: whose poses."""
     spacing_ns = max(MIN_SPACING_NS, (dive.end_ns - dive.start_ns) // MAX_POINTS)
     summary = Summary(PairPicture(pair), Coverage(dive.start_ns, dive.end_ns), spacing_ns)
+    lit_before_ns: int | None = None
     for envelope in dive.messages(*TOPICS):
         message, at_ns = envelope.message, envelope.time_ns
         summary.counts[envelope.key] += 1
@@ -75,6 +97,12 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
         if isinstance(message, RelativePose | Rejected):
             if envelope.ids == pair:
                 _take_outcome(summary, message, at_ns)
+        elif isinstance(message, Track):
+            if envelope.ids == pair:
+                lit_ns = at_ns - round(message.age_s * S_NS)
+                summary.dark_s = max(summary.dark_s, message.age_s, (lit_ns - (lit_before_ns or lit_ns)) / S_NS)
+                lit_before_ns = lit_ns
+                _keep(summary, summary.tracks, message, at_ns)
         elif isinstance(message, Depth):
             line = summary.depths.setdefault(message.node, [])
             if not line or at_ns - line[-1][0] >= max(DEPTH_SPACING_NS, spacing_ns):
@@ -95,9 +123,13 @@ def _take_outcome(summary: Summary, outcome: RelativePose | Rejected, at_ns: int
         return
     summary.coverage.add(at_ns, None)
     summary.poses.append(outcome)
-    if not summary.points or not 0 <= at_ns - summary.points[-1].at_ns < summary.spacing_ns:
+    _keep(summary, summary.points, outcome, at_ns)
+
+
+def _keep(summary: Summary, points: list[Point], estimate: Estimate, at_ns: int) -> None:
+    if not points or not 0 <= at_ns - points[-1].at_ns < summary.spacing_ns:
         frame = summary.picture.frame()
-        summary.points.append(Point(at_ns, outcome, frame.place(outcome), frame))
+        points.append(Point(at_ns, estimate, frame.place(estimate), frame))
 
 
 def _shots(dive: Dive, pair: Pair | None) -> dict[str, JudgedPicture]:
