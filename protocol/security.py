@@ -100,7 +100,11 @@ def check_identity(tls: Tls, expected: str) -> None:
 
 
 def refusal(endpoint: str, tls: Tls | None) -> str | None:
-    """Return why the hub at endpoint and this client refuse each other; None where they do not."""
+    """Return why the hub at endpoint and this client refuse each other; None where they do not.
+
+    A reason is a verdict on a certificate, or a hub that wants TLS. All else may heal by itself, and is waited for: no
+    answer, a connection that closes in mid-handshake, a hub without TLS.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -121,8 +125,9 @@ def refusal(endpoint: str, tls: Tls | None) -> str | None:
             return None
         reason = error.reason or ""
         said = next((words for alert, words in _ALERT_WORDS.items() if alert in reason), None)
+        # Without one of these alerts nobody has judged. OpenSSL's other words differ from version to version.
         if said is None:
-            return f"no TLS with {endpoint}: {reason}"
+            return None
         return f"the hub at {endpoint} refuses {tls.certificate}: it {said}"
     except OSError:
         return None

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import socket
+import struct
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,13 +18,13 @@ from buddyline.protocol.bus import Received
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
-from buddyline.protocol.security import RefusedError, Tls
+from buddyline.protocol.security import RefusedError, Tls, refusal
 from buddyline.protocol.zenoh_bus import ZenohBus, connect, open_hub
 
 from tests.processes import Process, buddyline, free_endpoint
 from tests.tools.identities import copy_of, expired, make_keys, tls
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -210,6 +214,85 @@ def test_a_hub_without_tls_is_waited_for_and_what_is_missing_is_said(keys: Path)
         assert connect(wanted, stop=stop, on_wait=on_wait, tls=tls(keys, "node-a")) is None
     assert len(said) == 1
     assert "no hub with TLS" in said[0]
+
+
+def reset(link: socket.socket) -> None:
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+
+
+# An alert's record: type 21, TLS 1.2, two bytes: fatal (2), and which one.
+ALERT = b"\x15\x03\x03\x00\x02\x02"
+
+
+@contextmanager
+def listener(endpoint: str, answer: Callable[[socket.socket], object]) -> Iterator[threading.Semaphore]:
+    """Accept connections, read each one's first bytes, answer, close; the semaphore counts them."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    calls, listening = threading.Semaphore(0), socket.create_server((host, int(port)))
+
+    def serve() -> None:
+        while True:
+            try:
+                link, _ = listening.accept()
+            except OSError:
+                return
+            with link:
+                link.settimeout(WAIT_S)
+                if link.recv(4096):
+                    answer(link)
+            calls.release()
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    try:
+        yield calls
+    finally:
+        listening.shutdown(socket.SHUT_RDWR)
+        listening.close()
+        thread.join(WAIT_S)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda _: None,
+        reset,
+        lambda link: link.sendall(b"\x16\x03\x03"),
+        lambda link: link.sendall(b"\x10\x00" + bytes(16)),
+        lambda link: link.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n"),
+        lambda link: link.sendall(ALERT + b"\x50"),
+        lambda link: link.sendall(ALERT + b"\x28"),
+    ],
+    ids=["closed", "reset", "half a record", "zenoh", "http", "alert: internal error", "alert: handshake failure"],
+)
+def test_what_is_no_verdict_on_a_certificate_is_waited_for(
+    keys: Path, answer: Callable[[socket.socket], object]
+) -> None:
+    endpoint = tls_endpoint()
+    with listener(endpoint, answer):
+        assert refusal(endpoint, tls(keys, "node-a")) is None
+
+
+def test_a_hub_that_closes_in_mid_handshake_is_tried_again_until_it_is_well(keys: Path) -> None:
+    endpoint, stop, joined = tls_endpoint(), threading.Event(), []
+
+    def attempt() -> None:
+        joined.append(connect(endpoint, stop=stop, on_wait=lambda _: None, tls=tls(keys, "node-a")))
+
+    client = threading.Thread(target=attempt, daemon=True)
+    try:
+        with listener(endpoint, lambda _: None) as calls:
+            client.start()
+            for _ in range(6):
+                assert calls.acquire(timeout=WAIT_S), "it gave up"
+            assert not joined
+        with open_hub(endpoint, tls=tls(keys, "hub")):
+            client.join(WAIT_S)
+            assert len(joined) == 1
+            joined[0].close()
+    finally:
+        stop.set()
+        client.join(WAIT_S)
 
 
 def test_marks_and_stored_dives_reach_a_secured_hub_with_the_right_certificate_alone(
