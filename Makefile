@@ -1,6 +1,16 @@
 # `make demo` and `make test` do all their own set-up.
 PYTHON ?= python3
 BIN := .venv/bin
+COMMA := ,
+# What was installed before stays: INSTALLED extras, and CONSTRAINTS where others than ours were asked for.
+-include .venv/installed.mk
+CONSTRAINTS ?= constraints.txt
+WANTED = $(sort $(INSTALLED) $(subst $(COMMA), ,$(EXTRAS)))
+EMPTY :=
+DOTTED = .$(if $(1),[$(subst $(EMPTY) $(EMPTY),$(COMMA),$(strip $(1)))])
+PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off -c $(CONSTRAINTS) -e
+# picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
+VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
 .PHONY: demo test coverage install names clean
 
@@ -18,7 +28,14 @@ test: .venv/.test names
 coverage: .venv/.test
 	$(BIN)/pytest --cov --cov-report=term:skip-covered
 
-install: .venv/.run
+# make install EXTRAS=keys,monitor: adds extras (pyproject.toml lists them) to what is installed.
+install: | .venv/bin/python
+	@echo "== installing buddyline$(if $(WANTED), with $(WANTED)) into .venv"
+	$(if $(filter pi,$(WANTED)),$(VENV))
+	$(PIP_INSTALL) '$(call DOTTED,$(WANTED))'
+	@printf '%s\n' 'INSTALLED := $(WANTED)' 'CONSTRAINTS := $(CONSTRAINTS)' > .venv/installed.mk
+	@touch .venv/.run
+	@echo "== installed: $(BIN)/buddyline --help; or '. $(BIN)/activate' first, then 'buddyline --help'"
 
 # The four folders under their one import name, as an installation has them: what mypy and import-linter read.
 names:
@@ -27,16 +44,19 @@ names:
 	ln -sfn $(addprefix ../../../,protocol node solver_service tools) build/names/buddyline/
 
 .venv/bin/python:
+	@echo "== setting up .venv; this takes one to three minutes, once"
 	$(PYTHON) -c 'import sys; sys.exit("Buddyline needs Python 3.11 or newer: make PYTHON=python3.11 ..." if sys.version_info < (3, 11) else 0)'
-	$(PYTHON) -m venv .venv
+	$(VENV)
 
 .venv/.run: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e .
-	touch $@
+	@echo "== installing the packages that buddyline needs"
+	$(PIP_INSTALL) '$(call DOTTED,$(WANTED))'
+	@touch $@
 
 .venv/.test: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@ .venv/.run
+	@echo "== installing the packages that the tests need"
+	$(PIP_INSTALL) '$(call DOTTED,$(sort dev $(WANTED)))'
+	@touch $@ .venv/.run
 
 clean:
 	rm -rf .venv build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage

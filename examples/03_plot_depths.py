@@ -1,4 +1,4 @@
-"""Draw both nodes' depths over time (needs matplotlib: pip install 'buddyline[plots]')."""
+"""Draw both nodes' depths over time (needs matplotlib: make install EXTRAS=plots)."""
 
 import sys
 

@@ -140,7 +140,7 @@ class VqfAttitude:
         try:
             from vqf import VQF
         except ModuleNotFoundError as error:
-            raise BuddylineError("attitude needs the package vqf: pip install 'buddyline[pi]'") from error
+            raise BuddylineError("attitude needs the package vqf: make install EXTRAS=pi") from error
         self._new_filter: Any = VQF
         self._calibration = calibration
         self._declination_rad = field.declination_rad if field else declination_rad

@@ -104,7 +104,7 @@ def load(registry: Mapping[str, str], what: str, name: str) -> Callable[..., Any
     try:
         return getattr(import_module(module), attribute)  # type: ignore[no-any-return]
     except ModuleNotFoundError as error:
-        raise BuddylineError(f"{what} {name!r} needs the package {error.name}: pip install 'buddyline[pi]'") from error
+        raise BuddylineError(f"{what} {name!r} needs the package {error.name}: make install EXTRAS=pi") from error
 
 
 def open_camera(config: NodeConfig, clock: Clock) -> CameraDevice:

@@ -39,7 +39,7 @@ def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> Ear
     try:
         from pygeomag import GeoMag
     except ModuleNotFoundError as error:
-        raise BuddylineError("declination from a position needs pygeomag: pip install 'buddyline[pi]'") from error
+        raise BuddylineError("declination from a position needs pygeomag: make install EXTRAS=pi") from error
     model = GeoMag()
     moment = datetime.fromtimestamp(stamp_ns // S_NS, UTC)
     start = datetime(moment.year, 1, 1, tzinfo=UTC)

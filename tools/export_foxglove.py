@@ -199,7 +199,7 @@ def export_foxglove(dive: Dive, output: Path) -> int:
         from foxglove import messages as fox
     except ImportError as error:
         raise BuddylineError(
-            "--format foxglove needs foxglove-sdk, which is not installed: pip install 'buddyline[foxglove]'"
+            "--format foxglove needs foxglove-sdk, which is not installed: make install EXTRAS=foxglove"
         ) from error
     from mcap.writer import CompressionType, Writer
 

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         from buddyline.tools.authority import Authority
     except ImportError as error:
-        raise BuddylineError("keys: the package cryptography is missing; `pip install 'buddyline[keys]'`") from error
+        raise BuddylineError("keys: the package cryptography is missing; `make install EXTRAS=keys`") from error
     if args.days is not None and args.days < 1:
         raise BuddylineError(f"--days {args.days}: at least 1")
     directory = Path(args.directory)

@@ -230,7 +230,7 @@ def type_store() -> Any:
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise BuddylineError("ros2 needs rosbags, which is not installed: pip install 'buddyline[ros2]'") from error
+        raise BuddylineError("ros2 needs rosbags, which is not installed: make install EXTRAS=ros2") from error
     return get_typestore(Stores.ROS2_JAZZY)
 
 

@@ -107,7 +107,7 @@ class Picamera2Camera:
             from picamera2 import MappedArray, Picamera2
         except ModuleNotFoundError as error:
             raise DeviceError(
-                f"camera: needs {error.name}: apt install python3-picamera2, and a venv with --system-site-packages"
+                f"camera: needs {error.name}: apt install python3-picamera2, then make install EXTRAS=pi"
             ) from error
         self._mapped_array: Any = MappedArray
         if not Picamera2.global_camera_info():

@@ -36,7 +36,7 @@ class I2cBus:
         try:
             from smbus2 import SMBus, i2c_msg
         except ModuleNotFoundError as error:
-            raise DeviceError(f"I2C bus {number}: needs smbus2: pip install 'buddyline[pi]'") from error
+            raise DeviceError(f"I2C bus {number}: needs smbus2: make install EXTRAS=pi") from error
         self.number = number
         self.retries = 0
         self._lock = threading.Lock()

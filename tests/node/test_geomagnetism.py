@@ -26,7 +26,7 @@ NOV_2025_NS = 1_764_000_000_000_000_000
     ],
 )
 def test_published_values(moment, latitude, longitude, declination_deg):
-    pytest.importorskip("pygeomag", reason="pygeomag is not installed: pip install 'buddyline[pi]'")
+    pytest.importorskip("pygeomag", reason="pygeomag is not installed: make install EXTRAS=pi")
     field = earth_field(latitude, longitude, int(moment.timestamp()) * 10**9)
     assert np.degrees(field.declination_rad) == pytest.approx(declination_deg, abs=0.011)
     assert 22e-6 < field.norm_t < 67e-6
@@ -34,7 +34,7 @@ def test_published_values(moment, latitude, longitude, declination_deg):
 
 
 def test_declination_moves_with_the_date_and_goes_on_past_the_model():
-    pytest.importorskip("pygeomag", reason="pygeomag is not installed: pip install 'buddyline[pi]'")
+    pytest.importorskip("pygeomag", reason="pygeomag is not installed: make install EXTRAS=pi")
     year_ns = 31_557_600 * 10**9
     one, two, far = (earth_field(59.9, 10.75, NOV_2025_NS + n * year_ns).declination_rad for n in (0, 1, 6))
     assert 0.1 < np.degrees(two - one) < 0.4

@@ -6,7 +6,7 @@ import pytest
 from buddyline.tools.bench import node
 from buddyline.tools.bench.__main__ import main
 
-pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
+pytest.importorskip("vqf", reason="vqf is not installed: make install EXTRAS=pi")
 
 
 @pytest.mark.slow

@@ -81,7 +81,7 @@ class TestFigures:
 
     def test_without_matplotlib_the_error_says_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-        with pytest.raises(BuddylineError, match=r"pip install 'buddyline\[plots\]'"):
+        with pytest.raises(BuddylineError, match="make install EXTRAS=plots"):
             figures.new_figure(1.0, 1.0)
 
     def test_a_figure_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:

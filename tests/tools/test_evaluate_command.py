@@ -162,7 +162,7 @@ def test_plots_without_matplotlib_say_what_to_install(tmp_path, capsys, monkeypa
     for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert "buddyline[plots]" in refused(capsys, solved, "--plots", tmp_path / "plots")
+    assert "EXTRAS=plots" in refused(capsys, solved, "--plots", tmp_path / "plots")
     assert not (tmp_path / "plots").exists()
 
 

@@ -186,7 +186,7 @@ def viewer(address: str) -> Iterator[list[int]]:
         from websockets.sync.client import connect
         from websockets.typing import Subprotocol
     except ImportError as error:
-        raise BuddylineError(f"{error.name} is not installed: pip install 'buddyline[monitor]'") from error
+        raise BuddylineError(f"{error.name} is not installed: make install EXTRAS=monitor") from error
     eye: dict[str, Any] = {
         **{"type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (3.0, 3.0, 3.0), "fov": 1.0},
         **{"near": 0.1, "far": 100.0, "image_height": 800, "image_width": 1280},

@@ -45,7 +45,7 @@ def check() -> None:
     try:
         import matplotlib as mpl
     except ImportError:
-        raise BuddylineError("drawing needs matplotlib: pip install 'buddyline[plots]'") from None
+        raise BuddylineError("drawing needs matplotlib: make install EXTRAS=plots") from None
     mpl.rcParams.update(_STYLE)
 
 

@@ -41,7 +41,7 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
         import viser
     except ImportError as error:
         raise BuddylineError(
-            f"the page needs viser, which is not installed ({error.name}): pip install 'buddyline[monitor]'"
+            f"the page needs viser, which is not installed ({error.name}): make install EXTRAS=monitor"
         ) from error
     logging.getLogger("websockets").setLevel(logging.WARNING)
     try:

@@ -70,7 +70,7 @@ def collect(source, clock: ManualClock, seconds: float) -> list:
     return messages
 
 
-pytest.importorskip("vqf", reason="vqf is not installed: pip install 'buddyline[pi]'")
+pytest.importorskip("vqf", reason="vqf is not installed: make install EXTRAS=pi")
 
 
 def test_imu_and_attitude_at_100_hz(config, clock, board, gauge):
@@ -243,7 +243,7 @@ def test_the_mount_is_the_configurations(config, clock, board):
 
 
 def test_declination_comes_with_the_position(config, clock, adapter):
-    pytest.importorskip("pygeomag", reason="pygeomag is not installed: pip install 'buddyline[pi]'")
+    pytest.importorskip("pygeomag", reason="pygeomag is not installed: make install EXTRAS=pi")
     calibration = CalibrationConfig(
         camera=CameraModel(model="pinhole", fx_px=600.0, fy_px=600.0, cx_px=410.0, cy_px=308.0, distortion=[0.0] * 5),
         light_left_m=(-0.44, 0.0, 0.0),
