@@ -97,7 +97,7 @@ def test_an_adapter_that_refuses_its_timeout_is_closed_again(adapter: Adapter, m
 
 def test_without_smbus2_the_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "smbus2", None)
-    with pytest.raises(DeviceError, match=r"buddyline\[pi\]"):
+    with pytest.raises(DeviceError, match="make install EXTRAS=pi"):
         I2cBus(1)
 
 
