@@ -182,7 +182,7 @@ class NodeService(Service):
                     break
                 self._last_s["camera"] = time.monotonic()
                 if self._watched:
-                    self.going_on()
+                    self.heartbeat()
                 with self._frame_ready:
                     self._frames.append(frame)
                     while len(self._frames) > FRAME_QUEUE:
@@ -199,11 +199,11 @@ class NodeService(Service):
     def _detect_frames(self) -> None:
         cv2.setNumThreads(1)
         while True:
-            self.going_on()
+            self.heartbeat()
             with self._frame_ready:
                 while not self._frames and self._capturing and not self.stop.is_set():
                     self._frame_ready.wait(0.5)
-                    self.going_on()
+                    self.heartbeat()
                 if not self._frames:
                     return
                 frame = self._frames.popleft()
@@ -271,7 +271,7 @@ class NodeService(Service):
     def _report(self) -> None:
         report_s = time.monotonic() + REPORT_S
         while not self.stop.wait(LOOK_S):
-            self.going_on()
+            self.heartbeat()
             self._clock_watch.look()
             if time.monotonic() >= report_s:
                 report_s += REPORT_S

@@ -1,3 +1,3 @@
-"""The shared vocabulary: messages, topics, bus, dive log, clock. Imports nothing else of ours."""
+"""What all packages share: messages, topics, bus, dive log, clock. Imports no other package of the project."""
 
 __version__ = "0.1.0"

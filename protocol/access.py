@@ -1,4 +1,4 @@
-"""Who may publish what: the hub's access rules, by the common name in each client's certificate."""
+"""The hub's access rules: who may publish which keys, by the common name in each client's certificate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Final
 from buddyline.protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
-# What `ros2` publishes: domain, topic, type and its hash. Longer than any key of ours behind a namespace is.
+# The keys that `ros2` publishes: domain, topic, type, and the type's hash. They have more chunks than any Buddyline
+# key behind a namespace, so they match none of them.
 _ROS_KEYS: Final = [
     *("*/buddyline/*/attitude/*/*", "*/buddyline/*/depth/*/*", "*/buddyline/*/*/pose/*/*", "*/tf/*/*"),
     "@ros2_lv/**",
@@ -17,11 +18,11 @@ _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"
 
 
 def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
-    """Return Zenoh's `access_control`: a node publishes its own keys, the solver its pair's, all read all.
+    """Return Zenoh's `access_control`: a node publishes its own keys, the solver those of pairs; all clients read all.
 
-    A surveyor marks where any node stands; a player stands in for all the nodes of a stored dive; a bridge to ROS
-    publishes ROS's keys. Everything else is denied. Caches live under `@adv`, which `*` and `**` do
-    not match: they are named beside each key, or history would be lost without a word.
+    A surveyor publishes marks for any node. A player publishes the keys of all nodes of a stored dive. A bridge to ROS
+    publishes ROS's keys. Everything else is denied. Zenoh keeps its caches under `@adv`, which `*` and `**` do not
+    match; each rule therefore also names them, because history would otherwise be lost silently.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
     everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**", *_ROS_KEYS]

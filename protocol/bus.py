@@ -1,6 +1,6 @@
-"""The bus: publish, subscribe, know who is alive. This is the contract of its two implementations.
+"""The bus: publish, subscribe, see which processes are alive. This is the interface of its two implementations.
 
-protocol.zenoh_bus works between processes, protocol.local_bus within one.
+protocol.zenoh_bus connects processes; protocol.local_bus works within one process.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ALIVE_NAME = re.compile(r"[a-z0-9_]{1,64}(/[a-z0-9_]{1,64})*\Z")
 
 @dataclass(frozen=True)
 class Received:
-    """One message off the bus, not yet opened; receive_ns is this process's clock."""
+    """One message from the bus, not yet decoded. receive_ns: receive time by this process's clock."""
 
     key: str
     payload: bytes
@@ -39,12 +39,12 @@ class Received:
     encoding: str
 
     def open(self) -> Envelope:
-        """Return its sound message; raise MessageError."""
+        """Decode and check the message; raise MessageError."""
         return open_envelope(self.key, self.payload, self.receive_ns)
 
 
 class Publisher(ABC):
-    """One topic of one node or pair, declared once. Safe to use from several threads."""
+    """Publishes one topic of one node or pair. Safe to use from several threads."""
 
     def __init__(self, topic: Topic, key: str, cap: RateCap) -> None:
         self.topic = topic
@@ -53,13 +53,13 @@ class Publisher(ABC):
         self._closed = False
 
     def put(self, message: Message) -> bool:
-        """Encode and send; False where the rate cap or a closed bus held it back. Raises MessageError."""
+        """Encode and send a message; return False if the rate cap or a closed bus prevents it. Raises MessageError."""
         if not isinstance(message, self.topic.schema):
             raise TypeError(f"topic {self.topic.name} carries {self.topic.schema.__name__}")
         return self.put_bytes(encode(message))
 
     def put_bytes(self, payload: bytes) -> bool:
-        """Send what is encoded already; False where the rate cap or a closed bus held it back."""
+        """Send an encoded message; return False if the rate cap or a closed bus prevents it."""
         return not self._closed and self._cap.passes() and self._send(payload)
 
     @abstractmethod
@@ -67,24 +67,24 @@ class Publisher(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Publish no longer; what the cache held is gone."""
+        """Stop publishing; the cache is dropped."""
 
 
 class Subscription(Protocol):
-    """Messages that match one key expression, handed to one handler in a thread of its own."""
+    """Passes the messages that match its key expressions to one handler, in a thread of its own."""
 
     @property
     def dropped(self) -> int:
-        """How many were dropped, oldest first, because the handler was too slow."""
+        """Number of messages dropped, oldest first, because the handler was too slow."""
         ...
 
     @property
     def missed(self) -> int:
-        """How many of its publishers' samples never came (of topics that keep more than the latest)."""
+        """Number of messages that were lost on the way (of topics that keep more than the latest message)."""
         ...
 
     def close(self) -> None:
-        """Let the handler finish what is queued, one second at most, and end its thread."""
+        """Let the handler finish the queued messages, for one second at most, and end its thread."""
         ...
 
 
@@ -101,48 +101,48 @@ class Bus(ABC):
 
     @property
     def failure(self) -> ThreadDiedError | None:
-        """The first thread that died, for the service to raise; None while all is well."""
+        """The failure of the first thread that died; None if none has died."""
         return self._failures.failure
 
     def on_failure(self, handle: Callable[[ThreadDiedError], None]) -> None:
-        """Call handle, from the dying thread, when a thread of the bus dies (at once where one did already)."""
+        """Call handle, from the dying thread, when a thread of the bus dies; at once if one has died already."""
         self._failures.on_failure(handle)
 
     @abstractmethod
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
-        """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
+        """Return a publisher on topic.key(*ids). max_rate_hz: messages above this rate are skipped."""
 
     @abstractmethod
     def subscribe(
         self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on these keys (`*`: one chunk, `**`: any number) to handle, one at a time.
+        """Pass every message on these keys (`*`: one chunk, `**`: any number) to handle, one at a time.
 
-        With history, nothing that publishers still hold is missed: what they sent before is queued before this
-        returns, first the newest of each topic with latest_only, then the last minute of the others, all
-        publishers' and keys' in order of their stamps; and what a fault of the link took is fetched when it is back.
-        Each publisher's samples come in order and once. Images are never kept.
-        Without history: only what comes from now on, as it comes.
-        Past capacity the oldest is dropped and counted. An exception in handle ends the subscription's
-        thread and is the bus's failure.
+        With history, the messages that publishers still hold are queued before this returns: first the newest
+        message of each latest-only topic, then the last minute of the other topics, sorted by stamp over all
+        publishers and keys. Messages lost in an outage of the link are fetched afterwards. Each publisher's messages
+        come in order and once. Images are never held.
+        Without history, only messages sent from now on are passed, as they arrive.
+        Beyond `capacity` the oldest message is dropped and counted. An exception in handle ends the subscription's
+        thread and becomes the bus's failure.
         """
 
     @abstractmethod
     def newest(self, topic: Topic) -> list[Received]:
-        """Return the newest message of each key of a retained topic, whether who sent it is still there or not.
+        """Return the newest message of each key of a retained topic, also if its sender is gone.
 
-        The list is empty where the hub was started since, or is another program than ours.
+        The hub holds them: a hub that has restarted since, or that is not Buddyline's, returns an empty list.
         """
 
     @abstractmethod
     def declare_alive(self, name: str) -> None:
-        """Let others see that this process lives, until it closes the bus or dies. name: `node/<id>`, ..."""
+        """Show others that this process is alive, until it closes the bus or dies. name: `node/<id>`, ..."""
 
     @abstractmethod
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
-        """Call handle(name, alive) for everyone who is alive now, and at every change.
+        """Call handle(name, alive) for every name that is alive now, and at every change.
 
-        While the hub is away nobody is alive.
+        Without a connection to the hub no name counts as alive.
         """
 
     @abstractmethod
@@ -150,7 +150,7 @@ class Bus(ABC):
         """Return whether another process on this bus has declared name."""
 
     def close(self) -> None:
-        """Close publishers and subscriptions and leave the bus; twice does no harm."""
+        """Close publishers and subscriptions and leave the bus; a second call does nothing."""
         with self._lock:
             if self._closed:
                 return
@@ -176,10 +176,10 @@ class Bus(ABC):
 
 
 def cache_depth(topic: Topic, cache_s: float) -> int:
-    """Return how many samples a publisher of topic keeps for those that missed them; 0: none.
+    """Return how many messages a publisher keeps for subscribers that missed them; 0 for none.
 
-    A trigger's topics may run faster than nominal, so none is sized for less than 30 Hz. Images are neither
-    small enough to keep nor worth sending late.
+    Topics of a trigger may run faster than nominal, so every cache has room for at least 30 Hz. Images are not kept:
+    they are large, and useless when late.
     """
     if topic.priority == "background":
         return 0
@@ -189,21 +189,21 @@ def cache_depth(topic: Topic, cache_s: float) -> int:
 
 
 def each_of(keys: KeyExprs) -> tuple[str, ...]:
-    """Return the key expressions, of which no two may match the same key."""
+    """Return the key expressions as a tuple. No two of them may match the same key."""
     return (keys,) if isinstance(keys, str) else keys
 
 
 def held_order(key: str, payload: bytes) -> tuple[bool, int]:
-    """Order what publishers hold for a late joiner: the topics with only a latest message, then by time.
+    """Return the sort key of a held message for a late subscriber: latest-only topics first, then by stamp.
 
-    By time, because a solver would otherwise get all frames of one node before the first of the other.
+    Without the order by stamp a solver would get all frames of one node before the first of the other.
     """
     parsed = parse_key(key)
     return parsed is None or not parsed[0].latest_only, payload_stamp_ns(payload) or 0
 
 
 def check_alive_name(name: str) -> str:
-    """Return name; raise ValueError where it cannot be part of a key."""
+    """Return name; raise ValueError if it cannot be part of a key."""
     if not _ALIVE_NAME.match(name):
         raise ValueError(f"alive name {name!r}: chunks of a-z, 0-9 and _, separated by /")
     return name

@@ -1,4 +1,4 @@
-"""Clocks as arguments: nothing else in the project asks what time it is."""
+"""Clocks, which are passed as arguments: no other module reads the wall clock for stamps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Clock(Protocol):
         ...
 
     def wait_until_ns(self, instant_ns: int, stop: threading.Event) -> bool:
-        """Sleep until instant_ns; return True where stop was set before."""
+        """Sleep until instant_ns; return True if stop is set before then."""
         ...
 
 
@@ -30,19 +30,19 @@ class SystemClock:
         return time.time_ns()
 
     def wait_until_ns(self, instant_ns: int, stop: threading.Event) -> bool:
-        """Sleep until instant_ns; return True where stop was set before."""
+        """Sleep until instant_ns; return True if stop is set before then."""
         remaining_ns = instant_ns - time.time_ns()
         return stop.wait(max(remaining_ns, 0) / S_NS) if remaining_ns > 0 else stop.is_set()
 
 
 class ManualClock:
-    """A clock that a test or an offline tool sets: waiting moves it on."""
+    """A clock for tests and offline tools: it is set by the caller, and waiting advances it."""
 
     def __init__(self, now_ns: int = 0) -> None:
         self._now_ns = now_ns
 
     def now_ns(self) -> int:
-        """Return the time that was set last."""
+        """Return the time set last."""
         return self._now_ns
 
     def set_ns(self, now_ns: int) -> None:
@@ -50,14 +50,14 @@ class ManualClock:
         self._now_ns = now_ns
 
     def wait_until_ns(self, instant_ns: int, stop: threading.Event) -> bool:
-        """Move on to instant_ns at once."""
+        """Advance to instant_ns at once; return whether stop is set."""
         self._now_ns = max(self._now_ns, instant_ns)
         return stop.is_set()
 
 
 def trigger_index(stamp_ns: int, trigger_period_ns: int) -> int:
-    """Return the index k of the trigger instant k * period since the epoch nearest to stamp_ns.
+    """Return the number k of the trigger whose instant, k * trigger_period_ns since the epoch, is nearest to stamp_ns.
 
-    Integer arithmetic: a float would lose the last digits of today's epoch nanoseconds.
+    Integer arithmetic: a float cannot hold today's epoch nanoseconds exactly.
     """
     return (stamp_ns + trigger_period_ns // 2) // trigger_period_ns

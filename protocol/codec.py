@@ -1,6 +1,6 @@
-"""Messages to and from the bytes of the bus and of dive logs: one JSON object a message, UTF-8.
+"""Encode messages to, and decode them from, the payloads of the bus and of dive logs: one JSON object each, UTF-8.
 
-`encode` writes nothing that `decode` would refuse. Numbers that are not integers by nature are written as floats.
+`encode` writes nothing that `decode` would refuse. Fields of type float are always written as floats.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ M = TypeVar("M", bound=Message)
 
 
 def _plain(value: object) -> object:
-    """Give numpy scalars and arrays as Python's own numbers and lists."""
+    """Convert numpy scalars and arrays to Python's numbers and lists."""
     to_list = getattr(value, "tolist", None)
     if to_list is None:
         raise TypeError(f"cannot encode {type(value).__name__}")
@@ -46,7 +46,7 @@ def decode(payload: bytes, schema: type[M]) -> M:
 
 
 def _non_finite_field(payload: bytes) -> str | None:
-    """Return which field holds a NaN or an infinity; None where none does."""
+    """Name the field that holds a NaN or an infinity; None if no field does."""
     if not any(word in payload for word in (b"NaN", b"Infinity")):
         return None
     try:
@@ -66,7 +66,7 @@ def _non_finite_field(payload: bytes) -> str | None:
 
 
 class _Stamp(msgspec.Struct):
-    """The measurement time of any message of ours."""
+    """The measurement time, in the two forms in which a message may have it."""
 
     stamp_ns: int | None = None
     timestamp: FoxgloveTime | None = None
@@ -76,7 +76,7 @@ _STAMP_DECODER = msgspec.json.Decoder(_Stamp)
 
 
 def payload_stamp_ns(payload: bytes) -> int | None:
-    """Return the measurement time that a payload carries, or None."""
+    """Return the measurement time of a payload, ns; None if it has none."""
     try:
         stamp = _STAMP_DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -87,10 +87,10 @@ def payload_stamp_ns(payload: bytes) -> int | None:
 
 
 def encode(message: Message) -> bytes:
-    """Encode one message; raise MessageError where it is not sound.
+    """Encode one message; raise MessageError if it is not valid.
 
-    What goes out is read back first: a NaN, an integer in place of a float or a numpy scalar never reaches
-    the bus.
+    The result is decoded again as a check, so that a NaN, an integer in place of a float or a numpy scalar never
+    reaches the bus.
     """
     try:
         first = _ENCODER.encode(message)

@@ -1,4 +1,4 @@
-"""Strict TOML configuration: an unknown key, a wrong type or value is refused, naming file, field and value."""
+"""Strict TOML configuration: unknown keys, wrong types and wrong values are errors that name file, field and value."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def load_config(path: Path | str, schema: type[C]) -> C:
 
 
 def parse_config(text: str, schema: type[C], name: str) -> C:
-    """Read TOML text as schema; name: what errors call it."""
+    """Read TOML text as schema; name: the file's name in errors. Raises ConfigError."""
     try:
         table = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -46,7 +46,7 @@ def parse_config(text: str, schema: type[C], name: str) -> C:
 
 
 def config_sha256(config: msgspec.Struct) -> str:
-    """Return the SHA-256 of a configuration as it is in force, defaults included."""
+    """Return the SHA-256 of a configuration, defaults included."""
     return hashlib.sha256(msgspec.json.encode(config, order="sorted")).hexdigest()
 
 

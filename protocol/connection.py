@@ -1,4 +1,4 @@
-"""Shuts down a TCP connection of this process that a library holds."""
+"""Shut down a TCP connection of this process that a library holds."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _DESCRIPTORS: Final = "/proc/self/fd"
 
 
 def cut_connection(host: str, port: int) -> bool:
-    """Shut down this process's connection whose own end is host:port; False where there is none, or no /proc.
+    """Shut down this process's connection with the local address host:port.
 
-    Its owner finds it broken at its next read or write.
+    The library finds it broken at its next read or write. Returns False where there is no such connection or no /proc.
     """
     try:
         descriptors = os.listdir(_DESCRIPTORS)
@@ -28,6 +28,6 @@ def cut_connection(host: str, port: int) -> bool:
                     connection.shutdown(socket.SHUT_RDWR)
                     return True
         except OSError:
-            # It was closed meanwhile, or is of a kind that has no name.
+            # The descriptor was closed meanwhile, or its kind of socket has no address.
             continue
     return False

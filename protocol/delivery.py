@@ -17,11 +17,11 @@ log = logging.getLogger(__name__)
 
 
 class ThreadDiedError(RuntimeError):
-    """A thread of the bus died; the text names it, __cause__ is what killed it."""
+    """A thread of the bus died. The text names the thread; __cause__ is its exception."""
 
 
 class FailureLatch:
-    """Keeps the first failure of a thread and tells its handlers."""
+    """Keeps the first failure of a thread and passes it to the handlers."""
 
     def __init__(self) -> None:
         self.failure: ThreadDiedError | None = None
@@ -29,7 +29,7 @@ class FailureLatch:
         self._handlers: list[Callable[[ThreadDiedError], None]] = []
 
     def on_failure(self, handle: Callable[[ThreadDiedError], None]) -> None:
-        """Call handle at the first failure; at once where it has happened."""
+        """Call handle at the first failure; at once if it has happened already."""
         with self._lock:
             self._handlers.append(handle)
             failure = self.failure
@@ -54,9 +54,10 @@ T = TypeVar("T")
 
 
 class Delivery(Generic[T]):
-    """A bounded queue that drops its oldest, and the thread that hands its items to one handler in order.
+    """A bounded queue, and the thread that passes its items to one handler in order.
 
-    capacity: how many items; MAX_QUEUED_BYTES bounds what they hold together. dropped counts both.
+    When the queue is full (`capacity` items, or MAX_QUEUED_BYTES together) the oldest item is dropped; `dropped`
+    counts them.
     """
 
     def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
@@ -86,7 +87,7 @@ class Delivery(Generic[T]):
             self._changed.notify()
 
     def close(self, timeout_s: float = CLOSE_S) -> None:
-        """Accept no more items, hand over the queued ones within timeout_s, end the thread."""
+        """Accept no more items, pass on the queued ones within timeout_s, and end the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -117,7 +118,7 @@ class Delivery(Generic[T]):
 
 
 class RateCap:
-    """Lets at most max_rate_hz through, on average; None lets all through."""
+    """Lets at most max_rate_hz messages pass, on average; None: all of them."""
 
     def __init__(self, max_rate_hz: float | None, clock: Clock) -> None:
         if max_rate_hz is not None and not max_rate_hz > 0:
@@ -128,15 +129,16 @@ class RateCap:
         self._due_ns: int | None = None
 
     def passes(self) -> bool:
-        """Return whether one may go out now, and count it as gone."""
+        """Return whether a message may be sent now; if so, count it as sent."""
         if self._period_ns is None:
             return True
         now_ns = self._clock.now_ns()
         with self._lock:
             late_ns = 0 if self._due_ns is None else now_ns - self._due_ns
-            # A clock that was set back by more than a period must not silence the topic for as long.
+            # A clock that was set back by more than a period must not silence the topic until it has caught up.
             if -self._period_ns <= late_ns < 0:
                 return False
-            # In time: the next is due one period after this one was due. After a pause: one period from now.
+            # In a steady stream the next message is due one period after this one was due; after a pause, one period
+            # from now.
             self._due_ns = now_ns + self._period_ns - (late_ns if 0 <= late_ns < self._period_ns else 0)
             return True

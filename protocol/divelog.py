@@ -1,4 +1,4 @@
-"""Dive logs: self-describing MCAP files that survive a power cut and can be read when they are damaged."""
+"""Dive logs: self-describing MCAP files that survive a power cut and stay readable when damaged."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 CHUNK_BYTES: Final = 1024 * 1024
-# One flipped bit costs a chunk.
+# One flipped bit loses a whole chunk, so chunks are short.
 CHUNK_NS: Final = S_NS
 LOG_NOTE: Final = "buddyline.log"
 MAX_NOTES: Final = 100
@@ -45,9 +45,9 @@ _DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, 
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """One message of a log: its key, times in ns, and payload as it went over the bus.
+    """One message of a log: its key, its times in ns, and its payload as on the bus.
 
-    sequence: how many its writer had written before it, modulo 2**32, in the logs of DiveLogWriter.
+    sequence: number of the message in its log, from 0, modulo 2**32, where DiveLogWriter wrote the log.
     """
 
     key: str
@@ -58,7 +58,7 @@ class Record:
     sequence: int = 0
 
     def open(self) -> Envelope:
-        """Return its sound message; raise MessageError."""
+        """Decode and check the message; raise MessageError."""
         return open_envelope(self.key, self.payload, self.log_time_ns)
 
 
@@ -83,21 +83,23 @@ class DiveLogWriter:
         self.count = 0
         if metadata:
             self._writer.add_metadata(LOG_NOTE, metadata)
-        # A power cut in the first second leaves a log that can be read. Where the disk is full, the next flush says so.
+        # With the head on the disk, a power cut in the first second leaves a readable log. A full disk is reported by
+        # the next flush.
         with suppress(OSError):
             self.flush(sync=True)
 
     @property
     def size_bytes(self) -> int:
-        """The file's length, without the chunk in progress."""
+        """Length of the file, without the unfinished chunk."""
         return self._file.tell()
 
     def write(
         self, key: str, payload: bytes, log_time_ns: int, publish_time_ns: int | None = None, schema: str = ""
     ) -> None:
-        """Add one payload; publish_time_ns: its stamp, by default read from it; schema: for keys not ours.
+        """Add one payload. publish_time_ns: its stamp, by default read from it. schema: for keys of other programs.
 
-        Raises OSError where the disk refuses; this payload is not in the log then, and the earlier ones stay queued.
+        Raises OSError where the disk refuses to write; then this payload is not in the log, and earlier ones stay
+        queued.
         """
         if self._file.stuck:
             self._file.flush()
@@ -113,7 +115,7 @@ class DiveLogWriter:
         self.count += 1
 
     def _cut(self, log_time_ns: int) -> None:
-        """Finish the chunk where it is a second old; messages that go back in time stay in it."""
+        """Finish the chunk if it spans a second of log time. Messages with earlier times stay in it."""
         if self._cut_ns is None:
             self._cut_ns = log_time_ns
         elif log_time_ns - self._cut_ns >= CHUNK_NS:
@@ -134,19 +136,19 @@ class DiveLogWriter:
             described = json_schema(parsed[0].schema) if parsed else b'{"type":"object"}'
             schema_id = self._schemas[name] = self._writer.register_schema(name, "jsonschema", described)
         channel = self._writer.register_channel(key, "json", schema_id)
-        # Outside the chunks, so that a later chunk can be read where the one that declares it is damaged.
+        # The channel's note is outside the chunks: later chunks stay readable if the declaring chunk is damaged.
         self._writer.add_metadata(CHANNEL_NOTE, {"id": str(channel), "topic": key, "schema": name})
         return channel
 
     def flush(self, *, sync: bool = False) -> None:
-        """Finish the chunk and write it; sync: to the disk. Raises OSError; a later call tries again."""
+        """Finish and write the chunk; sync: also fsync. Raises OSError; the next call tries again."""
         self._writer.flush()
         self._cut_ns = None
         if sync:
             self._file.sync()
 
     def close(self) -> None:
-        """Write index and end, and close the file."""
+        """Write the index and the end, and close the file; raise OSError."""
         if self._file.closed:
             return
         try:
@@ -157,7 +159,7 @@ class DiveLogWriter:
             self._file.close()
 
     def abandon(self) -> None:
-        """Close the file as it is, without what the disk refused."""
+        """Close the file without its end, and without what the disk refused to write."""
         self._file.close()
 
     def __enter__(self) -> DiveLogWriter:
@@ -169,7 +171,7 @@ class DiveLogWriter:
 
 @dataclass
 class _Contents:
-    """Where the chunks of a log are, with their log times, and its channels and metadata."""
+    """The places and log times of a log's chunks, its channels, its messages outside chunks, and its metadata."""
 
     # start, end (ns), offset in the file, and the channels in it (None: not known before it is read)
     chunks: list[tuple[int, int, int, frozenset[int] | None]] = field(default_factory=list)
@@ -179,9 +181,9 @@ class _Contents:
 
 
 class DiveLogReader:
-    """Reads one MCAP file, whole or damaged. damage: what could not be read, a line each.
+    """Reads one MCAP file, whole or damaged. damage: a line for each part that could not be read.
 
-    trust_index: use the index at the end of a file that has one; False: walk through the file in any case.
+    trust_index: use the index at the file's end if there is one; False: always read through the whole file.
     """
 
     def __init__(self, path: Path | str, *, trust_index: bool = True) -> None:
@@ -204,30 +206,30 @@ class DiveLogReader:
 
     @property
     def keys(self) -> list[str]:
-        """Topics of the log, sorted, as far as they are declared."""
+        """The keys that the log declares, sorted."""
         return sorted({topic for topic, _ in self._contents.channels.values()})
 
     @property
     def start_ns(self) -> int | None:
-        """Log time of the first message, None for a log without messages."""
+        """Log time of the first message, ns; None for a log without messages."""
         starts = [start for start, *_ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
         return min(starts, default=None)
 
     @property
     def end_ns(self) -> int | None:
-        """Log time of the last message, None for a log without messages."""
+        """Log time of the last message, ns; None for a log without messages."""
         ends = [end for _, end, *_ in self._contents.chunks] + [m.log_time for m in self._contents.loose]
         return max(ends, default=None)
 
     def metadata(self) -> dict[str, str]:
-        """Return what the writer noted about the log itself."""
+        """Return the writer's notes about the log."""
         return dict(self._contents.metadata)
 
     def records(self, wanted: Callable[[str], bool] | None = None, since_ns: int | None = None) -> Iterator[Record]:
-        """Yield the records by log time (ties: as in the file); memory holds only chunks that overlap.
+        """Yield the records by log time, and in the file's order where times are equal.
 
-        wanted: whether a topic is to be read; since_ns: the least log time. Where the log has an index, chunks
-        without such records are not read.
+        Only chunks that overlap in time are in memory at once. wanted: returns whether to read a key. since_ns: the
+        least log time. If the log has an index, chunks without wanted records are not read.
         """
         wanted = cache(wanted) if wanted else None
         heap: list[tuple[int, int, Record]] = []
@@ -298,7 +300,7 @@ class DiveLogReader:
                 self._contents.channels[record.id] = (record.topic, schemas.get(record.schema_id, ""))
 
     def _index(self) -> _Contents | None:
-        """Read the index at the end of a log that was closed; None where there is none."""
+        """Read the index at the end of a closed log; None if there is no usable index."""
         self._file.seek(0)
         try:
             reader = SeekingReader(self._file, record_size_limit=MAX_RECORD_BYTES)
@@ -312,7 +314,7 @@ class DiveLogReader:
             return None
         contents = _Contents()
         for index in summary.chunk_indexes:
-            # A chunk whose writer made no index of its messages may hold any.
+            # A chunk without a message index may hold messages of any channel.
             channels = frozenset(index.message_index_offsets) or None
             contents.chunks.append(
                 (index.message_start_time, index.message_end_time, index.chunk_start_offset, channels)
@@ -323,13 +325,13 @@ class DiveLogReader:
         try:
             noted = next((note for note in reader.iter_metadata() if note.name == LOG_NOTE), None)
         except _DAMAGE as error:
-            self._note(f"what was noted about the log is lost ({error or type(error).__name__})")
+            self._note(f"the writer's notes about the log are lost ({error or type(error).__name__})")
         else:
             contents.metadata = dict(noted.metadata) if noted else {}
         return contents
 
     def _scan(self) -> _Contents:
-        """Find the chunks of a log by walking through it, past damage."""
+        """Find the chunks of a log by reading through it; damaged parts are skipped."""
         contents = self._contents = _Contents()
         declared: list[object] = []
         for found in walk(self._file, self._size, self._note):
@@ -355,7 +357,7 @@ class DiveLogReader:
                 channel = int(note.metadata["id"])
                 self._contents.channels[channel] = (note.metadata["topic"], note.metadata["schema"])
             except (KeyError, ValueError):
-                self._note("the note of a channel makes no sense")
+                self._note("the note of a channel is malformed")
 
     def close(self) -> None:
         """Close the file."""
@@ -371,5 +373,5 @@ class DiveLogReader:
 def read_logs(
     readers: Iterable[DiveLogReader], wanted: Callable[[str], bool] | None = None, since_ns: int | None = None
 ) -> Iterator[Record]:
-    """Yield the records of several logs as one, by log time, from since_ns on."""
+    """Yield the records of several logs, merged by log time, from since_ns on."""
     return heapq.merge(*(reader.records(wanted, since_ns) for reader in readers), key=lambda record: record.log_time_ns)

@@ -1,4 +1,4 @@
-"""Where the hub is: `tcp/<host>:<port>`, or `tls/...`."""
+"""The hub's address: `tcp/<host>:<port>`, or `tls/<host>:<port>`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _ENDPOINT = re.compile(r"(?:tcp|tls)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9_.-]+):([0-9]
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return where endpoint is; raise BuddylineError where it is not `tcp/<host>:<port>` or `tls/...`."""
+    """Return host and port of an endpoint; raise BuddylineError unless it is `tcp/<host>:<port>` or `tls/...`."""
     match = _ENDPOINT.match(endpoint)
     if match is None or not 0 < int(match.group(2)) < 65536:
         raise BuddylineError(
@@ -24,7 +24,7 @@ def host_and_port(endpoint: str) -> tuple[str, int]:
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether endpoint is reached from this machine alone, as far as its name tells."""
+    """Return whether only this machine can reach endpoint, judged by its host: a loopback address or localhost."""
     host, _ = host_and_port(endpoint)
     try:
         return ipaddress.ip_address(host).is_loopback

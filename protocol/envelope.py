@@ -1,6 +1,6 @@
-"""The one door for messages: a key and a payload in, a sound message with its topic and node ids out.
+"""Decode and check messages: a key and a payload in, a valid message with its topic and node ids out.
 
-Nothing else in the project decodes a payload. What is not sound is refused, counted and named.
+This is the only place in the project that decodes payloads. Invalid messages are refused, counted and reported.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ CAMERA_FRAME: Final = "_camera"
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """A sound message, and what its key says of it.
+    """A valid message, with the topic and the ids of its key.
 
-    ids: the node's id, or the pair's two. payload: the message as it came, to be passed on unchanged.
-    time_ns: receive time on the bus, log time in a log; 0 where neither is known.
+    ids: the node's id, or the pair's two. payload: the message as received, to be passed on unchanged.
+    time_ns: receive time on the bus, log time in a log, 0 where unknown.
     """
 
     key: str
@@ -39,7 +39,7 @@ class Envelope:
 
     @property
     def node(self) -> str:
-        """The node that it is of; A of a pair."""
+        """The id of the message's node; of a pair, A's."""
         fields = self.topic.id_fields
         return self.ids[fields.index("node") if "node" in fields else 0]
 
@@ -47,12 +47,12 @@ class Envelope:
 def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:
     """Decode and check one message.
 
-    Raises MessageError, naming the field, where the key is none of ours, the payload is not sound, or the message
-    says that it is of another node or pair than its key.
+    Raises MessageError, naming the field, for a key that is no Buddyline topic, an invalid payload, or a message of
+    another node or pair than its key's.
     """
     parsed = parse_key(key)
     if parsed is None:
-        raise MessageError(f"{key}: no topic of ours")
+        raise MessageError(f"{key}: not a Buddyline topic")
     topic, ids = parsed
     message = decode(payload, topic.schema)
     _check_sender(key, topic, ids, message)
@@ -60,7 +60,7 @@ def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:
 
 
 def envelope_of(message: Message, time_ns: int) -> Envelope:
-    """Return a message of our own making as if it had come; raise MessageError where it is not sound."""
+    """Return the envelope of a message made by this process; raise MessageError if it is not valid."""
     key = key_of(message)
     parsed = parse_key(key)
     assert parsed is not None
@@ -70,7 +70,7 @@ def envelope_of(message: Message, time_ns: int) -> Envelope:
 def _check_sender(key: str, topic: Topic, ids: tuple[str, ...], message: Message) -> None:
     fields = topic.id_fields
     if isinstance(message, CompressedImage):
-        # Other programs name frames as they like; `<node>_camera` is ours.
+        # Other programs choose their own frame names; only `<node>_camera` is checked.
         named = message.frame_id.endswith(CAMERA_FRAME)
         said = (message.frame_id.removesuffix(CAMERA_FRAME),) if named else ids
         fields = ("frame_id",)
@@ -82,31 +82,31 @@ def _check_sender(key: str, topic: Topic, ids: tuple[str, ...], message: Message
 
 
 class Sealed(Protocol):
-    """What can be opened: a `Received` of the bus, a `Record` of a log."""
+    """A message that is not decoded yet: a `Received` of the bus, or a `Record` of a log."""
 
     @property
     def key(self) -> str:
-        """Its Zenoh key and MCAP topic."""
+        """Its Zenoh key, which is also its MCAP topic."""
         ...
 
     def open(self) -> Envelope:
-        """Return its sound message; raise MessageError."""
+        """Decode and check the message; raise MessageError."""
         ...
 
 
 @dataclass
 class Refused:
-    """What was refused of one key: how many messages, and why the first."""
+    """The refused messages of one key: their number, and the reason of the first."""
 
     count: int
     first: str
 
 
 class Refusals:
-    """Counts what is refused, by key, and says so: the 1st, 2nd, 4th ... of each key. Safe in several threads.
+    """Counts refused messages by key, and logs the 1st, 2nd, 4th, 8th ... of each key. Safe in several threads.
 
-    who: begins each line of the log, "" for a reader that says everything at its end. by_key: of the first keys;
-    more than MAX_NAMED_KEYS are counted together under "other keys".
+    who: begins each logged line; "" logs nothing, for a reader that reports at its end. by_key: the counts of the
+    first MAX_NAMED_KEYS keys; all others are counted together under "other keys".
     """
 
     def __init__(self, who: str = "") -> None:
@@ -116,12 +116,12 @@ class Refusals:
 
     @property
     def count(self) -> int:
-        """How many messages were refused."""
+        """Number of messages refused."""
         with self._lock:
             return sum(refused.count for refused in self.by_key.values())
 
     def open(self, sealed: Sealed) -> Envelope | None:
-        """Open one; None where it is refused."""
+        """Decode and check one message; None if it is refused."""
         try:
             return sealed.open()
         except MessageError as error:
@@ -129,7 +129,7 @@ class Refusals:
             return None
 
     def note(self, key: str, error: MessageError) -> None:
-        """Count a refusal."""
+        """Count a refused message."""
         with self._lock:
             if key not in self.by_key and len(self.by_key) >= MAX_NAMED_KEYS:
                 key = "other keys"
@@ -140,7 +140,7 @@ class Refusals:
             log.warning("%s: bad message on %s: %s (%d so far)", self._who, key, error, count)
 
     def lines(self) -> list[str]:
-        """Return a line for each key: how many of its messages were refused, and why the first."""
+        """Return a line for each key: the number of refused messages, and the reason of the first."""
         with self._lock:
             return [
                 f"{key}: {refused.count} refused, the first: {refused.first}" for key, refused in self.by_key.items()

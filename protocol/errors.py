@@ -2,8 +2,8 @@
 
 
 class BuddylineError(Exception):
-    """A known error: one line that names what is wrong and what to do; commands exit with 2."""
+    """A known error: one line that names the problem and the remedy; commands exit with 2."""
 
 
 class MessageError(BuddylineError):
-    """A payload that is not a sound message; the text names the field."""
+    """A payload that is not a valid message; the text names the field."""

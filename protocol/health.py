@@ -1,4 +1,4 @@
-"""The limits that node, solver, doctor, monitor and demo judge by: one table, beside the topics' own (topics.py)."""
+"""The limits of health for node, solver, doctor, monitor and demo. The topics' own limits are in topics.py."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ from typing import Final
 
 from buddyline.protocol.topics import NODE_STATUS, Topic
 
-# A stream is stale once this many of its periods have passed, where that is longer than its topic's stale_s.
+# A stream is stale after this many of its periods, or after its topic's stale_s, whichever is longer.
 STALE_PERIODS: Final = 3
-# A node says something with each status. Without anything for this long, node or link is down.
+# A node sends at least its status. After this time without any message, the node or the link is down.
 SILENT_S: Final = 1.5 / NODE_STATUS.rate_hz
-# A pair whose nodes are well, without a pose for this long, is told why; over these last seconds the reasons count.
+# When healthy nodes give no pose for NO_POSE_S, the reasons of the last REASONS_S are shown.
 NO_POSE_S: Final = 2.0
 REASONS_S: Final = 10.0
-# A track covers an instant where its position's sigma is below this share of the range; else it is uncertain.
+# A track covers an instant if the sigma of its position is below this share of the range; else it is uncertain.
 TRACK_SIGMA_SHARE: Final = 0.05
-# A track that has used no light for longer than this is told to be without: several triggers.
+# After this time without a light, several triggers, a track is reported to be without lights.
 NO_LIGHT_S: Final = 0.5
-# Frames of one instant arrive within the matching window; with stamps further apart nothing of two nodes matches.
+# Frames of one trigger arrive within the matching window. If their stamps differ by more, two nodes never match.
 FRAMES_APART_S: Final = 1.0
-# Two nodes' clocks. At 1 m/s, 5 ms are 5 mm.
+# Between the clocks of two nodes. At 1 m/s, 5 ms are 5 mm.
 CLOCKS_APART_S: Final = 0.005
-# One node's clock from its time server, as chrony estimates it: two nodes together stay within the limit above.
+# Between one node's clock and its time server, by chrony's estimate: two nodes then stay within CLOCKS_APART_S.
 CLOCK_OFF_S: Final = 0.002
-# Two calibrated compasses away from steel: several times what they say of themselves.
+# Between two compasses: several times the sigma of calibrated compasses away from steel.
 HEADINGS_APART_RAD: Final = math.radians(20.0)
 # A Raspberry Pi slows down at 80 degrees.
 HOT_DEGC: Final = 70.0
 TOO_HOT_DEGC: Final = 80.0
-# A dive, with reserve: how long the disk should last.
+# The disk should have room for a dive with reserve.
 DIVE_H: Final = 4.0
 
 
 def stale_after_s(topic: Topic, period_s: float = 0.0) -> float:
-    """Return the age from which a stream is stale. period_s: how often a frame's topics are due, where known."""
+    """Return the age, s, from which a stream is stale. period_s: the trigger period for topics of a frame, 0: none."""
     return max(topic.stale_s, STALE_PERIODS * period_s)

@@ -1,4 +1,4 @@
-"""The bus within one process: for tests, and wherever a whole system runs in one program."""
+"""The bus within one process: for tests, and for programs that run a whole system."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from buddyline.protocol.topics import Topic
 
 
 def key_matches(key_expr: str, key: str) -> bool:
-    """Return whether key is one of key_expr's: `*` stands for one chunk, `**` for any number of them.
+    """Return whether key_expr matches key: `*` stands for one chunk, `**` for any number of chunks.
 
     Neither matches a chunk that begins with @.
     """
@@ -45,12 +45,12 @@ def _chunks_match(pattern: list[str], chunks: list[str]) -> bool:
 
 
 class LocalNetwork:
-    """What several LocalBus clients have in common, as the hub is for several processes."""
+    """Connects several LocalBus clients, as the hub connects processes."""
 
     def __init__(self, clock: Clock | None = None, cache_s: float = CACHE_S) -> None:
         self.clock = clock or SystemClock()
         self.cache_s = cache_s
-        # Held while a sample is handed round, so that all subscribers see one order.
+        # Held while a message is distributed, so that all subscribers see the same order.
         self.lock = threading.RLock()
         self.publishers: list[LocalPublisher] = []
         self.subscriptions: list[LocalSubscription] = []
@@ -59,7 +59,7 @@ class LocalNetwork:
         self.newest: dict[str, tuple[Topic, bytes]] = {}
 
     def connect(self) -> LocalBus:
-        """Return one more client."""
+        """Return a new client."""
         return LocalBus(self)
 
     def tell(self, name: str, alive: bool) -> None:
@@ -87,7 +87,7 @@ class LocalPublisher(Publisher):
         return True
 
     def close(self) -> None:
-        """Publish no longer; what the cache held is gone."""
+        """Stop publishing; the cache is dropped."""
         with self._network.lock:
             if not self._closed:
                 self._closed = True
@@ -95,7 +95,7 @@ class LocalPublisher(Publisher):
 
 
 class LocalSubscription:
-    """A Subscription within one process, where nothing is ever missed."""
+    """A Subscription within one process, where no message is lost on the way."""
 
     missed = 0
 
@@ -106,20 +106,20 @@ class LocalSubscription:
 
     @property
     def dropped(self) -> int:
-        """How many were dropped because the handler was too slow."""
+        """Number of messages dropped because the handler was too slow."""
         return self._delivery.dropped
 
     def takes(self, key: str) -> bool:
-        """Return whether key is one of those asked for."""
+        """Return whether the subscription matches key."""
         return any(key_matches(key_expr, key) for key_expr in self._key_exprs)
 
     def offer(self, publisher: LocalPublisher, payload: bytes) -> None:
-        """Queue one of publisher's messages."""
+        """Queue a message of publisher."""
         received = Received(publisher.key, payload, self._network.clock.now_ns(), publisher.topic.encoding)
         self._delivery.offer(received, len(payload))
 
     def close(self) -> None:
-        """Let the handler finish what is queued, one second at most, and end its thread."""
+        """Let the handler finish the queued messages, for one second at most, and end its thread."""
         with self._network.lock:
             if self in self._network.subscriptions:
                 self._network.subscriptions.remove(self)
@@ -127,7 +127,7 @@ class LocalSubscription:
 
 
 class LocalWatch:
-    """Who is alive, told to one handler."""
+    """Tells one handler which names are alive."""
 
     missed = 0
 
@@ -137,7 +137,7 @@ class LocalWatch:
 
     @property
     def dropped(self) -> int:
-        """How many changes were dropped because the handler was too slow."""
+        """Number of changes dropped because the handler was too slow."""
         return self._delivery.dropped
 
     def offer(self, name: str, alive: bool) -> None:
@@ -160,7 +160,7 @@ class LocalBus(Bus):
         self._network = network
 
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
-        """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
+        """Return a publisher on topic.key(*ids). max_rate_hz: messages above this rate are skipped."""
         publisher = LocalPublisher(self._network, topic, topic.key(*ids), RateCap(max_rate_hz, self.clock))
         with self._network.lock:
             self._network.publishers.append(publisher)
@@ -170,7 +170,7 @@ class LocalBus(Bus):
     def subscribe(
         self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on these keys to handle, one at a time (protocol.bus.Bus has the contract)."""
+        """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         delivery = Delivery(f"bus {' '.join(each_of(keys))}", handle, capacity, self._failures)
         subscription = LocalSubscription(self._network, each_of(keys), delivery)
         with self._network.lock:
@@ -191,7 +191,7 @@ class LocalBus(Bus):
         return [Received(key, payload, now_ns, of.encoding) for key, (of, payload) in held if of is topic]
 
     def declare_alive(self, name: str) -> None:
-        """Let others see that this process lives, until it closes the bus."""
+        """Show others that this process is alive, until it closes the bus."""
         check_alive_name(name)
         with self._network.lock:
             known = any(name == other for other, _ in self._network.alive)
@@ -200,7 +200,7 @@ class LocalBus(Bus):
                 self._network.tell(name, True)
 
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
-        """Call handle(name, alive) for everyone who is alive now, and at every change."""
+        """Call handle(name, alive) for every name that is alive now, and at every change."""
         delivery = Delivery[tuple[str, bool]]("bus alive", lambda item: handle(*item), 1024, self._failures)
         watch = LocalWatch(self._network, delivery)
         with self._network.lock:

@@ -1,6 +1,6 @@
 """The messages of the bus and of dive logs, as validated structures.
 
-What `codec.decode` gives is sound: types, lengths, finite numbers, unit quaternions, blobs inside their picture.
+`codec.decode` checks types, lengths, finite numbers, unit quaternions, and that blobs are inside their picture.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _check_finite(field: str, values: tuple[float, ...]) -> None:
 
 
 class Message(Struct, frozen=True, kw_only=True):
-    """What every message has in common: its schema's name."""
+    """Base of all messages."""
 
 
 class CameraModel(Struct, frozen=True, kw_only=True):
@@ -77,7 +77,7 @@ class CameraModel(Struct, frozen=True, kw_only=True):
 class ArTag(Struct, frozen=True, kw_only=True):
     """An AR tag on a node. corners_m: of its black square, in the node's camera frame.
 
-    In the order in which one who faces the tag sees it upright: top left, top right, bottom right, bottom left.
+    Their order, as seen by an observer who faces the upright tag: top left, top right, bottom right, bottom left.
     family: "36h11", "16h5", ...
     """
 
@@ -86,7 +86,7 @@ class ArTag(Struct, frozen=True, kw_only=True):
     family: str = "36h11"
 
     def __post_init__(self) -> None:
-        """Check that the corners are apart."""
+        """Check that the corners are distinct."""
         if min(math.dist(self.corners_m[i], self.corners_m[i - 1]) for i in range(4)) < 1e-3:
             raise ValueError("corners_m: two corners less than 1 mm apart")
 
@@ -96,7 +96,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
 
     light_left_m, light_right_m, depth_port_m: in the node's camera frame. sigma_px: candidate noise, 1 sd.
     row_time_ns: 0 for a global shutter. q_body_camera_xyzw: camera to body. declination_rad: 0 where headings
-    are magnetic. tags: AR tags that the node carries, to compare with. imu_m: the inertial unit's place in the camera
+    are magnetic. tags: AR tags on the node, for comparison only. imu_m: place of the inertial unit in the camera
     frame. imu_delay_ns: stamp of an inertial sample minus its true time.
     """
 
@@ -129,7 +129,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
 class Blob(Struct, frozen=True, kw_only=True):
     """One light candidate. Pixel centres at integers, distorted image.
 
-    dt_ns: exposure of its row minus the frame's stamp_ns. score: how likely a light, 0-1.
+    dt_ns: exposure time of its row minus the frame's stamp_ns. peak: grey levels. score: probability of a light, 0-1.
     """
 
     u_px: float
@@ -143,10 +143,10 @@ class Blob(Struct, frozen=True, kw_only=True):
 
 
 class Candidates(Message, frozen=True, kw_only=True):
-    """Light candidates of one frame, the likeliest first.
+    """Light candidates of one frame, the most likely first.
 
     stamp_ns: middle of exposure of the image's middle row. trigger: round(stamp_ns / trigger_period_ns).
-    seq: consecutive per boot. truncated: how many candidates were left out.
+    seq: sequence number, from 0 at each boot. truncated: number of candidates left out.
     """
 
     node: NodeId
@@ -160,7 +160,7 @@ class Candidates(Message, frozen=True, kw_only=True):
     truncated: Count = 0
 
     def __post_init__(self) -> None:
-        """Check that every blob lies inside the picture."""
+        """Check that every blob is inside the picture."""
         for i, blob in enumerate(self.blobs):
             if not -0.5 <= blob.u_px <= self.width_px - 0.5:
                 raise ValueError(f"blobs[{i}].u_px: {blob.u_px:g} is outside the image, width {self.width_px}")
@@ -169,7 +169,7 @@ class Candidates(Message, frozen=True, kw_only=True):
 
 
 class Imu(Message, frozen=True, kw_only=True):
-    """Raw inertial sample in the body frame; mag_t is left out where there is no magnetometer."""
+    """Raw inertial sample in the body frame; mag_t is absent without a magnetometer."""
 
     node: NodeId
     stamp_ns: StampNs
@@ -192,7 +192,7 @@ class Attitude(Message, frozen=True, kw_only=True):
 
 
 class Depth(Message, frozen=True, kw_only=True):
-    """Depth of the pressure port, down, 0 at the surface."""
+    """Depth of the pressure port: positive down, 0 at the surface."""
 
     node: NodeId
     stamp_ns: StampNs
@@ -203,9 +203,9 @@ class Depth(Message, frozen=True, kw_only=True):
 
 
 class HeardClock(Struct, frozen=True, kw_only=True):
-    """Another node's newest ClockBeacon, as it arrived.
+    """Another node's newest ClockBeacon, as received.
 
-    sent_ns: its stamp_ns, on that node's clock. received_ns: on the clock of the node that says this.
+    sent_ns: its stamp_ns, on the sender's clock. received_ns: on the receiver's clock.
     """
 
     node: NodeId
@@ -215,9 +215,9 @@ class HeardClock(Struct, frozen=True, kw_only=True):
 
 
 class ClockBeacon(Message, frozen=True, kw_only=True):
-    """The time at which a node sent this, and when it received the others' newest ones.
+    """The time at which a node sent this beacon, and the times at which it received the others' newest beacons.
 
-    Two nodes' beacons together hold what a ping's four timestamps do: their clocks' offset and the round trip.
+    The beacons of two nodes hold the four timestamps of a ping, which give the clock offset and the round trip.
     """
 
     node: NodeId
@@ -250,12 +250,11 @@ class CompressedImage(Message, frozen=True, kw_only=True):
 class NodeStatus(Message, frozen=True, kw_only=True):
     """Health of a node, 1 Hz.
 
-    rates: messages a second by topic; drops: lost messages by cause; ages_s: time since the newest sample of a
-    device; bus_retries: transfers on the sensors' I2C bus that had to be repeated; problem: what is wrong in words,
-    empty where nothing is.
-    clock_offset_s: this clock minus the true time, as chrony estimates it; clock_rms_s: chrony's long-term RMS of it;
-    clock_bound_s: the true time is no farther away; clock_frequency_ppm: by how much the uncorrected clock gains;
-    clock_source: what chrony follows, empty where nothing. All are left out where chrony does not tell.
+    rates_hz: messages per second by topic. drops: lost messages by cause. ages_s: time since the newest sample of each
+    device. bus_retries: repeated transfers on the sensors' I2C bus. problem: what is wrong, in words; empty if nothing.
+    clock_offset_s: this clock minus true time, estimated by chrony. clock_rms_s: its long-term RMS.
+    clock_bound_s: greatest possible error of this clock. clock_frequency_ppm: rate at which the uncorrected clock
+    gains. clock_source: the reference that chrony follows, empty if none. All five are absent without chrony.
     """
 
     node: NodeId
@@ -321,9 +320,9 @@ class Track(Message, frozen=True, kw_only=True):
     """The fused estimate of T_a_b at stamp_ns, also between triggers.
 
     covariance: 6x6 row-major as in RelativePose. v_a_b_mps: velocity of B's camera relative to A's, in A's camera
-    frame, A's turning not counted; v_covariance: 3x3 row-major. lights: how many lights the last trigger before
-    stamp_ns told. age_s: since a light was last used. With attitude: t_ned_m and the angles, whose sigmas include the
-    compass's error.
+    frame, without the part that comes from A's rotation; v_covariance: 3x3 row-major. lights: number of lights used
+    at the last trigger before stamp_ns. age_s: time since a light was last used. With attitude only: t_ned_m and the
+    angles; their sigmas include the compass's error.
     """
 
     node_a: NodeId
@@ -351,11 +350,11 @@ class Track(Message, frozen=True, kw_only=True):
 
 
 class NodePose(Message, frozen=True, kw_only=True):
-    """A node's place and attitude in the frame of a net: T_net_camera.
+    """A node's pose in the frame of a net: T_net_camera.
 
-    p_m: of the camera's centre; q_xyzw: camera to net; v_mps; all in the net's frame, which is north-east-down where an
-    attitude or a fixed node gives it. covariance: 6x6 row-major, position, then small rotation, both in the net's
-    frame. fixed: the configuration says that the node stands still.
+    p_m: of the camera's centre; q_xyzw: camera to net; v_mps: velocity. All are in the net's frame, which is NED if an
+    attitude or a fixed node defines it. covariance: 6x6 row-major, position, then small rotation, both in the net's
+    frame. fixed: the configuration declares the node to be at rest.
     """
 
     net: NodeId
@@ -375,7 +374,7 @@ class NodePose(Message, frozen=True, kw_only=True):
 
 
 class Rejected(Message, frozen=True, kw_only=True):
-    """A trigger without a pose, and why."""
+    """A trigger without a pose, with the reason."""
 
     node_a: NodeId
     node_b: NodeId
@@ -399,7 +398,7 @@ class Truth(Message, frozen=True, kw_only=True):
 
 
 class TrueLight(Struct, frozen=True, kw_only=True):
-    """Where one light of the other node truly is in a picture; merged: its halo is one with the other's."""
+    """The true place of one light of the other node in a picture. merged: both lights' clipped cores overlap."""
 
     name: Literal["left", "right"]
     u_px: float
@@ -409,7 +408,7 @@ class TrueLight(Struct, frozen=True, kw_only=True):
 
 
 class LightTruth(Message, frozen=True, kw_only=True):
-    """Where the other node's lights truly are in this node's picture."""
+    """The true places of the other node's lights in this node's picture."""
 
     node: NodeId
     stamp_ns: StampNs
@@ -418,10 +417,10 @@ class LightTruth(Message, frozen=True, kw_only=True):
 
 
 class Mark(Message, frozen=True, kw_only=True):
-    """A word on the survey: what a person, or a check, says of a node at an instant.
+    """A note for the survey about a node at an instant, by a person or by an automatic check.
 
-    station: the node stands at the station `name` from the rest nearest to this instant until it leaves. point: the
-    node is at a point of interest. note: `note` alone. alarm: a check of the survey failed; `name` says which.
+    kind: station: the node is at the station `name`, from the rest nearest to this instant until it moves. point: the
+    node is at a point of interest. note: the text `note` only. alarm: the survey's check `name` failed.
     """
 
     node: NodeId
@@ -434,9 +433,9 @@ class Mark(Message, frozen=True, kw_only=True):
 class SolverStatus(Message, frozen=True, kw_only=True):
     """Health of the solver, 1 Hz; counts since its start.
 
-    latency: from the middle of exposure to the pose, over the last second's poses (live dives only).
-    clock_skew_s: B's clock minus A's as the dive itself tells it, left out until it does.
-    unused: nodes that the solver hears and is not told to use, left out where there are none.
+    latency: from the middle of exposure to the pose, over the poses of the last second (live dives only).
+    clock_skew_s: B's clock minus A's, estimated from the dive's own messages; absent until there is an estimate.
+    unused: nodes that the solver receives but is configured not to use; absent if there are none.
     """
 
     node_a: NodeId

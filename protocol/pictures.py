@@ -1,6 +1,6 @@
-"""A dive's pictures, in files of their own beside its log: when the disk fills up, the oldest pictures go first.
+"""The pictures of a dive, in files of their own beside its log, so that the oldest can be deleted from a full disk.
 
-`a-....mcap` has its pictures in the folder `a-....pictures`, in `000000.mcap` and so on; each is a dive log.
+The pictures of `a-....mcap` are in the folder `a-....pictures`, in `000000.mcap` and so on; each is a dive log.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SEGMENT_BYTES: Final = 128 * 1024 * 1024
 
 
 def with_pictures(paths: Iterable[Path | str]) -> list[Path]:
-    """Return these logs, each followed by the files of its pictures that are not named themselves."""
+    """Return these logs, each followed by the files of its pictures, except files that are listed themselves."""
     named = [Path(path) for path in paths]
     known = {path.resolve() for path in named}
     found = []
@@ -35,11 +35,11 @@ def with_pictures(paths: Iterable[Path | str]) -> list[Path]:
 
 
 class PictureLog:
-    """Writes pictures beside a log. Where room runs out it deletes the oldest, and then stops recording them.
+    """Writes pictures beside a log. On a nearly full disk it deletes the oldest pictures, then stops recording them.
 
-    kin: a pattern of the names of this node's logs in the same folder; pictures of older ones are deleted first.
-    min_free_bytes: room to leave on the disk. dropped: pictures that were not written; deleted: files that were
-    deleted.
+    kin: a pattern that matches the names of this node's logs in the same folder; pictures of older logs are deleted
+    first. min_free_bytes: space to leave on the disk. dropped: number of pictures not written. deleted: number of
+    files deleted.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class PictureLog:
         self._folder = log_path.with_suffix(SUFFIX)
         self._kin = kin
         self._min_free_bytes = min_free_bytes
-        # On a small disk, too, deleting one file must make enough room.
+        # Also on a small disk, deleting one file must free enough space.
         self._segment_bytes = min(SEGMENT_BYTES, min_free_bytes // 2) if min_free_bytes else SEGMENT_BYTES
         self._metadata = metadata
         self._writer: DiveLogWriter | None = None
@@ -60,7 +60,7 @@ class PictureLog:
 
     @property
     def problem(self) -> str:
-        """What is wrong, "" where nothing is."""
+        """What is wrong, in words; "" if nothing."""
         if self._error and not self._paused:
             return f"pictures are not recorded: {self._error}"
         if self._paused:
@@ -70,7 +70,7 @@ class PictureLog:
         return ""
 
     def write(self, key: str, payload: bytes, log_time_ns: int, schema: str = "") -> None:
-        """Add one picture where there is room; a disk that refuses is reported and raises nothing."""
+        """Add one picture if there is space. A write error is reported by `problem` and never raised."""
         if self._paused:
             self.dropped += 1
             return
@@ -85,7 +85,7 @@ class PictureLog:
             self._fail(error)
 
     def flush(self) -> None:
-        """Sync everything to the disk."""
+        """Write everything to the disk (fsync)."""
         if self._writer is None:
             return
         try:
@@ -94,11 +94,11 @@ class PictureLog:
             self._fail(error)
 
     def keep_room(self, *, full: bool = False) -> None:
-        """Delete the oldest pictures while there is too little room; full: a write failed for lack of room."""
+        """Delete the oldest pictures while there is too little space. full: a write failed for lack of space."""
         try:
             free_bytes = self._free_bytes()
             if not full and free_bytes >= self._min_free_bytes:
-                # Some more than the least, so that recording does not start and stop all the time.
+                # Resumed only with some space above the limit, so that recording does not start and stop repeatedly.
                 if self._paused and free_bytes >= self._min_free_bytes + self._segment_bytes:
                     self._paused, self._error = False, ""
                     log.info("pictures are recorded again")
@@ -118,7 +118,7 @@ class PictureLog:
             log.warning("disk: %.0f MB free: no more pictures are recorded, everything else is", free_bytes / 1e6)
 
     def close(self) -> None:
-        """Write the last file's end."""
+        """Finish the last file."""
         try:
             self._end_file()
         except OSError as error:
@@ -139,7 +139,7 @@ class PictureLog:
             writer.close()
 
     def _oldest_first(self) -> list[Path]:
-        # Names begin with the time at which their log was begun, and the files are numbered.
+        # The order of names is the order of time: folders are named by their log's start, and files are numbered.
         return sorted(self._folder.parent.glob(f"{self._kin}{SUFFIX}/*.mcap"))
 
     def _delete(self, file: Path) -> None:

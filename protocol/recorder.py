@@ -1,4 +1,4 @@
-"""A dive log written by its own thread, so that nobody who records waits for the disk."""
+"""Record a dive log in a thread of its own, so that callers do not wait for the disk."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class RecordError(BuddylineError):
 class Recorder:
     """Writes payloads into a dive log and syncs it every second.
 
-    Where the disk is slow or refuses, messages wait in memory. Beyond 64 MB the oldest pictures are dropped first,
-    then the oldest messages; `dropped` counts them. `error` says why nothing can be written, None while it can: the
-    thread tries again until it is closed. pictures: where pictures go, instead of into the log.
+    While the disk is slow or refuses to write, messages wait in memory. Beyond 64 MB the oldest pictures are dropped
+    first, then the oldest messages; `dropped` counts them. `error`: why nothing can be written; None if it can. After
+    an error the thread tries again until `close`. pictures: receives the pictures, in place of the log.
     """
 
     def __init__(
@@ -74,12 +74,12 @@ class Recorder:
         try:
             while not self._turn():
                 pass
-        except Exception as error:  # the thread's end is reported, whatever ended it
+        except Exception as error:  # any error that ends the thread is reported
             log.error("log %s: no longer written", self.path, exc_info=error)
             self.error = error
 
     def _turn(self) -> bool:
-        """Write for a second, then sync; return whether the log is closed now."""
+        """Write for one second, then sync; return whether the log is closed."""
         ends_s = time.monotonic() + SYNC_INTERVAL_S
         closing = False
         try:
@@ -105,7 +105,7 @@ class Recorder:
         return closing
 
     def _write(self, batch: deque[Item]) -> None:
-        """Write the items and take them out of the batch; raise OSError with those in it that are still to be."""
+        """Write the items of the batch and remove each from it; raise OSError, with the unwritten ones still in it."""
         while batch:
             key, payload, log_time_ns, schema = batch[0]
             if self.pictures is not None and _is_picture(key):
@@ -116,7 +116,7 @@ class Recorder:
             self.written += 1
 
     def _refused(self, error: OSError, unwritten: deque[Item]) -> bool:
-        """Queue again what the disk refused, make room where it is full, and wait; return False: go on."""
+        """Queue the unwritten items again, free space if the disk is full, and wait; return False, to continue."""
         with self._ready:
             if self._last_try:
                 self._writer.abandon()
@@ -140,13 +140,13 @@ class Recorder:
         self._writer.close()
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Write what is queued and the log's end; raise RecordError where the disk refuses them."""
+        """Write the queued messages and the log's end; raise RecordError if the disk refuses to."""
         with self._ready:
             self._closing = True
             self._ready.notify()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            raise RecordError(f"{self.path}: the disk has not taken its end within {timeout_s:g} s")
+            raise RecordError(f"{self.path}: its end was not written within {timeout_s:g} s")
         if isinstance(self.error, OSError):
             raise RecordError(f"{self.path}: its end is lost: {self.error.strerror}") from self.error
         if self.error is not None:

@@ -1,8 +1,8 @@
-"""Walks an MCAP file record by record, past damage, to its end or to where it breaks off.
+"""Read an MCAP file record by record; skip damaged parts, and stop at its end or where it is cut off.
 
-After a malformed record the next chunk (or channel note) is searched byte by byte. It is known by its first bytes and
-by lengths that agree with one another; other data looks like this only by rare chance. Checksums of chunks are checked
-when they are read.
+After a malformed record, the next chunk (or channel note) is searched byte by byte. It is recognized by its first bytes
+and by consistent lengths, which other data has only by rare chance. Checksums of chunks are checked when chunks are
+read.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _MALFORMED: Final = (McapError, struct.error, ValueError, EOFError, MemoryError,
 
 @dataclass(frozen=True, slots=True)
 class ChunkAt:
-    """A chunk that begins at offset; times in ns, of the messages in it."""
+    """A chunk that begins at byte `offset`. start_ns, end_ns: first and last log time of its messages."""
 
     offset: int
     start_ns: int
@@ -60,7 +60,7 @@ class MalformedError(ValueError):
 
 
 def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Found]:
-    """Yield the records of an MCAP file of size bytes; note gets a line for everything that is skipped."""
+    """Yield the records of an MCAP file of `size` bytes. note: is called with a line for each skipped part."""
     offset = suspect = len(MAGIC)
     while offset < size:
         try:
@@ -70,12 +70,12 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
             if resumed is None:
                 note(f"breaks off at byte {offset} of {size} ({error})")
                 return
-            note(f"bytes {offset} to {resumed} are damaged and passed over ({error})")
+            note(f"bytes {offset} to {resumed} are damaged and skipped ({error})")
             offset = suspect = resumed
             continue
         if found is not None:
             yield found
-        # A damaged length may have led too far: the search begins after the last sound chunk.
+        # A damaged length may have skipped valid chunks: the search begins after the last valid chunk.
         if isinstance(found, ChunkAt):
             suspect = end
         offset = end
@@ -88,7 +88,7 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
 
 
 def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
-    """Return the record's end, its content where it is of a kind that readers use, and whether it is the last."""
+    """Return the record's end, its content (None for kinds that no reader uses), and whether it is the last one."""
     file.seek(offset)
     head = file.read(_HEAD_BYTES)
     if len(head) < _HEAD_BYTES:
@@ -121,7 +121,7 @@ def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | No
 
 
 def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Schema | Channel]:
-    """Return the records of the chunk at offset; raise MalformedError, or the error of its compression or checksum."""
+    """Return the records of the chunk at offset; raise MalformedError, or its compression's or checksum's error."""
     end, found, _ = _record_at(file, offset, size)
     if not isinstance(found, ChunkAt):
         raise MalformedError("no chunk where the index says")
@@ -135,13 +135,13 @@ def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Sc
 
 
 def _records_in(content: bytes) -> Iterator[McapMessage | Schema | Channel]:
-    """Yield the records of an unpacked chunk: messages, by the thousands, without a call for each of their fields."""
+    """Yield the records of an unpacked chunk. A message's head is unpacked in one call, because there are thousands."""
     at = 0
     while at < len(content):
         opcode, length = _RECORD_HEAD.unpack_from(content, at)
         at += _RECORD_HEAD.size
         if at + length > len(content):
-            raise MalformedError("a record that ends behind its chunk")
+            raise MalformedError("a record that ends after its chunk's end")
         if opcode == Opcode.MESSAGE:
             channel, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
             payload = content[at + _MESSAGE_HEAD.size : at + length]
@@ -154,7 +154,7 @@ def _records_in(content: bytes) -> Iterator[McapMessage | Schema | Channel]:
 
 
 def summary_is_sound(file: IO[bytes], size: int) -> bool:
-    """Whether the index at the end of a closed log agrees with its checksum, where it has one."""
+    """Return whether the index at the end of a closed log matches its checksum; True if there is no checksum."""
     file.seek(size - len(MAGIC) - _FOOTER.size)
     _, _, start, _, checksum = _FOOTER.unpack(file.read(_FOOTER.size))
     if checksum == 0:
@@ -178,7 +178,7 @@ def _chunk_at(file: IO[bytes], offset: int, length: int) -> ChunkAt:
 
 
 def _resume(file: IO[bytes], begin: int, damaged: int, size: int) -> int | None:
-    """Return where the next sound chunk or channel note begins, from `begin` on and not at `damaged`."""
+    """Return the offset of the next valid chunk or channel note, from `begin` on and not at `damaged`; None if none."""
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         at = begin
         while (match := _RESUME.search(data, at)) is not None:

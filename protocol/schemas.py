@@ -1,4 +1,4 @@
-"""Flat JSON schemas of the messages, as log viewers take them: no $ref, no anyOf, plain types inline."""
+"""Flat JSON schemas of the messages, as log viewers need them: no $ref, no anyOf, all types inline."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""TLS identities of the bus, checked before use, so that errors name the wrong file and its fault.
+"""Check the TLS identities of the bus before use, so that errors name the wrong file and what is wrong with it.
 
-Zenoh reports every refusal as a failure to connect. Faults of an identity are found by a handshake with itself, and a
-hub's reason to refuse by a handshake with the hub; both use Python's ssl.
+Zenoh reports every refusal as a failure to connect. Here Python's ssl makes two test handshakes: one within this
+process, which finds faults of the identity, and one with the hub, which finds the hub's reason to refuse.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ALERT_WORDS: Final = {
     "DECRYPT_ERROR": "is of another authority than the hub's",
     "BAD_CERTIFICATE": "is of another authority than the hub's",
     "UNSUPPORTED_CERTIFICATE": "is not for a client",
-    "CERTIFICATE_REQUIRED": "was not shown",
+    "CERTIFICATE_REQUIRED": "was not sent",
 }
 
 
@@ -46,7 +46,7 @@ class SecurityError(BuddylineError):
 
 
 class RefusedError(BuddylineError):
-    """A hub that refuses this client, or that this client refuses; trying again as it is leads nowhere."""
+    """The hub refuses this client, or this client refuses the hub; another attempt would fail in the same way."""
 
 
 class Tls(Config, frozen=True, kw_only=True):
@@ -57,7 +57,7 @@ class Tls(Config, frozen=True, kw_only=True):
     key: str
 
     def beside(self, path: Path | str) -> Tls:
-        """Return it with its relative names taken from the directory of the configuration at path."""
+        """Return a copy with relative file names resolved against the directory of the configuration at path."""
         directory = Path(path).parent
         return replace(
             self,
@@ -68,12 +68,12 @@ class Tls(Config, frozen=True, kw_only=True):
 
 
 def node_name(node: str) -> str:
-    """Return the common name in a node's certificate (no node id has a hyphen: none is another role)."""
+    """Return the common name in a node's certificate. Node ids have no hyphen, so it equals no other role's name."""
     return f"node-{node}"
 
 
 def check_identity(tls: Tls, expected: str) -> None:
-    """Raise SecurityError, naming the file and its fault, unless tls proves to be `expected` right now."""
+    """Raise SecurityError, naming the file and its fault, unless `tls` is a valid identity of the role `expected`."""
     for path in (tls.ca, tls.certificate, tls.key):
         try:
             Path(path).read_bytes()
@@ -100,10 +100,10 @@ def check_identity(tls: Tls, expected: str) -> None:
 
 
 def refusal(endpoint: str, tls: Tls | None) -> str | None:
-    """Return why the hub at endpoint and this client refuse each other; None where they do not.
+    """Return why the hub at endpoint refuses this client, or this client the hub; None if neither does.
 
-    A reason is a verdict on a certificate, or a hub that wants TLS. All else may heal by itself, and is waited for: no
-    answer, a connection that closes in mid-handshake, a hub without TLS.
+    A reason is a rejected certificate, or a hub that requires TLS. Everything else may pass, and the client waits: no
+    answer, a connection that closes during the handshake, a hub without TLS.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
@@ -115,7 +115,7 @@ def refusal(endpoint: str, tls: Tls | None) -> str | None:
         with socket.create_connection(host_and_port(endpoint), PROBE_S) as raw, context.wrap_socket(raw) as link:
             if tls is None:
                 return f"the hub at {endpoint} wants TLS: connect to tls/..., with a [tls] table (`buddyline keys`)"
-            # A hub that refuses says so only after its own side of the handshake is done.
+            # A hub that refuses sends its alert only after its own side of the handshake is complete.
             link.recv(1)
     except ssl.SSLCertVerificationError as error:
         words = _VERIFY_WORDS.get(error.verify_message, "was not made by our authority")
@@ -148,7 +148,7 @@ def _show(context: ssl.SSLContext, tls: Tls) -> None:
     except ssl.SSLError as error:
         raise SecurityError(f"{tls.certificate}: is not a certificate in PEM") from error
     try:
-        # An empty password: a key that wants one is refused and not asked for at the terminal.
+        # With an empty password, a protected key is an error; without one, ssl would ask for it at the terminal.
         context.load_cert_chain(tls.certificate, tls.key, password="")
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":
@@ -157,7 +157,7 @@ def _show(context: ssl.SSLContext, tls: Tls) -> None:
 
 
 def _name_shown(server: ssl.SSLContext, client: ssl.SSLContext, *, judged_by_client: bool) -> str:
-    """Shake hands within this process; return the common name that one side showed the other."""
+    """Make a TLS handshake within this process; return the common name that one side sent to the other."""
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     called = server.wrap_bio(to_server, to_client, server_side=True)
     caller = client.wrap_bio(to_client, to_server)

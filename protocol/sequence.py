@@ -1,6 +1,6 @@
-"""Puts each publisher's samples in order, each once, though the network drops, doubles and reorders them.
+"""Put the messages of each publisher in order, each once; the network may drop, double and reorder them.
 
-Pure: no bus, no clock, no threads. The bus says what arrived and what could be fetched; this says what is due.
+No bus, no clock, no threads: the bus passes in what has arrived and what it could fetch, and gets the gaps to fetch.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Source = tuple[str, int]
 
 @dataclass(frozen=True)
 class Gap:
-    """Numbers missing before a sample that has arrived. known: the publisher was heard of before them."""
+    """The missing numbers before a sample that has arrived. known: earlier samples of the publisher have arrived."""
 
     source: Source
     key: str
@@ -28,7 +28,7 @@ class Gap:
 
 @dataclass
 class _Sender(Generic[S]):
-    """The number that is due next, and what arrived after a gap that is still open."""
+    """The next expected number of a publisher, and its samples that arrived after a gap that is still open."""
 
     due: int
     known: bool
@@ -36,27 +36,27 @@ class _Sender(Generic[S]):
 
 
 class Sequence(Generic[S]):
-    """Hands samples to deliver. A gap holds up the later samples of its own publisher until it is closed.
+    """Passes samples to `deliver` in order. A gap holds back the later samples of its publisher until it is closed.
 
-    missed: how many numbers could not be fetched.
+    missed: number of samples that could not be fetched.
     """
 
     def __init__(self, deliver: Callable[[S], None]) -> None:
         self.missed = 0
         self._deliver = deliver
-        # The one that has been silent longest comes first.
+        # Sorted by last sample: the publisher that has been silent longest is first.
         self._publishers: dict[Source, _Sender[S]] = {}
 
     def begin(self, source: Source, number: int) -> None:
-        """Take number as a publisher's first: earlier samples can no longer be fetched."""
+        """Take `number` as the first of a publisher: earlier samples can no longer be fetched."""
         self._publishers.setdefault(source, _Sender(number, known=True))
 
     def accept(
         self, source: Source, number: int, key: str, sample: S, *, recover: bool = True, newest_only: bool = False
     ) -> Gap | None:
-        """Deliver or hold a sample; return the gap that it opened, to be closed.
+        """Deliver or hold a sample; return the gap that it opens, if any, for the caller to close.
 
-        Without recover, missing numbers are skipped and counted. newest_only: they are skipped and not counted.
+        recover=False: missing numbers are skipped and counted. newest_only: they are skipped and not counted.
         """
         publisher = self._publishers.pop(source, None) or _Sender[S](0, known=False)
         self._publishers[source] = publisher
@@ -78,7 +78,7 @@ class Sequence(Generic[S]):
         return None
 
     def close(self, gap: Gap, found: Iterable[tuple[int, S]]) -> Gap | None:
-        """Deliver what was found of a gap, count the rest, and go on; return the next gap, where there is one."""
+        """Deliver the found samples of a gap, count the others as missed, and continue; return the next gap or None."""
         publisher = self._publishers.get(gap.source)
         if publisher is None or not publisher.held:
             return None

@@ -1,4 +1,4 @@
-"""A service's threads: named, watched, and ended together."""
+"""The threads of a service: named, watched, and ended together."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ log = logging.getLogger(__name__)
 
 JOIN_TIMEOUT_S: Final = 1.5
 STUCK_S: Final = 15.0
-# A stuck thread may hold a lock that the process needs to end in good order.
+# A stuck thread may hold a lock that an orderly end needs: after this time the process ends without one.
 END_ANYWAY_S: Final = 10.0
 WATCH_S: Final = 0.2
 BEAT_S: Final = 1.0 - WATCH_S / 2
 
 
 class StuckError(RuntimeError):
-    """A thread that neither goes on nor ends."""
+    """A thread that has stopped sending heartbeats."""
 
 
 class Service:
-    """Runs until `stop` is set or one of its threads fails; tells systemd and the status file how it is.
+    """Runs until `stop` is set or one of its threads fails; reports its health to systemd and the status file.
 
-    A thread that ends with an exception ends the service: exit status 2 for a BuddylineError (one line), 1
-    for a bug (with its traceback). A thread that returns only ends itself. One that has said `going_on` and
-    then does not say so for STUCK_S ends the process with its name and status 1. problems: what is wrong, in
-    words; status: the last status message. Both go into the status file, where there is one.
+    A thread that ends with an exception ends the service: exit status 2 for a BuddylineError (one line), 1 for a bug
+    (with its traceback). A thread that returns ends only itself. A thread that has called `heartbeat` once and then
+    does not call it for STUCK_S ends the process, with its name and status 1. problems: what is wrong, in words.
+    status_message: the last status message. Both go into the status file, if there is one.
     """
 
     def __init__(self, name: str, status_file: StatusFile | None = None) -> None:
@@ -52,7 +52,7 @@ class Service:
         self.interrupted = False
         self.failure: tuple[str, BaseException] | None = None
         self._threads: list[threading.Thread] = []
-        self._went_on_s: dict[str, float] = {}
+        self._heartbeat_s: dict[str, float] = {}
 
     def spawn(self, name: str, target: Callable[[], None]) -> None:
         """Start a thread of this service."""
@@ -60,18 +60,18 @@ class Service:
         def run() -> None:
             try:
                 target()
-            except Exception as error:  # a dead thread is named, whatever ended it
+            except Exception as error:  # any error that ends a thread is reported
                 self.fail(name, error)
             finally:
-                self._went_on_s.pop(name, None)
+                self._heartbeat_s.pop(name, None)
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
 
-    def going_on(self) -> None:
-        """Say that the calling thread is not stuck; from the first time on it is watched."""
-        self._went_on_s[threading.current_thread().name] = time.monotonic()
+    def heartbeat(self) -> None:
+        """Report that the calling thread is not stuck. From its first call on, the thread is watched."""
+        self._heartbeat_s[threading.current_thread().name] = time.monotonic()
 
     def fail(self, where: str, error: BaseException) -> None:
         """End the service because of error."""
@@ -80,8 +80,8 @@ class Service:
         self.stop.set()
 
     def handle_signals(self) -> None:
-        """Stop on SIGINT, SIGTERM and a terminal that closes; for the main thread of a process."""
-        # systemd's watchdog ends a process with SIGABRT: what each thread was at is then in the journal.
+        """Stop on SIGINT, SIGTERM and SIGHUP (the terminal closes). Call it in the main thread."""
+        # systemd's watchdog ends a process with SIGABRT; the traceback of each thread is then in the journal.
         if sys.__stderr__ is not None:
             faulthandler.enable(sys.__stderr__)
 
@@ -95,9 +95,9 @@ class Service:
         signal.signal(signal.SIGHUP, interrupt)
 
     def wait(self, seconds: float | None = None) -> None:
-        """Wait until the service stops, or for this long."""
+        """Wait until the service stops, or for this time."""
         ends_s = None if seconds is None else time.monotonic() + seconds
-        # In slices: an Event.wait without an end keeps Python from handling signals on some platforms.
+        # In short waits: on some platforms Python handles no signal during an Event.wait without a time limit.
         looked_s = time.monotonic()
         self._notifier.ready()
         self._beat()
@@ -114,22 +114,22 @@ class Service:
         self.stop.set()
 
     def progressing(self) -> bool:
-        """Return whether the service does its work; where not, systemd restarts it after a while."""
+        """Return whether the service does its work. If it does not, systemd's watchdog restarts it."""
         return True
 
     def _beat(self) -> None:
-        self._notifier.tell("; ".join(self.problems) or "all is well", goes_on=self.progressing())
+        self._notifier.tell("; ".join(self.problems) or "all is well", feed_watchdog=self.progressing())
         if self._status_file is not None:
             self._status_file.write(self.name, self.problems, self.status_message)
 
     def _look_for_stuck(self, now_s: float, stood_s: float) -> None:
-        """Fail where a thread has not gone on; stood_s: for how long this one did not either."""
-        for name, went_on_s in list(self._went_on_s.items()):
-            # A process that was frozen, or a machine that was, is not stuck: its threads get their time again.
+        """Fail if a thread has sent no heartbeat for STUCK_S. stood_s: by how much this thread's own wait was late."""
+        for name, heartbeat_s in list(self._heartbeat_s.items()):
+            # The process or the machine was frozen. Its threads are not stuck: their time begins anew.
             if stood_s > WATCH_S:
-                self._went_on_s[name] = max(went_on_s + stood_s, self._went_on_s.get(name, 0.0))
-            elif now_s - went_on_s > STUCK_S:
-                self.fail(name, StuckError(f"thread {name} is stuck: nothing for {now_s - went_on_s:.0f} s"))
+                self._heartbeat_s[name] = max(heartbeat_s + stood_s, self._heartbeat_s.get(name, 0.0))
+            elif now_s - heartbeat_s > STUCK_S:
+                self.fail(name, StuckError(f"thread {name} is stuck: nothing for {now_s - heartbeat_s:.0f} s"))
                 faulthandler.dump_traceback(2)
                 self._end_anyway()
                 return
@@ -164,5 +164,5 @@ class Service:
 
 
 def start_logging(verbose: bool = False) -> None:
-    """Send the log to stderr, as journald and people read it: level and text."""
+    """Send log messages to stderr, for journald and for people: level and text."""
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format="%(levelname).1s %(message)s")

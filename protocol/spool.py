@@ -1,4 +1,4 @@
-"""A new file whose writes never fail: what the disk refuses stays in memory and is tried again."""
+"""A new file whose writes never fail: data that the disk refuses stays in memory and is written later."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ HELD_BYTES: Final = 1024 * 1024
 
 
 class Spool:
-    """A new file, as a stream to write to.
+    """A new file, opened for writing.
 
-    `write` never fails. `flush` raises OSError and loses nothing: the next call goes on where this one stopped.
-    stuck: whether the disk refused the last flush.
+    `write` never fails. `flush` may raise OSError but loses nothing: the next call continues where this one stopped.
+    stuck: whether the last flush failed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -27,25 +27,25 @@ class Spool:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed."""
+        """Whether the file is closed."""
         return self._fd < 0
 
     def tell(self) -> int:
-        """Return how many bytes were written, queued ones included."""
+        """Return the number of bytes written, including queued ones."""
         return self._length
 
     def write(self, data: bytes) -> int:
-        """Queue bytes; past HELD_BYTES they go to the system at once, unless the file is stuck."""
+        """Queue bytes; beyond HELD_BYTES the queue is flushed, unless the file is stuck. Return their number."""
         self._held.append(bytes(data))
         self._held_bytes += len(data)
         self._length += len(data)
         if self._held_bytes > HELD_BYTES and not self.stuck:
-            with contextlib.suppress(OSError):  # `stuck` says so, and the next flush raises
+            with contextlib.suppress(OSError):  # `stuck` is set, and the caller's next flush raises
                 self.flush()
         return len(data)
 
     def flush(self) -> None:
-        """Write what is queued; raise OSError where the system refuses it."""
+        """Write the queued bytes; raise OSError if the system refuses them."""
         self.stuck = True
         while self._held:
             data = self._held.popleft()
@@ -64,7 +64,7 @@ class Spool:
         os.fsync(self._fd)
 
     def close(self) -> None:
-        """Close the file; what is still queued is lost."""
+        """Close the file; bytes that are still queued are lost."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)

@@ -1,8 +1,8 @@
-"""A service's health in a small file, for lamps, beepers and scripts.
+"""A service's health in a small file, for indicator lamps, beepers and scripts.
 
-JSON, rewritten once a second, always whole: `service`, `stamp_ns`, `problems` (plain words; empty where all is well),
-and `status`, the last status message (NodeStatus, SolverStatus; null before there is one). The file is
-removed when the service ends in good order; one older than a few seconds is from a service that hangs or was killed.
+JSON, replaced once a second and always complete: `service`, `stamp_ns`, `problems` (in words; empty if there are none),
+and `status`, the last status message (NodeStatus or SolverStatus; null before the first). The service removes the file
+when it ends properly. A file older than a few seconds belongs to a service that hangs or was killed.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class StatusFile:
-    """The status file of one service. A file that cannot be written is reported once; the service goes on."""
+    """The status file of one service. A write error is logged once, and the service continues."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -28,9 +28,9 @@ class StatusFile:
 
     @classmethod
     def of(cls, name: str, configured: str = "") -> StatusFile | None:
-        """Return the file of a service: where it is configured, else `<name>.json` in the runtime directory.
+        """Return the file of a service: the configured path, else `<name>.json` in the runtime directory.
 
-        That is systemd's RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/buddyline; where there is neither, None.
+        The runtime directory is systemd's RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/buddyline. None if there is neither.
         """
         if configured:
             return cls(Path(configured))
@@ -41,7 +41,7 @@ class StatusFile:
         return cls(Path(session) / "buddyline" / f"{name}.json") if session else None
 
     def write(self, service: str, problems: list[str], status: Message | None) -> None:
-        """Write the present state."""
+        """Replace the file's content with the present state."""
         content = {"service": service, "stamp_ns": time.time_ns(), "problems": problems, "status": status}
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
@@ -56,6 +56,6 @@ class StatusFile:
             self._failed = False
 
     def remove(self) -> None:
-        """Remove the file: the service ends."""
+        """Remove the file, when the service ends."""
         with contextlib.suppress(OSError):
             self.path.unlink()

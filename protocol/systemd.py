@@ -1,7 +1,7 @@
 """Notifications to systemd (Type=notify), or to another manager that listens at NOTIFY_SOCKET.
 
-sd_notify(3): a datagram of lines KEY=VALUE to the socket of Unix whose path is in NOTIFY_SOCKET; a path that begins
-with @ is an abstract one. Without that variable nothing is sent.
+sd_notify(3): a datagram of lines KEY=VALUE to the Unix socket whose path is in the variable NOTIFY_SOCKET. A path that
+begins with @ is an abstract socket. Without the variable nothing is sent.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ PATIENCE_S: Final = 0.5
 
 
 class Notifier:
-    """Says that a service is ready, goes on, or stops. No method raises, or waits for more than PATIENCE_S."""
+    """Reports that a service is ready, alive or stopping. No method raises, or waits longer than PATIENCE_S."""
 
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
@@ -27,22 +27,22 @@ class Notifier:
         try:
             notified.connect("\0" + address[1:] if address[0] == "@" else address)
         except OSError:
-            notified.close()  # nobody listens there
+            notified.close()  # nobody listens at the socket
             return
         notified.settimeout(PATIENCE_S)
         self._socket = notified
 
     def ready(self) -> None:
-        """Tell that the service has started."""
+        """Report that the service has started."""
         self._send("READY=1")
 
-    def tell(self, text: str, *, goes_on: bool) -> None:
-        """Send a text for `systemctl status`; goes_on: feed the watchdog, too."""
+    def tell(self, text: str, *, feed_watchdog: bool) -> None:
+        """Send a text for `systemctl status`. feed_watchdog: also report that the service does its work."""
         lines = f"STATUS={' '.join(text.split())[:MAX_TEXT]}"
-        self._send(f"WATCHDOG=1\n{lines}" if goes_on else lines)
+        self._send(f"WATCHDOG=1\n{lines}" if feed_watchdog else lines)
 
     def stopping(self) -> None:
-        """Tell that the service is stopping, and close the socket."""
+        """Report that the service is stopping, and close the socket."""
         self._send("STOPPING=1")
         if self._socket is not None:
             self._socket.close()
@@ -51,5 +51,5 @@ class Notifier:
     def _send(self, lines: str) -> None:
         if self._socket is None:
             return
-        with contextlib.suppress(OSError):  # without a manager the work goes on
+        with contextlib.suppress(OSError):  # the service also works without a manager
             self._socket.send(lines.encode())

@@ -1,4 +1,4 @@
-"""The table of topics: publishing, recording, schemas and health all follow from it."""
+"""The table of topics. Publishing, recording, schemas and health are derived from it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Priority = Literal["interactive_high", "data_high", "data", "data_low", "backgro
 class Topic:
     """One kind of message.
 
-    template: its key, with {node}, {a} and {b}, or {net} and {node}. schema: the message's type; rate_hz: nominal, 0
-    where it comes on change. latest_only: late joiners get the newest one (else the cache serves to recover what was
-    missed). express: sent at once, not batched. stale_s: age at which a live consumer calls it stale (0: never).
-    retained: the hub keeps the newest of each key, and what was said stays known when who said it is gone. solved: a
-    solver's result, which is made anew from a stored dive.
+    template: its key, with {node}, {a} and {b}, or {net} and {node}. schema: the message's type. rate_hz: nominal; 0
+    for messages sent on change. latest_only: a late subscriber gets only the newest message (of other topics, what it
+    missed). express: sent at once, not in batches. stale_s: age from which it is stale (0: never). retained: the hub
+    keeps the newest message of each key, also after its sender is gone. solved: a result of the solver, which `solve`
+    computes again from a stored dive.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Topic:
     solved: bool = False
 
     def key(self, *ids: str) -> str:
-        """Return the Zenoh key and MCAP topic for these ids: a node's, a pair's two, or a net's and a node's."""
+        """Return the Zenoh key, which is also the MCAP topic. ids: a node's, a pair's two, or a net's and a node's."""
         for node_id in ids:
             check_node_id(node_id)
         names = _PLACES.findall(self.template)
@@ -106,7 +106,7 @@ POSE: Final = Topic(
     retained=True,
     solved=True,
 )
-# After POSE, which carries the same schema: topic_of gives the first.
+# After POSE, because topic_of returns the first topic of a schema.
 ARTAG: Final = Topic("artag", "buddyline/pair/{a}/{b}/artag", messages.RelativePose, 10.0, "data")
 REJECTED: Final = Topic(
     "rejected",
@@ -129,7 +129,7 @@ TRACK: Final = Topic(
     retained=True,
     solved=True,
 )
-# After TRACK, which carries the same schema: topic_of goes by the message's mode.
+# After TRACK, because topic_of returns the first topic of a schema (and this one for the mode `lag`).
 TRACK_LAG: Final = Topic(
     "track_lag", "buddyline/pair/{a}/{b}/track_lag", messages.Track, 20.0, "data", stale_s=3.0, solved=True
 )
@@ -180,7 +180,7 @@ _PATTERNS: Final = [
 
 
 def check_node_id(node_id: str) -> str:
-    """Return node_id; raise BuddylineError where it is not one."""
+    """Return node_id; raise BuddylineError if it is not valid."""
     if not _NODE_ID.match(node_id):
         raise BuddylineError(f"node id {node_id!r}: use 1 to 32 of a-z, 0-9 and _")
     return node_id
@@ -188,7 +188,7 @@ def check_node_id(node_id: str) -> str:
 
 @lru_cache(maxsize=4096)
 def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
-    """Return the topic and node ids of a key, or None where it is none of ours."""
+    """Return the topic and the ids of a key; None if it is not a Buddyline key."""
     for topic, pattern in _PATTERNS:
         match = pattern.match(key)
         if match:
@@ -207,7 +207,7 @@ def topic_of(message: Message) -> Topic:
 
 
 def key_of(message: Message) -> str:
-    """Return the key that a message is published on (truth needs its pair and goes by Topic.key)."""
+    """Return the key on which a message is published. Truth does not name its pair: use TRUTH.key for it."""
     topic = topic_of(message)
     if isinstance(message, messages.CompressedImage):
         return topic.key(message.frame_id.removesuffix("_camera"))

@@ -79,7 +79,7 @@ class SolverService(Service):
                     self._publish(self.core.advance(self.clock.now_ns()))
                 if ticks % TICKS_A_STATUS == 0:
                     self.report()
-                    self.going_on()
+                    self.heartbeat()
             with self._lock:
                 self._publish(self.core.flush())
 

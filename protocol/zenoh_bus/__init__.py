@@ -1,7 +1,7 @@
-"""The bus over Zenoh: one hub listens, all others are its clients. Nothing outside this package imports zenoh.
+"""The bus over Zenoh: one hub listens, all other processes are its clients. Only this package imports zenoh.
 
-There is no multicast: a client connects to the endpoint it was given. Missed samples are fetched from their
-publishers' caches; publishers never block, so that one frozen viewer does not stall the rest.
+There is no multicast: a client connects to its configured endpoint. Missed samples are fetched from the publishers'
+caches. Publishers never block, so a frozen viewer does not stall the others.
 """
 
 from buddyline.protocol.zenoh_bus.bus import ZenohBus, connect

@@ -1,4 +1,4 @@
-"""Who is alive, by Zenoh's liveliness tokens: a token ends with its process or its link."""
+"""Which names are alive, by Zenoh's liveliness tokens: a token ends with its process or its link."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import zenoh
 from buddyline.protocol.delivery import Delivery, FailureLatch
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake
 
-# `**` does not match parts that begin with @, so that no subscriber takes a token for a message.
+# `**` does not match chunks that begin with @, so no subscriber takes a token for a message.
 ALIVE: Final = "buddyline/@alive"
 
 
 class ZenohWatch:
-    """Tells one handler who is alive. A process counts once, however often its token is reported."""
+    """Tells one handler which names are alive. A token that is reported twice counts once."""
 
     missed = 0
 
@@ -26,7 +26,7 @@ class ZenohWatch:
 
     @property
     def dropped(self) -> int:
-        """How many changes were dropped because the handler was too slow."""
+        """Number of changes dropped because the handler was too slow."""
         return self._delivery.dropped
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""One process's connection to the hub: its publishers, its subscriptions, its token."""
+"""The connection of one process to the hub: its publishers, subscriptions and liveliness tokens."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ def connect(
     cache_s: float = CACHE_S,
     tls: Tls | None = None,
 ) -> ZenohBus | None:
-    """Connect to the hub, waiting for it where it is not there yet; None where stop was set before.
+    """Connect to the hub; wait until there is one. Returns None if stop is set before.
 
-    on_wait is called once, with what is being waited for. cache_s: how long an outage may last without loss.
-    Raises RefusedError where a hub is there and the two do not accept each other.
+    on_wait is called once, with a text, if it has to wait. cache_s: the longest outage without loss.
+    Raises RefusedError if the hub and this client do not accept each other.
     """
     config = config_of(client_settings(endpoint, namespace, tls))
     session = open_client(config, endpoint, tls, stop, on_wait)
@@ -63,7 +63,7 @@ def connect(
 
 
 class ZenohPublisher(Publisher):
-    """A Publisher over Zenoh. declare: returns None while its session is not there yet."""
+    """A Publisher over Zenoh. declare: declares it in its session; returns None while the session is not open."""
 
     def __init__(
         self,
@@ -86,14 +86,14 @@ class ZenohPublisher(Publisher):
         try:
             self._publisher.put(payload)
         except zenoh.ZError:
-            # The session may close under a device thread that is about to publish.
+            # The session may be closed while a device's thread publishes.
             if self._closed:
                 return False
             raise
         return True
 
     def close(self) -> None:
-        """Publish no longer; what the cache held is gone."""
+        """Stop publishing; the cache is dropped."""
         if not self._closed:
             self._closed = True
             if self._publisher is not None:
@@ -110,11 +110,11 @@ class ZenohBus(Bus):
         self._cache_s = cache_s
         self._tokens: list[zenoh.LivelinessToken] = []
         self._watchdog = Watchdog(session)
-        # A thread that is still inside Zenoh when the interpreter ends aborts the process.
+        # A thread inside Zenoh at the interpreter's end aborts the process, so the bus closes before that.
         atexit.register(self.close)
 
     def publisher(self, topic: Topic, *ids: str, max_rate_hz: float | None = None) -> Publisher:
-        """Declare what is published on topic.key(*ids); max_rate_hz skips what comes sooner."""
+        """Return a publisher on topic.key(*ids). max_rate_hz: messages above this rate are skipped."""
         key, depth = topic.key(*ids), cache_depth(topic, self._cache_s)
         settings: dict[str, Any] = {
             "encoding": topic.encoding,
@@ -145,7 +145,7 @@ class ZenohBus(Bus):
     def subscribe(
         self, keys: KeyExprs, handle: Callable[[Received], None], *, capacity: int = 1024, history: bool = True
     ) -> Subscription:
-        """Hand every message on these keys to handle, one at a time (protocol.bus.Bus has the contract)."""
+        """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         key_exprs = each_of(keys)
         delivery = Delivery(f"bus {' '.join(key_exprs)}", handle, capacity, self._failures)
         subscription = ZenohSubscription(
@@ -168,14 +168,14 @@ class ZenohBus(Bus):
         return [Received(str(s.key_expr), bytes(s.payload), now_ns, str(s.encoding)) for s in samples]
 
     def declare_alive(self, name: str) -> None:
-        """Let others see that this process lives, until it closes the bus or dies."""
+        """Show others that this process is alive, until it closes the bus or dies."""
         key = f"{ALIVE}/{check_alive_name(name)}/{self._session.zid()}"
         token = self._session.liveliness().declare_token(key)
         with self._lock:
             self._tokens.append(token)
 
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
-        """Call handle(name, alive) for everyone who is alive now, and at every change."""
+        """Call handle(name, alive) for every name that is alive now, and at every change."""
         delivery = Delivery[tuple[str, bool]]("bus alive", lambda item: handle(*item), 1024, self._failures)
         watch = ZenohWatch(self._session, delivery, self._failures)
         with self._lock:

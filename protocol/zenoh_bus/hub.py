@@ -22,7 +22,7 @@ MAX_RETAINED_BYTES: Final = 65536
 class Retained:
     """The newest message of each key of the retained topics, for `protocol.bus.Bus.newest`.
 
-    Nothing is recovered: where a message is missed, as a publisher's first may be, the next one takes its place.
+    A missed message (a publisher's first may be missed) is not recovered: the next one replaces it.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
@@ -30,7 +30,7 @@ class Retained:
         self._lock = threading.Lock()
         for topic in TOPICS:
             if topic.retained:
-                # A deployment's namespace stands in front; the hub has none of its own.
+                # Clients may have a namespace, which comes before the key; the hub itself has none.
                 key_expr = f"**/{topic.key_any()}"
                 session.declare_subscriber(key_expr, self._keep)
                 session.declare_queryable(key_expr, self._answer)
@@ -52,7 +52,7 @@ class Retained:
 
 
 class Hub:
-    """The one process that listens. When it closes, its clients wait for the next hub."""
+    """The one process that listens. When it closes, its clients wait for a new hub."""
 
     def __init__(self, session: zenoh.Session, endpoint: str) -> None:
         self.endpoint = endpoint
@@ -77,7 +77,7 @@ class Hub:
 def open_hub(
     endpoint: str = DEFAULT_ENDPOINT, *, tls: Tls | None = None, access: dict[str, object] | None = None
 ) -> Hub:
-    """Listen on endpoint; raise BuddylineError where the port is taken or the address is not this machine's."""
+    """Listen on endpoint; raise BuddylineError if the port is in use or the address is not this machine's."""
     config = config_of(hub_settings(endpoint, tls, access))
     try:
         return Hub(zenoh.open(config), endpoint)

@@ -1,4 +1,4 @@
-"""Takes samples out of Zenoh as soon as they arrive."""
+"""Take samples out of Zenoh as soon as they arrive."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ AnySubscriber: TypeAlias = (
 
 
 class Intake:
-    """A thread that takes samples out of Zenoh at once, so that Zenoh's ring does not overflow.
+    """A thread that takes samples out of Zenoh at once, so that Zenoh's ring buffer does not overflow.
 
-    name: the thread's. accept: gets each sample, and must not wait.
+    name: part of the thread's name. accept: is called with each sample, and must not wait.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class Intake:
         failures: FailureLatch,
     ) -> None:
         self._subscriber = subscriber
-        # The subscriber's own recv cannot be undeclared while another thread waits in it; its handler's can.
+        # A subscriber cannot be undeclared while a thread waits in its recv; it can while one waits in its handler's.
         self._samples = subscriber.handler
         self._accept = accept
         self._failures = failures
@@ -40,7 +40,7 @@ class Intake:
         self._thread.start()
 
     def close(self) -> None:
-        """Undeclare the subscriber, take what has arrived, end the thread."""
+        """Undeclare the subscriber, take the samples that have arrived, and end the thread."""
         if not self._closed:
             self._closed = True
             self._subscriber.undeclare()  # type: ignore[no-untyped-call]

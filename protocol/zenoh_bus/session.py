@@ -1,4 +1,4 @@
-"""Zenoh sessions: one that waits for the hub and can be interrupted, and one for large messages."""
+"""Open Zenoh sessions: a client's, which waits for the hub and can be interrupted, and one for large messages."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def config_of(settings: Mapping[str, object]) -> zenoh.Config:
 def open_session(
     endpoint: str, *, stop: threading.Event, on_wait: Callable[[str], None], tls: Tls | None = None
 ) -> zenoh.Session | None:
-    """Connect as `connect` does, for a client with keys and payloads of its own; the caller closes the session."""
+    """Open a session as `connect` does, for a client with its own keys and payloads; the caller closes it."""
     return open_client(config_of(client_settings(endpoint, None, tls)), endpoint, tls, stop, on_wait)
 
 
 def open_client(
     config: zenoh.Config, endpoint: str, tls: Tls | None, stop: threading.Event, on_wait: Callable[[str], None]
 ) -> zenoh.Session | None:
-    """Open a client's session, waiting for its hub; on_wait is called once, with what is being waited for."""
+    """Open a client's session; wait until there is a hub. on_wait is called once, with a text, if it has to wait."""
     return _open_when_there(
         config,
         stop,
@@ -49,9 +49,9 @@ def _open_when_there(
     on_wait: Callable[[], None] = lambda: None,
     why_refused: Callable[[], str | None] = lambda: None,
 ) -> zenoh.Session | None:
-    """Open a session, trying again until stop is set; on_wait is called once, after the first failure.
+    """Open a session; try again until stop is set. on_wait is called once, after the first failure.
 
-    Raises RefusedError where why_refused gives a reason after a failure.
+    Raises RefusedError if why_refused returns a reason after a failure.
     """
     waiting = False
     while not stop.is_set():
@@ -69,7 +69,7 @@ def _open_when_there(
 
 
 def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | None:
-    """Open a session in a thread of its own, because a listener that does not answer blocks it for seconds."""
+    """Open a session in a thread of its own: a listener that does not answer would block the caller for seconds."""
     opened: list[zenoh.Session] = []
     errors: list[Exception] = []
     ended = threading.Event()
@@ -101,9 +101,9 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
 
 
 class BulkLink:
-    """A session for large messages alone, opened on demand.
+    """A session for large messages only, opened on demand.
 
-    In a shared connection, a large message holds up all that is queued behind it.
+    In a shared connection, a large message delays all messages that are queued after it.
     """
 
     def __init__(self, config: zenoh.Config) -> None:
@@ -114,7 +114,7 @@ class BulkLink:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Start to connect, without waiting; session is set once the hub answers."""
+        """Start to connect, without waiting; `session` is set when the hub has answered."""
         with self._lock:
             if self._thread is None and not self._stop.is_set():
                 self._thread = threading.Thread(target=self._run, name="bus bulk", daemon=True)

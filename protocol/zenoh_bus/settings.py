@@ -9,8 +9,8 @@ from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import Tls
 
-# lease: a link that is silent for this long counts as dead. open_timeout: how long a client waits for a hub that
-# accepts the connection and does not answer; by default ten seconds.
+# lease, ms: a link that is silent for this time counts as dead. open_timeout, ms: how long a client waits for a hub
+# that accepts the connection but does not answer; Zenoh's default is ten seconds.
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -35,7 +35,7 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
 
 
 def client_settings(endpoint: str, namespace: str | None, tls: Tls | None = None) -> dict[str, object]:
-    """Return the Zenoh settings of a client: it connects to endpoint, again and again, and listens nowhere."""
+    """Return the Zenoh settings of a client: it connects to endpoint, reconnects after a failure, and never listens."""
     settings = {
         "mode": "client",
         "listen/endpoints": [],
@@ -56,18 +56,18 @@ def _tls_settings(tls: Tls | None, side: str) -> dict[str, object]:
         f"transport/link/tls/{side}_certificate": tls.certificate,
         f"transport/link/tls/{side}_private_key": tls.key,
         "transport/link/tls/enable_mtls": True,
-        # The hub is known by its authority and its certificate's purpose: tethers change their addresses.
+        # The hub is identified by its authority and its certificate's purpose: addresses on a tether change.
         "transport/link/tls/verify_name_on_connect": False,
     }
 
 
 def check_endpoint(endpoint: str, tls: Tls | None = None) -> str:
-    """Return endpoint; raise BuddylineError where it is none, or where it and the [tls] table do not agree."""
+    """Return endpoint; raise BuddylineError if it is not valid, or contradicts the [tls] table."""
     host_and_port(endpoint)
     if endpoint.startswith("tls/") and tls is None:
         raise BuddylineError(f"{endpoint}: needs a [tls] table in the configuration (`buddyline keys` makes it)")
     if endpoint.startswith("tcp/") and tls is not None:
         raise BuddylineError(
-            f"{endpoint}: is without TLS and the configuration has a [tls] table; write tls/... or leave it out"
+            f"{endpoint}: is without TLS, but the configuration has a [tls] table; write tls/..., or remove the table"
         )
     return endpoint

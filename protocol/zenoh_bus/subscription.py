@@ -1,4 +1,4 @@
-"""A subscription that hands on samples in order, each once, and fetches those that the link lost."""
+"""A subscription that passes on samples in order, each once, and fetches those that the link has lost."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ FETCHES: Final = 16
 
 
 class ZenohSubscription:
-    """A Subscription over Zenoh: samples in order, each once; missing ones are fetched where they can be.
+    """A Subscription over Zenoh: samples in order, each once; missing ones are fetched if their publisher has them.
 
-    Zenoh's own recovery does most of it. It does not cover a publisher first heard of in the middle of its numbers,
-    and gaps whose query was lost with the link, as when the hub stood still for longer than the lease.
+    Zenoh's own recovery does most of this. It does not cover a publisher whose first samples were missed, or a gap
+    whose query was lost with the link, for example when the hub was frozen for longer than the lease.
     """
 
     def __init__(
@@ -69,16 +69,16 @@ class ZenohSubscription:
 
     @property
     def dropped(self) -> int:
-        """How many were dropped because the handler was too slow."""
+        """Number of messages dropped because the handler was too slow."""
         return self._delivery.dropped
 
     @property
     def missed(self) -> int:
-        """How many of its publishers' samples never came."""
+        """Number of messages that were lost on the way."""
         return self._sequence.missed
 
     def close(self) -> None:
-        """Let the handler finish what is queued, one second at most, and end the threads."""
+        """Let the handler finish the queued messages, for one second at most, and end the threads."""
         self._stop.set()
         for intake in self._intakes:
             intake.close()
@@ -89,7 +89,7 @@ class ZenohSubscription:
             thread.join(CLOSE_S)
 
     def _accept(self, sample: zenoh.Sample) -> None:
-        """Deliver a sample, or hold it until those of its publisher that should have come before are fetched."""
+        """Deliver a sample, or hold it until the publisher's missing earlier samples are fetched."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
         if sample.source_info is None:
@@ -102,7 +102,7 @@ class ZenohSubscription:
             gap = self._sequence.accept(
                 _source(sample), _number(sample), key, sample, recover=self._history, newest_only=newest_only
             )
-            # A client that invents publishers with gaps must not cost a thread for each.
+            # Limited, so that a client that invents publishers with gaps does not cost a thread for each.
             while gap is not None and len(self._fetching) >= MAX_FETCHING:
                 gap = self._sequence.close(gap, [])
             if gap is not None:
@@ -111,7 +111,7 @@ class ZenohSubscription:
                 thread.start()
 
     def _fill(self, gap: Gap) -> None:
-        """Fetch what is missing and go on, in a thread of its own: other publishers' samples do not wait for it."""
+        """Fetch the missing samples and continue; runs in its own thread, so that other publishers do not wait."""
         try:
             due: Gap | None = gap
             while due is not None:
@@ -126,9 +126,9 @@ class ZenohSubscription:
                 self._fetching.discard(threading.current_thread())
 
     def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
-        """Return what its publisher still holds of a gap; what does not answer is asked again for a while."""
+        """Return the samples of a gap that its publisher still holds; ask again for some time if it does not answer."""
         zid, eid = gap.source
-        # The number after the gap has come, so whoever answers holds it: with it, all there is has been said.
+        # The sample after the gap has arrived, so the publisher has it: an answer that contains it is complete.
         after = gap.missing[-1] + 1
         selector = f"{gap.key}/@adv/pub/{zid}/{eid}/**?_sn={gap.missing[0]}..{after}"
         found: dict[int, zenoh.Sample] = {}

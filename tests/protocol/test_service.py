@@ -22,12 +22,12 @@ def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
         service = module.Service("node a")
 
         def detect():
-            service.going_on()
+            service.heartbeat()
             threading.Event().wait()
 
         def status():
             while not service.stop.wait(0.05):
-                service.going_on()
+                service.heartbeat()
 
         service.spawn("detect", detect)
         service.spawn("status", status)
@@ -50,7 +50,7 @@ def test_a_process_that_holds_on_when_stuck_is_ended_anyway():
         from buddyline.protocol import service as module
         module.STUCK_S, module.WATCH_S, module.END_ANYWAY_S = 0.2, 0.05, 0.2
         service = module.Service("node a")
-        service.spawn("camera", lambda: (service.going_on(), threading.Event().wait()))
+        service.spawn("camera", lambda: (service.heartbeat(), threading.Event().wait()))
         service.wait()
         threading.Event().wait()  # as a device does that cannot be closed
         """
@@ -70,7 +70,7 @@ def watched(monkeypatch):
     monkeypatch.setattr(service, "_end_anyway", lambda: None)
     monkeypatch.setattr(module.faulthandler, "dump_traceback", lambda _: None)
     said, stop = threading.Event(), threading.Event()
-    service.spawn("w", lambda: (service.going_on(), said.set(), stop.wait()))
+    service.spawn("w", lambda: (service.heartbeat(), said.set(), stop.wait()))
     assert said.wait(10.0)
     yield service
     stop.set()

@@ -22,8 +22,8 @@ def manager(request, tmp_path, monkeypatch):
 def test_each_word_is_a_datagram(manager):
     notifier = Notifier()
     notifier.ready()
-    notifier.tell("all is\nwell", goes_on=True)
-    notifier.tell("x" * 1000, goes_on=False)
+    notifier.tell("all is\nwell", feed_watchdog=True)
+    notifier.tell("x" * 1000, feed_watchdog=False)
     notifier.stopping()
     said = [manager.recv(4096).decode() for _ in range(4)]
     assert said == ["READY=1", "WATCHDOG=1\nSTATUS=all is well", f"STATUS={'x' * MAX_TEXT}", "STOPPING=1"]
@@ -60,7 +60,7 @@ def test_without_a_manager_nothing_is_said(monkeypatch, address):
         monkeypatch.setenv("NOTIFY_SOCKET", address)
     notifier = Notifier()
     notifier.ready()
-    notifier.tell("", goes_on=True)
+    notifier.tell("", feed_watchdog=True)
     notifier.stopping()
     assert notifier._socket is None
 
@@ -69,5 +69,5 @@ def test_a_manager_that_goes_away_stops_nothing(manager):
     notifier = Notifier()
     manager.close()
     notifier.ready()
-    notifier.tell("well", goes_on=True)
+    notifier.tell("well", feed_watchdog=True)
     notifier.stopping()
