@@ -39,6 +39,7 @@ BIAS_FORGETTING_S: Final = 10.0
 GAP_S: Final = 0.2
 LONG_GAP_S: Final = 5.0
 GAP_TURN_RADPS: Final = math.radians(10.0)
+SATURATED_TURN_RADPS: Final = math.radians(100.0)
 
 # The tilt that an accelerometer offset of 20 mg causes; the mount adds as much.
 TILT_SIGMA_RAD: Final = math.radians(1.4)
@@ -167,6 +168,10 @@ class VqfAttitude:
         dt_s = (sample.stamp_ns - self._last_ns) / S_NS
         if dt_s == 0:
             return None
+        if sample.saturated:
+            # The true rate was beyond full scale by an unknown amount.
+            self._transient_rad += SAMPLE_S * SATURATED_TURN_RADPS
+            self._heading.widen(SAMPLE_S * SATURATED_TURN_RADPS)
         if not 0 < dt_s <= GAP_S:
             self._bridge(sample, abs(dt_s))
             dt_s = SAMPLE_S

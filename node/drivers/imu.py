@@ -6,24 +6,33 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.l3gd20h import L3gd20h
+from buddyline.node.drivers.l3gd20h import GYRO_RADPS_PER_COUNT, L3gd20h
 from buddyline.node.drivers.lis3mdl import Lis3mdl
 from buddyline.node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
-from buddyline.node.drivers.lsm303d import Lsm303d
+from buddyline.node.drivers.lsm303d import ACCEL_MPS2_PER_COUNT, Lsm303d
 from buddyline.node.drivers.samples import DeviceError, ImuSample, Vector
-from buddyline.node.drivers.st_chip import WHO_AM_I
+from buddyline.node.drivers.st_chip import WHO_AM_I, StChip
+from buddyline.node.drivers.watch import FULL_SCALE_COUNTS, SensorWatch, SettingsWatch, SettlingError
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
 
-# Noise always moves the last bits. A few readings may repeat while the chip is slower than the loop;
-# ten in a row mean that the chip has stopped, as after a brown-out.
-FROZEN_READINGS: Final = 10
 MAG_RETRY_NS: Final = S_NS
+# The status, sent once a second, must not miss a saturation of one sample.
+SATURATION_SHOWN_NS: Final = 2 * S_NS
 
 
 class MotionSensor(Protocol):
-    """Accelerometer and gyroscope, in the board's frame."""
+    """Accelerometer and gyroscope, in the board's frame.
+
+    chips: whose settings are to be checked. watches: what judges the accelerometer and the gyroscope.
+    """
+
+    @property
+    def chips(self) -> tuple[StChip, ...]: ...  # noqa: D102
+
+    @property
+    def watches(self) -> tuple[SensorWatch, SensorWatch]: ...  # noqa: D102
 
     def start(self) -> None:
         """Check the identities and write the settings."""
@@ -52,6 +61,11 @@ class Lsm303dL3gd20h:
     def __init__(self, lsm303d: Lsm303d, l3gd20h: L3gd20h) -> None:
         self._lsm303d = lsm303d
         self._l3gd20h = l3gd20h
+        self.chips: tuple[StChip, ...] = (lsm303d, l3gd20h)
+        self.watches = (
+            SensorWatch("LSM303D accelerometer", lsm303d, FULL_SCALE_COUNTS * ACCEL_MPS2_PER_COUNT),
+            SensorWatch("L3GD20H gyroscope", l3gd20h, FULL_SCALE_COUNTS * GYRO_RADPS_PER_COUNT),
+        )
 
     def start(self) -> None:
         """Check the identities and write the settings."""
@@ -93,8 +107,8 @@ class ChipImu:
 
     R_body_chip: (3, 3), maps the board's axes to the body's (x forward, y right, z down). After any failure
     the chips are identified and set up again before the next reading counts, because a chip sleeps after a
-    brown-out. A magnetometer that fails, or is absent at the start, is named in `problem` and tried again once a
-    second; motion goes on without it.
+    brown-out. Control registers are read back once a second, and at once where a sensor reads zero. A magnetometer
+    that fails, or is absent at the start, is named in `problem` and tried again once a second; motion goes on without.
     """
 
     def __init__(
@@ -106,21 +120,27 @@ class ChipImu:
         clock: Clock,
     ) -> None:
         self.name = name
-        self.problem = ""
+        self._mag_problem = ""
+        self._saturated = ""
+        self._saturated_ns = 0
         self._motion = motion
+        self._accel_watch, self._gyro_watch = motion.watches
+        self._settings = SettingsWatch(motion.chips)
         self._magnetometer = magnetometer
         self._R_body_chip = check_rotation(R_body_chip)
         self._clock = clock
         self._motion_ready = False
         self._mag_ready = False
         self._mag_retry_ns = 0
-        self._last = np.full(6, np.nan)
-        self._repeats = 0
+
+    @property
+    def problem(self) -> str:
+        """What is wrong although samples come, "" where nothing is."""
+        return "; ".join(filter(None, (self._mag_problem, self._saturated)))
 
     def start(self) -> None:
         """Check and set up the chips; raise DeviceError where motion is absent, name an absent magnetometer."""
-        self._motion.start()
-        self._motion_ready = True
+        self._start_motion()
         if self._magnetometer is not None:
             try:
                 self._magnetometer.start()
@@ -128,32 +148,48 @@ class ChipImu:
             except DeviceError as error:
                 self._lose_mag(self._clock.now_ns(), error)
 
+    def _start_motion(self) -> None:
+        self._motion.start()
+        self._motion_ready = True
+        now_ns = self._clock.now_ns()
+        self._accel_watch.restart(now_ns)
+        self._gyro_watch.restart(now_ns)
+
     def read(self) -> ImuSample:
         """Return the newest sample; raise DeviceError where there is none. The next call tries again."""
         try:
             if not self._motion_ready:
-                self._motion.start()
-                self._motion_ready = True
+                self._start_motion()
             stamp_ns = self._clock.now_ns()
             accel_mps2, gyro_radps = self._motion.read_motion()
-            self._check_alive(np.concatenate((accel_mps2, gyro_radps)))
+            saturated = [
+                name
+                for name, watch, reading in (
+                    ("accelerometer", self._accel_watch, accel_mps2),
+                    ("gyroscope", self._gyro_watch, gyro_radps),
+                )
+                if watch.is_saturated(reading, stamp_ns)
+            ]
+            self._settings.look(stamp_ns)
+        except SettlingError:
+            raise
         except DeviceError:
             # The cause may have reset the board's other chips as well.
             self._motion_ready = self._mag_ready = False
             self._mag_retry_ns = 0
             raise
         mag_t = self._read_mag(stamp_ns)
+        self._note_saturation(saturated, stamp_ns)
         R = self._R_body_chip
-        return ImuSample(stamp_ns, R @ accel_mps2, R @ gyro_radps, None if mag_t is None else R @ mag_t)
+        return ImuSample(
+            stamp_ns, R @ accel_mps2, R @ gyro_radps, None if mag_t is None else R @ mag_t, bool(saturated)
+        )
 
-    def _check_alive(self, reading: NDArray[np.float64]) -> None:
-        if not reading.any():
-            raise DeviceError(f"{self.name}: all six axes read zero: the chip sleeps or SDA is held down")
-        self._repeats = self._repeats + 1 if np.array_equal(reading, self._last) else 0
-        self._last = reading
-        if self._repeats >= FROZEN_READINGS:
-            self._repeats = 0
-            raise DeviceError(f"{self.name}: the same reading {FROZEN_READINGS} times over: the chip has stopped")
+    def _note_saturation(self, names: list[str], now_ns: int) -> None:
+        if names:
+            self._saturated, self._saturated_ns = f"{' and '.join(names)} at full scale", now_ns
+        elif self._saturated and not 0 <= now_ns - self._saturated_ns < SATURATION_SHOWN_NS:
+            self._saturated = ""
 
     def _read_mag(self, now_ns: int) -> Vector | None:
         waiting = self._mag_retry_ns - MAG_RETRY_NS <= now_ns < self._mag_retry_ns
@@ -169,13 +205,13 @@ class ChipImu:
         except DeviceError as error:
             self._lose_mag(now_ns, error)
             return None
-        self.problem = ""
+        self._mag_problem = ""
         return mag_t
 
     def _lose_mag(self, now_ns: int, error: DeviceError) -> None:
         self._mag_ready = False
         self._mag_retry_ns = now_ns + MAG_RETRY_NS
-        self.problem = str(error)
+        self._mag_problem = str(error)
 
 
 class MinImu9V3(ChipImu):

@@ -7,10 +7,11 @@ from typing import ClassVar, Final
 
 from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2, Vector
 from buddyline.node.drivers.st_chip import StChip, decode_vector
+from buddyline.node.drivers.watch import FULL_SCALE_COUNTS, SensorWatch
 
 OUT_GYRO: Final = 0x22  # the accelerometer follows at 0x28: one burst of twelve bytes
 
-ACCEL_MPS2_PER_COUNT: Final = 0.061e-3 * STANDARD_GRAVITY_MPS2  # +-2 g
+ACCEL_MPS2_PER_COUNT: Final = 0.122e-3 * STANDARD_GRAVITY_MPS2  # +-4 g
 GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
 
 
@@ -20,16 +21,29 @@ def decode_motion(data: bytes) -> tuple[Vector, Vector]:
 
 
 class Lsm6ds(StChip):
-    """Both at 208 Hz, +-2 g and +-500 deg/s; the registers used are alike in the two chips."""
+    """Both at 208 Hz, +-4 g and +-500 deg/s; the two chips have the same registers here."""
 
     NAME = "LSM6DS33 or LSM6DSO"
     ADDRESSES = (0x6B, 0x6A)
     IDENTITIES: ClassVar[tuple[int, ...]] = (0x69, 0x6C)
     SETTINGS = (
         (0x12, 0x44),  # CTRL3_C: no update between low and high byte, addresses advance in a burst
-        (0x10, 0x50),  # CTRL1_XL: 208 Hz, +-2 g
+        (0x10, 0x58),  # CTRL1_XL: 208 Hz, +-4 g
         (0x11, 0x54),  # CTRL2_G: 208 Hz, +-500 deg/s
     )
+
+    @property
+    def watches(self) -> tuple[SensorWatch, SensorWatch]:
+        """Return what judges accelerometer and gyroscope."""
+        return (
+            SensorWatch(f"{self.NAME} accelerometer", self, FULL_SCALE_COUNTS * ACCEL_MPS2_PER_COUNT),
+            SensorWatch(f"{self.NAME} gyroscope", self, FULL_SCALE_COUNTS * GYRO_RADPS_PER_COUNT),
+        )
+
+    @property
+    def chips(self) -> tuple[StChip, ...]:
+        """Return the chips whose settings are to be checked."""
+        return (self,)
 
     def read_motion(self) -> tuple[Vector, Vector]:
         """Return specific force in m/s2 and angular rate in rad/s, (3,) each."""

@@ -1,4 +1,4 @@
-"""What sensors give: samples, the two kinds of device, and the error of a device that fails."""
+"""Samples of the sensors, the two kinds of device, and the error of a device that fails."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ STANDARD_GRAVITY_MPS2 = 9.80665
 
 
 class DeviceError(BuddylineError):
-    """A device that does not do its work; the text names bus, address and register."""
+    """A device that fails; the text names bus, address and register."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
     """One reading in the body frame, (3,) each.
 
-    accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None where there is none.
+    accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None without a magnetometer.
+    saturated: acceleration or rate was at full scale, so that the true one may be larger.
     """
 
     stamp_ns: int
     accel_mps2: Vector
     gyro_radps: Vector
     mag_t: Vector | None = None
+    saturated: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +43,15 @@ class DepthSample:
 
 
 class ImuDevice(Protocol):
-    """Accelerometer, gyroscope and, where there is one, magnetometer.
+    """Accelerometer, gyroscope and, on most boards, magnetometer.
 
     problem: what is wrong although samples come, "" where nothing is.
     """
 
     name: str
-    problem: str
+
+    @property
+    def problem(self) -> str: ...  # noqa: D102
 
     def read(self) -> ImuSample:
         """Return the newest sample; raise DeviceError where there is none. The next call tries again."""

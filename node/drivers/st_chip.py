@@ -1,4 +1,4 @@
-"""What ST's inertial chips have in common: identity, settings that stay written, six-byte vectors."""
+"""Common parts of ST's inertial chips: identity, settings that are read back, six-byte vectors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ def decode_vector(data: bytes) -> Vector:
 
 
 class StChip:
-    """One chip on a bus. Subclasses say what it answers, where it can be, and how it is set up."""
+    """One chip on a bus.
+
+    Subclasses give its identities, its possible addresses, and SETTINGS: (register, value) in the order of writing.
+    """
 
     NAME: ClassVar[str]
     ADDRESSES: ClassVar[tuple[int, ...]]
@@ -31,7 +34,7 @@ class StChip:
 
     @classmethod
     def find(cls, bus: I2cBus) -> Self | None:
-        """Return the chip where one of its addresses answers with its identity, else None."""
+        """Return the chip if one of its addresses answers with its identity, else None."""
         for address in cls.ADDRESSES:
             try:
                 identity = bus.read(address, WHO_AM_I, 1)[0]
@@ -56,3 +59,15 @@ class StChip:
             kept = self.bus.read(self.address, register, 1)[0]
             if kept != value:
                 raise self.bus.error(self.address, register, f"{self.NAME} kept 0x{kept:02x} in place of 0x{value:02x}")
+
+    def check_setting(self, register: int, value: int) -> None:
+        """Read one control register back; raise DeviceError where it is not value."""
+        found = self.bus.read(self.address, register, 1)[0]
+        if found != value:
+            what = f"{self.NAME} has reset: 0x{found:02x} in place of 0x{value:02x}"
+            raise self.bus.error(self.address, register, what)
+
+    def check_settings(self) -> None:
+        """Read all control registers back; raise DeviceError where one has lost its value."""
+        for register, value in self.SETTINGS:
+            self.check_setting(register, value)

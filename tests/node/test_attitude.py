@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -207,6 +207,18 @@ def test_a_clock_that_steps_widens_sigma_and_keeps_the_attitude(step_s):
             assert np.degrees(np.abs(error).max()) < 3
     assert after.sigma_rad[0] > before.sigma_rad[0]
     assert after.sigma_rad[2] > before.sigma_rad[2]
+
+
+def test_saturated_samples_widen_sigma():
+    """Full scale for half a second: the rate beyond it is not known."""
+    dive = swell.simulate(12.0)
+    ends = []
+    for saturated in (False, True):
+        estimator = VqfAttitude(SOUND, HERE)
+        for i, s in enumerate(dive.samples):
+            out = estimator.update(replace(s, saturated=saturated and i >= len(dive.samples) - 50))
+        ends.append(np.degrees(out.sigma_rad))
+    assert (ends[1] > ends[0] + 1.0).all()
 
 
 def test_samples_missing_for_seconds_are_survived():

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from buddyline.node.drivers import l3gd20h, lis3mdl, lsm6ds, lsm303d
 from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.imu import FROZEN_READINGS, Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
+from buddyline.node.drivers.imu import Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
 from buddyline.node.drivers.ms5837 import Ms5837
 from buddyline.node.drivers.registry import open_depth, open_imu
 from buddyline.node.drivers.samples import DeviceError
+from buddyline.node.drivers.watch import FROZEN_READINGS, SETTLING_NS
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.errors import BuddylineError
 
@@ -35,12 +36,12 @@ def plug(adapter: Adapter, name: str, sky: Sky) -> dict[int, StWire]:
 def test_vectors_are_little_endian_and_signed():
     data = bytes([0x00, 0x40, 0xFF, 0xFF, 0x00, 0x80])
     g = 9.80665
-    assert lsm303d.decode_accel(data) == pytest.approx(np.array([16384, -1, -32768]) * 0.061e-3 * g)
+    assert lsm303d.decode_accel(data) == pytest.approx(np.array([16384, -1, -32768]) * 0.122e-3 * g)
     assert lsm303d.decode_mag(data) == pytest.approx(np.array([16384, -1, -32768]) * 0.160e-7)
     assert l3gd20h.decode_gyro(data) == pytest.approx(np.radians(np.array([16384, -1, -32768]) * 17.5e-3))
     assert lis3mdl.decode_mag(data) == pytest.approx(np.array([16384, -1, -32768]) / 6842 * 1e-4)
     accel, gyro = lsm6ds.decode_motion(bytes([1, 0, 2, 0, 3, 0]) + data)
-    assert accel == pytest.approx(np.array([16384, -1, -32768]) * 0.061e-3 * g)
+    assert accel == pytest.approx(np.array([16384, -1, -32768]) * 0.122e-3 * g)
     assert gyro == pytest.approx(np.radians(np.array([1, 2, 3]) * 17.5e-3))
 
 
@@ -192,8 +193,105 @@ def test_a_brown_out_that_nobody_saw_is_never_published(unit, adapter, bus, cloc
     assert device.problem == ""
 
 
+def stop_gyro(adapter: Adapter, unit: str) -> None:
+    """Put the gyroscope to sleep, as a reset of it alone does, with zeros in its registers."""
+    chip = adapter.chips[0x6A if unit == "lsm6ds" else 0x6B]
+    if unit == "minimu9_v3":
+        chip.power_cycle()
+    else:
+        chip.registers[0x11] = 0x00
+        chip.registers.update((register, 0) for register in range(0x22, 0x28))
+
+
+def test_a_gyroscope_that_resets_alone_is_set_up_again_and_its_zeros_are_not_published(unit, adapter, bus, clock, sky):
+    sky.gyro = (300, -200, 100)
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    device.read()
+    stop_gyro(adapter, unit)
+    clock.set_ns(clock.now_ns() + 10 * MS_NS)
+    with pytest.raises(DeviceError, match="has reset"):
+        device.read()
+    for _ in range(50):
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+        assert device.read().gyro_radps.any()
+
+
+def test_a_setting_lost_without_zeros_is_found_within_a_second(unit, adapter, bus, clock, sky):
+    """The accelerometer's range alone falls back to +-2 g: its readings are twice as large, and not zero."""
+    chips = plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    register, value = (0x21, 0xC0) if unit == "minimu9_v3" else (0x10, 0x50)
+    chip = chips[{"minimu9_v3": 0x1D, "lsm6ds": 0x6A}.get(unit, 0x6B)]
+    chip.registers[register] = value
+    errors = []
+    for _ in range(105):
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+        try:
+            sample = device.read()
+        except DeviceError as error:
+            errors.append(str(error))
+    assert len(errors) == 1
+    assert f"register 0x{register:02x}" in errors[0]
+    assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
+
+
+def test_a_chip_that_starts_slowly_gets_its_time_and_publishes_no_zero(unit, adapter, bus, clock, sky):
+    sky.silent = {"gyro"}
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    for _ in range(20):
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+        with pytest.raises(DeviceError, match="no reading yet"):
+            device.read()
+    sky.silent, sky.gyro = set(), (300, -200, 100)
+    clock.set_ns(clock.now_ns() + 10 * MS_NS)
+    assert device.read().gyro_radps.any()
+
+
+def test_a_gyroscope_that_stays_at_zero_is_never_published(unit, adapter, bus, clock, sky):
+    sky.silent = {"gyro"}
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    clock.set_ns(clock.now_ns() + SETTLING_NS)
+    said = set()
+    for _ in range(100):
+        clock.set_ns(clock.now_ns() + 10 * MS_NS)
+        with pytest.raises(DeviceError) as raised:
+            device.read()
+        said.add(str(raised.value))
+    assert any("gyroscope: reads zero" in text for text in said)
+
+
+def test_full_scale_is_flagged_and_three_g_is_within_it(unit, adapter, bus, clock, sky):
+    sky.accel = (0, 0, -3 * 16384)
+    plug(adapter, unit, sky)
+    device = open_imu(bus, unit, clock=clock)
+    sample = device.read()
+    assert sample.accel_mps2[2] == pytest.approx(-3 * 9.8, abs=0.1)
+    assert not sample.saturated
+    sky.accel, sky.gyro = (0, 0, -5 * 16384), (0, 40_000, 0)
+    clock.set_ns(clock.now_ns() + 10 * MS_NS)
+    assert device.read().saturated
+    assert "accelerometer and gyroscope at full scale" in device.problem
+    sky.accel, sky.gyro = (0, 0, -16384), (0, 0, 0)
+    clock.set_ns(clock.now_ns() + S_NS)
+    assert not device.read().saturated
+    assert "full scale" in device.problem
+    clock.set_ns(clock.now_ns() + 2 * S_NS)
+    device.read()
+    assert device.problem == ""
+
+
+def test_the_anti_alias_filter_of_the_lsm303d_is_half_its_rate(adapter, bus, clock, sky):
+    chips = plug(adapter, "minimu9_v3", sky)
+    open_imu(bus, "minimu9_v3", clock=clock)
+    assert chips[0x1D].registers[0x20] >> 4 == 0b0110  # 100 Hz
+    assert chips[0x1D].registers[0x21] >> 6 == 0b11  # 50 Hz
+
+
 def test_a_frozen_chip_is_noticed_and_set_up_again(unit, adapter, bus, clock, sky):
-    sky.noisy = False
+    sky.noisy, sky.gyro = False, (300, -200, 100)
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
     for _ in range(FROZEN_READINGS):

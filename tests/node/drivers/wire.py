@@ -104,19 +104,27 @@ class StWire(Chip):
 
 
 class Sky:
-    """What the chips feel: counts that a test sets; a little noise in the last bits, as real chips have."""
+    """What the chips feel: counts that a test sets; a little noise in the last bits, as real chips have.
+
+    accel: counts at +-2 g. A chip set to another range reads fewer, and clips as a real one does. silent: sensors
+    that give zeros.
+    """
 
     def __init__(self) -> None:
         self.accel = (0, 0, -16384)
         self.gyro = (0, 0, 0)
         self.mag = (1250, 0, 2700)
         self.noisy = True
+        self.silent: set[str] = set()
         self._rng = np.random.default_rng(1)
 
-    def counts(self, what: str) -> Callable[[], tuple[int, int, int]]:
+    def counts(self, what: str, scale: Callable[[], int] = lambda: 1) -> Callable[[], tuple[int, int, int]]:
         def read() -> tuple[int, int, int]:
             noise = self._rng.integers(-2, 3, 3) if self.noisy else np.zeros(3, dtype=int)
-            x, y, z = (np.array(getattr(self, what)) + noise).tolist()
+            if what in self.silent:
+                return 0, 0, 0
+            felt = np.array(getattr(self, what)) // scale() + noise
+            x, y, z = np.clip(felt, -32768, 32767).tolist()
             return x, y, z
 
         return read
@@ -124,7 +132,10 @@ class Sky:
 
 def lsm303d(sky: Sky) -> StWire:
     chip = StWire(0x49, {0x20: 0x07, 0x24: 0x18, 0x25: 0x20, 0x26: 0x01}, marks=True)
-    chip.outputs[0x28] = (sky.counts("accel"), lambda: chip.registers.get(0x20, 0) >> 4 > 0)
+    chip.outputs[0x28] = (
+        sky.counts("accel", lambda: (1, 2, 3, 4, 8)[chip.registers.get(0x21, 0) >> 3 & 7]),
+        lambda: chip.registers.get(0x20, 0) >> 4 > 0,
+    )
     chip.outputs[0x08] = (sky.counts("mag"), lambda: chip.registers.get(0x26, 3) & 3 == 0)
     return chip
 
@@ -138,7 +149,10 @@ def l3gd20h(sky: Sky) -> StWire:
 def lsm6ds(sky: Sky, identity: int) -> StWire:
     chip = StWire(identity, {0x12: 0x04}, marks=False)
     chip.outputs[0x22] = (sky.counts("gyro"), lambda: chip.registers.get(0x11, 0) >> 4 > 0)
-    chip.outputs[0x28] = (sky.counts("accel"), lambda: chip.registers.get(0x10, 0) >> 4 > 0)
+    chip.outputs[0x28] = (
+        sky.counts("accel", lambda: (1, 8, 2, 4)[chip.registers.get(0x10, 0) >> 2 & 3]),
+        lambda: chip.registers.get(0x10, 0) >> 4 > 0,
+    )
     return chip
 
 
