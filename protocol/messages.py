@@ -285,7 +285,8 @@ class RelativePose(Message, frozen=True, kw_only=True):
     covariance: 6x6 row-major, position in A's camera frame (m), then the small rotation w (rad) with
     R_true = exp(w) R_a_b, in A's camera frame. blobs_a: [left, right] of B's lights, as indices into A's
     Candidates (-1: that light was not seen); blobs_b likewise. skew_ns: stamp_a - stamp_b.
-    t_ned_m, azimuth_rad (from north, clockwise), inclination_rad (up positive): with attitude only.
+    With attitude only: t_ned_m, azimuth_rad (from north, clockwise), inclination_rad (up positive), and their sigmas
+    (1 sd), which count the error of A's attitude as well as the pose's.
     """
 
     node_a: NodeId
@@ -308,8 +309,11 @@ class RelativePose(Message, frozen=True, kw_only=True):
     checks: list[str]
     skew_ns: int
     t_ned_m: Vector3 | UnsetType = UNSET
+    sigma_ned_m: tuple[NonNegative, NonNegative, NonNegative] | UnsetType = UNSET
     azimuth_rad: float | UnsetType = UNSET
+    sigma_azimuth_rad: NonNegative | UnsetType = UNSET
     inclination_rad: float | UnsetType = UNSET
+    sigma_inclination_rad: NonNegative | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check the quaternion's norm."""

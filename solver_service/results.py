@@ -7,10 +7,13 @@ import math
 import numpy as np
 from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.rotation import quat_to_matrix
+from buddyline.solver_service.geometry.direction import direction_of
+from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, skew
 from buddyline.solver_service.geometry.trigger import Fix, Rig, Sensed, View
 from buddyline.solver_service.sensors import SampleStream, attitude_at, depth_at
+from buddyline.solver_service.track.anchors import attitude_covariance
 from msgspec import UNSET
+from msgspec.structs import replace
 
 
 def rig_of(info: NodeInfo) -> Rig:
@@ -66,11 +69,8 @@ def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stam
 
 
 def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a: Sensed, fix: Fix) -> RelativePose:
-    """Return the message for a fix; azimuth and inclination follow A's attitude."""
-    t_ned_m = None
-    if sensed_a.q_ned_body_xyzw is not None:
-        t_ned_m = quat_to_matrix(sensed_a.q_ned_body_xyzw) @ rig_a.R_body_camera @ fix.t_a_b_m
-    return RelativePose(
+    """Return the message for a fix; what it says in north-east-down follows A's attitude."""
+    pose = RelativePose(
         node_a=frame_a.node,
         node_b=frame_b.node,
         stamp_ns=(frame_a.stamp_ns + frame_b.stamp_ns) // 2,
@@ -90,7 +90,34 @@ def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a
         method=fix.method,
         checks=list(fix.checks),
         skew_ns=frame_a.stamp_ns - frame_b.stamp_ns,
-        t_ned_m=UNSET if t_ned_m is None else tuple(t_ned_m.tolist()),
-        azimuth_rad=UNSET if t_ned_m is None else math.atan2(t_ned_m[1], t_ned_m[0]) % (2 * math.pi),
-        inclination_rad=UNSET if t_ned_m is None else -math.atan2(t_ned_m[2], math.hypot(t_ned_m[0], t_ned_m[1])),
+    )
+    if sensed_a.q_ned_body_xyzw is None or sensed_a.sigma_rad is None:
+        return pose
+    return in_ned(pose, rig_a.R_body_camera, sensed_a.q_ned_body_xyzw, sensed_a.sigma_rad)
+
+
+def in_ned(pose: RelativePose, R_body_camera: Floats, q_ned_body_xyzw: Floats, sigma_rad: Floats) -> RelativePose:
+    """Return a pose with its position in north-east-down, its angles and the sigmas of both.
+
+    q_ned_body_xyzw (4,): A's attitude; sigma_rad (3,): of its roll, pitch and yaw. With t_ned = R_ned_camera t and an
+    attitude that is off by a small rotation phi, dt_ned = R_ned_camera dt + phi x t_ned. phi counts as independent of
+    the fix, whose position comes from the pictures. Where a sigma is out of numeric range, nothing is added.
+    """
+    R_ned_body = quat_to_matrix(q_ned_body_xyzw)
+    R_ned_camera = R_ned_body @ R_body_camera
+    t_ned_m = R_ned_camera @ np.array(pose.t_a_b_m)
+    of_position = np.array(pose.covariance).reshape(6, 6)[:3, :3]
+    arm = skew(t_ned_m)
+    with np.errstate(all="ignore"):
+        of_attitude = attitude_covariance(R_ned_body, sigma_rad, 1.0, 1.0)
+        covariance = R_ned_camera @ of_position @ R_ned_camera.T + arm @ of_attitude @ arm.T
+    if not np.isfinite(covariance).all():
+        return pose
+    north_m, east_m, down_m = t_ned_m.tolist()
+    sigma_n_m, sigma_e_m, sigma_d_m = np.sqrt(np.diag(covariance)).tolist()
+    return replace(
+        pose,
+        t_ned_m=(north_m, east_m, down_m),
+        sigma_ned_m=(sigma_n_m, sigma_e_m, sigma_d_m),
+        **vars(direction_of(t_ned_m, covariance)),
     )

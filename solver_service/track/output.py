@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.solver_service.geometry.direction import direction_of
 from buddyline.solver_service.geometry.rotation import Floats, matrix_to_quat, rotation_exp, skew
 from buddyline.solver_service.track.state import CLOCK, NAV, PHI, R_, SIZE, V_, State
 
@@ -93,10 +94,6 @@ def row_of(stamp_ns: int, state: State, P: Floats, rates_radps: Floats, lights: 
     covariance, v_covariance, of_ned = whole[:6, :6], whole[6:9, 6:9], whole[9:, 9:]
     if not np.isfinite(whole).all() or math.sqrt(float(np.trace(covariance[:3, :3]))) > WORST_SHARE * range_m:
         return None
-    flat2 = max(float(r[0] ** 2 + r[1] ** 2), 1e-12)
-    flat = math.sqrt(flat2)
-    by_azimuth = np.array((-r[1], r[0], 0.0)) / flat2
-    by_inclination = np.array((r[0] * r[2] / flat, r[1] * r[2] / flat, -flat)) / (flat2 + float(r[2]) ** 2)
     return TrackRow(
         stamp_ns=stamp_ns,
         t_a_b_m=toward @ r,
@@ -109,8 +106,5 @@ def row_of(stamp_ns: int, state: State, P: Floats, rates_radps: Floats, lights: 
         range_m=range_m,
         t_ned_m=r.copy(),
         sigma_ned_m=np.sqrt(np.diag(of_ned)),
-        azimuth_rad=math.atan2(r[1], r[0]) % (2.0 * math.pi),
-        sigma_azimuth_rad=math.sqrt(float(by_azimuth @ of_ned @ by_azimuth)),
-        inclination_rad=-math.atan2(r[2], flat),
-        sigma_inclination_rad=math.sqrt(float(by_inclination @ of_ned @ by_inclination)),
+        **vars(direction_of(r, of_ned)),
     )

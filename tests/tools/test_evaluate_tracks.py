@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Track, Truth
+from buddyline.protocol.messages import NodePose, Track, Truth
 from buddyline.tools.evaluation.tracks import covered_share, tracks_figures
-from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.evaluation.truth import TruthTrack, ned_of_camera
+from msgspec.structs import replace
 
 PERIOD_NS = S_NS // 50
 SIGMA_M = 0.02
@@ -73,3 +74,50 @@ def test_time_without_a_sample_or_with_a_wide_sigma_is_not_covered():
 def test_each_mode_has_its_own_figures():
     tracks = [track(k, [0, 0, 4.0], mode=mode) for k in range(4) for mode in ("filter", "lag")]
     assert [figures.mode for figures in tracks_figures(tracks, [], truths(4))] == ["filter", "lag"]
+
+
+def test_sigmas_in_ned_are_judged_by_true_ned():
+    rng = np.random.default_rng(4)
+    sigma = np.array([0.02, 0.04, 0.01, 0.05, 0.01])
+    # A looks north: its camera's z is north, x east, y down.
+    looks_north = NodePose(
+        net="main",
+        node="a",
+        stamp_ns=0,
+        p_m=(0.0, 0.0, 10.0),
+        q_xyzw=(0.5, 0.5, 0.5, 0.5),
+        v_mps=(0.0, 0.0, 0.0),
+        covariance=[0.0] * 36,
+        fixed=False,
+        mode="truth",
+        age_s=0.0,
+    )
+    camera = ned_of_camera([replace(looks_north, stamp_ns=k * PERIOD_NS) for k in range(3000)], [], None)
+    told = []
+    for k in range(3000):
+        # Due south: published azimuths are about pi, true ones too, on either side of the cut.
+        north, east, down, azimuth, inclination = np.array([-4.0, 0.0, 0.0, np.pi, 0.0]) + sigma * rng.standard_normal(
+            5
+        )
+        told.append(
+            replace(
+                track(k, [0, 0, -4.0]),
+                t_ned_m=(north, east, down),
+                sigma_ned_m=tuple(sigma[:3]),
+                azimuth_rad=azimuth,
+                sigma_azimuth_rad=sigma[3],
+                inclination_rad=inclination,
+                sigma_inclination_rad=sigma[4],
+            )
+        )
+    south = TruthTrack(
+        [Truth(stamp_ns=k * PERIOD_NS, t_a_b_m=(0, 0, -4.0), q_a_b_xyzw=(0, 1, 0, 0)) for k in range(3000)]
+    )
+    (figures,) = tracks_figures(told, [], south, camera)
+    ned = figures.ned
+    assert ned.samples == 3000
+    assert [ned.north, ned.east, ned.down, ned.azimuth, ned.inclination] == pytest.approx([1.0] * 5, rel=0.1)
+    (doubled,) = tracks_figures([replace(one, sigma_azimuth_rad=0.025) for one in told], [], south, camera)
+    assert doubled.ned.azimuth == pytest.approx(4 * ned.azimuth)
+    (unknown,) = tracks_figures(told, [], south)
+    assert unknown.ned is None

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.messages import RelativePose, Track
+from buddyline.tools.evaluation.ned import angles_of, wrapped
 from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
 from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 from msgspec import UNSET
@@ -109,11 +110,6 @@ def _angle_between(one: Floats, other: Floats) -> Floats:
     return angle
 
 
-def _wrapped(angle_rad: Floats) -> Floats:
-    wrapped: Floats = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-    return wrapped
-
-
 def _published(values: Sequence[object]) -> Floats:
     return np.array([np.nan if value is UNSET else value for value in values], dtype=float)
 
@@ -143,15 +139,14 @@ def pose_errors(
     known_poses = [pose for pose, _ in found]
     off = differences(found)
 
-    north, east, down = rotate(_ned_of_a(known_poses, ned_camera_a), off.true_t_m).T
-    true_inclination_rad = np.arctan2(-down, np.hypot(north, east))
+    true_azimuth_rad, true_inclination_rad = angles_of(rotate(_ned_of_a(known_poses, ned_camera_a), off.true_t_m))
     right = (is_right(pose) for pose in known_poses)
     return PoseErrors(
         stamp_ns=np.array([pose.stamp_ns for pose in known_poses], dtype=np.int64),
         trigger=np.array([pose.trigger for pose in known_poses], dtype=np.int64),
         range_m=np.array([pose.range_m for pose in known_poses]) - off.true_range_m,
         bearing_rad=_angle_between(off.t_m, off.true_t_m),
-        azimuth_rad=_wrapped(_published([pose.azimuth_rad for pose in known_poses]) - np.arctan2(east, north)),
+        azimuth_rad=wrapped(_published([pose.azimuth_rad for pose in known_poses]) - true_azimuth_rad),
         inclination_rad=_published([pose.inclination_rad for pose in known_poses]) - true_inclination_rad,
         wrong=off.translation_m > WRONG_SHARE * off.true_range_m,
         right_pair=np.array([np.nan if verdict is None else float(verdict) for verdict in right]),

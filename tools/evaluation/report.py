@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from buddyline.tools.evaluation.detection import DetectionFigures
+from buddyline.tools.evaluation.ned import NedHonesty
 from buddyline.tools.evaluation.pairing import Pairing
 from buddyline.tools.evaluation.poses import WRONG_SHARE
 from buddyline.tools.evaluation.result import Accuracy, RangeBin, Result
@@ -44,7 +45,7 @@ def as_text(result: Result) -> str:
     if result.pairing is not None:
         parts.append(_pairing_text(result.pairing))
     if result.accuracy.poses:
-        parts += [_accuracy_text(result.accuracy), _bins_text(result.bins)]
+        parts += [_accuracy_text(result.accuracy) + _ned_text(result.ned), _bins_text(result.bins)]
     parts += [_track_text(track) for track in result.tracks if track.samples]
     if result.detection is not None:
         parts.append(_detection_text(result.detection))
@@ -138,8 +139,19 @@ def _track_text(track: TrackFigures) -> str:
     ]
     return (
         f"track ({track.mode}): covers {percent(track.covered)} of the time from the first to the last pose;"
-        f" wrong: {track.wrong} of {track.samples}, in gaps {track.wrong_in_gaps}\n{text_table(rows)}"
+        f" wrong: {track.wrong} of {track.samples}, in gaps {track.wrong_in_gaps}\n"
+        f"{text_table(rows)}{_ned_text(track.ned)}"
     )
+
+
+def _ned_text(ned: NedHonesty | None) -> str:
+    """Return a line to append, empty where there is nothing to say."""
+    if ned is None:
+        return ""
+    figures = ", ".join(
+        f"{name} {number(getattr(ned, name), 2)}" for name in ("north", "east", "down", "azimuth", "inclination")
+    )
+    return f"\nerror over sigma against true NED, mean of squares (honest: 1): {figures}"
 
 
 def _bins_text(bins: Sequence[RangeBin]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from buddyline.protocol.messages import Candidates
 from buddyline.tools.evaluation.detection import DetectionFigures, detection_figures
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
+from buddyline.tools.evaluation.ned import NedHonesty, ned_honesty
 from buddyline.tools.evaluation.pairing import Pairing, VisibleTrigger, pairing_figures, visible_triggers
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.recorded import Recorded
@@ -79,7 +80,7 @@ class RangeBin:
 class Result:
     """All that is measured of one pair. without_truth: poses that could not be compared. tracks: one a mode.
 
-    environment: the water, empty where the logs do not name it.
+    ned: of the poses, None without true NED. environment: the water, empty where the logs do not name it.
     """
 
     node_a: str
@@ -95,6 +96,7 @@ class Result:
     tracks: list[TrackFigures]
     errors: PoseErrors
     environment: str = ""
+    ned: NedHonesty | None = None
 
 
 def _bins(errors: PoseErrors, visible: Sequence[VisibleTrigger]) -> list[RangeBin]:
@@ -125,6 +127,9 @@ def evaluate(recorded: Recorded) -> Result:
         lambda pose: is_right_pair(pose, blobs, lights),
         ned_of_camera(recorded.ned_truths_a, recorded.attitudes_a, infos.get(nodes[0])),
     )
+    # By attitudes alone, what they err by would be in neither: such sigmas are judged by true poses only.
+    true_ned_a = ned_of_camera(recorded.ned_truths_a, [], None)
+    compared = [(pose, known[0]) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
     seen = visible_triggers(nodes, poses, rejected, lights, blobs, set(errors.trigger[errors.wrong].tolist()))
     return Result(
         node_a=nodes[0],
@@ -137,7 +142,8 @@ def evaluate(recorded: Recorded) -> Result:
         bins=_bins(errors, seen),
         pairing=pairing_figures(seen),
         detection=detection_figures(lights, blobs),
-        tracks=tracks_figures(recorded.tracks, poses, track),
+        tracks=tracks_figures(recorded.tracks, poses, track, true_ned_a),
         errors=errors,
         environment=recorded.environment,
+        ned=ned_honesty(compared, true_ned_a),
     )

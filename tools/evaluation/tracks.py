@@ -10,9 +10,10 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import RelativePose, Track, TrackMode
+from buddyline.tools.evaluation.ned import NedHonesty, ned_honesty
 from buddyline.tools.evaluation.poses import WRONG_SHARE, differences
 from buddyline.tools.evaluation.statistics import Stats, share
-from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 
 COVERED_SHARE: Final = TRACK_SIGMA_SHARE
 """A track covers an instant where its position's sigma is below this share of the range."""
@@ -27,7 +28,7 @@ class TrackFigures:
     """One mode of a pair's track. samples: that have truth; wrong_in_gaps: of the wrong ones, those in a gap.
 
     covered: share of the time from the first to the last pose. nees6, nees3: mean 6 and 3 where the covariance is
-    honest. in_gaps_m, outside_m: position errors in and outside gaps.
+    honest. in_gaps_m, outside_m: position errors in and outside gaps. ned: None without true NED.
     """
 
     mode: TrackMode
@@ -41,16 +42,31 @@ class TrackFigures:
     outside_m: Stats
     nees6: Stats
     nees3: Stats
+    ned: NedHonesty | None = None
 
 
-def tracks_figures(tracks: Sequence[Track], poses: Sequence[RelativePose], truth: TruthTrack) -> list[TrackFigures]:
-    """Measure each mode that stands among the tracks, in the order of the modes' first samples."""
+def tracks_figures(
+    tracks: Sequence[Track],
+    poses: Sequence[RelativePose],
+    truth: TruthTrack,
+    ned_camera_a: PoseHistory | None = None,
+) -> list[TrackFigures]:
+    """Measure each mode that stands among the tracks, in the order of the modes' first samples.
+
+    ned_camera_a: node a's camera in NED, as it truly was.
+    """
     modes = dict.fromkeys(track.mode for track in tracks)
-    return [_figures(mode, [track for track in tracks if track.mode == mode], poses, truth) for mode in modes]
+    return [
+        _figures(mode, [track for track in tracks if track.mode == mode], poses, truth, ned_camera_a) for mode in modes
+    ]
 
 
 def _figures(
-    mode: TrackMode, tracks: Sequence[Track], poses: Sequence[RelativePose], truth: TruthTrack
+    mode: TrackMode,
+    tracks: Sequence[Track],
+    poses: Sequence[RelativePose],
+    truth: TruthTrack,
+    ned_camera_a: PoseHistory | None,
 ) -> TrackFigures:
     found = [(track, known) for track in tracks if (known := truth.interpolated(track.stamp_ns)) is not None]
     off = differences(found)
@@ -68,6 +84,7 @@ def _figures(
         outside_m=Stats.of(off.translation_m[~in_gap]),
         nees6=Stats.of(off.nees6),
         nees3=Stats.of(off.nees3),
+        ned=ned_honesty([(track, known[0]) for track, known in found], ned_camera_a),
     )
 
 

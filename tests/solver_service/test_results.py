@@ -1,0 +1,93 @@
+"""What a pose says in north-east-down: its sigmas against numeric differences and against drawn errors."""
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.direction import ANY_AZIMUTH_RAD, direction_of
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
+from buddyline.solver_service.results import in_ned
+from msgspec import UNSET
+
+from tests.tools.evaluated import pose
+
+SIGMA_RAD = np.array([0.01, 0.015, 0.07])
+R_BODY_CAMERA = rotation_exp(np.array([0.02, -0.03, 0.01])) @ np.array(
+    [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+)
+T_M = (0.7, -1.9, 3.6)
+
+
+def attitude(roll, pitch, yaw):
+    """Return R_ned_body = Rz(yaw) Ry(pitch) Rx(roll), one or many (..., 3, 3)."""
+    zero = np.zeros_like(yaw)
+    turns = [np.stack(parts, axis=-1) for parts in ((zero, zero, yaw), (zero, pitch, zero), (roll, zero, zero))]
+    first, second, third = map(rotation_exp, turns)
+    return first @ second @ third
+
+
+def covariance(rng):
+    scale = np.array([0.02, 0.03, 0.06, 0.004, 0.004, 0.006])
+    mixed = np.eye(6) + 0.4 * rng.standard_normal((6, 6))
+    return (mixed * scale[:, None]) @ (mixed * scale[:, None]).T
+
+
+def angles(t_ned):
+    """Return north, east, down, azimuth, inclination (..., 5)."""
+    north, east, down = np.moveaxis(t_ned, -1, 0)
+    return np.stack([north, east, down, np.arctan2(east, north), np.arctan2(-down, np.hypot(north, east))], axis=-1)
+
+
+def said(attitude_rad, P, t_m=T_M, sigma_rad=SIGMA_RAD):
+    R = attitude(*np.array(attitude_rad))
+    made = in_ned(pose(0, t_m, covariance=P.ravel().tolist()), R_BODY_CAMERA, matrix_to_quat(R), sigma_rad)
+    return made, np.array([*made.sigma_ned_m, made.sigma_azimuth_rad, made.sigma_inclination_rad])
+
+
+@pytest.mark.parametrize("attitude_rad", [(0.0, 0.0, 0.0), (0.3, -0.4, 2.5), (-1.2, 0.9, -1.0), (3.0, 0.2, 0.4)])
+def test_sigmas_are_those_of_numeric_differences(attitude_rad):
+    P = covariance(np.random.default_rng(1))
+    made, sigmas = said(attitude_rad, P)
+
+    def at(x):
+        return angles(attitude(*(np.array(attitude_rad) + x[3:])) @ R_BODY_CAMERA @ (np.array(T_M) + x[:3]))
+
+    assert np.allclose(at(np.zeros(6))[:3], made.t_ned_m, atol=1e-12)
+    step = 1e-6
+    J = np.stack([(at(step * e) - at(-step * e)) / (2 * step) for e in np.eye(6)], axis=1)
+    of_both = np.zeros((6, 6))
+    of_both[:3, :3], of_both[3:, 3:] = P[:3, :3], np.diag(SIGMA_RAD**2)
+    assert np.allclose(sigmas, np.sqrt(np.diag(J @ of_both @ J.T)), rtol=1e-3)
+
+
+def test_errors_drawn_from_covariance_and_attitude_spread_as_said():
+    rng = np.random.default_rng(2)
+    P = covariance(rng)
+    told = np.array([0.3, -0.4, 2.5])
+    made, sigmas = said(told, P)
+    count = 40_000
+    t_m = rng.multivariate_normal(T_M, P[:3, :3], count)
+    R = attitude(*(told + SIGMA_RAD * rng.standard_normal((count, 3))).T)
+    spread = angles((R @ R_BODY_CAMERA @ t_m[:, :, None])[:, :, 0]) - angles(np.array(made.t_ned_m))
+    # First order, with a heading of 4 degrees: within a few per cent.
+    assert np.sqrt((spread**2).mean(axis=0)) == pytest.approx(sigmas, rel=0.03)
+
+
+def test_a_compass_that_is_worse_widens_the_azimuth_and_hardly_the_inclination():
+    P = covariance(np.random.default_rng(3))
+    _, good = said((0.0, 0.0, 1.0), P)
+    _, poor = said((0.0, 0.0, 1.0), P, sigma_rad=np.array([0.01, 0.015, 0.35]))
+    assert poor[3] == pytest.approx(0.35, rel=0.01)
+    assert poor[4] == pytest.approx(good[4], rel=1e-6)
+
+
+def test_straight_above_any_azimuth_is_as_likely():
+    found = direction_of(np.array([0.0, 0.0, -4.0]), 1e-4 * np.eye(3))
+    assert found.sigma_azimuth_rad == ANY_AZIMUTH_RAD
+    assert found.inclination_rad == pytest.approx(np.pi / 2)
+    assert found.sigma_inclination_rad == pytest.approx(0.01 / 4.0)
+
+
+def test_absurd_sigmas_of_an_attitude_say_nothing():
+    made = in_ned(pose(0), R_BODY_CAMERA, np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.01, 0.01, 1e200]))
+    assert made.t_ned_m is UNSET
+    assert made.sigma_ned_m is UNSET
+    assert np.isfinite(quat_to_matrix(np.array(made.q_a_b_xyzw))).all()
