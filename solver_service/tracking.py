@@ -92,6 +92,10 @@ class PairTracker:
         stamps_ns = [one.stamp_ns for one in outcomes if isinstance(one, RelativePose | Rejected)]
         if not stamps_ns or not self._describe(max(stamps_ns)):
             return []
+        if self._first_ns is None:
+            # However many outcomes come at once, the track begins with the first of them.
+            self._first_ns = self._told_ns = min(stamps_ns)
+            self._taken_ns = self._first_ns - S_NS
         self._settled_ns = max(self._settled_ns, *stamps_ns)
         fixes = [_fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if self._filter is not None:
@@ -146,10 +150,6 @@ class PairTracker:
     def _advance(self, to_ns: int) -> list[Message]:
         if to_ns <= self._taken_ns:
             return []
-        if self._first_ns is None:
-            self._first_ns = to_ns
-            self._taken_ns = to_ns - S_NS
-            self._told_ns = to_ns
         for node, stream in enumerate(self._streams):
             piece = self._piece(stream, node, self._taken_ns + 1, to_ns)
             self._oriented |= bool(piece.attitudes)

@@ -5,7 +5,7 @@ import random
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Track
+from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, RelativePose, Track
 from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
@@ -47,6 +47,19 @@ def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(i
         assert one.stamp_ns == other.stamp_ns
         np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once():
+    messages, _ = dive_messages(seconds=4.0, imu=True)
+    expected, _ = tracks_of(messages, "smooth")
+    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("smooth",)), 20.0))
+    results = core.handle_many(messages) + core.flush()
+    found = [one for one in results if isinstance(one, Track)]
+    first_ns = min(one.stamp_ns for one in results if isinstance(one, RelativePose))
+    assert found[0].stamp_ns <= first_ns + S_NS // 20
+    assert [one.stamp_ns for one in found] == [one.stamp_ns for one in expected]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
 
 
 def test_each_mode_is_better_than_the_one_before_it_and_says_how_good_it_is(inertial_dive):
