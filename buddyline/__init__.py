@@ -7,7 +7,7 @@ For notebooks and other programs:
     dive = buddyline.open_dive("a.mcap", "b.mcap")          # columns of numpy arrays
     dive.depths("a").depth_m, dive.attitudes("a").q_ned_body_xyzw
     solved = buddyline.solve("a.mcap", "b.mcap")            # in memory
-    solved.poses.t_a_b_m, solved.rejections.reason
+    solved.poses.t_a_b_m, solved.track.t_a_b_m, solved.rejections.reason
     blobs = buddyline.detect(picture)                       # of an image array
     info = buddyline.read_info("a.mcap")                    # calibration
     with buddyline.live_poses() as poses:                   # as the solver finds them
@@ -145,11 +145,14 @@ def solve(
     clock_offset_s: float = 0.0,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
+    track: str = "smooth",
+    track_hz: float = 50.0,
 ) -> SolvedDive:
     """Solve a stored dive in memory, as `buddyline solve` does; pictures are detected first where need be.
 
     pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's.
-    environment: of the detector. infos: node id to the calibration to use in place of the logs' own.
+    environment: of the detector. infos: node id to the calibration to use in place of the logs' own. track: the fused
+    estimate, "smooth" over the whole dive, "lag" or "filter" as live, "none" to save the time; track_hz: its rows.
     """
     from buddyline.tools.offline import solve_logs
 
@@ -161,6 +164,8 @@ def solve(
         clock_offset_s=clock_offset_s,
         environment=environment,
         infos=infos,
+        track=track,
+        track_hz=track_hz,
     )
 
 
@@ -171,14 +176,24 @@ def solve_messages(
     method: str = "refined",
     checks: Sequence[str] = ALL_CHECKS,
     clock_offset_s: float = 0.0,
+    track: str = "smooth",
+    track_hz: float = 50.0,
 ) -> SolvedDive:
-    """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Attitude and Depth if any.
+    """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Imu, Attitude, Depth if any.
 
-    They are taken in the order given, which is that of their stamps but for a second at most.
+    They are taken in the order given, which is that of their stamps but for a second at most. track: as of solve.
     """
     from buddyline.tools.offline import solve_messages as solve_in_memory
 
-    return solve_in_memory(messages, pair=pair, method=method, checks=checks, clock_offset_s=clock_offset_s)
+    return solve_in_memory(
+        messages,
+        pair=pair,
+        method=method,
+        checks=checks,
+        clock_offset_s=clock_offset_s,
+        track=track,
+        track_hz=track_hz,
+    )
 
 
 def detect(image: NDArray[np.uint8], *, environment: str = "auto", method: str = "source") -> list[Blob]:

@@ -6,7 +6,7 @@ import buddyline
 import numpy as np
 
 truth = buddyline.open_dive(*sys.argv[1:]).truth()
-poses = buddyline.solve(*sys.argv[1:]).poses
+poses = buddyline.solve(*sys.argv[1:], track="none").poses
 _, of_pose, of_truth = np.intersect1d(poses.trigger, truth.trigger, return_indices=True)
 error_m = np.linalg.norm(poses.t_a_b_m[of_pose] - truth.t_a_b_m[of_truth], axis=1)
 for start_m in range(1, 10):

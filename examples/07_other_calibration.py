@@ -15,7 +15,7 @@ wider = {
     )
     for node, info in infos.items()
 }
-before = buddyline.solve(*sys.argv[1:]).poses
-after = buddyline.solve(*sys.argv[1:], infos=wider).poses
+before = buddyline.solve(*sys.argv[1:], track="none").poses
+after = buddyline.solve(*sys.argv[1:], infos=wider, track="none").poses
 _, one, other = np.intersect1d(before.trigger, after.trigger, return_indices=True)
 print(f"ranges grow by {100 * (np.median(after.range_m[other] / before.range_m[one]) - 1):.2f} %")

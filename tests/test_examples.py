@@ -101,6 +101,13 @@ def test_own_candidates():
     assert run("08_own_candidates.py").startswith("range 4.000 m")
 
 
+def test_poses_and_track(tmp_path):
+    pytest.importorskip("matplotlib")
+    out = run("11_poses_and_track.py", DATA / "cavern.mcap", tmp_path / "range.png")
+    assert " rows of track; longest without a light " in out
+    assert cv2.imread(str(tmp_path / "range.png")).shape[0] > 100
+
+
 @pytest.fixture(scope="module")
 def hub():
     endpoint = free_endpoint()

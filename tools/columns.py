@@ -23,9 +23,23 @@ from buddyline.protocol.messages import (
     Rejected,
     RelativePose,
     Track,
+    TrackMode,
     Truth,
 )
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMAGE, IMU, INFO, POSE, REJECTED, TRACK, TRUTH, Topic
+from buddyline.protocol.topics import (
+    ATTITUDE,
+    CANDIDATES,
+    DEPTH,
+    IMAGE,
+    IMU,
+    INFO,
+    POSE,
+    REJECTED,
+    TRACK,
+    TRACK_LAG,
+    TRUTH,
+    Topic,
+)
 from buddyline.tools.dives import Dive
 from msgspec import UNSET
 from numpy.typing import NDArray
@@ -62,8 +76,8 @@ class PoseColumns(Columns):
 
     trigger (n,). t_a_b_m (n, 3), m. q_a_b_xyzw (n, 4). covariance (n, 6, 6): position (m), then the small rotation w
     (rad) with R_true = exp(w) R_a_b, both in A's camera frame. range_m, chi2 (n,). lights (n,): from how many of the
-    four lights. method (n,): "refined", "three_lights", ... t_ned_m (n, 3), azimuth_rad (from north, clockwise),
-    inclination_rad (up) (n,): with an attitude of A.
+    four lights. method (n,): "refined", "three_lights", ... With an attitude of A: t_ned_m, sigma_ned_m (n, 3),
+    azimuth_rad (from north, clockwise), inclination_rad (up) and their sigmas (n,), which count the compass's error.
     """
 
     trigger: Integers
@@ -75,30 +89,47 @@ class PoseColumns(Columns):
     lights: Integers
     method: Texts
     t_ned_m: Floats
+    sigma_ned_m: Floats
     azimuth_rad: Floats
+    sigma_azimuth_rad: Floats
     inclination_rad: Floats
+    sigma_inclination_rad: Floats
 
     @property
     def sigma_m(self) -> Floats:
         """Standard deviations of the position along A's camera axes, (n, 3)."""
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3]
-        sigma_m: Floats = np.sqrt(variances)
-        return sigma_m
+        return _sigma_m(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class TrackColumns(Columns):
-    """The fused estimate of T_a_b. Columns as in PoseColumns; v_a_b_mps (n, 3): velocity of B in A's camera frame.
+    """The fused estimate of T_a_b, also between poses. Columns as in PoseColumns, and:
 
-    lights (n,): how many different lights the last trigger told of. age_s (n,): since a light was last used.
+    v_a_b_mps (n, 3): velocity of B's camera relative to A's, in A's camera frame, A's turning not counted;
+    v_covariance (n, 3, 3). lights (n,): how many different lights the last trigger told of. age_s (n,): since a light
+    was last used. mode: "smooth" (whole dive), "lag" (a second later), "filter" (live); empty where there is no track.
     """
 
     t_a_b_m: Floats
     q_a_b_xyzw: Floats
     covariance: Floats
     v_a_b_mps: Floats
+    v_covariance: Floats
     lights: Integers
     age_s: Floats
+    range_m: Floats
+    t_ned_m: Floats
+    sigma_ned_m: Floats
+    azimuth_rad: Floats
+    sigma_azimuth_rad: Floats
+    inclination_rad: Floats
+    sigma_inclination_rad: Floats
+    mode: str
+
+    @property
+    def sigma_m(self) -> Floats:
+        """Standard deviations of the position along A's camera axes, (n, 3)."""
+        return _sigma_m(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,9 +222,13 @@ class DiveColumns:
         """Return the solved poses; pair: may be left out where there is one."""
         return pose_columns(self._of_pair(POSE, RelativePose, pair))
 
-    def tracks(self, pair: Pair | None = None) -> TrackColumns:
-        """Return the fused estimate; pair: may be left out where there is one."""
-        return track_columns(self._of_pair(TRACK, Track, pair))
+    def track(self, pair: Pair | None = None, mode: TrackMode | None = None) -> TrackColumns:
+        """Return the fused estimate; pair: may be left out where there is one.
+
+        mode: default: of the modes in the logs the best: smooth, lag, filter.
+        """
+        found = self._of_pair(TRACK, Track, pair) + self._of_pair(TRACK_LAG, Track, pair)
+        return track_columns(in_order(of_mode(found, mode)))
 
     def truth(self, pair: Pair | None = None) -> TruthColumns:
         """Return the true poses; pair: may be left out where there is one."""
@@ -273,7 +308,8 @@ class DiveColumns:
 
 _NOWHERE = (np.nan, np.nan, np.nan)
 _OF_NODES = (INFO, IMAGE, CANDIDATES, ATTITUDE, DEPTH, IMU)
-_OF_PAIRS = (POSE, REJECTED, TRACK, TRUTH)
+_OF_PAIRS = (POSE, REJECTED, TRACK, TRACK_LAG, TRUTH)
+BEST_FIRST: tuple[TrackMode, ...] = ("smooth", "lag", "filter")
 
 
 def in_order(found: Iterable[M]) -> list[M]:
@@ -301,23 +337,51 @@ def pose_columns(poses: Sequence[RelativePose]) -> PoseColumns:
         _floats([pose.chi2 for pose in poses]),
         _stamps([sum(index >= 0 for index in (*pose.blobs_a, *pose.blobs_b)) for pose in poses]),
         _texts([pose.method for pose in poses]),
-        _floats([_NOWHERE if pose.t_ned_m is UNSET else pose.t_ned_m for pose in poses], 3),
-        _floats([_known(pose.azimuth_rad) for pose in poses]),
-        _floats([_known(pose.inclination_rad) for pose in poses]),
+        *_ned_columns(poses),
     )
 
 
+def of_mode(tracks: Sequence[Track], mode: TrackMode | None = None) -> list[Track]:
+    """Return the samples of one mode; None: of the best mode that is among them."""
+    modes = {one.mode for one in tracks}
+    chosen = mode or next((best for best in BEST_FIRST if best in modes), None)
+    return [one for one in tracks if one.mode == chosen]
+
+
 def track_columns(tracks: Sequence[Track]) -> TrackColumns:
-    """Return a track's estimates, in their order, as columns."""
+    """Return a track's estimates, in their order and of one mode, as columns."""
     return TrackColumns(
         _stamps([one.stamp_ns for one in tracks]),
         _floats([one.t_a_b_m for one in tracks], 3),
         _floats([one.q_a_b_xyzw for one in tracks], 4),
         _floats([one.covariance for one in tracks], 36).reshape(-1, 6, 6),
         _floats([one.v_a_b_mps for one in tracks], 3),
+        _floats([one.v_covariance for one in tracks], 9).reshape(-1, 3, 3),
         _stamps([one.lights for one in tracks]),
         _floats([one.age_s for one in tracks]),
+        _floats([one.range_m for one in tracks]),
+        *_ned_columns(tracks),
+        tracks[0].mode if tracks else "",
     )
+
+
+def _ned_columns(
+    found: Sequence[RelativePose] | Sequence[Track],
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Return place and sigma in NED, azimuth and sigma, inclination and sigma."""
+    return (
+        _floats([_NOWHERE if one.t_ned_m is UNSET else one.t_ned_m for one in found], 3),
+        _floats([_NOWHERE if one.sigma_ned_m is UNSET else one.sigma_ned_m for one in found], 3),
+        _floats([_known(one.azimuth_rad) for one in found]),
+        _floats([_known(one.sigma_azimuth_rad) for one in found]),
+        _floats([_known(one.inclination_rad) for one in found]),
+        _floats([_known(one.sigma_inclination_rad) for one in found]),
+    )
+
+
+def _sigma_m(covariance: Floats) -> Floats:
+    sigma_m: Floats = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, :3])
+    return sigma_m
 
 
 def truth_columns(truths: Sequence[Truth]) -> TruthColumns:

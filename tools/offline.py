@@ -1,28 +1,51 @@
-"""The whole pipeline in memory: a dive's messages in, poses and rejections out, no file written."""
+"""The whole pipeline in memory: a dive's messages in, poses, rejections and track out, no file written."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import cast
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Candidates, CompressedImage, Message, NodeInfo, Rejected, RelativePose
-from buddyline.solver_service.choices import CHECKS
+from buddyline.protocol.messages import (
+    Candidates,
+    CompressedImage,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    Track,
+    TrackMode,
+)
+from buddyline.solver_service.choices import CHECKS, TRACKS
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
-from buddyline.tools.columns import Pair, PoseColumns, RejectionColumns, in_order, pose_columns, rejection_columns
+from buddyline.solver_service.tracking import TrackSettings
+from buddyline.tools.columns import (
+    Pair,
+    PoseColumns,
+    RejectionColumns,
+    TrackColumns,
+    in_order,
+    pose_columns,
+    rejection_columns,
+    track_columns,
+)
 from buddyline.tools.dives import Dive
+from buddyline.tools.solve import TOGETHER
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedDive:
-    """What became of a dive's triggers, as columns by time. pair: a and b of T_a_b."""
+    """What became of a dive's triggers, and the track, as columns by time. pair: a and b of T_a_b."""
 
     pair: Pair
     poses: PoseColumns
     rejections: RejectionColumns
+    track: TrackColumns
 
 
 def solve_messages(
@@ -32,11 +55,14 @@ def solve_messages(
     method: str = "refined",
     checks: Sequence[str] = CHECKS,
     clock_offset_s: float = 0.0,
+    track: str = "smooth",
+    track_hz: float = 50.0,
 ) -> SolvedDive:
-    """Solve a pair's messages (NodeInfo, Candidates, Attitude, Depth), in the order in which they were received.
+    """Solve a pair's messages (NodeInfo, Candidates, Imu, Attitude, Depth), in the order in which they were received.
 
-    pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. The results are those
-    of `buddyline solve`. Raises BuddylineError where the pair or its calibration is not there.
+    pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. track:
+    "smooth", "lag", "filter" or "none". The results are those of `buddyline solve`. Raises BuddylineError where the
+    pair or its calibration is not there.
     """
     taken = list(messages)
     chosen = _pair(sorted({message.node for message in taken if isinstance(message, Candidates)}), pair)
@@ -45,13 +71,28 @@ def solve_messages(
         if node not in known:
             raise BuddylineError(f"no NodeInfo of node {node}")
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
-    core = SolverCore(settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)})
-    outcomes = core.handle_many(taken) + core.flush()
+    core = SolverCore(
+        settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)}, track=_track_settings(track, track_hz)
+    )
+    rest, outcomes = iter(taken), list[Message]()
+    # A node's streams keep a minute: what is handed over at once has to be less.
+    while together := list(islice(rest, TOGETHER)):
+        outcomes += core.handle_many(together)
+    outcomes += core.flush()
     return SolvedDive(
         chosen,
         pose_columns(in_order(one for one in outcomes if isinstance(one, RelativePose))),
         rejection_columns(sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)),
+        track_columns(in_order(one for one in outcomes if isinstance(one, Track))),
     )
+
+
+def _track_settings(mode: str, rate_hz: float) -> TrackSettings | None:
+    if mode not in TRACKS:
+        raise BuddylineError(f"track={mode!r}: one of {', '.join(TRACKS)}")
+    if not 0.1 <= rate_hz <= 1000.0:
+        raise BuddylineError(f"track_hz={rate_hz:g}: give 0.1 to 1000")
+    return None if mode == "none" else TrackSettings(frozenset((cast(TrackMode, mode),)), rate_hz)
 
 
 def solve_logs(
@@ -63,6 +104,8 @@ def solve_logs(
     clock_offset_s: float = 0.0,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
+    track: str = "smooth",
+    track_hz: float = 50.0,
 ) -> SolvedDive:
     """Solve a stored dive; the pictures of a node without candidates are detected first.
 
@@ -70,7 +113,15 @@ def solve_logs(
     """
     with Dive([Path(log) for log in logs]) as dive:
         found = list(_messages(dive, environment, dict(infos or {})))
-        return solve_messages(found, pair=pair, method=method, checks=checks, clock_offset_s=clock_offset_s)
+        return solve_messages(
+            found,
+            pair=pair,
+            method=method,
+            checks=checks,
+            clock_offset_s=clock_offset_s,
+            track=track,
+            track_hz=track_hz,
+        )
 
 
 def _messages(dive: Dive, environment: str, infos: dict[str, NodeInfo]) -> Iterator[Message]:
@@ -81,7 +132,7 @@ def _messages(dive: Dive, environment: str, infos: dict[str, NodeInfo]) -> Itera
         from buddyline.tools.detect import DEFAULT_METHOD, DiveDetector
 
         detector = DiveDetector(DEFAULT_METHOD, environment, dive.infos() | infos)
-    topics = ("info", "candidates", "attitude", "depth", *(("image",) if raw else ()))
+    topics = ("info", "candidates", "imu", "attitude", "depth", *(("image",) if raw else ()))
     for envelope in dive.messages(*topics):
         message = envelope.message
         if isinstance(message, CompressedImage):

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import buddyline
 import numpy as np
@@ -56,6 +57,47 @@ def test_in_memory_and_by_command_are_the_same(solved):
     np.testing.assert_allclose(memory.poses.t_ned_m, poses.t_ned_m, atol=1e-9)
     np.testing.assert_array_equal(memory.rejections.trigger, rejections.trigger)
     np.testing.assert_array_equal(memory.rejections.reason, rejections.reason)
+
+
+def test_the_track_of_memory_is_that_of_the_log(solved):
+    memory, dive = buddyline.solve(CAVERN).track, buddyline.open_dive(solved).track()
+    said = [entry.message for entry in read_log(solved) if entry.topic == "track"]
+    said.sort(key=lambda one: one["stamp_ns"])
+    n = len(said)
+    assert n > 300
+    assert dive.mode == memory.mode == "smooth"
+    np.testing.assert_array_equal(dive.stamp_ns, [one["stamp_ns"] for one in said])
+    for name in ("t_a_b_m", "q_a_b_xyzw", "v_a_b_mps", "lights", "age_s", "range_m", "t_ned_m", "sigma_ned_m"):
+        np.testing.assert_array_equal(getattr(dive, name), [one[name] for one in said], err_msg=name)
+    for name in ("azimuth_rad", "sigma_azimuth_rad", "inclination_rad", "sigma_inclination_rad"):
+        np.testing.assert_array_equal(getattr(dive, name), [one[name] for one in said], err_msg=name)
+    np.testing.assert_array_equal(dive.covariance.reshape(n, 36), [one["covariance"] for one in said])
+    np.testing.assert_array_equal(dive.v_covariance.reshape(n, 9), [one["v_covariance"] for one in said])
+    np.testing.assert_array_equal(memory.stamp_ns, dive.stamp_ns)
+    np.testing.assert_allclose(memory.t_a_b_m, dive.t_a_b_m, atol=1e-6)
+    np.testing.assert_allclose(dive.sigma_m[0], np.sqrt(np.diag(dive.covariance[0])[:3]))
+
+
+def test_a_track_can_be_left_out_and_a_mode_must_be_known():
+    without = buddyline.solve(CAVERN, track="none")
+    assert len(without.track) == 0
+    assert without.track.mode == ""
+    assert without.track.covariance.shape == (0, 6, 6)
+    assert len(without.poses) > 100
+    with pytest.raises(buddyline.BuddylineError, match="track='best': one of smooth, lag, filter, none"):
+        buddyline.solve(CAVERN, track="best")
+    with pytest.raises(buddyline.BuddylineError, match="track_hz=0"):
+        buddyline.solve(CAVERN, track_hz=0.0)
+
+
+def test_of_a_recording_s_tracks_the_best_is_taken(tmp_path, solved):
+    tracks = [entry for entry in read_log(solved) if entry.topic == "track"][:10]
+    live = [entry.saying(mode="filter") for entry in tracks]
+    late = [replace(entry.saying(mode="lag"), key=entry.key.replace("/track", "/track_lag")) for entry in tracks[:4]]
+    dive = buddyline.open_dive(write_log(tmp_path / "live.mcap", live + late))
+    assert (dive.track().mode, len(dive.track())) == ("lag", 4)
+    assert (dive.track(mode="filter").mode, len(dive.track(mode="filter"))) == ("filter", 10)
+    assert len(dive.track(mode="smooth")) == 0
 
 
 def test_sensors_truth_and_candidates():

@@ -52,17 +52,17 @@ def ned_honesty(
     for said, true_t_m in found:
         stamp_ns = said.stamp_ns + (said.skew_ns // 2 if isinstance(said, RelativePose) else 0)
         known = ned_camera_a.at(stamp_ns)
-        if known is None or said.t_ned_m is UNSET or said.sigma_ned_m is UNSET:
+        angles = (said.azimuth_rad, said.inclination_rad, said.sigma_azimuth_rad, said.sigma_inclination_rad)
+        told = [angle for angle in angles if angle is not UNSET]
+        if known is None or said.t_ned_m is UNSET or said.sigma_ned_m is UNSET or len(told) < len(angles):
             continue
         true_m = rotate(known[1], true_t_m)
         azimuth_rad, inclination_rad = angles_of(true_m[None])
-        off = np.subtract(
-            (*said.t_ned_m, said.azimuth_rad, said.inclination_rad), (*true_m, *azimuth_rad, *inclination_rad)
-        )
+        off = np.subtract((*said.t_ned_m, *told[:2]), (*true_m, *azimuth_rad, *inclination_rad))
         off[3] = wrapped(off[3:4])[0]
         errors.append(off)
-        sigmas.append((*said.sigma_ned_m, said.sigma_azimuth_rad, said.sigma_inclination_rad))
+        sigmas.append((*said.sigma_ned_m, *told[2:]))
     if not errors:
         return None
-    squares = (np.array(errors) / np.maximum(np.array(sigmas, dtype=float), 1e-12)) ** 2
+    squares = (np.array(errors) / np.maximum(np.array(sigmas), 1e-12)) ** 2
     return NedHonesty(len(errors), *squares.mean(axis=0).tolist())
