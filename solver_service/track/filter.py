@@ -56,6 +56,10 @@ MAX_DELAY_S: Final = 0.03
 CHECK_EVERY_S: Final = 2.0
 REJECTED_TO_SAY: Final = 10
 REFUSED_TO_SAY: Final = 10
+LEAST_SIGMA_RAD: Final = 1e-3
+UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
+# No fix's numbers, in m, rad and their squares, are as large.
+BEYOND: Final = 1e4
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
 WITHOUT_RAD: Final = 0.03
@@ -205,7 +209,10 @@ class TrackFilter:
         self.samples[node].add(times_s, values)
 
     def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
-        """Take an attitude message."""
+        """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
+        if not (seen.sigma_rad > LEAST_SIGMA_RAD).all():
+            seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
+            self._report(f"node {'ab'[node]}: attitude sigmas of nothing are taken for unknown")
         t_s = self.seconds(node, seen.stamp_ns)
         bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
         self._turning[node].add(t_s, self.level_camera(node, seen))
@@ -224,7 +231,11 @@ class TrackFilter:
         self._push(t_s, 1 + node, sight)
 
     def add_fix(self, fix: FixSeen) -> None:
-        """Take a pose that one trigger's lights gave by themselves."""
+        """Take a pose that one trigger's lights gave by themselves; one beyond all measure is left out."""
+        numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
+        if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
+            self._report("nodes a and b: fixes beyond all measure are left out")
+            return
         self._push(self.between(fix.stamp_ns), 0, fix)
 
     def _push(self, t_s: float, kind: int, what: Sight | FixSeen | int) -> None:

@@ -241,3 +241,36 @@ def test_a_faulty_unit_is_named_and_left_out(dive: Dive, fault: str) -> None:
     judged = score(dive, result.rows)
     assert judged.wrong == 0
     assert judged.covered >= 0.95
+
+
+@pytest.mark.parametrize("harm", ["nothing", "one node", "pixels", "fixes", "frames twice", "attitudes", "no sensors"])
+def test_absurd_input_never_crashes(dive: Dive, harm: str) -> None:
+    a, b = dive.records
+    fixes = list(dive.fixes)
+    if harm == "nothing":
+        a, b = (replace(r, frames=(), attitudes=(), depths=()) for r in (a, b))
+        fixes = []
+    elif harm == "one node":
+        b = replace(b, frames=())
+    elif harm == "pixels":
+        spoilt = [
+            replace(f, pixels=f.pixels * np.array((np.nan, 1e300)), sigma_px=0.0 * f.sigma_px) if i % 5 == 0 else f
+            for i, f in enumerate(b.frames)
+        ]
+        b = replace(b, frames=spoilt)
+    elif harm == "fixes":
+        fixes[0] = replace(fixes[0], t_a_b_m=np.full(3, np.nan))
+        fixes[3] = replace(fixes[3], covariance=np.zeros((6, 6)))
+        fixes[6] = replace(fixes[6], covariance=np.full((6, 6), np.inf))
+        fixes[9] = replace(fixes[9], t_a_b_m=np.full(3, 1e200))
+    elif harm == "frames twice":
+        b = replace(b, frames=[f for f in b.frames for _ in (0, 1)])
+    elif harm == "attitudes":
+        b = replace(b, attitudes=[replace(s, sigma_rad=0.0 * s.sigma_rad) for s in b.attitudes])
+    else:
+        bare = {"imu_stamps_ns": np.zeros(0, np.int64), "accel_mps2": np.zeros((0, 3)), "gyro_radps": np.zeros((0, 3))}
+        a, b = (replace(r, attitudes=(), depths=(), **bare) for r in (a, b))
+    rows = smooth((a, b), fixes, dive.stamps_ns).rows
+    assert all(np.isfinite(row.covariance).all() and np.isfinite(row.t_a_b_m).all() for row in rows)
+    if rows:
+        assert score(dive, rows).wrong == 0
