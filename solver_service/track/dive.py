@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.filter import Estimate, Guide, Step, TrackFilter
+from buddyline.solver_service.track.estimate import Estimate, Guide, Step
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow

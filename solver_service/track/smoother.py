@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
-from buddyline.solver_service.track.filter import Step
+from buddyline.solver_service.track.estimate import Step
 from buddyline.solver_service.track.output import TrackRow, row_of
 from buddyline.solver_service.track.state import NAV, State
 from buddyline.solver_service.track.strapdown import predicted

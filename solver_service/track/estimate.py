@@ -1,0 +1,104 @@
+"""One hypothesis of a track, its steps, and what a pass over a dive leaves to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats, rotation_log
+from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.state import State
+
+CHALLENGE_S: Final = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One picture within a step, and the lights that were used: (candidate, light, variance)."""
+
+    sight: Sight
+    chosen: tuple[tuple[int, int, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of a track as the smoother needs it.
+
+    before: predicted; after, covariance: with what was seen at t_s. F (NAV, SIZE), Q (NAV, NAV), walk: how it came here
+    from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
+    """
+
+    t_s: float
+    before: State
+    after: State
+    covariance: Floats
+    F: Floats
+    Q: Floats
+    walk: Floats
+    rates_radps: Floats
+    light_s: float
+    lights: int
+    looks: tuple[Look, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """What a whole pass over the dive knew at one picture: for the next pass to decide its lights again.
+
+    after_s: the picture's time after the pass's step.
+    """
+
+    after_s: float
+    state: State
+    covariance: Floats
+    rates_radps: Floats
+    chosen: tuple[tuple[int, int, float], ...]
+
+
+@dataclass(eq=False)
+class Estimate:
+    """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
+
+    evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
+
+    detection (2, 2): by observer and light, how likely the light is found where it is in the picture.
+    """
+
+    t_s: float
+    state: State
+    covariance: Floats
+    start_s: float
+    evidence: float = 0.0
+    evidence_by: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    baseline: float = 0.0
+    detection: Floats = field(default_factory=lambda: np.full((2, 2), 0.8))
+    rates_radps: Floats = field(default_factory=lambda: np.zeros((2, 3)))
+    light_s: float = -np.inf
+    trigger: list[tuple[float, int, int]] = field(default_factory=list)
+    attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
+    depth_s: float = -np.inf
+    steps: list[Step] = field(default_factory=list)
+    confirmed: bool = False
+    surprise: float = 0.0
+    told: int = 0
+    end_s: float = np.inf
+    skip_s: float = 0.02
+    patience_s: float = CHALLENGE_S
+    unseen_by: int | None = None
+    searched: bool = False
+    bars: int = 0
+    told_by: list[int] = field(default_factory=lambda: [0, 0])
+    without: list[bool] = field(default_factory=lambda: [False, False])
+
+
+def alike(one: Estimate, other: Estimate) -> bool:
+    """Whether two estimates are of one pose: a twentieth of the range and 0.06 rad."""
+    if one.unseen_by != other.unseen_by:
+        return False
+    range_m = float(np.linalg.norm(other.state.r_m))
+    first, second = (e.state.R[0].T @ e.state.r_m for e in (one, other))
+    if np.linalg.norm(first - second) > 0.05 * range_m:
+        return False
+    turned, meant = (e.state.R[0].T @ e.state.R[1] for e in (one, other))
+    return float(np.linalg.norm(rotation_log(turned @ meant.T))) < 0.06

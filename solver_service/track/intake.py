@@ -1,0 +1,149 @@
+"""What comes into a track: samples, sensors, pictures and fixes, each at its time."""
+
+from __future__ import annotations
+
+import bisect
+import heapq
+from dataclasses import replace
+from typing import Final, TypeVar
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.lights import Sight, sight_of
+from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.turning import Turning
+from buddyline.solver_service.track.units import clipped, fault_of
+
+CHECK_EVERY_S: Final = 2.0
+REJECTED_TO_SAY: Final = 10
+LEAST_SIGMA_RAD: Final = 1e-3
+UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
+# No fix's numbers, in m, rad and their squares, are as large.
+BEYOND: Final = 1e4
+Seen = TypeVar("Seen", AttitudeSeen, DepthSeen)
+
+
+class TrackIntake:
+    """All that two nodes, a (0) and b (1), have told, in order of time. `problems` says what is wrong with it."""
+
+    def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
+        self.nodes = nodes
+        self.problems: list[str] = []
+        self.epoch_ns: int | None = None
+        self.clock_ns = 0
+        self.samples = (Samples(), Samples())
+        self._attitudes: tuple[list[tuple[float, AttitudeSeen]], list[tuple[float, AttitudeSeen]]] = ([], [])
+        self._depths: tuple[list[tuple[float, DepthSeen]], list[tuple[float, DepthSeen]]] = ([], [])
+        self._events: list[tuple[float, int, int, Sight | FixSeen | int]] = []
+        self._turning = (Turning(), Turning())
+        self._ports = np.stack([node.rig.depth_port_m for node in self.nodes])
+        self._count = 0
+        self._checked_s = -np.inf
+
+    def seconds(self, node: int, stamp_ns: int) -> float:
+        """Give a stamp of a node as s since the epoch, on A's clock as first believed."""
+        if self.epoch_ns is None:
+            self.epoch_ns = stamp_ns - stamp_ns % 86_400_000_000_000
+        return (stamp_ns - (self.clock_ns if node else 0) - self.epoch_ns) * 1e-9
+
+    def between(self, stamp_ns: int) -> float:
+        """Give a stamp between both clocks, as those of fixes and rows are, as `seconds` does."""
+        return self.seconds(0, stamp_ns - self.clock_ns // 2)
+
+    def add_imu(self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats) -> None:
+        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame."""
+        if not len(stamps_ns):
+            return
+        self.seconds(node, int(stamps_ns[0]))
+        assert self.epoch_ns is not None
+        times_s = np.asarray(stamps_ns - (self.clock_ns if node else 0) - self.epoch_ns, np.float64) * 1e-9
+        R_body_camera = self.nodes[node].rig.R_body_camera
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = np.hstack((accel_mps2 @ R_body_camera, gyro_radps @ R_body_camera))
+            values[clipped(gyro_radps), 3:] = np.nan
+        self.samples[node].add(times_s, values)
+
+    def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
+        """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
+        if not (seen.sigma_rad > LEAST_SIGMA_RAD).all():
+            seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
+            self._report(f"node {'ab'[node]}: attitude sigmas of nothing are taken for unknown")
+        t_s = self.seconds(node, seen.stamp_ns)
+        bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
+        self._turning[node].add(t_s, self.level_camera(node, seen))
+
+    def add_depth(self, node: int, seen: DepthSeen) -> None:
+        """Take a depth message."""
+        bisect.insort(self._depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
+
+    def add_frame(self, node: int, frame: Frame) -> None:
+        """Take a picture's candidates."""
+        t_s = self.seconds(node, frame.stamp_ns)
+        dt_s = np.zeros(len(frame.pixels))
+        if len(frame.dt_ns):
+            dt_s += frame.dt_ns * 1e-9
+        sight = sight_of(self.nodes[node].rig, node, frame.stamp_ns, t_s, frame.pixels, frame.sigma_px, dt_s)
+        self._push(t_s, 1 + node, sight)
+
+    def add_fix(self, fix: FixSeen) -> None:
+        """Take a pose that one trigger's lights gave by themselves; one beyond all measure is left out."""
+        numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
+        if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
+            self._report("nodes a and b: fixes beyond all measure are left out")
+            return
+        self._push(self.between(fix.stamp_ns), 0, fix)
+
+    def _push(self, t_s: float, kind: int, what: Sight | FixSeen | int) -> None:
+        # The count keeps two of a kind at one time in their order: they cannot be compared.
+        self._count += 1
+        heapq.heappush(self._events, (t_s, kind, self._count, what))
+
+    def level_camera(self, node: int, seen: AttitudeSeen) -> Floats:
+        """Give R_level_camera of an attitude message."""
+        R: Floats = seen.R_ned_body @ self.nodes[node].rig.R_body_camera
+        return R
+
+    def _check_units(self, t_s: float) -> None:
+        """Every seconds, say what is wrong with a unit; it is not used until it is well again."""
+        if t_s - self._checked_s < CHECK_EVERY_S:
+            return
+        # At the dive's start there is little to judge by: at every picture, until there is enough.
+        if min(len(samples.last(t_s, CHECK_EVERY_S)) for samples in self.samples) > 100:
+            self._checked_s = t_s
+        for node, samples in enumerate(self.samples):
+            seen = newest_before(self._attitudes[node], t_s)
+            down = None
+            if seen is not None and t_s - seen[0] < 0.5:
+                down = self.level_camera(node, seen[1])[2]
+            fault = fault_of("ab"[node], samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
+            samples.trusted = fault is None
+            if fault is not None:
+                self._report(fault)
+            if samples.rejected > REJECTED_TO_SAY:
+                self._report(f"node {'ab'[node]}: inertial samples not finite, clipped or sent twice are left out")
+
+    def _report(self, problem: str) -> None:
+        """Add a problem, each kind once."""
+        kind = problem.split(":")[0:1] + problem.split(":")[-1:]
+        if all(known.split(":")[0:1] + known.split(":")[-1:] != kind for known in self.problems):
+            self.problems.append(problem)
+
+    def _forget_before(self, t_s: float) -> None:
+        """Drop what no step will look at again."""
+        for node in (0, 1):
+            self.samples[node].forget_before(t_s)
+            self._turning[node].forget_before(t_s)
+            for items in (self._attitudes[node], self._depths[node]):
+                while len(items) > 1 and items[0][0] < t_s:
+                    items.pop(0)
+
+
+def _time_of(item: tuple[float, object]) -> float:
+    return item[0]
+
+
+def newest_before(items: list[tuple[float, Seen]], t_s: float) -> tuple[float, Seen] | None:
+    """Give the last of (time, message) at or before t_s, None where there is none."""
+    at = bisect.bisect_right(items, t_s, key=_time_of)
+    return items[at - 1] if at else None

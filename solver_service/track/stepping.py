@@ -1,0 +1,269 @@
+"""How an estimate moves from picture to picture, and what each sensor adds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.track import anchors
+from buddyline.solver_service.track.association import Association, associate
+from buddyline.solver_service.track.estimate import Estimate, Guide, Look, Step
+from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.intake import TrackIntake, newest_before
+from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals
+from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
+from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
+
+# How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
+HOLD_S: Final = 0.05
+# Longest step without a frame.
+TICK_S: Final = 0.1
+# Two pictures nearer than this share a step: the state is carried over so short a time by its rates.
+TOGETHER_S: Final = 0.005
+ATTITUDE_EVERY_S: Final = 0.5
+MAX_DELAY_S: Final = 0.03
+# How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
+WITHOUT_RADPS: Final = 0.25
+WITHOUT_RAD: Final = 0.03
+BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
+
+
+class TrackSteps(TrackIntake):
+    """Moves estimates by what has come in. unrest: how much of the guessed motion's noise is taken."""
+
+    def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float) -> None:
+        super().__init__(nodes)
+        self.unrest = 1.0
+        self.guides: dict[tuple[int, int], Guide] = {}
+        self._keep_s = keep_s
+
+    def increments(self, estimate: Estimate, t_s: float) -> tuple[Increment, Increment]:
+        """Integrate both nodes from the estimate's time to t_s."""
+        state = estimate.state
+        parts = []
+        for node in (0, 1):
+            shift = float(np.clip(state.delay_s[node], -MAX_DELAY_S, MAX_DELAY_S))
+            grid, values, told = self.samples[node].between(estimate.t_s + shift, t_s + shift, t_s + HOLD_S)
+            without = not told.any() and not self.samples[node].near(t_s + shift, t_s + HOLD_S)
+            if without:
+                values = np.zeros_like(values)
+            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told)
+            parts.append(replace(part, without=True) if without else part)
+        return parts[0], parts[1]
+
+    def _noises(self, t_s: float) -> tuple[Noise, Noise]:
+        a, b = (self.samples[node].noise(t_s).scaled(self.unrest) for node in (0, 1))
+        return a, b
+
+    def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
+        span_s = t_s - estimate.t_s
+        parts = self.increments(estimate, t_s)
+        noises = self._noises(t_s)
+        after, F = propagate(estimate.state, parts, span_s)
+        Q, walk = process_noise(after, parts, noises, span_s)
+        for node, part in enumerate(parts):
+            if part.without != estimate.without[node]:
+                # The unit has stopped, or come back: its constants and what stands in their place are told anew.
+                estimate.without[node] = part.without
+                walk[GYRO_BIAS[node].start - NAV : GYRO_BIAS[node].stop - NAV] += WITHOUT_RADPS**2
+                walk[MOUNT[node].start - NAV : MOUNT[node].stop - NAV] += WITHOUT_RAD**2
+        estimate.covariance = predicted(estimate.covariance, F, Q, walk)
+        estimate.state, estimate.t_s = after, t_s
+        estimate.rates_radps = np.stack((parts[0].rate_radps, parts[1].rate_radps))
+        return F, Q, walk
+
+    def _step(self, estimate: Estimate, t_s: float, sight: Sight | None) -> None:
+        """Bring an estimate to t_s, by ticks where that is long, and update it."""
+        while t_s - estimate.t_s > 1.5 * TICK_S:
+            self._step(estimate, estimate.t_s + TICK_S, None)
+        together = sight is not None and t_s - estimate.t_s < TOGETHER_S and bool(estimate.steps or not self._keep_s)
+        looks: tuple[Look, ...] = ()
+        if not together:
+            moved = self._move(estimate, t_s)
+            before = estimate.state
+            self._take_depth(estimate, t_s)
+            self._take_attitude(estimate, t_s)
+            self._take_turning(estimate, t_s)
+        if sight is not None:
+            looks = (self._take_lights(estimate, sight),)
+        if not self._keep_s:
+            return
+        while estimate.steps and estimate.steps[0].t_s < t_s - self._keep_s:
+            estimate.steps.pop(0)
+        lights = sum(len(look.chosen) for look in looks)
+        if together:
+            last = estimate.steps[-1]
+            estimate.steps[-1] = replace(
+                last,
+                after=estimate.state,
+                covariance=estimate.covariance,
+                light_s=estimate.light_s,
+                lights=last.lights + lights,
+                looks=last.looks + looks,
+            )
+        else:
+            estimate.steps.append(
+                Step(
+                    t_s=t_s,
+                    before=before,
+                    after=estimate.state,
+                    covariance=estimate.covariance,
+                    F=moved[0],
+                    Q=moved[1],
+                    walk=moved[2],
+                    rates_radps=estimate.rates_radps,
+                    light_s=estimate.light_s,
+                    lights=lights,
+                    looks=looks,
+                )
+            )
+
+    def _take_lights(self, estimate: Estimate, sight: Sight) -> Look:
+        observer = sight.node
+        lights_m = self.nodes[1 - observer].rig.lights_m
+        camera = self.nodes[observer].rig.camera
+        offset_s = sight.t_s - estimate.t_s
+        X, D = light_positions(estimate.state, observer, lights_m, estimate.rates_radps, sight.dt_s + offset_s)
+        detection = estimate.detection[observer].copy()
+        wide = estimate.covariance[:3, :3].trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
+        if wide:
+            inside = [True, True]
+        else:
+            at = X[0] if len(X) else self._expected(estimate, observer)
+            inside = [in_picture(camera, at[light]) for light in (0, 1)]
+            detection = detection * np.where(inside, 1.0, 0.02)
+        clutter = max(len(sight.index) - 1.0, 1.0) / camera.area_px2
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        guide = self.guides.get((sight.stamp_ns, observer))
+        if guide is None:
+            found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
+        else:
+            found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+        estimate.evidence += found.evidence
+        estimate.evidence_by[observer] += found.evidence
+        for light in (0, 1):
+            if inside[light]:
+                old = estimate.detection[observer, light]
+                estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
+        if found.chosen:
+            self._update_lights(estimate, found, y, H, sight)
+            if estimate.unseen_by == observer:
+                estimate.unseen_by = None
+            estimate.bars += len(found.chosen) == 2
+            estimate.told_by[observer] += 1
+        return Look(sight, found.chosen)
+
+    def _expected(self, estimate: Estimate, observer: int) -> Floats:
+        lights_m = self.nodes[1 - observer].rig.lights_m
+        X, _ = light_positions(estimate.state, observer, lights_m, estimate.rates_radps, np.zeros(1))
+        at: Floats = X[0]
+        return at
+
+    def _without(self, guide: Guide, sight: Sight) -> tuple[Floats, Floats, Floats]:
+        """Give residuals, Jacobians and covariance by all the dive but this picture.
+
+        The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
+        """
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        dt_s = sight.dt_s + guide.after_s
+        X, D = light_positions(guide.state, sight.node, lights_m, guide.rates_radps, dt_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        P = guide.covariance
+        if guide.chosen:
+            H_used = np.concatenate([H[k, light] for k, light, _ in guide.chosen])
+            y_used = np.concatenate([y[k, light] for k, light, _ in guide.chosen])
+            R = np.diag(np.repeat([variance for _, _, variance in guide.chosen], 2))
+            across = P @ H_used.T
+            rest = R - H_used @ across
+            # Rounding, and pictures that share a step, can leave less than nothing.
+            values, vectors = np.linalg.eigh(rest)
+            inverse = (vectors / np.maximum(values, 0.02 * R[0, 0])) @ vectors.T
+            gain = across @ inverse
+            P = P + gain @ across.T
+            y = y + H @ (gain @ y_used)
+        return y, H, P
+
+    def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
+        rows_y = np.concatenate([y[k, light] for k, light, _ in found.chosen])
+        rows_H = np.zeros((len(rows_y), SIZE))
+        rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in found.chosen])
+        noise = np.diag(np.repeat([variance for _, _, variance in found.chosen], 2))
+        estimate.surprise += self._apply(estimate, rows_H, rows_y, noise)
+        estimate.told += len(rows_y)
+        estimate.light_s = max(estimate.light_s, sight.t_s)
+        estimate.trigger = [seen for seen in estimate.trigger if sight.t_s - seen[0] < 0.03]
+        estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
+
+    @staticmethod
+    def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> float:
+        error, estimate.covariance, chi2 = anchors.kalman(estimate.covariance, H, y, noise)
+        estimate.state = estimate.state.plus(error)
+        return chi2
+
+    def _take_depth(self, estimate: Estimate, t_s: float) -> None:
+        of_a, of_b = (newest_before(of_node, t_s) for of_node in self._depths)
+        if of_a is None or of_b is None:
+            return
+        (time_a, a), (time_b, b) = of_a, of_b
+        time_s = max(time_a, time_b)
+        if min(time_a, time_b) <= estimate.depth_s or t_s - time_s > 0.3 or abs(time_a - time_b) > 0.2:
+            return
+        estimate.depth_s = time_s
+        y, H = anchors.depth_residual(estimate.state, b.depth_m - a.depth_m, t_s - 0.5 * (time_a + time_b), self._ports)
+        noise = a.sigma_m**2 + b.sigma_m**2 + (0.3 * (time_a - time_b)) ** 2 + 1e-6
+        variance = float((H @ estimate.covariance @ H.T)[0, 0]) + noise
+        if y[0] ** 2 < 16.0 * variance:
+            self._apply(estimate, H, y, np.array([[noise]]))
+
+    def _take_attitude(self, estimate: Estimate, t_s: float) -> None:
+        for node in (0, 1):
+            found = newest_before(self._attitudes[node], t_s)
+            since = t_s - estimate.attitude_s[node]
+            if found is None or since < ATTITUDE_EVERY_S or t_s - found[0] > 0.1:
+                continue
+            time_s, seen = found
+            first = estimate.attitude_s[node] == -np.inf
+            estimate.attitude_s[node] = t_s
+            camera = self.level_camera(node, seen)
+            turn = estimate.rates_radps[node] * (t_s - time_s)
+            y, H = anchors.attitude_residual(estimate.state, node, camera @ rotation_exp(turn))
+            factors = (1.0, 1.0) if first else (2.0 * anchors.TILT_TIME_S / since, 2.0 * anchors.HEADING_TIME_S / since)
+            noise = anchors.attitude_covariance(seen.R_ned_body, seen.sigma_rad, *factors)
+            S = noise + (H @ estimate.covariance @ H.T)
+            chi2 = float(y @ np.linalg.solve(S, y))
+            if chi2 > 16.0:
+                noise = noise * (chi2 / 4.0)
+            self._apply(estimate, H, y, noise)
+
+    def _take_turning(self, estimate: Estimate, t_s: float) -> None:
+        """Update a node without an inertial unit by its attitude as it is at t_s, which may be off by a slow error."""
+        for node in (0, 1):
+            near = self._turning[node].at(t_s, t_s + HOLD_S) if estimate.without[node] else None
+            if near is None:
+                continue
+            R_level_camera, variances = near
+            y, H = anchors.attitude_residual(estimate.state, node, R_level_camera)
+            y = y - estimate.state.mount_rad[node]
+            H[:, MOUNT[node]] = np.eye(3)
+            noise = (R_level_camera * variances) @ R_level_camera.T
+            S = noise + (H @ estimate.covariance @ H.T)
+            if float(y @ np.linalg.solve(S, y)) < 30.0:
+                self._apply(estimate, H, y, noise)
+
+    def _open(self, estimate: Estimate) -> None:
+        if self._keep_s:
+            still = np.eye(SIZE)[:NAV], np.zeros((NAV, NAV)), np.zeros(SIZE - NAV)
+            state, rates = estimate.state, estimate.rates_radps
+            first = Step(estimate.t_s, state, state, estimate.covariance, *still, rates, estimate.light_s, 0)
+            estimate.steps.append(first)
+
+    def _predict(self, estimate: Estimate, t_s: float, least_s: float = 0.0) -> tuple[State, Floats]:
+        span_s = t_s - estimate.t_s
+        if span_s <= least_s:
+            return estimate.state, estimate.covariance
+        parts = self.increments(estimate, t_s)
+        after, F = propagate(estimate.state, parts, span_s)
+        Q, walk = process_noise(after, parts, self._noises(t_s), span_s)
+        return after, predicted(estimate.covariance, F, Q, walk)
