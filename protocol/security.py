@@ -125,7 +125,7 @@ def refusal(endpoint: str, tls: Tls | None) -> str | None:
             return None
         reason = error.reason or ""
         said = next((words for alert, words in _ALERT_WORDS.items() if alert in reason), None)
-        # Without one of these alerts nobody has judged. OpenSSL's other words differ from version to version.
+        # Only these alerts are a verdict on the certificate. OpenSSL's other texts differ from version to version.
         if said is None:
             return None
         return f"the hub at {endpoint} refuses {tls.certificate}: it {said}"

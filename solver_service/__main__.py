@@ -11,10 +11,10 @@ from buddyline.protocol.service import start_logging
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--config", metavar="FILE.toml", help="the solver's configuration (all of it has defaults)")
-    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, tcp/host:7447, in place of the configured one")
-    parser.add_argument("--nodes", metavar="A,B,...", help="solve the pairs of these alone, in place of the configured")
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+    parser.add_argument("--config", metavar="FILE.toml", help="the solver's configuration (every key has a default)")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, as tcp/host:7447; replaces the configured one")
+    parser.add_argument("--nodes", metavar="A,B,...", help="solve only the pairs of these, not the configured ones")
+    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,8 +1,8 @@
-"""The offset between two nodes' clocks, estimated from the dive itself.
+"""Estimate the offset between two nodes' clocks from the dive itself.
 
-A pair that moves is seen by A and by B at two instants if their clocks disagree: the range gap and the twist gap
-then follow the motion. Each fix gives two linear equations for the offset, by the motion of the fixes around it; a
-constant bias of either gap, from calibration, is estimated beside it.
+If the clocks disagree, A and B take their pictures of one trigger at different instants. While the pair moves, the
+range gap and the twist gap then follow the motion. Each fix gives two linear equations for the offset, with the
+motion taken from the fixes around it. A constant bias of each gap, from calibration errors, is estimated too.
 """
 
 from __future__ import annotations
@@ -23,22 +23,23 @@ Floats = NDArray[np.float64]
 
 STEP_S: Final = 1e-3
 MIN_FIXES: Final = 20
-# The motion at a fix is that of the fixes this far before and after it.
+# The motion at a fix is fitted to the fixes within this time before and after it.
 HALF_WINDOW_S: Final = 1.0
 MIN_NEIGHBOURS: Final = 2
-# A diver sways within the window: a straight line through it is a tenth too slow, a cubic is not, and needs more fixes.
+# A diver sways within the window. A straight line underestimates the velocity by a tenth; a cubic does not, but it
+# needs this many fixes.
 MIN_FOR_CUBIC: Final = 8
-# A gap further off than this many standard deviations has another cause than the clocks, and counts less.
+# Huber's threshold, in standard deviations: a residual beyond it has another cause than the clocks, and weighs less.
 HUBER: Final = 2.0
 ROUNDS: Final = 8
 MAX_EQUATIONS: Final = 20_000
-# Fixes are turned into equations in batches of this size: a batch costs little more than one fix.
+# Fixes are turned into equations in batches of this size, because a batch costs little more than one fix.
 BATCH: Final = 256
 
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """offset_s: B's clock minus A's (positive: B is ahead); sigma_s: 1 sd; fixes: how many it is from."""
+    """offset_s: B's clock minus A's (positive: B is ahead). sigma_s: its 1 sd. fixes: number of fixes used."""
 
     offset_s: float
     sigma_s: float
@@ -47,7 +48,7 @@ class ClockOffset:
 
 @dataclass(frozen=True)
 class _Sighting:
-    """A fix with what its equations need; see ClockAlignment.add."""
+    """A fix with the values for its equations; see ClockAlignment.add."""
 
     time_s: float
     fix: Fix
@@ -57,21 +58,21 @@ class _Sighting:
 
 
 class ClockAlignment:
-    """Collects the equations of a dive. Memory is bounded: the oldest equations are dropped."""
+    """Collects the equations of a dive, and solves them for the offset. Beyond MAX_EQUATIONS the oldest are dropped."""
 
     def __init__(self) -> None:
         self._rows: deque[Floats] = deque()  # batches (4, N) of gap kind, slope, value, sd
         self._window: deque[_Sighting] = deque()
-        self._next = 0  # the first of the window whose motion is still to be found
+        self._next = 0  # index of the first fix in the window without a motion yet
         self._moving: list[tuple[_Sighting, Floats]] = []  # with their rates (6,)
         self._rigs: tuple[Rig, Rig] | None = None
 
     def add(
         self, stamp_ns: int, fix: Fix, rigs: tuple[Rig, Rig], known_s: float, sigma_rad: tuple[float, float]
     ) -> None:
-        """Take one fix, in order of time.
+        """Take one fix; fixes come in order of time.
 
-        known_s: stamp of B's frame minus A's. sigma_rad: bearing noise of A's and B's view.
+        known_s: stamp of B's frame minus A's. sigma_rad: bearing noise, 1 sd, of A's and B's view.
         """
         if min(fix.pair_a + fix.pair_b) < 0:
             return
@@ -96,13 +97,16 @@ class ClockAlignment:
             self._make_equations()
 
     def _rates(self, centre: _Sighting) -> Floats | None:
-        """Velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,): of a cubic through its neighbours."""
+        """Return velocity (m/s) and turn rate (rad/s) of T_a_b at a fix, (6,), from a cubic through its neighbours.
+
+        None if it has too few neighbours. With fewer than MIN_FOR_CUBIC fixes: from a straight line.
+        """
         near = [s for s in self._window if abs(s.time_s - centre.time_s) <= HALF_WINDOW_S]
         times_s = np.array([s.time_s - centre.time_s for s in near])
         if (times_s < 0).sum() < MIN_NEIGHBOURS or (times_s > 0).sum() < MIN_NEIGHBOURS:
             return None
         turned = np.array([s.R_a_b for s in near]) @ centre.R_a_b.T
-        # Within the window a pair turns by some tenths of a radian: the sine of the angle over the angle matters.
+        # Within the window a pair turns by some tenths of a radian, too much to take the sine for the angle.
         sine = (
             np.stack(
                 (
@@ -120,7 +124,7 @@ class ClockAlignment:
         return np.asarray(np.linalg.lstsq(powers, moved, rcond=None)[0][1])
 
     def _make_equations(self) -> None:
-        """Turn the fixes whose motion is known into rows."""
+        """Turn the fixes with known motion into rows."""
         if not self._moving or self._rigs is None:
             return
         sightings = [sighting for sighting, _ in self._moving]
@@ -142,7 +146,7 @@ class ClockAlignment:
             self._rows.popleft()
 
     def estimate(self) -> ClockOffset | None:
-        """Return the offset, None where the fixes are too few or the pair did not move."""
+        """Return the offset; None if there are too few fixes, or the pair did not move."""
         self._make_equations()
         if sum(batch.shape[1] for batch in self._rows) < 2 * MIN_FIXES:
             return None
@@ -156,7 +160,7 @@ class ClockAlignment:
                 return None
             solution = np.linalg.solve(normal, design.T @ (weight * target))
             off = np.abs(target - design @ solution)
-            # The candidates' own noise may be stated wrongly: the residuals tell its scale.
+            # The stated noise of the candidates may be wrong: its scale is estimated from the residuals.
             scale = max(1.4826 * float(np.median(off)), 0.1)
             weight = np.minimum(1.0, HUBER * scale / np.maximum(off, 1e-12))
         sigma_s = scale * math.sqrt(float(np.linalg.inv(normal)[0, 0]))
@@ -164,10 +168,11 @@ class ClockAlignment:
 
 
 def gap_slopes(t_a_b_m: Floats, R_a_b: Floats, rates: Floats, rigs: tuple[Rig, Rig]) -> tuple[Floats, Floats, Floats]:
-    """Return both gaps of noise-free views, their slopes by the time B's view is later (1/s), and both alphas (rad).
+    """Return the gaps of noise-free views, their derivatives by the delay of B's view, and the angles between lights.
 
-    t_a_b_m: (K, 3), R_a_b: (K, 3, 3), rates: (K, 6). All three results are (2, K). The gaps: log of the ratio of
-    both ranges, and the twist gap.
+    t_a_b_m: (K, 3), R_a_b: (K, 3, 3), rates: (K, 6), m/s and rad/s. All three results are (2, K). Gaps: the log of the
+    ratio of both ranges, and the twist gap (rad). Derivatives: per s. Angles (alpha): rad, between the bearings of
+    B's lights in A's view, and of A's lights in B's view.
     """
     count = len(t_a_b_m)
     shifts_s = np.repeat([0.0, -STEP_S, STEP_S], count)[:, None]

@@ -1,4 +1,4 @@
-"""What can be chosen of the solver: known without loading what it names."""
+"""The names that the solver's configuration can choose from, without importing what they name."""
 
 from typing import Final
 

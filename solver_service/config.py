@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 
 class SolveConfig(Config, frozen=True, kw_only=True):
-    """[solve]: method, the checks to use, the ranges to believe; skew_sigma_s: how well the clocks agree, 1 sd."""
+    """[solve]: method, checks to use, possible ranges. skew_sigma_s: difference of the nodes' clocks, 1 sd."""
 
     method: str = "refined"
     checks: list[str] = field(default_factory=lambda: list(CHECKS))
@@ -28,7 +28,7 @@ class SolveConfig(Config, frozen=True, kw_only=True):
     skew_sigma_s: Annotated[float, Meta(ge=0)] = 0.0
 
     def settings(self, source: str) -> Settings:
-        """Return what the geometry takes; source: the file, for errors."""
+        """Return the settings of the geometry; raise ConfigError. source: the file's name in errors."""
         if self.method not in METHODS:
             raise ConfigError(f"{source}: solve.method = {self.method!r}: known are {', '.join(METHODS)}")
         unknown = [check for check in self.checks if check not in CHECKS]
@@ -47,20 +47,21 @@ class SolveConfig(Config, frozen=True, kw_only=True):
 
 
 class TrackConfig(Config, frozen=True, kw_only=True):
-    """[track]: the live track's rows a second; 0: no track."""
+    """[track]: rate of the live track's messages; 0 for no track."""
 
     rate_hz: Annotated[float, Meta(ge=0, le=200)] = 20.0
 
     @property
     def settings(self) -> TrackSettings | None:
-        """What the solver takes: the track as it goes, and a second later and better."""
+        """The settings of the tracks: one without delay, and a more accurate one a second later."""
         return TrackSettings(frozenset(("filter", "lag")), self.rate_hz) if self.rate_hz else None
 
 
 class SolverConfig(Config, frozen=True, kw_only=True):
-    """A whole solver. nodes: solve every pair of these; pairs: solve these, A first. Neither: every pair that appears.
+    """The solver's configuration.
 
-    status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py).
+    nodes: solve every pair of these nodes. pairs: solve these pairs, A first. Neither: solve every pair that appears.
+    status_file: its path; "" for the runtime directory (protocol/statusfile.py).
     """
 
     nodes: list[NodeId] = field(default_factory=list)
@@ -83,12 +84,12 @@ class SolverConfig(Config, frozen=True, kw_only=True):
 
     @property
     def chosen(self) -> list[tuple[str, str]] | None:
-        """The pairs to solve; None: all that appear."""
+        """The pairs to solve; None for all that appear."""
         return self.pairs or list(combinations(self.nodes, 2)) or None
 
 
 def node_ids(words: list[str]) -> list[str]:
-    """Return the ids of `--nodes A B` or `--nodes A,B`; raise ConfigError where they are not two or more."""
+    """Return the ids of `--nodes A B` or `--nodes A,B`; raise ConfigError unless they are two or more different ids."""
     ids = [check_node_id(node) for word in words for node in word.split(",")]
     if len(ids) < 2 or len(set(ids)) != len(ids):
         raise ConfigError(f"--nodes {' '.join(words)}: give two or more different ids")

@@ -1,8 +1,8 @@
 """The solver's pure core: messages in, messages out, for any number of nodes; no clock, no bus, no files.
 
-The live service, the offline solver, replay and tests all call `SolverCore.handle`. A pair's triggers are resolved in
-their own order and from their own data alone, so that the same messages give the same poses in whatever order they
-arrive within the matching window, and whatever other nodes there are.
+The live service, the offline solver, replay and tests all call `SolverCore.handle`. The triggers of a pair are
+resolved in their own order, from the pair's own data. So the same messages give the same poses in any order of arrival
+within the matching window, and with any other nodes.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from msgspec.structs import replace
 
 NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu
 
-# A frame this near the receiver's own time is of a live dive, else of a stored one that is played.
+# A frame whose stamp is this near to the receive time is of a live dive; any other is of a stored dive that is played.
 LIVE_WITHIN_NS: Final = 60 * S_NS
-# The receiver's own clock was set back where it goes back by more than this.
+# If the receive time goes back by more than this, the receiver's clock was set back.
 SET_BACK_NS: Final = 1 * S_NS
-# Whoever invents node ids must not have memory for each.
+# Limits memory: a sender that invents node ids must not get a stream for each.
 MAX_NODES: Final = 16
 
 
 class SolverCore:
     """Solves each trigger of each pair once.
 
-    chosen: the pairs to solve; None: every two nodes that appear, A before B in the alphabet. clock_offsets_ns: a
-    node's clock minus the common one, where it is known; its times are brought to the common clock. align: collect
-    what the fixes tell about each pair's clocks. track: the tracks to make; None: none. unused: nodes that were heard
-    and are in no pair, and how often. What needs several pairs, such as a network of all nodes, belongs here, after the
-    pairs have settled.
+    chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clock_offsets_ns:
+    each node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
+    estimate the clock offset of each pair. track: the tracks to make; None for no track. unused: number of messages of
+    each node that is in no pair. Work on several pairs, such as a network of all nodes, belongs here, after the pairs
+    have settled.
     """
 
     def __init__(
@@ -73,28 +73,28 @@ class SolverCore:
 
     @property
     def counts(self) -> Counter[str]:
-        """What became of all pairs' triggers: "solved", and the reasons."""
+        """The outcomes of all pairs: the number solved, and the number of each rejection reason."""
         return sum((pair.counts for pair in self.pairs.values()), Counter())
 
     @property
     def matched(self) -> int:
-        """Triggers of all pairs with a frame and a calibration from both nodes."""
+        """Number of triggers of all pairs with a frame and a calibration from both nodes."""
         return sum(pair.matcher.matched for pair in self.pairs.values())
 
     @property
     def pending(self) -> int:
-        """Triggers of all pairs that wait for something."""
+        """Number of triggers of all pairs that wait for data."""
         return sum(pair.matcher.pending for pair in self.pairs.values())
 
     def handle(self, message: Message, receive_ns: int | None = None) -> list[Message]:
-        """Take one message of a node; return what is resolved by it, each pair's in the order of its triggers.
+        """Take one message of a node; return the outcomes that it completes, in the order of each pair's triggers.
 
         receive_ns: receive time; None when read from a log.
         """
         return _settled(self._take(message, self._steady(receive_ns), receive_ns))
 
     def handle_many(self, messages: Iterable[Message], receive_ns: int | None = None) -> list[Message]:
-        """Take several messages as if one by one; what they match is solved together."""
+        """Take several messages, as if one by one; their matched triggers are solved together."""
         now_ns = self._steady(receive_ns)
         touched: dict[PairId, PairCore] = {}
         for message in messages:
@@ -103,18 +103,18 @@ class SolverCore:
         return _settled(touched.values())
 
     def advance(self, receive_ns: int) -> list[Message]:
-        """Let time pass; return what need not wait any longer."""
+        """Advance the receive time; return the outcomes whose waiting time is over."""
         now_ns = self._steady(receive_ns)
         for pair in self.pairs.values():
             pair.resolve(now_ns)
         return _settled(self.pairs.values())
 
     def flush(self) -> list[Message]:
-        """Resolve all that is pending with what there is: the dive has ended."""
+        """Resolve all pending triggers with the data at hand, at the end of the dive."""
         return [message for pair in self.pairs.values() for message in pair.finish()]
 
     def report(self, stamp_ns: int, receive_ns: int, bad_messages: int, problems: list[str]) -> list[SolverStatus]:
-        """Return each pair's status; bad_messages, problems: what was received and could not be used."""
+        """Return each pair's status. bad_messages: number of refused messages. problems: added to each pair's own."""
         now_ns = self._steady(receive_ns) or 0
         unused = sorted(self.unused)
         return [
@@ -127,13 +127,13 @@ class SolverCore:
         return [pair.nodes for pair in self._pairs_of.get(node, ())]
 
     def saw_published(self, messages: Iterable[Message], now_ns: int) -> None:
-        """Take note of when outcomes went out; now_ns: wall clock."""
+        """Note the latency of published poses; now_ns: wall clock."""
         for message in messages:
             if isinstance(message, RelativePose) and 0 <= now_ns - message.stamp_ns < LIVE_WITHIN_NS:
                 self.pairs[message.node_a, message.node_b].latencies_s.append((now_ns - message.stamp_ns) / S_NS)
 
     def _steady(self, receive_ns: int | None) -> int | None:
-        """Return the receive time on a clock that never goes back: whoever waits must not wait for an hour more."""
+        """Return the receive time on a clock that never goes back, so that a clock set back prolongs no waiting."""
         if receive_ns is None:
             return None
         now_ns = receive_ns + self._set_back_ns
@@ -143,7 +143,7 @@ class SolverCore:
         return self._now_ns
 
     def _take(self, message: Message, now_ns: int | None, receive_ns: int | None) -> Sequence[PairCore]:
-        """Take one message; return the pairs that it may have resolved something of."""
+        """Take one message; return the pairs for which it may have completed a trigger."""
         if not isinstance(message, NodeMessage):
             return ()
         stream = self._stream(message.node)
@@ -171,7 +171,7 @@ class SolverCore:
         return pairs
 
     def _stream(self, node: str) -> NodeStream | None:
-        """Return a node's stream, None where the node is not used."""
+        """Return a node's stream; None if the node is not used."""
         stream = self.streams.get(node)
         if stream is None:
             if self._chosen is not None or len(self.streams) >= MAX_NODES:
@@ -182,7 +182,7 @@ class SolverCore:
         return stream
 
     def _form_pairs(self, stream: NodeStream, now_ns: int | None) -> None:
-        """Pair a node that has appeared with all that have before; what their windows hold counts as received now."""
+        """Pair a new node with all known ones. The frames in their windows count as received now."""
         others = sorted(self._pairs_of)
         self._pairs_of[stream.node] = []
         for node in others:

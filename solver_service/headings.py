@@ -1,6 +1,6 @@
-"""By how much the two nodes' headings disagree, learned from the poses: magnetometers are biased, and slowly so.
+"""Estimate the difference of two nodes' heading biases from the poses. Magnetometer biases change slowly.
 
-A Kalman filter on one angle that drifts; how much the headings scatter about it is learned along with it.
+A Kalman filter on one angle that drifts. The scatter of the headings about it, its measurement noise, is estimated too.
 """
 
 from __future__ import annotations
@@ -11,31 +11,32 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.observation import Heading
 
-# Without a pose for so long, another bias is as likely as this one.
+# After this time without a pose the estimate is dropped: the bias may have changed.
 LIFETIME_NS: Final = 60 * S_NS
-# How fast a bias drifts as a diver turns and passes by steel, rad^2/s.
+# Drift of the bias as a diver turns and passes by steel, rad^2/s.
 DRIFT: Final = math.radians(1.0) ** 2
-# At first: what a bias may be, and how the headings scatter; and between which the latter is believed to be.
+# Initial variance of the bias, and initial variance of the headings' scatter, rad^2; then the bounds of the latter.
 START_VARIANCE: Final = math.radians(15.0) ** 2
 START_NOISE: Final = math.radians(4.0) ** 2
 LEAST_NOISE, MOST_NOISE = math.radians(1.0) ** 2, math.radians(10.0) ** 2
-# So many poses tell the bias better than the sensors' own word.
+# After this many poses the estimate is better than the sensors' stated sigmas.
 ENOUGH: Final = 5
-# Of what the last pose tells of the scatter.
+# Weight of the old estimate of the scatter at each pose.
 MEMORY: Final = 0.95
-# A heading this many times its variance off is a jump, or a wrong pose: so much more is then thought possible.
+# A squared innovation above GATE_CHI2 times its variance is a jump of the bias, or a wrong pose. It is not used, and
+# the variance of the bias grows by JUMP_VARIANCE, rad^2.
 GATE_CHI2: Final = 25.0
 JUMP_VARIANCE: Final = math.radians(10.0) ** 2
 
 
 class HeadingOffset:
-    """Follows what is to be added to B's heading so that both agree with the poses."""
+    """Tracks the angle to add to B's heading so that both headings agree with the poses."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget it."""
+        """Forget the estimate."""
         self._stamp_ns: int | None = None
         self._offset_rad = 0.0
         self._variance = START_VARIANCE
@@ -43,13 +44,13 @@ class HeadingOffset:
         self._count = 0
 
     def predict(self, stamp_ns: int) -> Heading | None:
-        """Return it for stamp_ns, None where too few poses, too old or later ones, have told it."""
+        """Return the estimate at stamp_ns; None after too few poses, or if the last pose is later or too old."""
         if self._count < ENOUGH or not self._follows(stamp_ns):
             return None
         return Heading(self._offset_rad, self._predicted(stamp_ns) + self._noise)
 
     def update(self, stamp_ns: int, offset_rad: float, variance: float) -> None:
-        """Take what one pose tells, with the variance (rad^2) that the pose itself has."""
+        """Take the offset that one pose gives, rad, and its variance from the pose alone, rad^2."""
         if not self._follows(stamp_ns):
             self.reset()
         predicted = self._predicted(stamp_ns)

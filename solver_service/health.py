@@ -1,4 +1,4 @@
-"""What is wrong with the nodes, as the solver sees it: gone, silent, or with a clock that disagrees."""
+"""Problems of the nodes that the solver sees: a node is gone or silent, or two clocks disagree."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_PROCESSES: Final = 256
 
 
 class Health:
-    """Keeps when each node was heard. now_ns: receive time that never goes back."""
+    """Keeps each node's last frame, and whether its process is alive. now_ns: receive time that never goes back."""
 
     def __init__(self) -> None:
         self._frames: dict[str, tuple[int, int]] = {}
@@ -20,21 +20,21 @@ class Health:
         self._alive: dict[str, bool] = {}
 
     def saw_frame(self, node: str, stamp_ns: int, now_ns: int) -> None:
-        """Take note of a frame."""
+        """Note a frame of a node."""
         self._frames[node] = (now_ns, stamp_ns)
 
     def saw_period(self, node: str, trigger_period_ns: int) -> None:
-        """Take note of how often a node's frames are due."""
+        """Note a node's trigger period."""
         self._period_s[node] = trigger_period_ns / S_NS
 
     def saw_process(self, name: str, alive: bool) -> None:
-        """Take note of a process that came or went; name: as it was declared alive."""
+        """Note that a process has started or ended; name: as declared alive on the bus."""
         node = name.removeprefix("node/")
         if name != node and (node in self._alive or len(self._alive) < MAX_PROCESSES):
             self._alive[node] = alive
 
     def problems(self, nodes: tuple[str, str], now_ns: int) -> list[str]:
-        """Say what is wrong with a pair of nodes, a phrase each."""
+        """Return the problems of a pair of nodes, one phrase each."""
         found = [text for node in nodes if (text := self._problem_of(node, now_ns))]
         if not found:
             node_a, node_b = nodes

@@ -1,7 +1,7 @@
-"""Frames of two nodes, brought together by their triggers: each trigger is matched once, or has a reason why not.
+"""Match the frames of two nodes by trigger. Each trigger is matched once, or gets a reason why not.
 
-A trigger waits for what may still come. What is read from a log, or played from one, waits in the dive's own time;
-what is live waits in receive time, since a backlog arrives in a burst after an outage.
+A trigger waits for frames and samples that may still come. A dive that is read or played from a log waits in the dive's
+own time. A live dive waits in receive time, because a backlog arrives in a burst after an outage.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from buddyline.solver_service.pair import Matched
 from buddyline.solver_service.results import sensed_of
 from buddyline.solver_service.streams import FAR_NS, Arrival, NodeStream, size_bytes
 
-# How far a node's frames go on, in the dive's own time, before one that is missing is given up.
+# A missing frame is given up when the node's frames have advanced this far beyond it, in the dive's own time.
 MATCH_WINDOW_NS: Final = 1 * S_NS
-# How long a frame waits where the other node is silent altogether.
+# How long a frame waits for a node that sends no frames at all.
 SILENCE_WINDOW_NS: Final = 2 * S_NS
-# How long a trigger waits for anything at all, a sensor that has stopped for instance.
+# How long a trigger waits at most, for example for a sensor that has stopped.
 LONGEST_WAIT_NS: Final = 3 * S_NS
 MAX_PENDING: Final = 512
 MAX_PENDING_BYTES: Final = 16 << 20
@@ -32,7 +32,7 @@ TWO_FRAMES: Final = "two different frames claim this trigger: two nodes of one i
 
 @dataclass(frozen=True)
 class Unmatched:
-    """A trigger that cannot be solved, and why; stamp_ns: of its frame."""
+    """A trigger that cannot be solved, with the reason; stamp_ns: of its frame."""
 
     trigger: int
     stamp_ns: int
@@ -42,10 +42,10 @@ class Unmatched:
 
 @dataclass(eq=False, slots=True)
 class _Waiting:
-    """A trigger's frames, of a and b, and when the first came.
+    """The frames of one trigger, of a and b, and the arrival of the first one.
 
-    receive_ns: None where it is read from a log; then elapsed_ns counts, how far both nodes' frames had come. live:
-    whether receive time tells how old it is.
+    receive_ns: receive time; None when read from a log. elapsed_ns: both streams' elapsed_ns at that time, which
+    measures the waiting where receive time does not. live: the dive is live, so it waits in receive time.
     """
 
     trigger: int
@@ -58,7 +58,7 @@ class _Waiting:
 
 @dataclass(frozen=True, slots=True)
 class _Resolved:
-    """Both nodes' time lines when a trigger was resolved (how often their clocks had been set), and who had a frame."""
+    """A resolved trigger: both nodes' time lines then (how often their clocks had been set), and which had a frame."""
 
     time_lines: tuple[int, int]
     had_frame: tuple[bool, bool]
@@ -67,8 +67,8 @@ class _Resolved:
 class PairMatcher:
     """Matches the frames of nodes a and b. Deterministic; time is an argument.
 
-    late: frames that came after their trigger was resolved. duplicates: frames that came twice. matched: triggers
-    with a frame and a calibration from both.
+    late: number of frames that came after their trigger was resolved. duplicates: number of frames that came twice.
+    matched: number of triggers with a frame and a calibration from both nodes.
     """
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream) -> None:
@@ -87,15 +87,15 @@ class PairMatcher:
 
     @property
     def pending(self) -> int:
-        """Triggers that wait for something."""
+        """Number of triggers that wait for data."""
         return len(self._order)
 
     def take(
         self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool
     ) -> list[Matched | Unmatched]:
-        """Take a frame that its node's stream has judged; return what is resolved by that alone.
+        """Take a frame; return a trigger that it resolves at once.
 
-        On CLOCK_SET, call `restart` first.
+        arrival: the verdict of the node's stream. For CLOCK_SET call `restart` first.
         """
         if receive_ns is not None:
             self._now_ns = receive_ns
@@ -110,7 +110,7 @@ class PairMatcher:
                 return []
             seconds = (frame.stamp_ns - (self.streams[side].newest_ns or 0)) / S_NS
             detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
-            # Should a new time line begin with it, it has its outcome there.
+            # It may be the first frame of a new time line: its outcome is stored for that one.
             return [self._give_up(frame, "late", detail, ahead=1)]
         if resolved:
             self.late += 1
@@ -137,9 +137,10 @@ class PairMatcher:
         return []
 
     def restart(self, node: str) -> list[Matched | Unmatched]:
-        """Begin a new time line of a node whose clock was set; return what waited with a frame of the old one.
+        """Begin a new time line of a node whose clock was set; return the results of triggers with its old frames.
 
-        The node's triggers may come again, as in a dive played twice, but not those whose frames showed the new time.
+        The node's triggers may then come again, as in a dive played twice. The triggers of the frames that showed the
+        new time may not: they have their outcome.
         """
         side = 0 if self.streams[0].node == node else 1
         results = [
@@ -153,7 +154,7 @@ class PairMatcher:
         return results
 
     def resolve(self, receive_ns: int | None, *, everything: bool = False) -> list[Matched | Unmatched]:
-        """Resolve in the order of the triggers what need not wait any longer; everything: also what should."""
+        """Resolve the triggers whose waiting is over, in order; everything: resolve all of them."""
         if receive_ns is not None:
             self._now_ns = receive_ns
         if not self._order:
@@ -174,7 +175,7 @@ class PairMatcher:
         return 0 if frame.node == self.streams[0].node else 1
 
     def _newest_overdue(self) -> int:
-        """Return the newest trigger that has waited too long; those before it do not wait any longer either."""
+        """Return the newest trigger that has waited too long, -1 for none. Earlier triggers stop waiting with it."""
         overdue = -1
         while self._arrivals:
             first = self._arrivals[0]
@@ -195,7 +196,7 @@ class PairMatcher:
         return any(stream.elapsed_ns - began_ns > LONGEST_WAIT_NS for stream, began_ns in since)
 
     def _resolve_one(self, waiting: _Waiting, *, at_once: bool) -> Matched | Unmatched | None:
-        """Resolve one trigger; None where it still waits for something that may come."""
+        """Resolve one trigger; None if it still waits."""
         frame_a, frame_b = waiting.frames
         frame = frame_a or frame_b
         if frame is None:
@@ -242,8 +243,8 @@ class PairMatcher:
         )
 
     def _expired(self, waiting: _Waiting, frame: Candidates, other: NodeStream) -> bool:
-        """Whether the other node's frame for the trigger of this one can be given up."""
-        # A node whose clock is far from this frame says nothing about what of it may still come.
+        """Return whether to stop waiting for the other node's frame of this frame's trigger."""
+        # If the other node's clock is far from this frame, its frames do not show that this one will not come.
         if other.newest_ns is not None and MATCH_WINDOW_NS < other.newest_ns - frame.stamp_ns <= FAR_NS:
             return True
         if waiting.live and waiting.receive_ns is not None and self._now_ns is not None:
@@ -252,7 +253,7 @@ class PairMatcher:
         return own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
 
     def _is_resolved(self, trigger: int, side: int) -> bool:
-        """Whether a trigger has its outcome already, unless a node's new time line has come to it again."""
+        """Return whether a trigger has its outcome; not if a node has reached it again on a new time line."""
         resolved = self._resolved.get(trigger)
         if resolved is None:
             return False
@@ -260,14 +261,14 @@ class PairMatcher:
         return not (anew[side] and (resolved.had_frame[side] or anew[1 - side]))
 
     def _give_up(self, frame: Candidates, reason: Reason, detail: str, *, ahead: int = 0) -> Unmatched:
-        """End a trigger without a match; ahead: 1 where the frame may be the first of a new time line."""
+        """End a trigger without a match; ahead: 1 if the frame may be the first of a new time line."""
         self._finish(frame.trigger, self._side(frame), ahead)
         if reason != "late":
             self._newest_resolved = max(self._newest_resolved, frame.trigger)
         return Unmatched(frame.trigger, frame.stamp_ns, reason, detail)
 
     def _finish(self, trigger: int, side: int, ahead: int = 0) -> None:
-        """Forget a trigger's frames, and remember that it has its outcome; side: of one of its frames."""
+        """Drop a trigger's frames, and store that it has its outcome. side: 0 or 1, the node that had a frame."""
         waiting = self._waiting.pop(trigger, None)
         had_frame = [False, False]
         if waiting is not None:

@@ -1,6 +1,6 @@
-"""One pair of nodes: matched frames in, a fix or the reason against one out.
+"""Solve one pair of nodes: matched frames in, a fix or the reason for having none out.
 
-The pair's memory (motion prior, heading bias, clock alignment) lives here and nowhere else.
+The pair's memory (motion prior, heading bias, clock alignment) is kept here and nowhere else.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.results import view_of
 
-# Triggers that are solved at once, and their combinations of pairs of candidates: beyond, arrays outgrow the caches,
-# and in crowded pictures the memory.
+# Limits of one batch: its triggers, and their combinations of pairs of candidates. Larger arrays do not fit into the
+# processor's caches and, with crowded pictures, into memory.
 _MAX_TOGETHER: Final = 128
 _MAX_COMBINATIONS: Final = 250_000
 
@@ -48,7 +48,7 @@ class Matched:
 
 
 def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
-    """Split triggers into runs of one calibration that are solved at once."""
+    """Split triggers into batches, which are solved at once; all triggers of a batch have the same calibration."""
     batch: list[Matched] = []
     total = 0
     for one in matched:
@@ -64,7 +64,7 @@ def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
 
 
 class PairSolver:
-    """Solves the triggers of one pair; alignment: collects what the fixes tell about the clocks' offset."""
+    """Solves the triggers of one pair. alignment: gets each fix, to estimate the clock offset; None for none."""
 
     def __init__(self, settings: Settings, alignment: ClockAlignment | None = None) -> None:
         self.settings = settings
@@ -75,19 +75,20 @@ class PairSolver:
     def solve(self, matched: Sequence[Matched]) -> list[Fix | NoFix]:
         """Return one result for each trigger.
 
-        The triggers come in increasing order, also from call to call. How they are split into calls changes nothing.
+        The triggers come in increasing order, also from call to call. Their distribution over calls does not change
+        the results.
         """
-        # Absurd values end as rejections, not as warnings.
+        # Absurd values give rejections, not numpy's warnings.
         with np.errstate(all="ignore"):
             return [fix for batch in _batches(matched) for fix in self._solve_batch(batch)]
 
     def forget(self) -> None:
-        """Forget what earlier fixes told: a clock was set, or the values make no sense."""
+        """Forget all earlier fixes, after a clock was set or a value was out of numeric range."""
         self._prior.reset()
         self._headings.reset()
 
     def heading(self, stamp_ns: int) -> Heading | None:
-        """Return how far the two headings disagree at stamp_ns, None where too few fixes have told it."""
+        """Return the difference of the two headings' biases at stamp_ns; None without an estimate."""
         return self._headings.predict(stamp_ns)
 
     def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
@@ -96,7 +97,7 @@ class PairSolver:
         except (ArithmeticError, ValueError) as error:
             if len(batch) == 1:
                 return [self._out_of_range(batch[0], error)]
-            # One of them holds absurd but finite values, such as 1e300, that leave a singular matrix.
+            # One trigger has absurd but finite values, such as 1e300, which make a matrix singular: solve one by one.
             return [fix for one in batch for fix in self._solve_batch([one])]
         return [self._decide(one, readings, place) for place, one in enumerate(batch)]
 

@@ -1,4 +1,4 @@
-"""One pair's work from matched frames to messages: outcomes and status."""
+"""One pair from frames to messages: outcomes, track and status."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from msgspec import UNSET
 
 PairId: TypeAlias = tuple[str, str]
 
-# What a pair publishes.
+# The topics that a pair publishes.
 PUBLISHED: Final = (POSE, REJECTED, TRACK, TRACK_LAG, SOLVER_STATUS)
-# The clocks' offset is reported once the dive tells it this well.
+# The clock offset is reported when its sigma is below this.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 ALIGN_EVERY_NS: Final = 10 * S_NS
 
 
 class PairCore:
-    """One pair: its matcher, its solver, and what became of its triggers.
+    """One pair: its matcher, its solver, its track, and the counts of its outcomes.
 
-    counts: "solved" and the reasons. latencies_s: from the middle of exposure to publication, since the last report.
-    tracker: makes the pair's track, None where none is wanted.
+    counts: number of "solved", and of each rejection reason. latencies_s: from the middle of exposure to publication,
+    since the last report. tracker: makes the pair's track; None for no track.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class PairCore:
         self._settled: list[Message] = []
 
     def take(self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool) -> None:
-        """Take a frame of one of the two nodes."""
+        """Take a frame of one of the two nodes; see PairMatcher.take."""
         if arrival is Arrival.CLOCK_SET:
             self._unsettled += self.matcher.restart(frame.node)
             self._solve()
@@ -70,17 +70,17 @@ class PairCore:
         self._unsettled += self.matcher.take(frame, arrival, receive_ns, live=live)
 
     def resolve(self, receive_ns: int | None, *, everything: bool = False) -> None:
-        """Match what waits for nothing more."""
+        """Match or reject the triggers whose waiting is over; everything: all of them."""
         self._unsettled += self.matcher.resolve(receive_ns, everything=everything)
 
     def settle(self) -> list[Message]:
-        """Solve what is matched, all at once; return the outcomes in the order of the triggers, and the track."""
+        """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track."""
         self._solve()
         settled, self._settled = self._settled, []
         return settled + (self.tracker.take(settled) if self.tracker is not None else [])
 
     def finish(self) -> list[Message]:
-        """Return the outcomes and the rest of the track: the dive has ended."""
+        """Return the last outcomes and the rest of the track, at the end of the dive."""
         self.resolve(None, everything=True)
         return self.settle() + (self.tracker.finish() if self.tracker is not None else [])
 
@@ -117,7 +117,7 @@ class PairCore:
     def report(
         self, stamp_ns: int, now_ns: int, problems: list[str], bad_messages: int, unused: list[str]
     ) -> SolverStatus:
-        """Return the pair's status at stamp_ns; now_ns: steady receive time, problems: what else is wrong."""
+        """Return the pair's status at stamp_ns. now_ns: steady receive time. problems: known from outside the pair."""
         (node_a, node_b), (stream_a, stream_b) = self.nodes, self.streams
         latencies_s = sorted(self.latencies_s)
         self.latencies_s.clear()
@@ -152,7 +152,7 @@ class PairCore:
         return self._offset
 
     def _disagreements(self, offset: ClockOffset | None) -> list[str]:
-        """Say what the poses tell against the two nodes' clocks and compasses."""
+        """Return problems that the poses show: the two nodes' clocks or compasses disagree."""
         found = []
         node_a, node_b = self.nodes
         if offset is not None and abs(offset.offset_s) > max(CLOCKS_APART_S, 4 * offset.sigma_s):

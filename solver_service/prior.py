@@ -1,4 +1,4 @@
-"""What earlier fixes say of the present one: a prediction that fades, is lost, and starts again.
+"""The motion prior: a prediction of the pose from earlier fixes.
 
 A constant-velocity filter on T_a_b, twelve error states: position (m), small rotation (rad), velocity (m/s) and
 turn rate (rad/s), all in A's camera frame. A fix outside the gate resets the filter; the prior never
@@ -17,27 +17,27 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
 
 LIFETIME_NS: Final = 2 * S_NS
-# How divers and the cameras they hold speed up and turn: spectral densities of white acceleration,
-# (m/s^2)^2/Hz and (rad/s^2)^2/Hz. A knows no better of the camera's own shaking, which is in T_a_b too.
+# Motion of divers and of the cameras they hold: spectral densities of white acceleration, (m/s^2)^2/Hz, and of white
+# angular acceleration, (rad/s^2)^2/Hz. The shaking of A's own camera is included, because it moves T_a_b too.
 ACCELERATION_DENSITY: Final = 0.3**2
 TURN_DENSITY: Final = 0.6**2
-# At first: 1 sd of what a pair may be doing.
+# Initial 1 sd of the pair's velocity and turn rate.
 SPEED_MPS: Final = 0.5
 TURN_RADPS: Final = 0.5
-# Innovations beyond this (six degrees of freedom, 1 in 10^6) mean that something else was seen.
+# Gate on the innovation's chi² (six degrees of freedom; 1 in 10^6 true fixes is above it).
 GATE_CHI2: Final = 38.0
 
 
 _DENSITY: Final = np.diag([ACCELERATION_DENSITY] * 3 + [TURN_DENSITY] * 3)
-# Where the density stands in the covariance of rates, of rates and pose, of the pose.
+# The density's place in the covariance: in the block of the pose, the mixed blocks, the block of the rates.
 _OF_POSE, _OF_BOTH, _OF_RATES = (np.kron(at, _DENSITY) for at in (np.diag((1, 0)), 1 - np.eye(2), np.diag((0, 1))))
-# Where the rates stand in the transition: the pose moves by them.
+# The transition of the state over dt_s is _IDENTITY + dt_s * _RATES.
 _IDENTITY: Final = np.eye(12)
 _RATES: Final = np.eye(12, k=6)
 
 
 class PosePrior:
-    """Follows the fixes and predicts the next."""
+    """Filters the fixes and predicts the next pose."""
 
     def __init__(self) -> None:
         self._stamp_ns: int | None = None
@@ -47,18 +47,18 @@ class PosePrior:
         self._last: tuple[tuple[int, int], tuple[SE3, Floats]] | None = None
 
     def reset(self) -> None:
-        """Forget it."""
+        """Forget all fixes."""
         self._stamp_ns = self._last = None
 
     def predict(self, stamp_ns: int) -> Prior | None:
-        """Return the prediction for stamp_ns, None where the last fix is too old, or later."""
+        """Return the prediction for stamp_ns; None if the last fix is later, or older than LIFETIME_NS."""
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             return None
         T_a_b, P = self._predicted(self._stamp_ns, stamp_ns)
         return Prior(T_a_b, P[:6, :6], self._rates, P[6:, 6:])
 
     def update(self, stamp_ns: int, fix: Fix) -> None:
-        """Take a new fix."""
+        """Update the filter with a fix; restart it with the fix if that is outside the gate."""
         if self._stamp_ns is None or not 0 <= stamp_ns - self._stamp_ns <= LIFETIME_NS:
             self._start(stamp_ns, fix)
             return
@@ -83,13 +83,13 @@ class PosePrior:
         self._P[:6, :6] = fix.covariance
 
     def _predicted(self, since_ns: int, stamp_ns: int) -> tuple[SE3, Floats]:
-        """Return T_a_b and P at stamp_ns; asked for twice a trigger, worked out once."""
+        """Return T_a_b and P at stamp_ns; the last result is kept, because each trigger asks twice."""
         if self._last is None or self._last[0] != (since_ns, stamp_ns):
             self._last = (since_ns, stamp_ns), self._predict((stamp_ns - since_ns) / S_NS)
         return self._last[1]
 
     def _predict(self, dt_s: float) -> tuple[SE3, Floats]:
-        """Move on at the present rates; P by the noise of a white acceleration."""
+        """Return T_a_b after dt_s at constant rates, and P with the noise of a white acceleration added."""
         F = _IDENTITY + dt_s * _RATES
         noise = dt_s * _OF_RATES + dt_s**2 / 2 * _OF_BOTH + dt_s**3 / 3 * _OF_POSE
         return self._T_a_b.retract(dt_s * self._rates), F @ self._P @ F.T + noise

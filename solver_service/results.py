@@ -1,4 +1,4 @@
-"""Between messages and geometry: what the solver computes with, and the pose it publishes."""
+"""Convert messages to the geometry's types, and a fix to the message that is published."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 
 def rig_of(info: NodeInfo) -> Rig:
-    """Return a node's calibration as the geometry takes it."""
+    """Return a node's calibration as the geometry's Rig."""
     camera = info.camera
     return Rig(
         camera=Camera(
@@ -38,7 +38,7 @@ def rig_of(info: NodeInfo) -> Rig:
 
 
 def view_of(frame: Candidates) -> View:
-    """Return a frame's candidates as arrays; an unknown score is NaN."""
+    """Return a frame's candidates as arrays; a missing score becomes NaN."""
     rows = [
         (
             blob.u_px,
@@ -57,7 +57,7 @@ def view_of(frame: Candidates) -> View:
 
 
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:
-    """Return a node's attitude and depth at stamp_ns, each None where unknown."""
+    """Return a node's attitude and depth at stamp_ns; each is None if unknown."""
     oriented = attitude_at(attitude, stamp_ns)
     immersed = depth_at(depth, stamp_ns)
     return Sensed(
@@ -69,7 +69,7 @@ def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stam
 
 
 def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a: Sensed, fix: Fix) -> RelativePose:
-    """Return the message for a fix; what it says in north-east-down follows A's attitude."""
+    """Return the message for a fix. Its values in NED are computed with A's attitude, and absent without."""
     pose = RelativePose(
         node_a=frame_a.node,
         node_b=frame_b.node,

@@ -12,39 +12,39 @@ from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.messages import Attitude, Depth, Imu
 from numpy.typing import NDArray
 
-# Samples further back than this come from a clock that was set.
+# A sample this much older than the newest one shows that the clock was set back.
 HORIZON_NS: Final = 20 * S_NS
-# After an outage a node's samples wait for the other node's frames, as far back as the nodes' caches reach.
+# Samples are kept for this time: after an outage the other node's frames may come from its cache, which is as long.
 KEPT_NS: Final = 60 * S_NS
 MAX_SAMPLES: Final = 8192
 SENSOR_WAIT_NS: Final = 3 * S_NS
 
-# An attitude is interpolated between neighbours at most this far apart, or held at most this long.
+# An attitude is interpolated between samples at most this far apart, or taken from one sample at most this far away.
 ATTITUDE_GAP_NS: Final = 300 * MS_NS
 ATTITUDE_HOLD_NS: Final = 100 * MS_NS
-# A held attitude ages by a diver's ordinary turning.
+# A diver's ordinary turn rate: the sigma of an attitude from one sample grows by it.
 TURN_RATE_RADPS: Final = 0.2
 
-# Depth comes at 10 to 20 Hz: a frame never waits for the next sample, it uses those up to 100 ms before.
+# Depth has 10 to 20 Hz. A frame does not wait for the next sample: it uses samples up to this long before it.
 DEPTH_LAG_NS: Final = 100 * MS_NS
 DEPTH_FIT_NS: Final = 350 * MS_NS
 DEPTH_STALE_NS: Final = 1 * S_NS
-# What a linear fit leaves of a diver's vertical motion, per second of extrapolation.
+# Error of the linear fit, from a diver's vertical motion, per second of extrapolation.
 DEPTH_DRIFT_MPS: Final = 0.1
 
 S = TypeVar("S", Attitude, Depth)
 
 
 class BackwardJump:
-    """Tells samples of a clock that was set back from samples that are merely late."""
+    """Distinguishes samples of a clock that was set back from samples that are late."""
 
     def __init__(self) -> None:
         self._stamps: deque[int] = deque(maxlen=5)
 
     def judge(self, stamp_ns: int, newest_ns: int | None) -> Literal["take", "drop", "restart"]:
-        """Say what to do with a sample; newest_ns: of those that are kept."""
+        """Return what to do with a sample. newest_ns: stamp of the newest kept sample; None for none."""
         if newest_ns is not None and stamp_ns < newest_ns - HORIZON_NS:
-            # A clock that jumped back is believed once it goes on from there.
+            # Several samples in a row with the old time show that the clock was set back.
             self._stamps.append(stamp_ns)
             if len(self._stamps) < 5:
                 return "drop"
@@ -56,9 +56,9 @@ class BackwardJump:
 
 
 class SampleStream(Generic[S]):
-    """Samples of one sensor by time, bounded; `lag_ns`: how far before a frame its samples may end.
+    """Samples of one sensor by time; memory is bounded. lag_ns: how far before a frame its samples may end.
 
-    missing_ns: for how long, in receive time, frames have come without samples of their time.
+    missing_ns: how long, in receive time, frames have come without samples of their time.
     """
 
     def __init__(self, lag_ns: int) -> None:
@@ -70,11 +70,11 @@ class SampleStream(Generic[S]):
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest sample, None where there is none."""
+        """Stamp of the newest sample; None if there is none."""
         return self._stamps[-1] if self._stamps else None
 
     def add(self, sample: S) -> None:
-        """Take one sample, in any order."""
+        """Take one sample; samples may come in any order."""
         verdict = self._jump.judge(sample.stamp_ns, self._stamps[-1] if self._stamps else None)
         if verdict == "drop":
             return
@@ -91,18 +91,18 @@ class SampleStream(Generic[S]):
             del self._stamps[:keep], self._samples[:keep]
 
     def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int, *, live: bool) -> bool:
-        """Whether what matters for a frame at stamp_ns is here, or is not going to come.
+        """Return whether the samples for a frame at stamp_ns are here, or will not come.
 
-        A sensor that is missing for three seconds has stopped: in receive time where the dive is live, since a
-        backlog comes in a burst, else in the dive's own time. first_frame_ns, newest_frame_ns: the node's frames so
-        far.
+        A sensor without samples for three seconds has stopped. A live dive counts receive time, because a backlog
+        arrives in a burst; other dives count their own time. first_frame_ns, newest_frame_ns: stamps of the node's
+        frames so far.
         """
         newest_ns = self._stamps[-1] if self._stamps else first_frame_ns
         missing_ns = self.missing_ns if live else newest_frame_ns - newest_ns
         return missing_ns > SENSOR_WAIT_NS or newest_ns >= stamp_ns - self._lag_ns
 
     def around(self, stamp_ns: int) -> tuple[S | None, S | None]:
-        """Return the samples at or before, and after, stamp_ns."""
+        """Return the last sample at or before stamp_ns, and the first after it; None where there is none."""
         at = bisect.bisect_right(self._stamps, stamp_ns)
         before = self._samples[at - 1] if at else None
         after = self._samples[at] if at < len(self._samples) else None
@@ -114,7 +114,7 @@ class SampleStream(Generic[S]):
 
 
 class ImuWindow:
-    """The last minute of a node's inertial samples in order of their stamps, as arrays; bounded."""
+    """The last minute of a node's inertial samples, sorted by stamp, as arrays; memory is bounded."""
 
     def __init__(self) -> None:
         self._stamps = np.empty(2 * MAX_SAMPLES, dtype=np.int64)
@@ -123,16 +123,16 @@ class ImuWindow:
         self._jump = BackwardJump()
 
     def __len__(self) -> int:
-        """Count the samples."""
+        """Return the number of samples."""
         return self._end - self._start
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest sample, None where there is none."""
+        """Stamp of the newest sample; None if there is none."""
         return int(self._stamps[self._end - 1]) if len(self) else None
 
     def add(self, sample: Imu) -> None:
-        """Take one sample, in any order."""
+        """Take one sample; samples may come in any order."""
         newest_ns = self.newest_ns
         verdict = self._jump.judge(sample.stamp_ns, newest_ns)
         if verdict == "drop":
@@ -156,7 +156,7 @@ class ImuWindow:
         self._start = max(self._start, self._end - MAX_SAMPLES, self._place(int(self._stamps[self._end - 1]) - KEPT_NS))
 
     def between(self, start_ns: int, end_ns: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return stamps (N,) and accelerometer m/s^2 with gyroscope rad/s (N, 6), from start_ns to end_ns, both in."""
+        """Return the samples from start_ns to end_ns, both included: stamps (N,), and (N, 6) m/s^2 and rad/s."""
         first, last = self._place(start_ns), self._place(end_ns, "right")
         return self._stamps[first:last].copy(), self._values[first:last].copy()
 
@@ -167,9 +167,9 @@ class ImuWindow:
 def attitude_at(
     stream: SampleStream[Attitude], stamp_ns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return q_ned_body_xyzw (4,) and sigma_rad (3,) at stamp_ns, None where no sample is near.
+    """Return q_ned_body_xyzw (4,) and sigma_rad (3,) at stamp_ns; None if no sample is near.
 
-    Between two samples it turns at a constant rate (slerp; samples are close, so the chord serves).
+    Between two samples the quaternion is interpolated linearly and normalized: they are close, so slerp is not needed.
     """
     before, after = stream.around(stamp_ns)
     if before is not None and before.stamp_ns == stamp_ns:
@@ -194,9 +194,9 @@ def attitude_at(
 
 
 def depth_at(stream: SampleStream[Depth], stamp_ns: int) -> tuple[float, float] | None:
-    """Return depth and its standard deviation (m) at stamp_ns, None where the sensor is stale.
+    """Return depth and its sigma (m) at stamp_ns; None if the sensor is stale.
 
-    A line through the samples of the last 0.35 s that may be used, carried on to stamp_ns.
+    A line is fitted to 0.35 s of samples, which end DEPTH_LAG_NS before stamp_ns or earlier, and extrapolated.
     """
     end_ns = stamp_ns - DEPTH_LAG_NS
     newest, _ = stream.around(end_ns)

@@ -1,4 +1,4 @@
-"""The live solver: subscribes to all nodes, feeds the core, publishes what it makes."""
+"""The live solver: subscribes to all nodes, passes their messages to the core, publishes its results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
-# Time is told to the core this often, and the status goes out every so many times.
+# The core gets the time at this interval; every fourth time the status is published.
 TICK_S: Final = 0.25
 TICKS_A_STATUS: Final = 4
 MAX_ALIVE_NAME: Final = 64
@@ -84,17 +84,18 @@ class SolverService(Service):
                 self._publish(self.core.flush())
 
     def attach(self, bus: Bus) -> None:
-        """Subscribe to the nodes, and publish on this bus."""
+        """Subscribe to the nodes on this bus, and publish on it from now on."""
         self._bus = bus
         self._answered = Answered(_said_before(bus))
         self.problems = ["no two nodes yet"]
         self._declare()
-        # In one, so that what the caches hold comes in order: a frame would not wait for an attitude a minute behind.
+        # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
+        # not wait for an attitude that comes a minute later.
         bus.subscribe(tuple(topic.key_any() for topic in SOLVED_FROM), self.receive, capacity=32768)
         self._joined_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:
-        """Take one message off the bus; a bad one is counted and reported, and stops nothing."""
+        """Take one message from the bus; a bad one is counted and reported."""
         try:
             message = received.open().message
         except MessageError as error:
@@ -108,7 +109,7 @@ class SolverService(Service):
                 self._handle(message)
 
     def watch(self, name: str, alive: bool) -> None:
-        """Report at once that a process has come or gone."""
+        """Report at once that a process has started or ended."""
         with self._lock:
             self.core.health.saw_process(name, alive)
         self.report()
@@ -127,10 +128,10 @@ class SolverService(Service):
             self._publish(statuses)
 
     def _take_frame(self, frame: Candidates, receive_ns: int) -> None:
-        """Handle a frame, unless it comes out of a cache and was answered long ago."""
+        """Handle a frame, unless it is from a cache and an earlier solver has answered it."""
         new = self._joined_ns is not None and receive_ns > self._joined_ns
         if new:
-            # So are all after it, whatever becomes of the clock.
+            # All later frames are new too, even if the clock is set.
             self._joined_ns = 0
         elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
             return
@@ -139,13 +140,13 @@ class SolverService(Service):
             self._publish(self._answered.saw_new_frame(self.core.pairs_of(frame.node), frame.trigger))
 
     def _handle(self, message: Message) -> None:
-        # Now, and not when it came: what has waited in the queue has not waited for other nodes.
+        # The time is now, not the receive time: a message that waited in the queue has not yet waited for other nodes.
         results = self.core.handle(message, self.clock.now_ns())
         self._declare()
         self._publish(results)
 
     def _declare(self) -> None:
-        """Declare what new pairs publish, so that subscribers find it before the first message."""
+        """Declare the publishers of new pairs, so that subscribers find them before the first message."""
         if self._bus is None:
             return
         for pair in self.core.pairs.keys() - self._declared:
@@ -162,7 +163,7 @@ class SolverService(Service):
 
 
 def _said_before(bus: Bus) -> list[RelativePose | Rejected]:
-    """Return the last of what solvers before this one have said of each pair."""
+    """Return the last outcome of each pair that earlier solvers have published, as kept by the hub."""
     refusals = Refusals("solver, of what the hub holds")
     held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]
     return [one.message for one in held if one and isinstance(one.message, RelativePose | Rejected)]

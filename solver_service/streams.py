@@ -1,6 +1,6 @@
-"""One node's side of the dive: a bounded window of frames, samples and calibrations in its own time.
+"""The stream of one node: a bounded window of its frames, samples and calibrations, by its own clock.
 
-Many pairs read a node's stream, and none takes anything out of it.
+All pairs of a node read its stream; none removes anything from it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from buddyline.solver_service.sensors import DEPTH_LAG_NS, KEPT_NS, SENSOR_WAIT_
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# A frame further than this from the node's newest one is on another time line ...
+# A frame further than this from the node's newest one may be from a clock that was set ...
 FAR_NS: Final = 5 * S_NS
-# ... until this many frames in a row agree that the clock was set.
+# ... which is believed when this many frames in a row agree.
 FRAMES_TO_BELIEVE: Final = 5
-# Progress counts at most this much a frame: a gap in the dive is no time in which anything could have come.
+# Each frame adds at most this much to elapsed_ns: during a gap in the dive no frames could have come.
 LONGEST_STEP_NS: Final = 1 * S_NS
 MAX_FRAME_BYTES: Final = 8 << 20
 MAX_INFOS: Final = 64
@@ -31,7 +31,11 @@ MAX_SEQUENCE_MEMORY: Final = 512
 
 
 class Arrival(Enum):
-    """What a frame turned out to be."""
+    """The verdict on a frame.
+
+    FRESH: usable. DUPLICATE: came before. CONFLICT: another frame has its trigger. FAR: its stamp is far from the
+    node's newest. CLOCK_SET: the node's clock was set, and a new time line begins with it.
+    """
 
     FRESH = "fresh"
     DUPLICATE = "duplicate"
@@ -41,12 +45,12 @@ class Arrival(Enum):
 
 
 def size_bytes(frame: Candidates) -> int:
-    """Estimate the memory that a frame takes."""
+    """Estimate the memory of a frame."""
     return 512 + len(frame.boot) + 256 * len(frame.blobs)
 
 
 class FrameWindow:
-    """A node's frames in order of their stamps; past a minute or MAX_FRAME_BYTES the oldest go, and are counted."""
+    """A node's frames, sorted by stamp. Beyond a minute or MAX_FRAME_BYTES the oldest are dropped; `evicted` counts."""
 
     def __init__(self) -> None:
         self.evicted = 0
@@ -55,11 +59,11 @@ class FrameWindow:
         self._frames: list[tuple[Candidates, int | None]] = []
 
     def __len__(self) -> int:
-        """Count the frames."""
+        """Return the number of frames."""
         return len(self._frames)
 
     def add(self, frame: Candidates, receive_ns: int | None) -> None:
-        """Take a frame, in any order."""
+        """Take a frame; frames may come in any order."""
         at = bisect.bisect_right(self._stamps, frame.stamp_ns)
         self._stamps.insert(at, frame.stamp_ns)
         self._frames.insert(at, (frame, receive_ns))
@@ -75,21 +79,21 @@ class FrameWindow:
         return [frame for frame, _ in self._frames[first:last]]
 
     def received_since(self, receive_ns: int | None) -> list[Candidates]:
-        """Return the frames that came at receive_ns or later; all where either time is not known."""
+        """Return the frames received at receive_ns or later, and those whose receive time is unknown; None: all."""
         return [frame for frame, came_ns in self._frames if receive_ns is None or (came_ns or receive_ns) >= receive_ns]
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Drop all frames."""
         self._stamps.clear()
         self._frames.clear()
         self.bytes = 0
 
 
 class NodeStream:
-    """What one node has sent. All windows are bounded.
+    """The messages of one node. All windows are bounded.
 
-    received: frames so far. first_ns, newest_ns: stamps of this time line's first and newest frame. elapsed_ns: how
-    far the frames have come, without the gaps between them: the clock of a dive that is read from a log.
+    received: number of frames so far. first_ns, newest_ns: stamps of the first and newest frame since the node's clock
+    was last set. elapsed_ns: time covered by the frames, without gaps: the waiting clock of a dive read from a log.
     """
 
     def __init__(self, node: str) -> None:
@@ -109,8 +113,8 @@ class NodeStream:
         self._far: deque[int] = deque(maxlen=FRAMES_TO_BELIEVE)
 
     def add_info(self, info: NodeInfo) -> None:
-        """Take a calibration; it holds from its stamp on."""
-        # What the solver does not need may be of any length.
+        """Take a calibration; it is in force from its stamp on."""
+        # Fields that the solver does not need are dropped, because they may be of any length.
         info = replace(info, software="", config_sha256="", tags=UNSET)
         at = bisect.bisect_left(self._calibrations, info.stamp_ns, key=_since)
         if at < len(self._calibrations) and _since(self._calibrations[at]) == info.stamp_ns:
@@ -120,7 +124,7 @@ class NodeStream:
             del self._calibrations[:-MAX_INFOS]
 
     def calibration(self, stamp_ns: int) -> tuple[NodeInfo, Rig] | None:
-        """Return the calibration in force at stamp_ns (before the first one: the first)."""
+        """Return the calibration in force at stamp_ns, or the first one if stamp_ns is before it; None for none."""
         at = bisect.bisect_right(self._calibrations, stamp_ns, key=_since)
         return self._calibrations[max(at - 1, 0)] if self._calibrations else None
 
@@ -140,9 +144,9 @@ class NodeStream:
             sensor.missing_ns = 0
 
     def add_frame(self, frame: Candidates, others_ns: Iterable[int], receive_ns: int | None) -> Arrival:
-        """Take a frame, or say why not.
+        """Take a frame, and return the verdict on it.
 
-        others_ns: newest stamps of the other nodes; one that is near a frame confirms it after a gap.
+        others_ns: newest stamps of the other nodes; after a gap, a stamp near to the frame's confirms it.
         """
         self.received += 1
         verdict = self._place_in_time(frame.stamp_ns, others_ns)
@@ -161,7 +165,7 @@ class NodeStream:
         return verdict
 
     def has_passed(self, trigger: int) -> bool:
-        """Whether this node sent no frame for trigger: its neighbours are here, with nothing between them."""
+        """Return whether the node made no frame for a trigger: the frames around it are consecutive."""
         if trigger in self._sequence or trigger > self._newest_trigger:
             return False
         if trigger - 1 in self._sequence and trigger + 1 in self._sequence:
@@ -177,7 +181,7 @@ class NodeStream:
         return boot_0 == boot_1 and seq_1 == seq_0 + 1
 
     def sensors_cover(self, stamp_ns: int, *, live: bool) -> bool:
-        """Whether attitude and depth for a frame at stamp_ns are here, or are not going to come."""
+        """Return whether attitude and depth for a frame at stamp_ns are here, or will not come."""
         if self.first_ns is None or self.newest_ns is None:
             return True
         first_ns, newest_ns = self.first_ns, self.newest_ns
@@ -207,7 +211,7 @@ class NodeStream:
         return Arrival.CLOCK_SET
 
     def _count_missing(self, receive_ns: int | None) -> None:
-        """Count how long frames have come without the samples of a sensor."""
+        """Add the time since the last frame to each sensor's missing_ns."""
         if receive_ns is None:
             return
         if self._newest_receive_ns is not None:
