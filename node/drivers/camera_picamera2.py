@@ -1,7 +1,7 @@
-"""A Raspberry Pi camera through picamera2 (0.3.25 or later): running freely, everything fixed, frames by trigger.
+"""A Raspberry Pi camera through picamera2 (0.3.25 or later): free-running, fixed settings, one frame a trigger.
 
-The camera is never started or stopped for a picture. Its exposure, gain and white balance do not move, so a
-light looks alike from frame to frame; one control alone moves, the frame's duration, to lock the phase.
+The camera is never started or stopped for a picture. Exposure, gain and white balance are fixed, so that a light
+looks the same in all frames. Only the frame duration is changed, to lock the phase.
 """
 
 from __future__ import annotations
@@ -16,7 +16,14 @@ import numpy as np
 from buddyline.node.config import CameraConfig, NodeConfig
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.health import DeviceHealth
-from buddyline.node.drivers.readout import GLOBAL_SHUTTERS, Readout, boottime_ns, line_time_ns, wall_offset_ns
+from buddyline.node.drivers.readout import (
+    GLOBAL_SHUTTERS,
+    LineTimer,
+    Readout,
+    boottime_ns,
+    first_line_ns,
+    wall_offset_ns,
+)
 from buddyline.node.drivers.samples import DeviceError
 from buddyline.node.trigger import FrameChooser, PhaseLock, frames_per_trigger
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
@@ -45,8 +52,7 @@ CAMERA_ERRORS: Final = (RuntimeError, OSError, ValueError, LookupError, Assertio
 class Picamera2Camera:
     """One camera.
 
-    Its pictures are BGR, or luminance alone. problem: what is wrong, "" where nothing is. row_time_ns: from
-    one row to the next. skipped: frames that were not given out, by reason.
+    Its pictures are BGR, or luminance alone. skipped: frames that were not given out, by reason.
     """
 
     def __init__(
@@ -56,7 +62,6 @@ class Picamera2Camera:
         clock: Clock,
         boottime: Callable[[], int] = boottime_ns,
     ) -> None:
-        self.row_time_ns = 0
         self.skipped: Counter[str] = Counter()
         self._config = config
         self._trigger_period_ns = trigger_period_ns
@@ -73,12 +78,21 @@ class Picamera2Camera:
         """What is wrong with it, "" where nothing is."""
         return self._health.problem
 
+    @property
+    def row_time_ns(self) -> int:
+        """Time from one row of the whole view to the next, as far as it has been measured."""
+        return round(self._readout(self._mode_crop).row_time_ns(self._config.height_px))
+
+    def _readout(self, crop: tuple[int, int, int, int]) -> Readout:
+        line_ns = self._timer.line_ns if self._rolling else 0.0
+        return Readout.of_crop(crop, self._mode_crop, self._mode_height, line_ns)
+
     def info(self) -> NodeInfo | None:
-        """Return None: the calibration stands in the configuration."""
+        """Return None: the calibration is in the configuration."""
         return None
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
-        """Wait for the next trigger's frame; None once stop is set. A camera that fails is opened anew."""
+        """Wait for the next trigger's frame; None once stop is set. A camera that fails is opened again."""
         while not stop.is_set():
             try:
                 frame = self._next(stop)
@@ -95,7 +109,7 @@ class Picamera2Camera:
         camera, self._camera = self._camera, None
         if camera is None:
             return
-        # libcamera can hang on a camera that is gone; the node's end must not.
+        # libcamera can hang on a camera that was unplugged; the node must still end.
         closing = threading.Thread(target=_close, args=(camera,), name="camera closing", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
@@ -143,12 +157,11 @@ class Picamera2Camera:
         self._mode_crop, self._mode_height = tuple(mode["crop_limits"]), int(mode["size"][1])
         model = str(camera.camera_properties.get("Model", "unknown"))
         shortest_us = int(camera.camera_controls["FrameDurationLimits"][0])
-        line_ns = line_time_ns(model, shortest_us, self._mode_height)
-        self._line_ns = 0.0 if model in GLOBAL_SHUTTERS else line_ns
-        self._lock = PhaseLock(self._trigger_period_ns, self._frames, shortest_us * 1000, line_ns)
+        self._rolling = model not in GLOBAL_SHUTTERS
+        self._timer = LineTimer(first_line_ns(model, shortest_us, self._mode_height))
+        self._timer.update(shortest_us)
+        self._lock = PhaseLock(self._trigger_period_ns, self._frames, shortest_us * 1000, self._timer.line_ns)
         self._chooser = FrameChooser(self._trigger_period_ns, self._frame_period_ns)
-        whole = Readout.of_crop(self._mode_crop, self._mode_crop, self._mode_height, self._line_ns)
-        self.row_time_ns = round(whole.row_time_ns(config.height_px))
         if self._frame_period_ns < shortest_us * 1000 or self._frame_period_ns <= config.exposure_us * 1000:
             raise DeviceError(
                 f"camera: a frame each {self._frame_period_ns / 1e6:.1f} ms cannot be had (mode: "
@@ -157,7 +170,7 @@ class Picamera2Camera:
         camera.set_controls(self._controls(camera.camera_controls))
 
     def _controls(self, known: dict[str, tuple[Any, Any, Any]]) -> dict[str, Any]:
-        """Return all controls, fixed. Enumerations go by libcamera's numbers."""
+        """Return all controls, fixed. Enumerations are libcamera's numbers."""
         config = self._config
         controls: dict[str, Any] = {
             "AeEnable": False,
@@ -201,9 +214,8 @@ class Picamera2Camera:
             if wrong:
                 self._health.update(wrong)
                 return None
-            readout = Readout.of_crop(
-                tuple(metadata.get("ScalerCrop", self._mode_crop)), self._mode_crop, self._mode_height, self._line_ns
-            )
+            self._measure_line(metadata)
+            readout = self._readout(tuple(metadata.get("ScalerCrop", self._mode_crop)))
             stamp_ns = readout.middle_ns(metadata["SensorTimestamp"], metadata["ExposureTime"])
             stamp_ns += wall_offset_ns(self._boottime, self._clock.now_ns)
             self._keep_phase(stamp_ns)
@@ -212,7 +224,7 @@ class Picamera2Camera:
                 return None
             image = self._copy(request)
         finally:
-            # What set_controls was given goes out with the request that is released next.
+            # Controls given to set_controls ride on the request that is released next.
             request.release()
         self._health.update("")
         return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])))
@@ -232,7 +244,7 @@ class Picamera2Camera:
                     raise RuntimeError(f"no frame for {SILENCE_NS / 1e9:.0f} s") from None
 
     def _wrong_time(self, metadata: dict[str, Any]) -> str:
-        """Say why a frame does not tell when it was taken, "" where it does."""
+        """Return why the frame's time is unknown, "" where it is known."""
         sensor_ns = metadata.get("SensorTimestamp")
         if sensor_ns is None or metadata.get("ExposureTime") is None:
             self.skipped["no_time"] += 1
@@ -243,6 +255,15 @@ class Picamera2Camera:
             return f"SensorTimestamp is {age_ns / 1e9:.3f} s away from CLOCK_BOOTTIME"
         return ""
 
+    def _measure_line(self, metadata: dict[str, Any]) -> None:
+        if self._timer.measured:
+            return
+        for name in ("ExposureTime", "FrameDuration"):
+            if name in metadata:
+                self._timer.update(int(metadata[name]))
+        if self._timer.measured:
+            log.info("camera: a line takes %.3f us", self._timer.line_ns / 1000)
+
     def _keep_phase(self, stamp_ns: int) -> None:
         if self._config.sync == "client":
             return  # libcamera moves this camera's frames to the server's
@@ -251,7 +272,7 @@ class Picamera2Camera:
             self._camera.set_controls({"FrameDurationLimits": _limits(duration_ns)})
 
     def _copy(self, request: Any) -> NDArray[np.uint8]:
-        """Return the picture, out of the camera's memory: that is overwritten once the request is released."""
+        """Return a copy of the picture: the camera's buffer is overwritten once the request is released."""
         height, width = self._config.height_px, self._config.width_px
         with self._mapped_array(request, "main") as mapped:
             return np.array(mapped.array[:height, :width], np.uint8, order="C")

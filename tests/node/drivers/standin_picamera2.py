@@ -251,8 +251,10 @@ class Picamera2:
         buffer[:, self._config["main"]["size"][0] :] = 255  # padding is no picture
         metadata = {
             "SensorTimestamp": readout_ns,
-            "ExposureTime": self._active.get("ExposureTime", 20_000),
-            "FrameDuration": round(lines * sensor.line_ns / 1000),
+            "ExposureTime": int(
+                self._active.get("ExposureTime", 20_000) * 1000 // sensor.line_ns * sensor.line_ns / 1000
+            ),
+            "FrameDuration": int(lines * sensor.line_ns / 1000),
             "ScalerCrop": next(
                 m["crop_limits"] for m in sensor.modes if m.get("size") == self._config["sensor"]["output_size"]
             ),

@@ -76,7 +76,7 @@ def test_stamp_is_the_middle_of_exposure_of_the_middle_row_on_the_wall_clock(sen
     camera = make(sensor, CameraConfig(exposure_us=6000))
     (frame,) = frames(camera, 1)
     boot_to_wall_ns = sensor.start_ns - standin.BOOT_NS + 5 * S_NS
-    expected_ns = seen[-1] + (1232 - 1) / 2 * 18_904 - 3_000_000 + boot_to_wall_ns
+    expected_ns = seen[-1] + (1232 - 1) / 2 * 18_904 - 317 * 18_904 / 2 + boot_to_wall_ns
     assert frame.stamp_ns == pytest.approx(expected_ns, abs=2000)
     assert frame.row_time_ns == pytest.approx(2 * 18_904, abs=5)
     assert camera.row_time_ns == frame.row_time_ns
@@ -125,6 +125,22 @@ def test_everything_is_fixed_before_the_start(sensor):
     low, high = first["FrameDurationLimits"]
     assert low == high == pytest.approx(100_000, abs=20)
     assert "AfMode" not in first
+
+
+@pytest.mark.parametrize(
+    ("model", "blanking"), [("imx708", 40), ("imx708", 58), ("imx219", 32), ("imx219", 50), ("imx999", 21)]
+)
+def test_the_line_is_measured_whatever_the_kernels_blanking_is(sensor, model, blanking):
+    """A line 1.3 % too short puts the middle of exposure of the middle row off by 114 us on the IMX708."""
+    sensor.model, sensor.blanking, sensor.line_ns = model, blanking, 13_365.1
+    seen = []
+    sensor.alter_metadata = lambda metadata: seen.append((metadata["SensorTimestamp"], metadata["ExposureTime"]))
+    camera = make(sensor)
+    frame = frames(camera, 60)[-1]
+    boot_to_wall_ns = sensor.start_ns - standin.BOOT_NS
+    expected_ns = seen[-1][0] + (1232 - 1) / 2 * 13_365.1 - seen[-1][1] * 500 + boot_to_wall_ns
+    assert frame.stamp_ns == pytest.approx(expected_ns, abs=5000)
+    assert camera.row_time_ns == pytest.approx(2 * 13_365.1, abs=5)
 
 
 def test_module_3_gets_a_fixed_focus(sensor):

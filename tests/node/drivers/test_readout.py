@@ -5,19 +5,40 @@ from __future__ import annotations
 import logging
 
 import pytest
-from buddyline.node.drivers.readout import Readout, boottime_ns, line_time_ns, wall_offset_ns
+from buddyline.node.drivers.readout import LineTimer, Readout, boottime_ns, first_line_ns, wall_offset_ns
 
 FULL = (0, 0, 3280, 2464)
 
 
 def test_line_time_of_the_imx219s_binned_mode():
     """41.85 frames a second of 1232 + 32 lines."""
-    assert line_time_ns("imx219", 23_895, 1232) == pytest.approx(18_904, abs=1)
+    assert first_line_ns("imx219", 23_895, 1232) == pytest.approx(18_904, abs=1)
+
+
+@pytest.mark.parametrize("exposure_us", [1000, 4000, 20_000])
+@pytest.mark.parametrize("error", [-0.04, -0.013, 0.0, 0.013, 0.04])
+def test_whole_numbers_of_lines_tell_the_line(exposure_us, error):
+    """IMX708's binned mode: 1296 + 40 lines of 13.365 us; durations in whole microseconds, as libcamera gives them."""
+    true_ns = 13_365.1
+    timer = LineTimer(true_ns * (1 + error))
+    timer.update(int(1336 * true_ns / 1000))
+    timer.update(int(exposure_us * 1000 // true_ns * true_ns / 1000))
+    for lines in (7482, 9104, 7483, 6011, 8257, 5555):
+        timer.update(int(lines * true_ns / 1000))
+    assert timer.measured
+    assert timer.line_ns == pytest.approx(true_ns, abs=1.0)
+
+
+def test_a_duration_that_is_no_whole_number_of_lines_is_left_out():
+    timer = LineTimer(18_904.0)
+    timer.update(23_895)
+    timer.update(9)
+    assert timer.line_ns == pytest.approx(18_904, abs=5)
 
 
 def test_a_sensor_not_known_is_good_to_a_few_percent_and_says_so(caplog):
     with caplog.at_level(logging.WARNING):
-        assert line_time_ns("imx999", 23_895, 1232) == pytest.approx(18_904, rel=0.04)
+        assert first_line_ns("imx999", 23_895, 1232) == pytest.approx(18_904, rel=0.04)
     assert "imx999" in caplog.text
 
 
