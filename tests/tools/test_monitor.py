@@ -374,8 +374,10 @@ class PlotFolder:
     def add_folder(self, _: str) -> AbstractContextManager[None]:
         return nullcontext()
 
-    def add_uplot(self, data: tuple[Floats, ...], _: object, *, title: str, **how: object) -> SimpleNamespace:
-        self.plots[title] = SimpleNamespace(data=data, visible=True)
+    def add_uplot(
+        self, data: tuple[Floats, ...], _: object, *, title: str, scales: object, **how: object
+    ) -> SimpleNamespace:
+        self.plots[title] = SimpleNamespace(data=data, scales=scales, visible=True)
         return self.plots[title]
 
 
@@ -391,6 +393,9 @@ class TestTimePlots:
             assert np.isfinite(plot.data[0]).all()
             # Each instant has one value: the pose's or the track's.
             assert (np.isfinite(plot.data[1:]).sum(axis=0) == 1).all()
+            low, high = plot.scales["y"]["range"]
+            assert low <= np.nanmin(plot.data[1:]) <= np.nanmax(plot.data[1:]) <= high
+            assert low < high
             assert (np.diff(plot.data[0]) > 0).all()
             assert len(plot.data[0]) == len(plot.data[1])
         # The azimuth was known once.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, redirect_stdout
 from typing import TYPE_CHECKING, Any, Final
 
@@ -81,31 +82,47 @@ class TimePlots:
             counts, edges_s = np.histogram(missed_s, int(PLOTTED_S), (-PLOTTED_S, 0.0))
             plots[MISSES] = edges_s[1:], counts.astype(float)
         for title, data in plots.items():
-            if title in self._plots:
-                self._plots[title].data = data
-            else:
-                self._plots[title] = self._add(title, data)
+            scales = _scales(data[1:])
+            plot = self._plots.get(title)
+            if plot is None:
+                self._plots[title] = self._add(title, data, scales)
+                continue
+            # Other scales make the browser draw the whole plot anew, where other data do not.
+            if plot.scales != scales:
+                plot.scales = scales
+            plot.data = data
         for title, plot in self._plots.items():
             if plot.visible != (title in plots):
                 plot.visible = title in plots
 
-    def _add(self, title: str, data: tuple[Floats, ...]) -> viser.GuiUplotHandle:
+    def _add(self, title: str, data: tuple[Floats, ...], scales: Any) -> viser.GuiUplotHandle:
         drawn = [_series(title, NO_POSE_COLOUR, 0, 1)] if title == MISSES else [
             _series("pose", POSE_COLOUR, 4, 0),
             _series("track", TRACK_COLOUR, 2, 0),
         ]  # fmt: skip
         series: Any = ({"label": "s before now"}, *drawn)
-        x_scale: Any = {"time": False, "range": (-PLOTTED_S, 0.0)}
         with self._folder:
             return self._gui.add_uplot(
                 data,
                 series,
                 title=title,
-                scales={"x": x_scale},
+                scales=scales,
                 axes=({"size": 26}, {}),
                 legend={"show": False},
                 height=PLOT_PX,
             )
+
+
+def _scales(columns: Sequence[Floats]) -> Any:
+    """Return the scales of a plot: the browser finds no range among values of which some are NaN.
+
+    The range is of round numbers, so that it seldom changes.
+    """
+    values = np.concatenate(columns)
+    least, most = float(np.nanmin(values)), float(np.nanmax(values))
+    step = 10.0 ** math.floor(math.log10(max(most - least, 1e-3 * abs(most), 1e-3)))
+    low, high = step * math.floor(least / step), step * math.ceil(most / step)
+    return {"x": {"time": False, "range": (-PLOTTED_S, 0.0)}, "y": {"range": (low, max(high, low + step))}}
 
 
 def _series(label: str, colour: str, dot_px: int, line_px: int) -> dict[str, Any]:
