@@ -7,6 +7,7 @@ import statistics
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -15,32 +16,48 @@ from buddyline.node.sim.scenario import Environment, Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
-from buddyline.protocol.health import stale_after_s
-from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus, Truth
-from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS
+from buddyline.protocol.health import NO_LIGHT_S, stale_after_s
+from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus, Track, TrackMode, Truth
+from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
-from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
+from buddyline.tools.estimate import Estimate, known, range_sigma_m, sigma_m
+from buddyline.tools.evaluation.poses import PoseErrors, differences, pose_errors
+from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.live import follow
-from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
 
 RECENT_S: Final = 5.0
+# For the figures of the whole run the track is kept so often: its errors last longer.
+TRACK_SPACING_NS: Final = S_NS // 5
+SHARE_SAMPLES: Final = 500
 
 
 class Dashboard:
     """Keeps the newest of everything; safe to feed from the bus's threads."""
 
-    def __init__(self, environment: str, seed: int, start_ns: int, rate_hz: float) -> None:
+    def __init__(
+        self,
+        environment: str,
+        seed: int,
+        start_ns: int,
+        rate_hz: float,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._now_s = now_s
         self._title = f"Buddyline demo: {environment}, seed {seed}, {rate_hz:g} Hz"
         self._period_s = 1.0 / rate_hz
         self._world = World(Scenario(environment=cast(Environment, environment), seed=seed, start_ns=start_ns))
         self._lock = threading.Lock()
-        self._began_s = time.monotonic()
+        self._began_s = self._now_s()
         self._poses: list[RelativePose] = []
         self._truths: list[Truth] = []
+        self._track: Track | None = None
+        self._track_came_s = 0.0
+        self._tracks: dict[TrackMode, list[Track]] = {}
+        self._track_truths: list[Truth] = []
         self._latencies_s: list[float] = []
         self._recent: deque[float] = deque()
         self._rejected: Counter[str] = Counter()
@@ -49,9 +66,9 @@ class Dashboard:
         self._solver: SolverStatus | None = None
 
     def subscribe(self, bus: Bus) -> None:
-        """Follow poses, rejections and everyone's health."""
+        """Follow poses, tracks, rejections and everyone's health."""
         refusals = Refusals("demo")
-        for topic in (POSE, REJECTED, SOLVER_STATUS, NODE_STATUS):
+        for topic in (POSE, TRACK, TRACK_LAG, REJECTED, SOLVER_STATUS, NODE_STATUS):
             follow(bus, topic.key_any(), refusals, self.take)
 
     def take(self, envelope: Envelope) -> None:
@@ -62,9 +79,11 @@ class Dashboard:
                 self._poses.append(message)
                 self._truths.append(self._world.truth(message.stamp_ns, message.trigger))
                 self._latencies_s.append((envelope.time_ns - message.stamp_ns) / S_NS)
-                self._recent.append(time.monotonic())
+                self._recent.append(self._now_s())
                 while self._recent[0] < self._recent[-1] - RECENT_S:
                     self._recent.popleft()
+            elif isinstance(message, Track):
+                self._take_track(message)
             elif isinstance(message, Rejected):
                 self._rejected[message.reason] += 1
                 self._last_rejected = message
@@ -76,13 +95,15 @@ class Dashboard:
     def line(self) -> str:
         """Return the present state in one line, for a log."""
         with self._lock:
-            start, end = f"{self._passed_s():6.1f} s", f"rejected {sum(self._rejected.values())}"
-            if not self._poses:
+            start = f"{self._passed_s():6.1f} s"
+            end = f"rejected {sum(self._rejected.values())}"
+            shown = self._shown()
+            if shown is None:
                 return f"{start}  no pose yet  {end}"
-            pose, off_m, _, turned_deg = self._newest()
+            off_m, _, turned_deg = self._off(shown)
             return (
-                f"{start}  range {pose.range_m:6.3f} m  {_direction(pose)}  off {off_m * 1e3:6.1f} mm "
-                f"{turned_deg:5.2f} deg  {self._rate_hz():4.1f} poses/s  {end}"
+                f"{start}  range {shown.range_m:6.3f} m ± {range_sigma_m(shown) * 1e3:.0f} mm  {_direction(shown)}  "
+                f"off {off_m * 1e3:6.1f} mm {turned_deg:5.2f} deg  {self._age(shown)}{self._shares()}  {end}"
             )
 
     def screen(self) -> str:
@@ -91,38 +112,82 @@ class Dashboard:
             lines = [self._title, "", *self._pose_lines(), "", *self._health_lines(), "", "Ctrl-C ends."]
         return "\x1b[H\x1b[2J" + "\n".join(lines)
 
-    def _errors(self, newest: int = 0) -> PoseErrors:
-        """Return the errors of the newest poses (0: of all)."""
-        poses, track = self._poses[-newest:], TruthTrack(self._truths[-newest:])
-        return pose_errors(poses, track, lambda _: None, None)
+    def _errors(self) -> PoseErrors:
+        return pose_errors(self._poses, TruthTrack(self._truths), lambda _: None, None)
 
-    def _newest(self) -> tuple[RelativePose, float, float, float]:
-        """Return the newest pose, how far it is off, m, its range's error, m, and how far it is turned, deg."""
-        errors = self._errors(newest=1)
-        turned_deg = math.degrees(errors.rotation_rad[0])
-        return self._poses[-1], float(errors.translation_m[0]), float(errors.range_m[0]), turned_deg
+    def _track_figures(self) -> list[TrackFigures]:
+        tracks = [track for kept in self._tracks.values() for track in kept]
+        return tracks_figures(tracks, self._poses, TruthTrack(self._track_truths))
+
+    def _take_track(self, track: Track) -> None:
+        if track.mode == "filter":
+            self._track, self._track_came_s = track, self._now_s()
+        kept = self._tracks.setdefault(track.mode, [])
+        if not kept or track.stamp_ns - kept[-1].stamp_ns >= TRACK_SPACING_NS:
+            kept.append(track)
+            self._track_truths.append(self._world.truth(track.stamp_ns, 0))
+
+    def _shown(self) -> Estimate | None:
+        """Return the track, or where it is missing or stale the newest pose."""
+        stale_s = stale_after_s(TRACK, self._period_s)
+        if self._track is not None and self._now_s() - self._track_came_s < stale_s:
+            return self._track
+        return self._poses[-1] if self._poses else self._track
+
+    def _age(self, shown: Estimate) -> str:
+        """Return what is to be said of the age of what is shown, "" where it goes without saying."""
+        if isinstance(shown, Track):
+            dark_s = shown.age_s + self._now_s() - self._track_came_s
+            return f"no light for {dark_s:.1f} s  " if dark_s > NO_LIGHT_S else ""
+        age_s = self._now_s() - self._recent[-1]
+        stale = f", STALE: {age_s:.1f} s old" if age_s >= stale_after_s(POSE, self._period_s) else ""
+        return f"no track, the last pose{stale}  "
+
+    def _shares(self) -> str:
+        """Return the shares of time with a track and of triggers with a pose."""
+        tracks = self._tracks.get("filter", [])
+        # Of a long run a part is enough to tell a share by.
+        covered = covered_share(tracks[:: 1 + len(tracks) // SHARE_SAMPLES], self._poses)
+        solved = self._solved_share()
+        return f"track {covered or 0.0:.0%} of the time, poses {solved or 0.0:.0%} of triggers"
+
+    def _solved_share(self) -> float | None:
+        total = len(self._poses) + sum(self._rejected.values())
+        return len(self._poses) / total if total else None
+
+    def _off(self, shown: Estimate) -> tuple[float, float, float]:
+        """Return how far an estimate is off, m, its range's error, m, and how far it is turned, deg."""
+        true = TruthTrack([self._world.truth(shown.stamp_ns, 0)]).interpolated(shown.stamp_ns)
+        off = differences([(shown, true)] if true is not None else [])
+        return (
+            float(off.translation_m[0]),
+            shown.range_m - float(off.true_range_m[0]),
+            math.degrees(float(off.rotation_rad[0])),
+        )
 
     def _pose_lines(self) -> list[str]:
-        if not self._poses:
+        shown = self._shown()
+        if shown is None:
             return ["no pose yet"]
-        pose, off_m, off_range_m, turned_deg = self._newest()
-        age_s = time.monotonic() - self._recent[-1]
-        stale = f"   (STALE: {age_s:.1f} s old)" if age_s >= stale_after_s(POSE, self._period_s) else ""
-        sigma_m = math.sqrt(max(np.trace(np.array(pose.covariance).reshape(6, 6)[:3, :3]), 0.0))
-        R = R_BODY_CAMERA @ quat_to_matrix(np.array(pose.q_a_b_xyzw)) @ R_BODY_CAMERA.T
+        off_m, off_range_m, turned_deg = self._off(shown)
+        R = R_BODY_CAMERA @ quat_to_matrix(np.array(shown.q_a_b_xyzw)) @ R_BODY_CAMERA.T
         roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
         pitch = math.asin(min(max(-R[2, 0], -1.0), 1.0))
         roll_deg, pitch_deg, yaw_deg = map(math.degrees, (roll, pitch, yaw))
-        return [
-            f"range        {pose.range_m:8.3f} m   (1 sd of the position: {sigma_m * 1e3:.1f} mm){stale}",
-            f"direction    {_direction(pose)}",
+        lines = [
+            f"range        {shown.range_m:8.3f} m   (1 sd of the position: {sigma_m(shown) * 1e3:.1f} mm)",
+            f"direction    {_direction(shown)}",
             f"B beside A   roll {roll_deg:+7.2f}  pitch {pitch_deg:+7.2f}  yaw {yaw_deg:+7.2f} deg",
             f"against truth {off_m * 1e3:7.1f} mm off, range {off_range_m * 1e3:+.1f} mm, turned {turned_deg:.2f} deg",
-            f"checks       {', '.join(pose.checks)}   ({pose.method}, {pose.hypotheses} hypotheses)",
+            f"from         {'the track  ' if isinstance(shown, Track) else ''}{self._age(shown)}",
         ]
+        if self._poses:
+            pose = self._poses[-1]
+            lines.append(f"checks       {', '.join(pose.checks)}   ({pose.method}, {pose.hypotheses} hypotheses)")
+        return lines
 
     def _health_lines(self) -> list[str]:
-        lines = [f"poses        {len(self._poses)} so far, {self._rate_hz():.1f} a second"]
+        lines = [f"poses        {len(self._poses)} so far, {self._rate_hz():.1f} a second; {self._shares()}"]
         if self._latencies_s:
             median_ms = statistics.median(self._latencies_s[-200:]) * 1e3
             lines.append(f"latency      {median_ms:.1f} ms from exposure to here")
@@ -138,10 +203,10 @@ class Dashboard:
         return lines
 
     def _passed_s(self) -> float:
-        return time.monotonic() - self._began_s
+        return self._now_s() - self._began_s
 
     def _rate_hz(self) -> float:
-        now_s = time.monotonic()
+        now_s = self._now_s()
         return sum(1 for s in self._recent if s > now_s - RECENT_S) / min(RECENT_S, max(self._passed_s(), 1.0))
 
     def summary(self, cpu_s: dict[str, float]) -> dict[str, Any]:
@@ -153,8 +218,21 @@ class Dashboard:
                 "seconds": self._passed_s(),
                 "poses": len(errors),
                 "rejected": dict(self._rejected),
+                "solved_share": self._solved_share(),
                 "wrong_poses": int(errors.wrong.sum()),
+                "tracks": {
+                    figures.mode: {
+                        "samples": figures.samples,
+                        "covered_share": figures.covered,
+                        "wrong_samples": figures.wrong,
+                        "position_error_m": figures.position_m.median,
+                        "worst_position_error_m": figures.worst_m,
+                        "rotation_error_deg": _degrees(figures.rotation_rad.median),
+                    }
+                    for figures in self._track_figures()
+                },
                 "position_error_m": _median(errors.translation_m),
+                "worst_position_error_m": float(errors.translation_m.max()) if len(errors) else None,
                 "range_error_m": _median(np.abs(errors.range_m)),
                 "rotation_error_deg": _median(np.degrees(errors.rotation_rad)),
                 "latency_ms": _median(latencies_ms),
@@ -175,22 +253,43 @@ def summary_text(summary: dict[str, Any]) -> str:
         return f"no pose in {summary['seconds']:.0f} s; rejected: {summary['rejected'] or 'nothing'}"
     rejected = ", ".join(f"{reason} {count}" for reason, count in summary["rejected"].items()) or "none"
     cpu = ", ".join(f"{name} {share:.0%}" for name, share in summary["cpu_share"].items())
-    return (
-        f"{summary['poses']} poses in {summary['seconds']:.0f} s; without a pose: {rejected}\n"
+    lines = [
+        f"{summary['poses']} poses in {summary['seconds']:.0f} s, of {summary['solved_share']:.0%} of the triggers; "
+        f"without a pose: {rejected}",
         f"median error: position {summary['position_error_m'] * 1e3:.1f} mm, range "
-        f"{summary['range_error_m'] * 1e3:.1f} mm, rotation {summary['rotation_error_deg']:.2f} deg; "
-        f"{summary['wrong_poses']} wrong (off by more than a tenth of the range)\n"
-        f"exposure to pose: median {summary['latency_ms']:.0f} ms, p99 {summary['latency_p99_ms']:.0f} ms\n"
-        f"processor: {cpu}"
+        f"{summary['range_error_m'] * 1e3:.1f} mm, rotation {summary['rotation_error_deg']:.2f} deg; worst position "
+        f"{summary['worst_position_error_m'] * 1e3:.0f} mm; "
+        f"{summary['wrong_poses']} wrong (off by more than a tenth of the range)",
+        *(_track_words(mode, track) for mode, track in summary["tracks"].items() if track["samples"]),
+        f"exposure to pose: median {summary['latency_ms']:.0f} ms, p99 {summary['latency_p99_ms']:.0f} ms",
+        f"processor: {cpu}",
+    ]
+    return "\n".join(lines)
+
+
+def _track_words(mode: str, track: dict[str, Any]) -> str:
+    name = {"filter": "track", "lag": "track, a second later"}.get(mode, mode)
+    return (
+        f"{name}: covers {track['covered_share'] or 0.0:.0%} of the time; median error: position "
+        f"{track['position_error_m'] * 1e3:.1f} mm, rotation {track['rotation_error_deg']:.2f} deg; worst position "
+        f"{track['worst_position_error_m'] * 1e3:.0f} mm; {track['wrong_samples']} of {track['samples']} samples wrong"
     )
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
 
 
 def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
-def _direction(pose: RelativePose) -> str:
-    if pose.azimuth_rad is UNSET or pose.inclination_rad is UNSET:
-        return "azimuth unknown"
-    azimuth_deg, inclination_deg = math.degrees(pose.azimuth_rad), math.degrees(pose.inclination_rad)
-    return f"azimuth {azimuth_deg:6.2f} deg  inclination {inclination_deg:+6.2f} deg"
+def _direction(shown: Estimate) -> str:
+    said = []
+    for name, digits in (("azimuth", "6.2f"), ("inclination", "+6.2f")):
+        angle_rad, sigma_rad = known(shown, f"{name}_rad"), known(shown, f"sigma_{name}_rad")
+        if angle_rad is None:
+            return "azimuth unknown"
+        sigma = "" if sigma_rad is None else f" ± {math.degrees(sigma_rad):.2f}"
+        said.append(f"{name} {math.degrees(angle_rad):{digits}}{sigma} deg")
+    return "  ".join(said)

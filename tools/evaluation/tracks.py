@@ -27,8 +27,9 @@ GAP_S: Final = NO_LIGHT_S
 class TrackFigures:
     """One mode of a pair's track. samples: that have truth; wrong_in_gaps: of the wrong ones, those in a gap.
 
-    covered: share of the time from the first to the last pose. nees6, nees3: mean 6 and 3 where the covariance is
-    honest. in_gaps_m, outside_m: position errors in and outside gaps. ned: None without true NED.
+    covered: share of the time from the first to the last pose. worst_m: largest error of position. nees6, nees3: mean
+    6 and 3 where the covariance is honest. in_gaps_m, outside_m: position errors in and outside gaps. ned: None
+    without true NED.
     """
 
     mode: TrackMode
@@ -37,6 +38,7 @@ class TrackFigures:
     wrong: int
     wrong_in_gaps: int
     position_m: Stats
+    worst_m: float | None
     rotation_rad: Stats
     in_gaps_m: Stats
     outside_m: Stats
@@ -79,6 +81,7 @@ def _figures(
         wrong=int(wrong.sum()),
         wrong_in_gaps=int((wrong & in_gap).sum()),
         position_m=Stats.of(off.translation_m),
+        worst_m=float(off.translation_m.max()) if found else None,
         rotation_rad=Stats.of(off.rotation_rad),
         in_gaps_m=Stats.of(off.translation_m[in_gap]),
         outside_m=Stats.of(off.translation_m[~in_gap]),

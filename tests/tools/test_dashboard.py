@@ -1,0 +1,107 @@
+"""What the demo says of a running pair: the track between fixes, its age, and both against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.codec import encode
+from buddyline.protocol.envelope import open_envelope
+from buddyline.protocol.messages import Message
+from buddyline.protocol.topics import key_of
+from buddyline.tools.dashboard import Dashboard, summary_text
+
+from tests.tools.evaluated import pose, rejection, track
+from tests.tools.watched import START_NS, at
+
+OFF_M = np.array((0.0, 0.0, 0.02))
+NED = {"azimuth_rad": 1.0, "inclination_rad": 0.1}
+SIGMAS = {"sigma_azimuth_rad": 0.05, "sigma_inclination_rad": 0.01}
+WORLD = World(Scenario(environment="cavern", seed=1, start_ns=START_NS))
+
+
+class Watch:
+    """A dashboard, and a clock that stands still."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.dashboard = Dashboard("cavern", 1, START_NS, 10.0, lambda: self.now_s)
+
+    def take(self, message: Message) -> None:
+        self.dashboard.take(open_envelope(key_of(message), encode(message), at(0)))
+
+
+def estimate(k: int, off_m: float = 1.0) -> dict[str, object]:
+    """The truth at trigger k, as an estimate that is off by so many times OFF_M."""
+    true = WORLD.truth(at(k), k)
+    t_m = np.array(true.t_a_b_m) + off_m * OFF_M
+    return {"t_a_b_m": tuple(t_m), "q_a_b_xyzw": true.q_a_b_xyzw, "range_m": float(np.linalg.norm(t_m))}
+
+
+def running() -> Watch:
+    """Eleven poses, twenty rejections, and a track that goes on; one sample of it is wrong."""
+    watch = Watch()
+    for k in range(31):
+        watch.take(pose(k, **estimate(k, 2.0)) if k % 3 == 0 else rejection(k))
+        for mode in ("filter", "lag"):
+            watch.take(
+                track(k, mode=mode, age_s=0.7 * (k == 30), **estimate(k, 100.0 if k == 20 else 1.0), **NED, **SIGMAS)
+            )
+    return watch
+
+
+def test_the_line_shows_the_track_with_its_sigma_and_how_long_it_saw_no_light():
+    watch = running()
+    watch.now_s = 0.5
+    line = watch.dashboard.line()
+    assert "azimuth  57.30 ± 2.86 deg  inclination  +5.73 ± 0.57 deg" in line
+    assert "off   20.0 mm" in line
+    assert "no light for 1.2 s" in line
+    assert "track 100% of the time, poses 35% of triggers" in line
+    assert "no light for 1.2 s" in watch.dashboard.screen()
+
+
+def test_a_stale_track_gives_way_to_the_last_pose_and_that_is_said():
+    watch = running()
+    watch.now_s = 2.0
+    line = watch.dashboard.line()
+    assert "off   40.0 mm" in line
+    assert "no track, the last pose, STALE: 2.0 s old" in line
+    assert "no track, the last pose" in watch.dashboard.screen()
+
+
+def test_a_track_without_poses_is_shown():
+    watch = Watch()
+    assert "no pose yet" in watch.dashboard.line()
+    assert "no pose yet" in watch.dashboard.screen()
+    watch.take(track(0, **estimate(0)))
+    assert "off   20.0 mm" in watch.dashboard.line()
+
+
+def test_the_summary_has_the_track_s_errors_beside_the_poses():
+    watch = running()
+    watch.now_s = 1.0
+    summary = watch.dashboard.summary({})
+    assert summary["solved_share"] == pytest.approx(11 / 31)
+    assert summary["position_error_m"] == pytest.approx(0.04)
+    assert set(summary["tracks"]) == {"filter", "lag"}
+    found = summary["tracks"]["filter"]
+    # Every second of the 31 is kept.
+    assert (found["samples"], found["wrong_samples"], found["covered_share"]) == (16, 1, 1.0)
+    assert found["position_error_m"] == pytest.approx(0.02)
+    assert found["worst_position_error_m"] == pytest.approx(2.0)
+    text = summary_text(summary)
+    assert "track: covers 100% of the time; median error: position 20.0 mm" in text
+    assert "worst position 2000 mm; 1 of 16 samples wrong" in text
+    assert "track, a second later" in text
+
+
+def test_a_run_without_a_track_has_no_figures_of_it():
+    watch = Watch()
+    watch.now_s = 1.0
+    assert summary_text(watch.dashboard.summary({})).startswith("no pose in 1 s")
+    watch.take(pose(0, **estimate(0)))
+    summary = watch.dashboard.summary({})
+    assert summary["tracks"] == {}
+    assert "track" not in summary_text(summary)
