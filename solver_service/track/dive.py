@@ -22,6 +22,7 @@ _BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 # How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
 UNTOLD_CLOCK_S: Final = 0.1
 CLOCK_LEFT_S: Final = 0.003
+CLOCK_WITHOUT_S: Final = 0.003
 FAR_CLOCK_S: Final = 0.06
 CLOCK_ROUNDS: Final = 3
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
@@ -79,7 +80,7 @@ def smooth(
     records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
 ) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    end_ns = last_ns(records)
+    end_ns, told_ns = last_ns(records), clock_ns
     for _ in range(CLOCK_ROUNDS):
         first = filter_of(records, fixes, clock_ns, UNTOLD_CLOCK_S)
         first.advance(end_ns)
@@ -90,6 +91,11 @@ def smooth(
             break
         # So far off, the pass was not linear: once more, from there.
         clock_ns += round(parts[-1].state.clock_s * 1e9)
+    if any(any(part.without) for part in parts):
+        # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
+        only = filter_of(records, fixes, told_ns, CLOCK_WITHOUT_S)
+        only.advance(end_ns)
+        return rows_of(only, parts_of(only), outputs_ns)
     # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
     learned = parts[-1]
     shift_s = learned.state.clock_s
