@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import IO, Final, cast
 
+import msgspec
 from buddyline.protocol import topics
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
@@ -43,8 +44,7 @@ MAX_NOTES: Final = 100
 _DAMAGE = (McapError, ValueError, struct.error, EOFError, OSError, MemoryError, RuntimeError, ZstdError)
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(msgspec.Struct, frozen=True, gc=False):
     """One message of a log: its key, its times in ns, and its payload as on the bus.
 
     sequence: number of the message in its log, from 0, modulo 2**32, where DiveLogWriter wrote the log.
@@ -124,9 +124,9 @@ class DiveLogWriter:
 
     def write_message(self, message: Message, log_time_ns: int | None = None, key: str | None = None) -> None:
         """Add one message; log_time_ns: by default its own stamp; key: by default its topic's."""
-        payload = encode(message)
-        stamp_ns = payload_stamp_ns(payload) or 0
-        self.write(key or topics.key_of(message), payload, stamp_ns if log_time_ns is None else log_time_ns, stamp_ns)
+        stamp_ns: int = getattr(message, "stamp_ns", 0)
+        time_ns = stamp_ns if log_time_ns is None else log_time_ns
+        self.write(key or topics.key_of(message), encode(message), time_ns, stamp_ns)
 
     def _register(self, key: str, schema: str) -> int:
         parsed = topics.parse_key(key)

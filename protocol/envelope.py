@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
+import msgspec
 from buddyline.protocol.codec import M, decode, encode
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, Message
@@ -22,8 +23,7 @@ MAX_NAMED_KEYS: Final = 32
 CAMERA_FRAME: Final = "_camera"
 
 
-@dataclass(frozen=True, slots=True)
-class Envelope:
+class Envelope(msgspec.Struct, frozen=True, gc=False):
     """A valid message, with the topic and the ids of its key.
 
     ids: the node's id, or the pair's two. payload: the message as received, to be passed on unchanged.
@@ -42,6 +42,12 @@ class Envelope:
         """The id of the message's node; of a pair, A's."""
         fields = self.topic.id_fields
         return self.ids[fields.index("node") if "node" in fields else 0]
+
+    @property
+    def stamp_ns(self) -> int:
+        """The message's measurement time."""
+        stamp_ns: int = getattr(self.message, "stamp_ns", self.time_ns)
+        return stamp_ns
 
 
 def open_envelope(key: str, payload: bytes, time_ns: int = 0) -> Envelope:
@@ -75,7 +81,7 @@ def _check_sender(key: str, topic: Topic, ids: tuple[str, ...], message: Message
         said = (message.frame_id.removesuffix(CAMERA_FRAME),) if named else ids
         fields = ("frame_id",)
     else:
-        said = tuple(getattr(message, field, own) for field, own in zip(fields, ids, strict=True))
+        said = tuple([getattr(message, field, own) for field, own in zip(fields, ids, strict=True)])
     if said != ids:
         words = ", ".join(f"{field} {value!r}" for field, value in zip(fields, said, strict=True))
         raise MessageError(f"{topic.schema_name}: {words} on key {key}")

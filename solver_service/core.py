@@ -166,8 +166,9 @@ class SolverCore:
         else:
             stream.add_sample(message)
         pairs = self._pairs_of.get(stream.node, ())
-        for pair in pairs:
-            pair.resolve(now_ns)
+        if not isinstance(message, Imu):  # No trigger waits for inertial samples.
+            for pair in pairs:
+                pair.resolve(now_ns)
         return pairs
 
     def _stream(self, node: str) -> NodeStream | None:

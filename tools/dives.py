@@ -25,14 +25,14 @@ from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
-from buddyline.protocol.topics import INFO, POSE, REJECTED, TOPICS, parse_key
+from buddyline.protocol.topics import INFO, TOPICS, parse_key
 from buddyline.tools import losses
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
 _NAMES: Final = frozenset(topic.name for topic in TOPICS)
-_OUTCOMES: Final = (POSE, REJECTED)
+_OUTCOMES: Final = (RelativePose, Rejected)
 
 
 @dataclass
@@ -154,7 +154,7 @@ class Dive:
         self._passes.append(reading)
         for envelope in heapq.merge(*streams, key=lambda envelope: envelope.time_ns):
             message = envelope.message
-            if envelope.topic in _OUTCOMES and isinstance(message, RelativePose | Rejected):
+            if isinstance(message, _OUTCOMES):
                 if (envelope.ids, message.trigger) in answered:
                     reading.repeated["/".join(envelope.ids)] += 1
                     continue

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
             while together := list(islice(envelopes, TOGETHER)):
                 sound = [envelope for envelope in together if not _is_replaced(envelope.message, replaced)]
                 for envelope in sound:
-                    writer.write(envelope.key, envelope.payload, envelope.time_ns)
+                    writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
                 _write(writer, core.handle_many(envelope.message for envelope in sound))
             _write(writer, core.flush())
         bad = dive.refused
