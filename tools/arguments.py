@@ -231,10 +231,17 @@ def export(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=("tum", "csv", "foxglove"),
         required=True,
-        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row for each pose, units in the header; foxglove: a "
-        "log with pictures, marks and transforms for Foxglove, Lichtblick and rerun",
+        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row for each sample, units in the header; foxglove: "
+        "a log with pictures, marks, transforms and the track's path for Foxglove, Lichtblick and rerun",
+    )
+    parser.add_argument(
+        "--what",
+        choices=("poses", "track"),
+        help="default: the track where the log has one (of several modes the best), else the poses",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses instead of the solved ones (tum)")
-    parser.add_argument("--rejected", action="store_true", help="rows for triggers without a pose as well (csv)")
+    parser.add_argument(
+        "--rejected", action="store_true", help="poses, and rows for triggers without one as well (csv)"
+    )
     add_pair_argument(parser, "the only one")

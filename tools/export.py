@@ -1,4 +1,4 @@
-"""`buddyline export`: poses for other programs."""
+"""`buddyline export`: the track, or the poses, for other programs."""
 
 from __future__ import annotations
 
@@ -7,51 +7,86 @@ import csv
 import io
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Rejected, RelativePose, Truth
+from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
+from buddyline.tools.columns import in_order, of_mode
 from buddyline.tools.evaluation.logs import load
+from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
 
+_AXES: Final = ("x", "y", "z", "wx", "wy", "wz")
+_UPPER: Final = [(row, column) for row in range(6) for column in range(row, 6)]
 _SD_FIELDS: Final = ("sd_x_m", "sd_y_m", "sd_z_m", "sd_wx_rad", "sd_wy_rad", "sd_wz_rad")
-_CSV_FIELDS: Final = (
-    *("stamp_ns", "trigger", "node_a", "node_b"),
+_PLACE_FIELDS: Final = (
     *("t_a_b_x_m", "t_a_b_y_m", "t_a_b_z_m", "q_a_b_x", "q_a_b_y", "q_a_b_z", "q_a_b_w"),
     *_SD_FIELDS,
     *("range_m", "azimuth_rad", "inclination_rad", "t_ned_north_m", "t_ned_east_m", "t_ned_down_m"),
+)
+_NED_SD_FIELDS: Final = (*("sd_azimuth_rad", "sd_inclination_rad", "sd_ned_north_m", "sd_ned_east_m", "sd_ned_down_m"),)
+_CSV_FIELDS: Final = (
+    *("stamp_ns", "trigger", "node_a", "node_b"),
+    *_PLACE_FIELDS,
     *("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "checks", "skew_ns"),
+    *_NED_SD_FIELDS,
 )
 _REASON_FIELDS: Final = ("reason", "detail")
+_TRACK_FIELDS: Final = (
+    *("stamp_ns", "node_a", "node_b", "mode"),
+    *_PLACE_FIELDS,
+    *_NED_SD_FIELDS,
+    *("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps", "lights", "age_s"),
+    # Row-major upper triangles, in m, rad and m/s.
+    *(f"cov_{_AXES[row]}_{_AXES[column]}" for row, column in _UPPER),
+    *(f"cov_v{_AXES[row]}_v{_AXES[column]}" for row, column in _UPPER if column < 3),
+)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the poses; return 0."""
+    """Write the track or the poses; return 0."""
     if args.truth and args.format != "tum":
         raise BuddylineError("--truth: only with --format tum")
     if args.rejected and args.format != "csv":
         raise BuddylineError("--rejected: only with --format csv")
+    if args.what == "track" and (args.truth or args.rejected):
+        raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
     if args.format == "foxglove":
         return _export_foxglove(args)
     if args.output is not None:
         check_new(args.output)
     recorded = load(args.logs, pair=args.pair)
-    poses: Sequence[RelativePose | Truth] = recorded.truths if args.truth else recorded.poses
-    rejected = recorded.rejected if args.rejected else []
-    if not poses and not rejected:
-        what = (
-            "no truth in it" if args.truth else "no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap"
-        )
-        raise BuddylineError(f"{', '.join(args.logs)}: {what}")
-    lines = tum_lines(poses) if args.format == "tum" else csv_lines(recorded.poses, rejected, reasons=args.rejected)
+    what, lines = _lines(args, recorded)
     if args.output is None:
         sys.stdout.writelines(lines)
-        return 0
-    write_new(args.output, "".join(lines))
+    else:
+        write_new(args.output, "".join(lines))
+    print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
     return 0
+
+
+def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[str]]:
+    """Return what is exported, in words, and its lines."""
+    name = ", ".join(args.logs)
+    if args.truth:
+        if not recorded.truths:
+            raise BuddylineError(f"{name}: no truth in it")
+        return f"the truth, {len(recorded.truths)} rows", tum_lines(recorded.truths)
+    track = [] if args.what == "poses" or args.rejected else in_order(of_mode(recorded.tracks))
+    if args.what == "track" and not track:
+        raise BuddylineError(f"{name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
+    if track:
+        other = "; --what poses gives the poses" if args.what is None and recorded.poses else ""
+        said = f"the track ({track[0].mode}), {len(track)} rows{other}"
+        return said, tum_lines(track) if args.format == "tum" else track_csv_lines(track)
+    poses, rejected = recorded.poses, recorded.rejected if args.rejected else []
+    if not poses and not rejected:
+        raise BuddylineError(f"{name}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
+    lines = tum_lines(poses) if args.format == "tum" else csv_lines(poses, rejected, reasons=args.rejected)
+    return f"the poses, {len(poses)} rows", lines
 
 
 def _export_foxglove(args: argparse.Namespace) -> int:
@@ -61,12 +96,12 @@ def _export_foxglove(args: argparse.Namespace) -> int:
     if args.output is None:
         raise BuddylineError("--format foxglove: give -o FILE.mcap")
     with Dive(args.logs) as dive:
-        count = export_foxglove(dive, args.output)
+        count = export_foxglove(dive, args.output, args.what)
     print(f"{args.output}: {count} messages", file=sys.stderr)
     return 0
 
 
-def tum_lines(poses: Iterable[RelativePose | Truth]) -> Iterator[str]:
+def tum_lines(poses: Iterable[RelativePose | Track | Truth]) -> Iterator[str]:
     """Yield `t x y z qx qy qz qw` of T_a_b by time; t in s, with all nine decimals that its ns have."""
     for pose in sorted(poses, key=lambda pose: pose.stamp_ns):
         seconds, rest_ns = divmod(pose.stamp_ns, S_NS)
@@ -97,14 +132,49 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
     }
     if isinstance(result, Rejected):
         return row
-    t_ned_m = ("", "", "") if result.t_ned_m is UNSET else result.t_ned_m
-    variances = result.covariance[::7]
-    row |= dict(zip(_CSV_FIELDS[4:11], (*result.t_a_b_m, *result.q_a_b_xyzw), strict=True))
-    row |= {name: math.sqrt(v) if v >= 0.0 else "" for name, v in zip(_SD_FIELDS, variances, strict=True)}
-    row |= dict(zip(("t_ned_north_m", "t_ned_east_m", "t_ned_down_m"), t_ned_m, strict=True))
-    for name in ("range_m", "azimuth_rad", "inclination_rad", "range_gap_m", "twist_gap_rad"):
-        value = getattr(result, name)
-        row[name] = "" if value is UNSET else value
-    row |= {name: getattr(result, name) for name in ("chi2", "hypotheses", "method", "skew_ns")}
+    row |= _place(result)
+    row |= {
+        name: getattr(result, name)
+        for name in ("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "skew_ns")
+    }
     row["checks"] = " ".join(result.checks)
     return row
+
+
+def track_csv_lines(track: Iterable[Track]) -> Iterator[str]:
+    """Yield a header and a row for each sample of a track, in the order given."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _TRACK_FIELDS, restval="", lineterminator="\n")
+    writer.writeheader()
+    yield text.getvalue()
+    for one in track:
+        text.seek(0)
+        text.truncate()
+        row: dict[str, object] = {name: getattr(one, name) for name in ("stamp_ns", "node_a", "node_b", "mode")}
+        row |= _place(one) | {"lights": one.lights, "age_s": one.age_s}
+        row |= dict(zip(("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps"), one.v_a_b_mps, strict=True))
+        for i, k in _UPPER:
+            row[f"cov_{_AXES[i]}_{_AXES[k]}"] = one.covariance[6 * i + k]
+            if k < 3:
+                row[f"cov_v{_AXES[i]}_v{_AXES[k]}"] = one.v_covariance[3 * i + k]
+        writer.writerow(row)
+        yield text.getvalue()
+
+
+def _place(result: RelativePose | Track) -> dict[str, object]:
+    """Return what poses and tracks have alike: where B is, and how sure that is; unknown is left out."""
+    row: dict[str, object] = dict(zip(_PLACE_FIELDS[:7], (*result.t_a_b_m, *result.q_a_b_xyzw), strict=True))
+    variances = result.covariance[::7]
+    row |= {name: math.sqrt(v) if v >= 0.0 else "" for name, v in zip(_SD_FIELDS, variances, strict=True)}
+    row["range_m"] = result.range_m
+    if result.t_ned_m is not UNSET:
+        row |= dict(zip(("t_ned_north_m", "t_ned_east_m", "t_ned_down_m"), result.t_ned_m, strict=True))
+    if result.sigma_ned_m is not UNSET:
+        row |= dict(zip(("sd_ned_north_m", "sd_ned_east_m", "sd_ned_down_m"), result.sigma_ned_m, strict=True))
+    angles = {
+        "azimuth_rad": result.azimuth_rad,
+        "inclination_rad": result.inclination_rad,
+        "sd_azimuth_rad": result.sigma_azimuth_rad,
+        "sd_inclination_rad": result.sigma_inclination_rad,
+    }
+    return row | {name: value for name, value in angles.items() if value is not UNSET}

@@ -1,13 +1,14 @@
 """A dive as Foxglove's own messages, which Foxglove, Lichtblick and rerun draw without any set-up.
 
 World is east, north, up with its origin on the surface above A, or at A where no depth is known. A stands in it by
-its attitude and depth, and B in A's camera frame by the solved pose.
+its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. B's path is a
+line: of the track's places in north-east-down, as seen from A.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,11 +25,13 @@ from buddyline.protocol.messages import (
     Depth,
     NodeInfo,
     RelativePose,
+    Track,
 )
-from buddyline.protocol.topics import parse_key
+from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
 from buddyline.tools.newfile import new_file
+from msgspec import UNSET
 
 WORLD: Final = "world"
 TRANSFORMS: Final = "/tf"
@@ -39,14 +42,18 @@ DISTORTION_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "kannala_brandt"}
 R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Level, looking north: what A is drawn as until its attitude is known.
 R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+# Pieces of the path, each of so much time, so that it can be watched as it grows.
+PATH_NS: Final = S_NS
 LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
 
 
 class FoxgloveTranslation:
-    """Turns a dive's messages into Foxglove's, one by one."""
+    """Turns a dive's messages into Foxglove's, one by one. tracked: pairs whose track, not poses, says where B is."""
 
-    def __init__(self, schemas: Any) -> None:
+    def __init__(self, schemas: Any, tracked: Collection[tuple[str, ...]] = ()) -> None:
         self._fox = schemas
+        self._tracked = set(tracked)
+        self._paths: dict[tuple[str, str], list[Track]] = {}
         self._infos: dict[str, NodeInfo] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._depth_m: dict[str, float] = {}
@@ -76,6 +83,8 @@ class FoxgloveTranslation:
             yield f"/{message.node}/camera/candidates", message.stamp_ns, self._candidates(message)
         elif isinstance(message, RelativePose):
             yield from self._pose(message)
+        elif isinstance(message, Track):
+            yield from self._track(message)
 
     def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
         node, stamp_ns = attitude.node, attitude.stamp_ns
@@ -135,7 +144,8 @@ class FoxgloveTranslation:
         fox, stamp_ns = self._fox, pose.stamp_ns
         base, child = f"{pose.node_a}_camera", f"{pose.node_b}_camera"
         t_m, R = np.array(pose.t_a_b_m), quat_to_matrix(np.array(pose.q_a_b_xyzw))
-        yield TRANSFORMS, stamp_ns, self._transform(base, child, t_m, R, stamp_ns)
+        if (pose.node_a, pose.node_b) not in self._tracked:
+            yield TRANSFORMS, stamp_ns, self._transform(base, child, t_m, R, stamp_ns)
         placed = fox.PoseInFrame(
             timestamp=self._time(stamp_ns),
             frame_id=base,
@@ -146,6 +156,45 @@ class FoxgloveTranslation:
             frame = next((f for f in reversed(self._frames.get(node, ())) if f.trigger == pose.trigger), None)
             if frame is not None and max(chosen) < len(frame.blobs):
                 yield f"/{node}/camera/chosen", frame.stamp_ns, self._chosen(frame, chosen)
+
+    def _track(self, track: Track) -> Iterator[tuple[str, int, Any]]:
+        base, child = f"{track.node_a}_camera", f"{track.node_b}_camera"
+        t_m, R = np.array(track.t_a_b_m), quat_to_matrix(np.array(track.q_a_b_xyzw))
+        yield TRANSFORMS, track.stamp_ns, self._transform(base, child, t_m, R, track.stamp_ns)
+        piece = self._paths.setdefault((track.node_a, track.node_b), [])
+        piece.append(track)
+        if track.stamp_ns - piece[0].stamp_ns >= PATH_NS:
+            yield self._path(piece)
+            piece[:] = [track]
+
+    def paths(self) -> Iterator[tuple[str, int, Any]]:
+        """Yield what is left of the paths at the end of the dive."""
+        for piece in self._paths.values():
+            if len(piece) > 1:
+                yield self._path(piece)
+
+    def _path(self, piece: list[Track]) -> tuple[str, int, Any]:
+        """Return a piece of B's path: in the world where A's attitude is known, else in A's camera frame."""
+        fox, first = self._fox, piece[0]
+        known = [one.t_ned_m for one in piece if one.t_ned_m is not UNSET]
+        if len(known) == len(piece):
+            above_m = np.array([0.0, 0.0, -self._depth_m.get(first.node_a, 0.0)])
+            frame, points_m = WORLD, np.array(known) @ R_ENU_NED.T + above_m
+        else:
+            frame, points_m = f"{first.node_a}_camera", np.array([one.t_a_b_m for one in piece])
+        line = fox.LinePrimitive(
+            type=fox.LinePrimitiveLineType.LineStrip,
+            pose=fox.Pose(position=self._vector(np.zeros(3)), orientation=self._quaternion(np.eye(3))),
+            thickness=2.0,
+            scale_invariant=True,
+            points=[fox.Point3(x=x, y=y, z=z) for x, y, z in points_m.tolist()],
+            color=fox.Color(r=OTHER[0], g=OTHER[1], b=OTHER[2], a=1.0),
+        )
+        entity = fox.SceneEntity(
+            timestamp=self._time(first.stamp_ns), frame_id=frame, id=f"path {first.stamp_ns}", lines=[line]
+        )
+        stamp_ns = piece[-1].stamp_ns
+        return f"/pair/{first.node_a}/{first.node_b}/path", stamp_ns, fox.SceneUpdate(entities=[entity])
 
     def _chosen(self, frame: Candidates, chosen: tuple[int, int]) -> Any:
         fox = self._fox
@@ -193,8 +242,11 @@ class FoxgloveTranslation:
         return self._fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def export_foxglove(dive: Dive, output: Path) -> int:
-    """Write a dive as Foxglove messages into output, which must not exist; return how many there are."""
+def export_foxglove(dive: Dive, output: Path, what: str | None = None) -> int:
+    """Write a dive as Foxglove messages into output, which must not exist; return how many there are.
+
+    what: "poses" leaves the track out, "track" asks for one; None: with the track where there is one.
+    """
     try:
         from foxglove import messages as fox
     except ImportError as error:
@@ -203,14 +255,18 @@ def export_foxglove(dive: Dive, output: Path) -> int:
         ) from error
     from mcap.writer import CompressionType, Writer
 
-    translation = FoxgloveTranslation(fox)
+    track = _track_topic(dive)
+    if what == "track" and track is None:
+        raise BuddylineError(f"{dive.name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
+    track = None if what == "poses" else track
+    translation = FoxgloveTranslation(fox, dive.ids(track) if track else ())
     count = cut_ns = 0
     schemas: dict[str, int] = {}
     channels: dict[str, int] = {}
     with new_file(output) as part, open(part, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="", library="buddyline")
-        for topic, stamp_ns, message in _translated(dive, translation):
+        for topic, stamp_ns, message in _translated(dive, translation, track):
             if topic not in channels:
                 schema = message.get_schema()
                 if schema.name not in schemas:
@@ -225,17 +281,21 @@ def export_foxglove(dive: Dive, output: Path) -> int:
     return count
 
 
-def _translated(dive: Dive, translation: FoxgloveTranslation) -> Iterator[tuple[str, int, Any]]:
-    topics = ("info", "candidates", "attitude", "depth", "image", "pose")
+def _track_topic(dive: Dive) -> str | None:
+    """Return the topic of the best track in a dive: of a live one, that which is a second late."""
+    return next((topic.name for topic in (TRACK_LAG, TRACK) if dive.ids(topic.name)), None)
+
+
+def _translated(dive: Dive, translation: FoxgloveTranslation, track: str | None) -> Iterator[tuple[str, int, Any]]:
+    topics = ["info", "candidates", "attitude", "depth", "image", "pose", *([track] if track else [])]
     yield from translation.start(dive.infos(), _base(dive), dive.start_ns)
     for envelope in dive.messages(*topics):
         yield from translation.messages(envelope)
+    yield from translation.paths()
 
 
 def _base(dive: Dive) -> str | None:
-    """Return A's id: of the first pair with poses, else the first node."""
-    for key in dive.keys:
-        parsed = parse_key(key)
-        if parsed is not None and parsed[0].name == "pose":
-            return parsed[1][0]
+    """Return A's id: of the first pair with poses or a track, else the first node."""
+    for ids in dive.ids("pose", "track", "track_lag"):
+        return ids[0]
     return next(iter(dive.nodes("info", "candidates", "image")), None)

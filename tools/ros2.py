@@ -1,4 +1,4 @@
-"""`buddyline ros2`: attitudes, depths and poses for ROS 2, laid on the bus as its middleware rmw_zenoh lays them.
+"""`buddyline ros2`: attitudes, depths, poses and tracks for ROS 2, as its middleware rmw_zenoh lays them.
 
 ROS 2 machines with RMW_IMPLEMENTATION=rmw_zenoh_cpp whose router is our hub see them as any other topic. Frames
 follow REP 103: the world `map` is east, north, up, with the surface at zero; bodies are forward, left, up; cameras
@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose
+from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose, Track
 from buddyline.protocol.security import ROS
-from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
+from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
@@ -37,6 +37,8 @@ NODE_NAME: Final = "buddyline"
 # Reliable, volatile, the last 10 kept; the rest as it is by default (rmw_zenoh's liveliness tokens).
 QOS: Final = "::,10:,:,:,,"
 TRANSFORM_SPACING_NS: Final = S_NS // 20
+# Poses say again where B is once a track has been silent for so long.
+TRACK_SILENT_NS: Final = S_NS
 R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Forward, left, up seen from forward, right, down: its own inverse.
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
@@ -44,6 +46,7 @@ R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 UNKNOWN_VARIANCE: Final = 1e6
 
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
 IMU_TYPE: Final = "sensor_msgs/msg/Imu"
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 
@@ -70,6 +73,7 @@ class Translation:
         self._infos: dict[str, NodeInfo] = {}
         self._depth_m: dict[str, float] = {}
         self._transform_ns: dict[str, int] = {}
+        self._tracked_ns: dict[tuple[str, str], int] = {}
         self._base: str | None = None
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
@@ -85,6 +89,9 @@ class Translation:
         elif isinstance(message, RelativePose):
             self._base = message.node_a
             yield from self._pose(message)
+        elif isinstance(message, Track):
+            self._base = message.node_a
+            yield from self._track(message)
 
     def _imu(self, attitude: Attitude) -> RosMessage:
         R_enu_flu = R_ENU_NED @ quat_to_matrix(np.array(attitude.q_ned_body_xyzw)) @ R_FRD_FLU
@@ -129,7 +136,43 @@ class Translation:
         # Position, then rotation about A's fixed axes: ROS's order and meaning are ours.
         value = self._posed(pose.stamp_ns, f"{a}_camera", pose.t_a_b_m, R_a_b, np.array(pose.covariance))
         yield RosMessage(f"/buddyline/{a}/{b}/pose", POSE_TYPE, value)
-        yield self._transform(pose.stamp_ns, f"{a}_camera", f"{b}_camera", pose.t_a_b_m, R_a_b)
+        tracked_ns = self._tracked_ns.get((a, b))
+        if tracked_ns is None or abs(pose.stamp_ns - tracked_ns) > TRACK_SILENT_NS:
+            yield self._transform(pose.stamp_ns, f"{a}_camera", f"{b}_camera", pose.t_a_b_m, R_a_b)
+
+    def _track(self, track: Track) -> Iterator[RosMessage]:
+        """Yield a track's sample as an odometry of B's camera; where B is on /tf follows the one that is not late.
+
+        nav_msgs/Odometry: the pose in the header's frame, A's camera; the twist in the child's, B's camera. So the
+        velocity and its covariance are turned by R_b_a. It is relative to A, but not to A's turning. The track says
+        nothing of B's rate of turn.
+        """
+        a, b = name_of(track.node_a), name_of(track.node_b)
+        R_a_b = quat_to_matrix(np.array(track.q_a_b_xyzw))
+        x, y, z = (R_a_b.T @ np.array(track.v_a_b_mps)).tolist()
+        of_twist = UNKNOWN_VARIANCE * np.eye(6)
+        of_twist[:3, :3] = R_a_b.T @ np.array(track.v_covariance).reshape(3, 3) @ R_a_b
+        placed = self._posed(track.stamp_ns, f"{a}_camera", track.t_a_b_m, R_a_b, np.array(track.covariance))
+        value = self._new(
+            ODOMETRY_TYPE,
+            header=placed.header,
+            child_frame_id=f"{b}_camera",
+            pose=placed.pose,
+            twist=self._new(
+                "geometry_msgs/msg/TwistWithCovariance",
+                twist=self._new(
+                    "geometry_msgs/msg/Twist",
+                    linear=self._new("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                    angular=self._new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0),
+                ),
+                covariance=of_twist.ravel(),
+            ),
+        )
+        late = track.mode == "lag"
+        yield RosMessage(f"/buddyline/{a}/{b}/{'track_lag' if late else 'track'}", ODOMETRY_TYPE, value)
+        if not late:
+            self._tracked_ns[a, b] = track.stamp_ns
+            yield self._transform(track.stamp_ns, f"{a}_camera", f"{b}_camera", track.t_a_b_m, R_a_b)
 
     def _posed(self, stamp_ns: int, frame_id: str, t_m: tuple[float, float, float], R: Any, covariance: Any) -> Any:
         x, y, z = t_m
@@ -258,7 +301,7 @@ def run(args: argparse.Namespace) -> int:
                         graph.publish(translated)
 
             follow(bus, INFO.key_any(), client.refusals, publish, capacity=64)
-            for topic in (ATTITUDE, DEPTH, POSE):
+            for topic in (ATTITUDE, DEPTH, POSE, TRACK, TRACK_LAG):
                 follow(bus, topic.key_any(), client.refusals, publish, capacity=256, history=False)
             client.wait()
         finally:

@@ -146,9 +146,11 @@ def light_truth(
 
 
 def write_log(path: object, *messages: object, pair: str = "a/b") -> str:
-    """Write messages into a log; truth under the given pair."""
+    """Write messages into a log, truth under the given pair, and tracks as `solve` writes them."""
     with DiveLogWriter(str(path)) as writer:
         for message in messages:
             key = f"buddyline/pair/{pair}/truth" if isinstance(message, Truth) else None
+            if isinstance(message, Track) and message.mode != "lag":
+                key = f"buddyline/pair/{pair}/track"
             writer.write_message(message, key=key)  # type: ignore[arg-type]
     return str(path)

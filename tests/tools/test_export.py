@@ -11,7 +11,7 @@ import pytest
 from buddyline.tools.cli import main
 from msgspec.structs import replace
 
-from tests.tools.evaluated import COVARIANCE, FIRST, PERIOD_NS, pose, rejection, truth, write_log
+from tests.tools.evaluated import COVARIANCE, FIRST, PERIOD_NS, pose, rejection, track, truth, write_log
 
 STAMP_NS = 1_764_000_000_123_456_789
 
@@ -89,3 +89,86 @@ def test_nothing_to_export_is_one_line(tmp_path, solved, capsys):
     assert "--truth" in refused(capsys, solved, "--format", "csv", "--truth")
     assert "--rejected" in refused(capsys, solved, "--format", "tum", "--rejected")
     assert exported(capsys, bare, "--format", "tum", "--truth").count("\n") == 1
+
+
+@pytest.fixture
+def tracked(tmp_path):
+    rng = np.random.default_rng(1)
+    mixed = rng.standard_normal((6, 6))
+    ned = {
+        "t_ned_m": (1 / 3, 2.0, -3.0),
+        "sigma_ned_m": (0.011, 0.012, 0.013),
+        "azimuth_rad": 1.4,
+        "sigma_azimuth_rad": 0.07,
+        "inclination_rad": 0.98,
+        "sigma_inclination_rad": 0.015,
+    }
+    moving = {"v_a_b_mps": (0.1, -0.2, 0.3), "v_covariance": np.diag([1e-4, 4e-4, 9e-4]).ravel().tolist()}
+    rows = [
+        track(
+            k,
+            tuple((3 * rng.standard_normal(3)).tolist()),
+            covariance=(mixed @ mixed.T).ravel().tolist(),
+            mode="smooth",
+            age_s=0.02,
+            **moving,
+            **ned,
+        )
+        for k in (2, 0, 1)
+    ]
+    late, live = track(3, mode="lag"), track(4, mode="filter")
+    return rows, write_log(tmp_path / "t.mcap", pose(0), pose(1, **ned), rejection(2), truth(0), *rows, late, live)
+
+
+def test_csv_of_a_track_is_the_log_s(tracked, capsys):
+    rows, log = tracked
+    assert main(["export", log, "--format", "csv"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err.splitlines() == [f"{log}: the track (smooth), 3 rows; --what poses gives the poses"]
+    found = list(csv.DictReader(io.StringIO(captured.out)))
+    axes = ("x", "y", "z", "wx", "wy", "wz")
+    for row, one in zip(found, sorted(rows, key=lambda one: one.stamp_ns), strict=True):
+        assert int(row["stamp_ns"]) == one.stamp_ns
+        assert (row["mode"], row["lights"], float(row["age_s"])) == ("smooth", "4", 0.02)
+
+        def read(*names, row=row):
+            return [float(row[name]) for name in names]
+
+        assert read("t_a_b_x_m", "t_a_b_y_m", "t_a_b_z_m") == list(one.t_a_b_m)
+        assert read("q_a_b_x", "q_a_b_y", "q_a_b_z", "q_a_b_w") == list(one.q_a_b_xyzw)
+        assert read("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps") == list(one.v_a_b_mps)
+        assert read("t_ned_north_m", "t_ned_east_m", "t_ned_down_m") == list(one.t_ned_m)
+        assert read("sd_ned_north_m", "sd_ned_east_m", "sd_ned_down_m") == list(one.sigma_ned_m)
+        assert read("azimuth_rad", "sd_azimuth_rad", "inclination_rad", "sd_inclination_rad") == [
+            1.4,
+            0.07,
+            0.98,
+            0.015,
+        ]
+        upper = [(i, k) for i in range(6) for k in range(i, 6)]
+        assert read(*(f"cov_{axes[i]}_{axes[k]}" for i, k in upper)) == [one.covariance[6 * i + k] for i, k in upper]
+        assert read("cov_vx_vx", "cov_vx_vy", "cov_vz_vz") == [1e-4, 0.0, 9e-4]
+        assert read("range_m") == [one.range_m]
+
+
+def test_tum_is_the_track_where_there_is_one_unless_poses_are_asked_for(tracked, capsys):
+    rows, log = tracked
+    lines = exported(capsys, log, "--format", "tum").splitlines()
+    first = min(rows, key=lambda one: one.stamp_ns)
+    assert len(lines) == 3
+    assert [float(word) for word in lines[0].split()[1:]] == [*first.t_a_b_m, *first.q_a_b_xyzw]
+    assert len(exported(capsys, log, "--format", "tum", "--what", "poses").splitlines()) == 2
+    rejected = list(csv.DictReader(io.StringIO(exported(capsys, log, "--format", "csv", "--rejected"))))
+    assert [row["reason"] for row in rejected] == ["", "", "ambiguous"]
+    assert [rejected[1][name] for name in ("sd_azimuth_rad", "sd_ned_down_m")] == ["0.07", "0.013"]
+    assert rejected[0]["sd_azimuth_rad"] == ""
+
+
+def test_a_track_that_is_asked_for_must_be_there(solved, tracked, tmp_path, capsys):
+    assert "no track in it" in refused(capsys, solved, "--format", "tum", "--what", "track")
+    assert "--what track: not with --rejected" in refused(
+        capsys, tracked[1], "--format", "csv", "--what", "track", "--rejected"
+    )
+    alone = write_log(tmp_path / "alone.mcap", track(0, mode="filter"), track(1, mode="lag"), track(2, mode="lag"))
+    # Of a recorded live dive the better one.
+    assert exported(capsys, alone, "--format", "tum").count("\n") == 2

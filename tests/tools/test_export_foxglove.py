@@ -13,7 +13,7 @@ from buddyline.protocol.messages import Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
 
-from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, write_log
+from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, track, write_log
 from tests.tools.watched import PNG, at, attitude, depth, image
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
@@ -109,3 +109,40 @@ def test_an_output_is_named_and_never_overwritten(tmp_path: Path, capsys: pytest
     assert "give -o" in capsys.readouterr().err
     with Dive([dive]) as opened, pytest.raises(BuddylineError, match="exists"):
         export_foxglove(opened, Path(dive))
+
+
+def test_a_track_moves_b_and_leaves_a_path(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    messages: list[Message] = list(INFOS.values())
+    tracks = []
+    for k in range(25):
+        # A looks north at 12.5 m: its camera's z is north, x east, y down.
+        x, y, z = 0.1 * k, -0.05 * k, 3.0
+        tracks.append(track(k, (x, y, z), t_ned_m=(z, x, y)))
+        messages += [attitude("a", at(k)), depth("a", at(k)), pose(k), tracks[-1]]
+    dive, output = write_log(tmp_path / "dive.mcap", *messages), tmp_path / "foxglove.mcap"
+    assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 0
+    found: dict[str, list[Any]] = defaultdict(list)
+    with open(output, "rb") as file:
+        for _, channel, _, message in make_reader(
+            file, decoder_factories=[decoding.DecoderFactory()]
+        ).iter_decoded_messages():
+            found[channel.topic].append(message)
+    assert len(found["/pair/a/b/pose"]) == 25
+    of_b = [t for tf in found["/tf"] for t in tf.transforms if t.child_frame_id == "b_camera"]
+    told = [(t.translation.x, t.translation.y, t.translation.z) for t in of_b]
+    np.testing.assert_allclose(told, [one.t_a_b_m for one in tracks], atol=1e-9)
+    pieces = [entity for update in found["/pair/a/b/path"] for entity in update.entities]
+    assert len({piece.id for piece in pieces}) == len(pieces) == 3
+    assert {piece.frame_id for piece in pieces} == {"world"}
+    lines = [[(p.x, p.y, p.z) for p in piece.lines[0].points] for piece in pieces]
+    # Each piece begins where the one before ends.
+    assert lines[0][-1] == lines[1][0]
+    path = lines[0] + lines[1][1:] + lines[2][1:]
+    expected = [(one.t_ned_m[1], one.t_ned_m[0], -one.t_ned_m[2] - 12.5) for one in tracks]  # type: ignore[index]
+    np.testing.assert_allclose(path, expected, atol=1e-9)
+    poses = tmp_path / "poses.mcap"
+    assert main(["export", dive, "--format", "foxglove", "--what", "poses", "-o", str(poses)]) == 0
+    with open(poses, "rb") as file:
+        assert "/pair/a/b/path" not in {c.topic for _, c, _ in make_reader(file).iter_messages()}

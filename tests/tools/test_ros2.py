@@ -17,7 +17,7 @@ from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
 
 from tests.processes import free_endpoint
-from tests.tools.evaluated import INFOS, pose
+from tests.tools.evaluated import INFOS, pose, track
 from tests.tools.watched import at, attitude, depth
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
@@ -68,6 +68,38 @@ def test_a_pose_goes_over_as_it_is_with_its_covariance(store: Any) -> None:
     np.testing.assert_array_equal(value.pose.covariance, pose(0).covariance)
 
 
+def test_a_track_is_an_odometry_with_its_twist_in_b_s_frame(store: Any) -> None:
+    rng = np.random.default_rng(1)
+    q = rng.standard_normal(4)
+    q /= np.linalg.norm(q)
+    mixed = rng.standard_normal((3, 3))
+    told = track(
+        0, q_a_b_xyzw=tuple(q.tolist()), v_a_b_mps=(0.1, -0.2, 0.3), v_covariance=(mixed @ mixed.T).ravel().tolist()
+    )
+    value = of(translated(store, told), "/buddyline/a/b/track")
+    R_a_b = quat_to_matrix(q)
+    assert (value.header.frame_id, value.child_frame_id) == ("a_camera", "b_camera")
+    assert value.pose.pose.position.z == 3.0
+    np.testing.assert_array_equal(value.pose.covariance, told.covariance)
+    linear = value.twist.twist.linear
+    np.testing.assert_allclose(R_a_b @ (linear.x, linear.y, linear.z), told.v_a_b_mps, atol=1e-12)
+    of_twist = value.twist.covariance.reshape(6, 6)
+    np.testing.assert_allclose(R_a_b @ of_twist[:3, :3] @ R_a_b.T, mixed @ mixed.T, atol=1e-12)
+    assert of_twist[5, 5] == 1e6
+
+
+def test_where_b_is_follows_the_track_that_is_not_late(store: Any) -> None:
+    def transforms(*messages: Message) -> int:
+        return sum(message.topic == "/tf" for message in translated(store, *messages))
+
+    live, late = track(0, mode="filter"), track(0, mode="lag")
+    assert transforms(live, pose(1), pose(9)) == 1
+    assert transforms(live, pose(1), pose(11)) == 2
+    assert transforms(late, pose(1)) == 1
+    topics = [message.topic for message in translated(store, late)]
+    assert topics == ["/buddyline/a/b/track_lag"]
+
+
 def test_transforms_lead_from_the_map_to_b(store: Any) -> None:
     said = translated(
         store, INFOS["a"], INFOS["b"], pose(0), depth("a", at(0)), attitude("a", at(1), EAST), attitude("b", at(1))
@@ -93,7 +125,7 @@ def test_transforms_of_a_fast_sensor_are_thinned(store: Any) -> None:
 
 
 def test_everything_can_be_encoded_and_read_back(store: Any) -> None:
-    for message in translated(store, INFOS["a"], pose(0), depth("a", at(0)), attitude("a", at(1))):
+    for message in translated(store, INFOS["a"], pose(0), depth("a", at(0)), attitude("a", at(1)), track(0)):
         payload = store.serialize_cdr(message.value, message.type_name)
         again = store.deserialize_cdr(payload, message.type_name)
         assert bytes(store.serialize_cdr(again, message.type_name)) == bytes(payload)

@@ -41,6 +41,7 @@ from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 _RESULTS: Final = (POSE, REJECTED)
 # Where a log has no result of the solver's: poses from tags are measured as any others.
 _TAGS: Final = (ARTAG,)
+_TRACKS: Final = (TRACK, TRACK_LAG)
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH, NET_TRUTH)
 
 
@@ -57,7 +58,7 @@ def _results(dives: Sequence[Dive]) -> tuple[Topic, ...]:
 
 
 def _choose_pair(dives: Sequence[Dive], wanted: Pair | None) -> Pair:
-    pairs = [(ids[0], ids[1]) for ids in _ids(dives, *_results(dives)) or _ids(dives, TRUTH)]
+    pairs = [(ids[0], ids[1]) for ids in _ids(dives, *_results(dives)) or _ids(dives, *_TRACKS) or _ids(dives, TRUTH)]
     if not pairs:
         nodes = [ids[0] for ids in _ids(dives, CANDIDATES)]
         pairs = [(nodes[0], nodes[-1])] if nodes else []
@@ -104,15 +105,15 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
 def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:
     """Read one pair's messages.
 
-    Poses and rejections are those of the first log named that holds any. Truth comes from truth_paths alone where
-    they hold it. Of Candidates and NodeInfo of several logs, the first named stand first.
+    Poses, rejections and track are those of the first log named that holds poses or rejections. Truth comes from
+    truth_paths alone where they hold it. Of Candidates and NodeInfo of several logs, the first named stand first.
     """
     with ExitStack() as stack:
         logs = open_each(paths, stack)
         truth_logs = open_each(truth_paths, stack)
         recorded = Recorded(_choose_pair([*logs, *truth_logs], pair))
         results = _results(logs)
-        answering = [log for log in logs if _ids([log], *results)]
+        answering = [log for log in logs if _ids([log], *results)] or [log for log in logs if _ids([log], *_TRACKS)]
         recorded.environment = next((log.metadata().get("environment", "") for log in [*logs, *truth_logs]), "")
         for log in answering[1:]:
             recorded.problems.append(f"{log.name}: its poses are left out, those of {answering[0].name} are taken")
@@ -120,7 +121,7 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
         for log in [*logs, *truth_logs]:
             topics: list[Topic] = [INFO, CANDIDATES]
             if log in answering[:1]:
-                topics += [*results, TRACK, TRACK_LAG]
+                topics += [*results, *_TRACKS]
             if answering:
                 topics += [ATTITUDE]
             topics += [topic for topic in _TRUTHS if log in truth_logs or topic.name not in sighted]
