@@ -26,6 +26,7 @@ LAKE = GoldenDive("lake_dead_lamp")
 NIGHT_REEF = GoldenDive("night_reef", ("night_reef_a", "night_reef_b"), ("--clock-offset", "0.03"))
 BASIN = GoldenDive("basin_damaged")
 SURVEY = GoldenDive("survey")
+INERTIAL = GoldenDive("cavern_inertial")
 OF_PICTURES = (
     GoldenDive("night_reef_pictures", pictures=True),
     GoldenDive("lake_pictures", pictures=True),

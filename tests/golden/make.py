@@ -76,6 +76,9 @@ def make(folder: Path) -> None:
     """Write all golden dives into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     simulate(folder / "cavern.mcap", "--environment cavern --seconds 14 --seed 3")
+    inertial = folder / "cavern_inertial.mcap"
+    entries = simulate(inertial, "--environment cavern --seconds 6 --seed 12 --imu --inertial poor --others 1")
+    write_log(inertial, [entry for entry in entries if entry.topic not in TRUTHS])
     lake = folder / "lake_dead_lamp.mcap"
     entries = simulate(lake, "--environment lake --seconds 12 --seed 11 --false 1 --others 0")
     # Three lights first, then two at one node, and then a lamp of the other goes out as well.

@@ -23,6 +23,7 @@ LOOSE_SIGMAS = 0.1
 LOOSE_PIXELS = 0.05
 LOOSE_BLOBS = 4
 SHOWN = 12
+ANGLES = ("azimuth_rad", "sigma_azimuth_rad", "inclination_rad", "sigma_inclination_rad")
 
 Compare = Callable[[Record, Record, bool], list[str]]
 
@@ -102,6 +103,32 @@ def compare_outcomes(old: Record, new: Record, loose: bool) -> list[str]:
         scales["t_ned_m"] = np.subtract(new["t_ned_m"], old["t_ned_m"]) / sigma[:3].max()
     worst = {name: float(np.abs(value).max()) for name, value in scales.items()}
     return [f"{name} by {value:.2g} sigma" for name, value in worst.items() if not value <= allowed]
+
+
+def compare_tracks(old: Record, new: Record, loose: bool) -> list[str]:
+    """Compare two rows of a track of one time: lights and mode exactly, numbers in units of the reference's sigma."""
+    numbers = ("t_a_b_m", "q_a_b_xyzw", "covariance", "v_a_b_mps", "v_covariance", "t_ned_m", "sigma_ned_m", *ANGLES)
+    said = _unequal(old, new, numbers)
+    if said:
+        return said
+    old_covariance, new_covariance = _covariance(old), _covariance(new)
+    sigma = np.sqrt(np.diag(old_covariance))
+    v_sigma = np.sqrt([old["v_covariance"][index] for index in (0, 3, 5)])
+    v_scale = np.outer(v_sigma, v_sigma)[np.triu_indices(3)]
+    ned_sigma = np.array(old["sigma_ned_m"])
+    scales = {
+        "position": np.subtract(new["t_a_b_m"], old["t_a_b_m"]) / sigma[:3],
+        "rotation": _rotation_rad(old["q_a_b_xyzw"], new["q_a_b_xyzw"]) / sigma[3:],
+        "covariance": (new_covariance - old_covariance) / np.outer(sigma, sigma),
+        "velocity": np.subtract(new["v_a_b_mps"], old["v_a_b_mps"]) / v_sigma,
+        "v_covariance": np.subtract(new["v_covariance"], old["v_covariance"]) / v_scale,
+        "t_ned_m": np.subtract(new["t_ned_m"], old["t_ned_m"]) / ned_sigma,
+        "sigma_ned_m": np.subtract(new["sigma_ned_m"], old["sigma_ned_m"]) / ned_sigma,
+    }
+    for name in ANGLES:
+        scales[name] = np.subtract(new[name], old[name]) / old[f"sigma_{name.removeprefix('sigma_')}"]
+    worst = {name: float(np.abs(value).max()) for name, value in scales.items()}
+    return [f"{name} by {value:.2g} sigma" for name, value in worst.items() if not value <= SIGMAS]
 
 
 def compare_frames(old: Record, new: Record, loose: bool) -> list[str]:

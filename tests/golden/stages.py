@@ -16,7 +16,10 @@ from buddyline.tools.cli import main
 from tests.golden.logs import read_log
 
 Record = dict[str, object]
+TRACK_STEP = 10
 UPPER = [6 * row + column for row in range(6) for column in range(row, 6)]
+
+UPPER_V = [0, 1, 2, 4, 5, 8]
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -36,8 +39,16 @@ def detect(dive: Path) -> tuple[int, list[Record]]:
 def solve(dives: list[Path], output: Path, *options: str) -> tuple[int, list[Record]]:
     """Candidates (or pictures) -> outcomes: exit status, and every pose and rejection by pair and trigger."""
     assert not output.exists(), output
-    status, _ = run("solve", *dives, "-o", output, *options)
+    status, _ = run("solve", *dives, "-o", output, "--track", "none", *options)
     return status, outcomes_of(output)
+
+
+def track(dives: list[Path], output: Path, mode: str) -> tuple[int, list[Record]]:
+    """Candidates and sensors -> track: exit status, and every tenth row of the track by time."""
+    assert not output.exists(), output
+    status, _ = run("solve", *dives, "-o", output, "--track", mode, "--track-hz", "20")
+    rows = [entry.message for entry in read_log(output) if entry.topic == "track"]
+    return status, [_row(row) for row in sorted(rows, key=lambda row: row["stamp_ns"])[::TRACK_STEP]]
 
 
 def outcomes_of(log: Path) -> list[Record]:
@@ -105,6 +116,26 @@ def _outcome(topic: str, message: Record) -> Record:
         outcome["t_ned_m"] = _rounded(message["t_ned_m"], 11)
     outcome["covariance"] = [_significant(message["covariance"][index], 10) for index in UPPER]
     return outcome
+
+
+def _row(message: Record) -> Record:
+    row: Record = {
+        "pair": f"{message['node_a']}/{message['node_b']}",
+        "name": str(message["stamp_ns"]),
+        "mode": message["mode"],
+        "lights": message["lights"],
+        "age_s": round(message["age_s"], 9),
+        "t_a_b_m": _rounded(message["t_a_b_m"], 11),
+        "q_a_b_xyzw": _rounded(message["q_a_b_xyzw"], 13),
+        "covariance": [_significant(message["covariance"][index], 10) for index in UPPER],
+        "v_a_b_mps": _rounded(message["v_a_b_mps"], 11),
+        "v_covariance": [_significant(message["v_covariance"][index], 10) for index in UPPER_V],
+    }
+    for name in ("t_ned_m", "sigma_ned_m"):
+        row[name] = _rounded(message[name], 11)
+    for name in ("azimuth_rad", "sigma_azimuth_rad", "inclination_rad", "sigma_inclination_rad"):
+        row[name] = round(message[name], 11)
+    return row
 
 
 def _rounded(values: Iterable[float], digits: int) -> list[float]:

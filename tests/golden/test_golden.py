@@ -3,8 +3,8 @@
 import pytest
 
 from tests.golden import references, stages
-from tests.golden.dives import ALL, NIGHT_REEF, OF_PICTURES, SURVEY
-from tests.golden.references import compare_clocks, compare_frames, compare_outcomes, compare_rows
+from tests.golden.dives import ALL, INERTIAL, NIGHT_REEF, OF_PICTURES, SURVEY
+from tests.golden.references import compare_clocks, compare_frames, compare_outcomes, compare_rows, compare_tracks
 
 
 @pytest.mark.parametrize("dive", OF_PICTURES, ids=lambda dive: dive.name)
@@ -17,6 +17,12 @@ def test_pictures_to_candidates(dive, update_refs):
 def test_candidates_to_outcomes(dive, update_refs, tmp_path):
     result = stages.solve(dive.logs, tmp_path / "out.mcap", *dive.options)
     references.check(f"{dive.name}.outcomes", result, compare_outcomes, update_refs, dive.pictures)
+
+
+@pytest.mark.parametrize("mode", ["smooth", "filter"])
+def test_candidates_and_sensors_to_track(mode, update_refs, tmp_path):
+    result = stages.track(INERTIAL.logs, tmp_path / "out.mcap", mode)
+    references.check(f"{INERTIAL.name}.{mode}", result, compare_tracks, update_refs)
 
 
 def test_candidates_to_clock_offset(update_refs):

@@ -5,7 +5,14 @@ import copy
 import pytest
 
 from tests.golden import references
-from tests.golden.references import FOLDER, compare_frames, compare_outcomes, compare_rows, differences
+from tests.golden.references import (
+    FOLDER,
+    compare_frames,
+    compare_outcomes,
+    compare_rows,
+    compare_tracks,
+    differences,
+)
 
 
 @pytest.fixture
@@ -54,6 +61,29 @@ def test_any_other_change_of_a_pose_is_seen(outcomes, change):
     found = copy.deepcopy(outcomes)
     change(next(one for one in found if "t_ned_m" in one))
     assert len(differences(outcomes, found, compare_outcomes)) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda row: row["t_a_b_m"].__setitem__(2, row["t_a_b_m"][2] + 1e-5 * row["covariance"][11] ** 0.5),
+        lambda row: row["v_a_b_mps"].__setitem__(0, row["v_a_b_mps"][0] + 1e-5 * row["v_covariance"][0] ** 0.5),
+        lambda row: row["covariance"].__setitem__(20, row["covariance"][20] * 1.001),
+        lambda row: row["v_covariance"].__setitem__(5, row["v_covariance"][5] * 1.001),
+        lambda row: row.update(sigma_azimuth_rad=1.001 * row["sigma_azimuth_rad"]),
+        lambda row: row.update(inclination_rad=row["inclination_rad"] + 1e-5 * row["sigma_inclination_rad"]),
+        lambda row: row.update(lights=row["lights"] - 1),
+        lambda row: row.pop("sigma_ned_m"),
+        lambda row: row.update(t_ned_m=[float("nan")] * 3),
+    ],
+)
+def test_any_change_of_a_track_is_seen(change):
+    rows = references._read(FOLDER / "cavern_inertial.smooth.jsonl")[1:]
+    assert len(rows) >= 10
+    found = copy.deepcopy(rows)
+    assert differences(rows, found, compare_tracks) == []
+    change(found[3])
+    assert len(differences(rows, found, compare_tracks)) == 1
 
 
 def test_outcomes_that_are_gone_new_or_double_are_seen(outcomes):
