@@ -27,5 +27,5 @@ def range_sigma_m(estimate: Estimate) -> float:
 
 def known(estimate: Estimate, field: str) -> float | None:
     """Return a number that an estimate may lack, such as sigma_azimuth_rad, None where it does."""
-    value = getattr(estimate, field, UNSET)
+    value = getattr(estimate, field)
     return None if value is UNSET else float(value)

@@ -150,6 +150,9 @@ class TestReport:
             page = report_html(opened, ("a", "b"))
         assert summary.dark_s == pytest.approx(2.0, abs=0.11)
         assert summary.covered() == pytest.approx(0.9, abs=0.03)
+        assert summary.track_coverage is not None
+        ((begin_ns, end_ns, _),) = summary.track_coverage.without()
+        assert (begin_ns - at(40), end_ns - at(50)) == (pytest.approx(0, abs=3e8), pytest.approx(0, abs=3e8))
         (figures,) = summary.track_figures()
         assert (figures.wrong, figures.samples) == (0, 50)
         for text in (

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Track
 from buddyline.tools.draw.figures import COLOURS, GAP_S, NO_POSE_COLOUR, broken, new_figure
 from buddyline.tools.draw.survey import ELLIPSE_SD
-from buddyline.tools.estimate import known
 from buddyline.tools.monitor.picture import UNCERTAINTY, Point, columns
 from buddyline.tools.monitor.scene import Floats
 from msgspec import UNSET
@@ -136,9 +134,9 @@ def _sigmas_m(point: Point) -> tuple[float, float, float]:
     covariance = R_s_a @ np.array(point.estimate.covariance).reshape(6, 6)[:3, :3] @ R_s_a.T
     axes = np.array(((north, east, 0.0), (-east, north, 0.0), (0.0, 0.0, 1.0)))
     along_m, across_m, down_m = np.sqrt(np.maximum(np.diag(axes @ covariance @ axes.T), 0.0)).tolist()
-    azimuth_rad = known(point.estimate, "sigma_azimuth_rad")
-    if azimuth_rad is not None and isinstance(point.estimate, Track) and point.estimate.sigma_ned_m is not UNSET:
-        across_m, down_m = flat_m * azimuth_rad, point.estimate.sigma_ned_m[2]
+    estimate = point.estimate
+    if estimate.sigma_azimuth_rad is not UNSET and estimate.sigma_ned_m is not UNSET:
+        across_m, down_m = flat_m * estimate.sigma_azimuth_rad, estimate.sigma_ned_m[2]
     return along_m, across_m, down_m
 
 

@@ -89,11 +89,10 @@ def _ned_words(estimate: Estimate) -> str:
     """Return B from A north, east and down, with the compass's error where it is known; else how sure it is."""
     if estimate.t_ned_m is UNSET:
         return f", position ± {length_words(sigma_m(estimate))}"
-    sigmas_m = getattr(estimate, "sigma_ned_m", UNSET)
-    named = zip(("north", "east", "down"), estimate.t_ned_m, strict=True)
-    if sigmas_m is UNSET:
+    named = list(zip(("north", "east", "down"), estimate.t_ned_m, strict=True))
+    if estimate.sigma_ned_m is UNSET:
         return ": " + ", ".join(f"{name} {x:+.2f} m" for name, x in named) + f", ± {length_words(sigma_m(estimate))}"
-    both = zip(named, sigmas_m, strict=True)
+    both = zip(named, estimate.sigma_ned_m, strict=True)
     return ": " + ", ".join(f"{name} {x:+.2f} ± {sigma:.2f} m" for (name, x), sigma in both)
 
 

@@ -25,7 +25,7 @@ from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.triggers import trigger_figures
 from buddyline.tools.health.words import duration_words, reason_words
 from buddyline.tools.monitor.coverage import CSS as STRIP_CSS
-from buddyline.tools.monitor.coverage import LEGEND, clock_words
+from buddyline.tools.monitor.coverage import LEGEND, TRACK_LEGEND, clock_words
 from buddyline.tools.monitor.panel import length_words
 from buddyline.tools.monitor.replay import keyframes, replay_html
 from buddyline.tools.monitor.summary import Summary, summarize
@@ -80,7 +80,7 @@ def report_html(dive: Dive, pair: Pair | None) -> str:
         section("Replay", _replay(summary)),
         section("Plan and profile", _maps(summary)),
         section("Over time", f'<div class="scroll"><div class="wide">{_over_time(summary)}</div></div>'),
-        section("Coverage: where there is a pose, and where and why not", _coverage(summary)),
+        section("Coverage: where there is a pose or a track, and where and why there is no pose", _coverage(summary)),
         section("Pictures", _pictures(summary)),
         section("Calibration and versions", _calibration(summary), _versions(dive, summary)),
         css=CSS,
@@ -171,10 +171,12 @@ def _coverage(summary: Summary) -> str:
     longest = sorted(sorted(gaps, key=lambda gap: gap[0] - gap[1])[:MAX_STRETCHES], key=lambda gap: gap[0])
     listed = "".join(f"<li>{escape(coverage.words(*gap))}</li>" for gap in longest)
     more = f"<p class='dim'>The {MAX_STRETCHES} longest of {len(gaps)}.</p>" if len(gaps) > MAX_STRETCHES else ""
+    track = summary.track_coverage
     return (
         coverage.strip()
         + f"<p class='dim'>{LEGEND.capitalize()}. "
         + f"From 0 to {clock_words((coverage.end_ns - coverage.begin_ns) / S_NS)}.</p>"
+        + (f"{track.strip()}<p class='dim'>{TRACK_LEGEND.capitalize()}.</p>" if track is not None else "")
         + (table(rows) if rows else "<p>No trigger ended without a pose.</p>")
         + (f"<p>Stretches of a second or more without a pose:</p><ul>{listed}</ul>{more}" if listed else "")
     )

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import Depth, NodeInfo, Rejected, RelativePose, Track, Truth
 from buddyline.tools.dives import Dive
-from buddyline.tools.estimate import Estimate
+from buddyline.tools.estimate import Estimate, sigma_m
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
-from buddyline.tools.monitor.coverage import Coverage
+from buddyline.tools.monitor.coverage import BINS, Coverage
 from buddyline.tools.monitor.panel import judged_picture
 from buddyline.tools.monitor.picture import PairPicture, Point
 from buddyline.tools.pairs import Pair
@@ -43,7 +44,7 @@ class Summary:
     """What the report shows of one pair.
 
     points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
-    which the track used no light.
+    which the track used no light. track_coverage: where the track covers the dive, None without a track.
     depths: by node, (ns, m). infos: by node, one for each calibration that it had. counts: messages by key.
     """
 
@@ -53,6 +54,7 @@ class Summary:
     points: list[Point] = field(default_factory=list)
     tracks: list[Point] = field(default_factory=list)
     dark_s: float = 0.0
+    track_coverage: Coverage | None = None
     poses: list[RelativePose] = field(default_factory=list)
     rejected: list[Rejected] = field(default_factory=list)
     truths: list[Truth] = field(default_factory=list)
@@ -102,6 +104,11 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
                 lit_ns = at_ns - round(message.age_s * S_NS)
                 summary.dark_s = max(summary.dark_s, message.age_s, (lit_ns - (lit_before_ns or lit_ns)) / S_NS)
                 lit_before_ns = lit_ns
+                if summary.track_coverage is None:
+                    bins = min(BINS, (dive.end_ns - dive.start_ns) // MIN_SPACING_NS + 1)
+                    summary.track_coverage = Coverage(dive.start_ns, dive.end_ns, bins)
+                uncertain = sigma_m(message) >= TRACK_SIGMA_SHARE * message.range_m
+                summary.track_coverage.add(at_ns, "uncertain" if uncertain else None)
                 _keep(summary, summary.tracks, message, at_ns)
         elif isinstance(message, Depth):
             line = summary.depths.setdefault(message.node, [])
