@@ -38,7 +38,8 @@ class CameraDevice(Protocol):
     is well. skipped: frames that were not given out, by reason.
     """
 
-    skipped: Counter[str]
+    @property
+    def skipped(self) -> Counter[str]: ...  # noqa: D102
 
     @property
     def row_time_ns(self) -> int: ...  # noqa: D102

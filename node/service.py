@@ -1,4 +1,4 @@
-"""One node, running: camera and sensors in threads of their own, a log that is always written, the bus."""
+"""One running node: camera and sensors in threads of their own, a log that is always written, the bus."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ import cv2
 import msgspec
 import numpy as np
 from buddyline.node import __version__
+from buddyline.node.awaited import AwaitedCamera
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.clock_watch import ClockWatch
 from buddyline.node.config import NodeConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
+from buddyline.node.drivers.samples import AbsentError
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FRAME_QUEUE: Final = 2
-# A device that has given nothing for so long, and does not say why, hangs; the first may take its time.
+# A device that gives nothing for this long without naming a problem hangs. The first sample may take longer.
 HANGS_S: Final = 5.0
 FIRST_S: Final = 15.0
 LOOK_S: Final = 0.2
@@ -52,7 +54,7 @@ REFUSED_RETRY_S: Final = 5.0
 
 
 class NodeService(Service):
-    """Captures, detects, publishes and records until it is stopped. camera, sensors: what opens them."""
+    """Captures, detects, publishes and records until it is stopped. camera, sensors: functions that open them."""
 
     def __init__(
         self,
@@ -73,6 +75,7 @@ class NodeService(Service):
         self._last_s: dict[str, float] = {}
         self._seen_s = self._started_s + FIRST_S
         self._ended: set[str] = set()
+        self._awaited: AwaitedCamera | None = None
         # Stored pictures may be far apart.
         self._watched = config.camera.name != "stored" and config.rate_hz >= 1.0
         self._detect_s: deque[float] = deque(maxlen=100)
@@ -86,8 +89,8 @@ class NodeService(Service):
         self._clock_sync = ClockSync(config.node, self.boot, self.clock)
 
     def open(self) -> None:
-        """Open devices and log; raise BuddylineError where one cannot be had."""
-        self.camera: CameraDevice = self._open_camera(self.config, self.clock)
+        """Open devices and log; raise BuddylineError for what waiting cannot mend. An absent camera is awaited."""
+        self.camera: CameraDevice = self._open_or_await_camera()
         self.sources: list[Source] = self._open_sensors(self.config, self.clock)
         info = self._info()
         self.pipeline = Pipeline(
@@ -106,6 +109,18 @@ class NodeService(Service):
         self._images = Images(self.config, self.outlet)
         self.outlet.send(info)
 
+    def _open_or_await_camera(self) -> CameraDevice:
+        try:
+            return self._open_camera(self.config, self.clock)
+        except AbsentError as error:
+            self._awaited = AwaitedCamera(
+                lambda: self._open_camera(self.config, self.clock),
+                str(error),
+                self.clock,
+                lambda: self.outlet.send(self._info()),
+            )
+            return self._awaited
+
     def _info(self) -> NodeInfo:
         own = self.camera.info()
         if own is None or self.config.calibration is not None:
@@ -115,7 +130,7 @@ class NodeService(Service):
         return own
 
     def _log_metadata(self) -> dict[str, str]:
-        """Return what a log is to be understood by later: the configuration in force goes with it, in full."""
+        """Return what is needed to understand a log later, with the whole configuration."""
         return {
             "node": self.config.node,
             "software": self._software,
@@ -162,9 +177,12 @@ class NodeService(Service):
     def progressing(self) -> bool:
         """Return whether frames and sensors go on.
 
-        A sensor that says what is wrong is looked for by its driver: to start the node anew would end the rest too.
+        A sensor that names its problem is tried again by its driver, and so is a camera that was never open: a restart
+        of the node would interrupt the rest.
         """
         now_s = time.monotonic()
+        if self._awaited is not None and not self._awaited.is_open:
+            self._seen_s = now_s + FIRST_S
         if self._watched and self._capturing and now_s - self._seen_s > HANGS_S:
             return False
         return all(

@@ -24,7 +24,7 @@ from buddyline.node.drivers.readout import (
     first_line_ns,
     wall_offset_ns,
 )
-from buddyline.node.drivers.samples import DeviceError
+from buddyline.node.drivers.samples import AbsentError, DeviceError
 from buddyline.node.trigger import FrameChooser, PhaseLock, frames_per_trigger
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import NodeInfo
@@ -125,14 +125,14 @@ class Picamera2Camera:
             ) from error
         self._mapped_array: Any = MappedArray
         if not Picamera2.global_camera_info():
-            raise DeviceError("camera: none found: check its cable, and rpicam-hello --list-cameras")
+            raise AbsentError("camera: none found: check its cable, and rpicam-hello --list-cameras")
         try:
             self._camera = Picamera2()
             self._configure()
             self._camera.start()
         except CAMERA_ERRORS as error:
             self.close()
-            raise DeviceError(f"camera: cannot be opened: {error}") from error
+            raise AbsentError(f"camera: cannot be opened: {error}") from error
         except DeviceError:
             self.close()
             raise

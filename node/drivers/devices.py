@@ -1,4 +1,4 @@
-"""Chips on the I2C bus as a node's sensors: two threads, one bus, and going on when a chip does not."""
+"""Chips on the I2C bus as a node's sensors: two threads, one bus, and recovery from chips that fail."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Metronome:
 
 
 class ImuSource:
-    """The inertial unit at 100 Hz, and the attitude that follows from it."""
+    """The inertial unit at 100 Hz, and the attitude estimated from it."""
 
     name = "imu"
 
@@ -123,7 +123,7 @@ class ImuSource:
 
 
 class DepthSource:
-    """The pressure sensor, and the depth that follows from it once the surface is known."""
+    """The pressure sensor, and the depth computed from it once the surface is known."""
 
     name = "depth"
 
@@ -149,7 +149,7 @@ class DepthSource:
     @property
     def problem(self) -> str:
         """What is wrong with it, "" where nothing is."""
-        return self._health.problem
+        return "; ".join(filter(None, (self._health.problem, self._zero.problem)))
 
     @property
     def retries(self) -> int:
@@ -171,30 +171,35 @@ class DepthSource:
             if sample is None:
                 continue
             self._health.update("")
-            if self._zero.complete or self._find_zero(sample):
+            if self._find_zero(sample):
                 return [self._message(sample)]
         return None
 
     def _wait(self, stop: threading.Event) -> bool:
-        """Wait until the device has something to do, and no longer than that can be: the clock may be set."""
+        """Wait until the device is due, for at most LONGEST_WAIT_NS: the clock may be set."""
         if self._device is None:
             return stop.is_set()
         now_ns = self._clock.now_ns()
         return self._clock.wait_until_ns(min(self._device.next_due_ns, now_ns + LONGEST_WAIT_NS), stop)
 
     def _find_zero(self, sample: DepthSample) -> bool:
-        """Return whether looking for the surface is over."""
+        """Return whether the search for the surface is over."""
         zero = self._zero
+        before = zero.complete, zero.surface_pa
         if not zero.update(sample):
             return False
+        if before == (zero.complete, zero.surface_pa):
+            return True
+        if zero.problem:
+            log.warning("%s: %s", self.name, zero.problem)
         if zero.measured:
             log.info("%s: surface at %.0f Pa", self.name, zero.surface_pa)
             try:
                 save_zero(self._zero_path, sample.stamp_ns, zero.surface_pa)
             except OSError as error:
                 log.warning("%s: surface not kept for a restart: %s", self.name, error)
-        else:
-            log.warning("%s: not started in calm air: surface taken at %.0f Pa", self.name, zero.surface_pa)
+        elif not zero.problem:
+            log.warning("%s: not in calm air: the day's surface is kept, %.0f Pa", self.name, zero.surface_pa)
         return True
 
     def _message(self, sample: DepthSample) -> Depth:
@@ -219,10 +224,10 @@ def _triple(vector: Vector) -> Vector3:
 
 
 def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSource]:
-    """Open the bus and the sensors on it; "none" leaves one out.
+    """Return the sensors on the bus; "none" leaves one out.
 
-    A chip that does not answer is looked for again every two seconds; a bus that is not there, or a name that
-    nobody knows, is an error.
+    A bus that cannot be opened, or a chip that does not answer, is named and tried again every two seconds. An unknown
+    name is an error.
     """
     sensors = config.sensors
     check_names(sensors.imu, sensors.depth)

@@ -9,14 +9,13 @@ from typing import Any, Final, Self
 
 from buddyline.node.drivers.samples import DeviceError
 
-# linux/i2c-dev.h: how long the adapter waits for a transfer, in units of 10 ms. Its default, one second,
-# would let one chip that holds the bus down silence the others for that long.
+# linux/i2c-dev.h: how long the adapter waits for a transfer, in units of 10 ms. With its default of one second,
+# one chip that holds the bus down would silence the others for that long.
 I2C_TIMEOUT: Final = 0x0702
 TRANSFER_TIMEOUT_10MS: Final = 5
 
 ATTEMPTS: Final = 3
-# NACK, lost arbitration, and what some adapters say in their place. A timeout is not among them: it has
-# waited long enough.
+# NACK, lost arbitration, and what some adapters report instead. A timeout is not repeated: it has waited already.
 _PASSING: Final = frozenset({errno.EREMOTEIO, errno.EIO, errno.ENXIO, errno.EAGAIN})
 
 _MEANING: Final = {
@@ -27,9 +26,10 @@ _MEANING: Final = {
 
 
 class I2cBus:
-    """Bus number /dev/i2c-<number>, shared by all chips on it and by all threads.
+    """Bus number /dev/i2c-<number>, shared by all its chips and by all threads.
 
-    retries: transfers that had to be repeated; a growing count is a wire going bad.
+    It is opened by `open` or the first transfer, so that a bus that is absent at the start can come later.
+    retries: transfers that were repeated; a growing count means a failing wire.
     """
 
     def __init__(self, number: int = 1) -> None:
@@ -40,20 +40,34 @@ class I2cBus:
         self.number = number
         self.retries = 0
         self._lock = threading.Lock()
+        self._new_bus: Any = SMBus
         self._message: Any = i2c_msg
+        self._bus: Any = None
+
+    def open(self) -> None:
+        """Open the adapter if it is not open; raise DeviceError where it cannot be. The next call tries again."""
+        with self._lock:
+            if self._bus is None:
+                self._bus = self._open()
+
+    def _open(self) -> Any:
+        number = self.number
         try:
-            self._bus: Any = SMBus(number)
+            bus = self._new_bus(number)
         except FileNotFoundError as error:
             raise DeviceError(
                 f"I2C bus {number}: no /dev/i2c-{number}: add dtparam=i2c_arm=on to config.txt and reboot"
             ) from error
         except PermissionError as error:
             raise DeviceError(f"I2C bus {number}: not allowed: add this user to the group i2c") from error
-        try:
-            ioctl(int(self._bus.fd or 0), I2C_TIMEOUT, TRANSFER_TIMEOUT_10MS)
         except OSError as error:
-            self._bus.close()
+            raise DeviceError(f"I2C bus {number}: cannot be opened: {error.strerror}") from error
+        try:
+            ioctl(int(bus.fd or 0), I2C_TIMEOUT, TRANSFER_TIMEOUT_10MS)
+        except OSError as error:
+            bus.close()
             raise DeviceError(f"I2C bus {number}: cannot set its timeout: {error.strerror}") from error
+        return bus
 
     def __enter__(self) -> Self:
         return self
@@ -64,7 +78,9 @@ class I2cBus:
     def close(self) -> None:
         """Free the bus; a second call does nothing."""
         with self._lock:
-            self._bus.close()
+            bus, self._bus = self._bus, None
+            if bus is not None:
+                bus.close()
 
     def read(self, address: int, register: int, count: int) -> bytes:
         """Read count bytes from a register on, in one transfer."""
@@ -81,6 +97,7 @@ class I2cBus:
         self._transfer(address, command, self._message.write(address, [command]))
 
     def _transfer(self, address: int, register: int, *messages: object) -> None:
+        self.open()
         with self._lock:
             for attempt in range(1, ATTEMPTS + 1):
                 try:

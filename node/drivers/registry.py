@@ -45,6 +45,7 @@ def open_imu(
     Raises DeviceError where no motion chip answers. A magnetometer may be absent (ImuDevice.problem names it).
     """
     _check_name("sensors.imu", name, (AUTO, *IMUS))
+    bus.open()
     R = np.eye(3) if R_body_chip is None else R_body_chip
     candidates = SEARCHED_IMUS if name == AUTO else (name,)
     for candidate in candidates:

@@ -18,6 +18,10 @@ class DeviceError(BuddylineError):
     """A device that fails; the text names bus, address and register."""
 
 
+class AbsentError(DeviceError):
+    """A device that is not there, or in use elsewhere; it may come later."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSample:
     """One reading in the body frame, (3,) each.

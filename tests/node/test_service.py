@@ -10,10 +10,19 @@ import socket
 import subprocess
 import threading
 import time
+from collections import Counter
 from itertools import pairwise
 
 import pytest
-from buddyline.node.config import CameraConfig, NodeConfig, PreviewConfig, RecordConfig, SensorsConfig
+from buddyline.node.config import (
+    CameraConfig,
+    NodeConfig,
+    PreviewConfig,
+    RecordConfig,
+    SensorsConfig,
+    load_node_config,
+)
+from buddyline.node.drivers.samples import AbsentError
 from buddyline.node.images import RateLimiter
 from buddyline.node.service import NodeService
 from buddyline.protocol.clock import MS_NS, S_NS, SystemClock
@@ -247,6 +256,58 @@ def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, mo
     service = NodeService(config)
     service.sources = [Silent(problem)]
     assert service.progressing() is progresses
+
+
+class NewCamera:
+    """A camera that gives nothing, as the driver makes it once the cable is in."""
+
+    problem, row_time_ns = "", 37_000
+
+    def __init__(self):
+        self.skipped = Counter()
+
+    def info(self):
+        return None
+
+    def next_frame(self, stop):
+        stop.wait()
+
+    def close(self):
+        pass
+
+
+def test_a_node_without_its_camera_at_the_start_runs_says_so_and_takes_it_later(tmp_path, monkeypatch):
+    monkeypatch.setattr("buddyline.node.awaited.RETRY_NS", 10 * MS_NS)
+    plugged = threading.Event()
+
+    def open_camera(config, clock):
+        if not plugged.is_set():
+            raise AbsentError("camera: none found: check its cable")
+        return NewCamera()
+
+    pi = load_node_config(REPOSITORY / "node/examples/pi.toml")
+    config = NodeConfig(
+        node="a",
+        connect=free_endpoint(),
+        camera=pi.camera,
+        calibration=pi.calibration,
+        record=RecordConfig(directory=str(tmp_path)),
+    )
+    service = NodeService(config, camera=open_camera)
+    service.open()
+    try:
+        service.start()
+        until(lambda: service.outlet.sent["imu"] > 2)
+        assert "camera: camera: none found" in service.status().problem
+        assert service.progressing()
+        plugged.set()
+        until(lambda: service.outlet.sent["info"] == 2)
+        assert "none found" not in service.status().problem
+    finally:
+        assert service.close() == 0
+    with DiveLogReader(service.recorder.path) as reader:
+        infos = [record.open().message for record in reader.records(lambda key: key.endswith("/info"))]
+    assert [info.row_time_ns for info in infos] == [0, 37_000]
 
 
 @pytest.mark.skipif(shutil.which("chronyd") is None, reason="chrony is not on this machine")

@@ -288,7 +288,9 @@ def test_a_pi_without_anything_attached_names_each():
     config = msgspec.structs.replace(config, sensors=msgspec.structs.replace(config.sensors, i2c_bus=250))
     found = rig.check_camera(config)
     assert levels(found) == {"camera": "problem", "calibration": "warning", "lights": "skipped"}
-    assert levels(rig.check_sensors(config)) == {"sensors": "problem"}
+    sensors = rig.check_sensors(config)
+    assert levels(sensors) == {"imu": "problem", "depth": "problem", "compass": "warning"}
+    assert "no /dev/i2c-250" in sensors[0].text
 
 
 def test_a_camera_that_gives_nothing(monkeypatch):

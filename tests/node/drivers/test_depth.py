@@ -37,6 +37,23 @@ def test_splashes_do_not_set_a_zero():
     assert zero.surface_pa == STANDARD_AIR_PA
 
 
+@pytest.mark.parametrize("under_m", [0.45, 0.7])
+def test_a_start_under_water_is_no_zero(under_m):
+    """With air at 101.3 kPa, 0.7 m of water are 108.2 kPa: no air is that heavy."""
+    zero = SurfaceZero()
+    feed(zero, [STANDARD_AIR_PA + 997.0 * 9.80665 * under_m] * ZERO_SAMPLES)
+    assert not zero.measured
+    assert "not started in calm air" in zero.problem
+    assert zero.sigma_m(0.0) > 0.25
+
+
+def test_swell_and_one_low_reading_leave_the_zero_alone():
+    zero = SurfaceZero()
+    feed(zero, [101_000.0] * ZERO_SAMPLES + [101_000.0, 98_000.0] * 50 + [100_000.0] * 100)
+    assert zero.surface_pa == 101_000.0
+    assert zero.problem == ""
+
+
 def test_started_under_water_keeps_the_standard_and_says_how_wrong_it_may_be():
     zero = SurfaceZero()
     feed(zero, [130_000.0] * 100)

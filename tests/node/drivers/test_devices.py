@@ -11,7 +11,6 @@ import pytest
 from buddyline.node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
 from buddyline.node.drivers.devices import Metronome, open_sensors
 from buddyline.node.drivers.ms5837 import compensate_30ba
-from buddyline.node.drivers.samples import DeviceError
 from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
@@ -226,10 +225,37 @@ def test_unknown_names_are_refused_at_start(config, clock, adapter, field):
     assert adapter.opened == 0
 
 
-def test_a_bus_that_is_not_there_is_refused_at_start(config, clock, adapter):
-    wrong = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", i2c_bus=7), record=config.record)
-    with pytest.raises(DeviceError, match="i2c_arm=on"):
-        open_sensors(wrong, clock)
+def test_a_bus_that_is_absent_at_the_start_is_named_and_opened_later(config, clock, adapter, board):
+    adapter.open_error = PermissionError(13, "Permission denied")
+    imu, depth = open_sensors(config, clock)
+    said = []
+    plain = clock.wait_until_ns
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        said.append(imu.problem)
+        if len(said) == 6:
+            adapter.open_error = None
+        return plain(instant_ns, event)
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    assert imu.next_messages(NEVER)
+    assert any("group i2c" in text for text in said)
+    assert imu.problem == ""
+    depth.close()
+    assert adapter.opened == 0
+
+
+def test_a_zero_taken_under_water_is_noticed_and_corrected(config, clock, board, gauge):
+    gauge.d1 = d1_for(101_000.0 + 997.0 * 9.80665 * 0.3)
+    imu, depth = open_sensors(config, clock)
+    assert abs(depth.next_messages(NEVER)[0].depth_m) < 0.02
+    assert depth.problem == ""
+    gauge.d1 = d1_for(101_000.0 + 997.0 * 9.80665 * 5.0)
+    assert collect(depth, clock, 3.0)[-1].depth_m == pytest.approx(4.7, abs=0.02)
+    gauge.d1 = d1_for(101_000.0)
+    assert abs(collect(depth, clock, 4.0)[-1].depth_m) < 0.02
+    assert "0.30 m too deep" in depth.problem
+    imu.close()
 
 
 def test_the_mount_is_the_configurations(config, clock, board):

@@ -80,8 +80,16 @@ def test_a_chip_that_hangs_leaves_the_others_reachable(bus: I2cBus, adapter: Ada
 )
 def test_a_bus_that_cannot_be_opened_says_what_to_do(adapter: Adapter, error: OSError, advice: str):
     adapter.open_error = error
+    bus = I2cBus(1)
     with pytest.raises(DeviceError, match=advice):
-        I2cBus(1)
+        bus.open()
+    assert adapter.opened == 0
+    adapter.open_error = None
+    bus.open()
+    bus.open()
+    assert adapter.opened == 1
+    bus.close()
+    bus.close()
     assert adapter.opened == 0
 
 
@@ -91,7 +99,7 @@ def test_an_adapter_that_refuses_its_timeout_is_closed_again(adapter: Adapter, m
 
     monkeypatch.setattr("buddyline.node.drivers.i2c.ioctl", refuse)
     with pytest.raises(DeviceError, match="timeout"):
-        I2cBus(1)
+        I2cBus(1).open()
     assert adapter.opened == 0
 
 
