@@ -40,7 +40,7 @@ def children_of(pid):
 
 @pytest.fixture
 def two_logs(tmp_path):
-    messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05)
+    messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05, imu=True)
     for node in ("a", "b"):
         with DiveLogWriter(tmp_path / f"{node}.mcap") as writer:
             for message in messages:
@@ -80,6 +80,10 @@ def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
     assert set(counts.values()) == {1}
     with DiveLogReader(tmp_path / "live.mcap") as reader:
         assert reader.damage == []
+    with Dive([tmp_path / "live.mcap"]) as dive:
+        assert sum(1 for _ in dive.messages("imu")) == 2 * 400
+        assert {envelope.message.mode for envelope in dive.messages("track")} == {"filter"}
+        assert {envelope.message.mode for envelope in dive.messages("track_lag")} == {"lag"}
 
 
 def wait_until_gone(pids, seconds):

@@ -6,11 +6,17 @@ from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Mark
 from buddyline.protocol.topics import key_of
 from buddyline.tools.cli import main
+from msgspec.structs import replace
 
 from tests.solver_service.conftest import dive_messages
+from tests.tools.evaluated import track
 
 S_NS = 1_000_000_000
 LATENCY_NS = 40_000_000
+
+
+# Of the live solver: on the bus, and in no node's log.
+TRACKS = [track(0, stamp_ns=50_000_000 * k, mode=mode) for k in range(20) for mode in ("filter", "lag")]
 
 
 def image(stamp_ns, data):
@@ -22,7 +28,7 @@ def image(stamp_ns, data):
 def dive(tmp_path_factory):
     """Two nodes' logs, and a topside recording without 2 s of node b, with some of a late, twice, and its own."""
     directory = tmp_path_factory.mktemp("dive")
-    messages, _ = dive_messages(seconds=5.0, seed=7)
+    messages, _ = dive_messages(seconds=5.0, seed=7, imu=True)
     begin_ns = min(message.stamp_ns for message in messages)
     for node in ("a", "b"):
         with DiveLogWriter(directory / f"{node}.mcap") as writer:
@@ -40,6 +46,9 @@ def dive(tmp_path_factory):
             for _ in range(2 if i % 50 == 0 else 1):
                 writer.write(key_of(message), encode(message), message.stamp_ns + late_ns, message.stamp_ns)
         writer.write_message(image(begin_ns + S_NS, b"preview"), begin_ns + S_NS + LATENCY_NS)
+        for row in TRACKS:
+            stamp_ns = begin_ns + S_NS + row.stamp_ns
+            writer.write_message(replace(row, stamp_ns=stamp_ns), stamp_ns + LATENCY_NS)
         mark = Mark(node="a", stamp_ns=begin_ns + S_NS, name="1")
         writer.write_message(mark, mark.stamp_ns + LATENCY_NS)
     out = directory / "out.mcap"
@@ -57,8 +66,10 @@ def test_everything_is_there_once_and_in_order(dive):
     directory, messages, mark = dive
     records = read(directory / "out.mcap")
     found = sorted((record.key, record.publish_time_ns) for record in records)
-    picture = ("buddyline/node/a/image", mark.stamp_ns)
-    assert found == sorted([*((key_of(m), m.stamp_ns) for m in messages), (key_of(mark), mark.stamp_ns), picture])
+    others = [("buddyline/node/a/image", mark.stamp_ns), (key_of(mark), mark.stamp_ns)]
+    others += [(key_of(row), mark.stamp_ns + row.stamp_ns) for row in TRACKS]
+    assert found == sorted([*((key_of(m), m.stamp_ns) for m in messages), *others])
+    assert {key.rpartition("/")[2] for key, _ in found} >= {"imu", "track", "track_lag"}
     times = [record.log_time_ns for record in records]
     assert times == sorted(times)
 
@@ -83,6 +94,7 @@ def test_it_is_solved_as_the_nodes_own_logs_are(dive, tmp_path):
     assert main(["solve", str(directory / "out.mcap"), "-o", str(tmp_path / "filled.mcap")]) == 0
 
     def results(path):
+        # The solver's own: what the live one said is in the topside recording alone, and is not solved again.
         return [record.payload for record in read(path) if record.key.startswith("buddyline/pair/")]
 
     assert results(tmp_path / "own.mcap")

@@ -3,7 +3,6 @@
 import math
 import threading
 import time
-from dataclasses import replace
 
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
@@ -11,21 +10,25 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import Candidates, NodeInfo, Rejected
+from buddyline.protocol.messages import Candidates, Imu, NodeInfo, Rejected
 from buddyline.protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
 from buddyline.tools import play
 from buddyline.tools.dives import Dive
 from buddyline.tools.play import Player, _selected, _span
+from msgspec.structs import replace
 
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
+from tests.tools.evaluated import track
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     path = tmp_path_factory.mktemp("play") / "dive.mcap"
     with DiveLogWriter(path) as writer:
-        for message in dive_messages(seconds=2.0)[0]:
+        for message in dive_messages(seconds=2.0, imu=True)[0]:
             writer.write_message(message)
+        for mode in ("filter", "lag"):
+            writer.write_message(track(0, stamp_ns=START_NS + PERIOD_NS, mode=mode))
         old = Rejected(node_a="a", node_b="b", stamp_ns=START_NS + PERIOD_NS, trigger=1, reason="late")
         writer.write_message(old)
     return path
@@ -55,9 +58,10 @@ class Played:
 
 def test_everything_but_what_a_solver_made_is_sent(log):
     played = Played(log)
-    assert played.sent == len(played.received) == len(dive_messages(seconds=2.0)[0])
+    assert played.sent == len(played.received) == len(dive_messages(seconds=2.0, imu=True)[0])
     assert not any("/pair/" in received.key for received in played.received)
     assert len(played.messages(Candidates)) == 2 * 18
+    assert len(played.messages(Imu)) == 2 * 200
 
 
 def test_pace_follows_speed(log):
