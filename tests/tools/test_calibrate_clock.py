@@ -182,7 +182,7 @@ def test_a_good_pair_is_told_with_chronys_figures():
     [
         ({"offset_s": 0.05}, "differ by more than 2 ms"),
         ({"offset_s": 0.0, "step": (5.0, 1.0)}, "a clock was set during the measurement"),
-        ({"offset_s": 0.0, "base_s": (0.02, 0.0)}, "too slow to tell: the clocks may differ by 10.0 ms more"),
+        ({"offset_s": 0.0, "base_s": (0.02, 0.0)}, "too slow to measure: the clocks may differ by 10.0 ms more"),
     ],
 )
 def test_what_stands_against_a_pair_is_named(pair, words):
@@ -231,7 +231,7 @@ def test_a_node_that_falls_silent_meanwhile_is_named(monkeypatch):
 
         thread = threading.Thread(target=say_once)
         thread.start()
-        with pytest.raises(BuddylineError, match="node b fell silent"):
+        with pytest.raises(BuddylineError, match="node b became silent"):
             clock_report.hear(tool, 1.0)
         ended.set()
         thread.join()

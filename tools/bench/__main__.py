@@ -1,4 +1,4 @@
-"""`python -m buddyline.tools.bench BENCHMARK`: one each, imported when it is called.
+"""`python -m buddyline.tools.bench BENCHMARK`: run one benchmark. Only its own module is imported.
 
 A benchmark is a module with add_arguments(parser), measure(args) and table(figures).
 """
@@ -25,7 +25,7 @@ BENCHMARKS: Final = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one benchmark, print its figures; return the exit status."""
+    """Run one benchmark and print its figures; return the exit status."""
     listing = "\n".join(f"  {name:8} {does}" for name, does in BENCHMARKS.items())
     parser = argparse.ArgumentParser(
         prog=PROGRAM,

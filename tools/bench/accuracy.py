@@ -1,10 +1,10 @@
-"""How good the solver is, on simulated triggers: errors over the Cramer-Rao bound, and the choice of the four lights.
+"""The solver's accuracy on simulated triggers: errors over the Cramer-Rao bound, and the choice of the four lights.
 
-Bound: of the eight coordinates, by numeric derivatives of the projection. Beside the solver's methods: OpenCV's
-solvePnP and SQPnP on A's picture alone. Two lights are too few for them: they are given four, B's bar doubled to a
-square. Choice: the right four lights of all
-triggers, with so many false candidates in each picture, by the range gap alone (the paper's test: the pairs whose
-ranges agree best), by pictures alone, and with attitude and depth; then wrong poses (more than 10 % of the range off).
+Errors: the bound is that of the eight image coordinates, from numeric derivatives of the projection. OpenCV's solvePnP
+and SQPnP are compared, on A's picture alone. Two lights are too few for them, so they get four: the corners of a square
+on B. Choice: the share of triggers with the right four lights, by number of false candidates in each picture. It is
+measured for the range gap alone (the paper's test: the pairs whose ranges agree best), for pictures alone, and with
+attitude and depth. Wrong poses are more than 10 % of the range off.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
 
 
 def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
-    """Return RMSE over the bound, position and rotation, of every method, and the covariance's normalized error."""
+    """Return each method's RMSE over the bound, of position and rotation, and the NEES per dimension of `refined`."""
     rng = np.random.default_rng(round(100 * range_m))
     bound, squares, nees = np.zeros(2), {method: np.zeros(2) for method in (*METHODS, *PNP)}, []
     for _ in range(count):
@@ -81,7 +81,7 @@ def over_bound(range_m: float, sigma_px: float, count: int) -> dict[str, Any]:
 
 
 def error_of(trigger: Trigger, t_a_b_m: Floats, R_a_b: Floats) -> Floats:
-    """Return the error (6,): position, then the small rotation."""
+    """Return the error (6,): position (m), then the small rotation (rad)."""
     return np.concatenate((trigger.t_a_b_m - t_a_b_m, rotation_log(trigger.R_a_b @ R_a_b.T)))
 
 
@@ -122,7 +122,7 @@ def choice(band_m: tuple[float, float], false: int, count: int) -> dict[str, Any
 
 
 def trigger_by_range_gap(trigger: Trigger) -> bool:
-    """Choose the pairs whose ranges agree best, the right light on the left in the picture; tell if they are right."""
+    """Return whether the pairs whose ranges agree best are right. In a picture B's right light is on the left side."""
     pairs, rays = [], []
     for view in trigger.views:
         first, second = np.triu_indices(len(view.pixels), 1)
@@ -141,7 +141,7 @@ def trigger_by_range_gap(trigger: Trigger) -> bool:
 
 
 def table(figures: dict[str, list[dict[str, Any]]]) -> str:
-    """Return both tables for a person."""
+    """Return both tables as text."""
     errors = {
         "range": "{range_m:.1f} m",
         "sigma": "{sigma_px:.1f} px",

@@ -1,9 +1,9 @@
-"""How fast the detectors are beside others' feature finders: milliseconds per picture, on one thread, as ratios.
+"""The detectors' speed compared with other feature finders: milliseconds per picture on one thread, and ratios.
 
-The same pictures for all: those of the dives named, or else rendered by this project's simulator. In each round every
-finder goes over all pictures of an environment before the next begins, as it would in a camera's loop; ratios are of
-the same round, as a machine's speed changes from minute to minute, and the median round counts. pupil-apriltags is
-measured in a process of its own, where it is installed: its releases corrupt the heap now and then.
+All finders get the same pictures: those of the given dives, or pictures rendered by this project's simulator. In each
+round every finder takes all pictures of an environment in turn. Ratios are taken within a round, because a machine's
+speed changes from minute to minute; the median over the rounds counts. pupil-apriltags, if it is installed, runs in a
+process of its own, because some of its releases corrupt the heap.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pictures", type=int, default=12, metavar="N", help="of each environment; default: 12")
     parser.add_argument("--width", type=int, nargs="+", default=list(WIDTHS_PX), metavar="PX")
     parser.add_argument(
-        "--frames", type=int, metavar="N", help="only: how the memory of ours grows up to this many pictures"
+        "--frames", type=int, metavar="N", help="measure only our detector's memory, up to this many pictures"
     )
 
 
 def measure(args: argparse.Namespace) -> Any:
-    """Return a row for each source and width, or with --frames the resident memory, KiB, by pictures seen.
+    """Return a row for each source and width, or with --frames the resident memory, KiB, by number of pictures.
 
-    A row: ms per picture by finder, and the time of ours over each one's.
+    A row: ms per picture of each finder, and our detector's time over each finder's.
     """
     if args.pictures < 1 or min(args.width) < 64 or (args.frames is not None and args.frames < 10):
         raise BuddylineError("--pictures: at least 1; --width: at least 64; --frames: at least 10")
@@ -85,7 +85,7 @@ def measure(args: argparse.Namespace) -> Any:
 
 
 def compare(source: str, width_px: int, pictures: Pictures) -> dict[str, Any]:
-    """Return the row of these pictures."""
+    """Return the row for these pictures."""
 
     def over_all(finder: Finder) -> Callable[[], object]:
         return lambda: [finder(picture) for picture in pictures]
@@ -101,7 +101,7 @@ def compare(source: str, width_px: int, pictures: Pictures) -> dict[str, Any]:
 
 
 def growth(pictures: Pictures, frames: int) -> dict[str, int]:
-    """Return the process's resident memory in KiB by the number of pictures that ours has gone over."""
+    """Return the process's resident memory, KiB, by the number of pictures that our detector has processed."""
     detector = make_detector(OURS)
     resident_kib = {}
     for i in range(1, frames + 1):
@@ -112,7 +112,7 @@ def growth(pictures: Pictures, frames: int) -> dict[str, int]:
 
 
 def table(figures: Any) -> str:
-    """Return the figures for a person: ms, and what ours takes of each other's time."""
+    """Return the figures as text: ms, and our detector's time over each finder's."""
     if isinstance(figures, dict):
         return "\n".join(f"after {frames:>6s} pictures: {kib} KiB resident" for frames, kib in figures.items())
     names = list(figures[0]["ms"])
@@ -142,7 +142,7 @@ def _over(ours_ms: float | None, other_ms: float | None) -> float | None:
 
 
 def _finders() -> dict[str, Finder]:
-    """Return what is compared, each with its defaults."""
+    """Return the finders, each with its default settings."""
     aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
     blobs = cv2.SimpleBlobDetector.create()
     finders: dict[str, Finder] = {method: make_detector(method).detect for method in METHODS}
@@ -150,7 +150,7 @@ def _finders() -> dict[str, Finder]:
 
 
 def _apriltags_ms(pictures: Pictures) -> float | None:
-    """Return pupil-apriltags' mean ms in a process of its own; None where it is missing or dies."""
+    """Return the mean ms of pupil-apriltags, in a process of its own; None if it is not installed or crashes."""
     if find_spec("pupil_apriltags") is None:
         return None
     with tempfile.TemporaryDirectory() as folder:
@@ -162,7 +162,7 @@ def _apriltags_ms(pictures: Pictures) -> float | None:
 
 
 def _pictures(source: str, width_px: int, count: int) -> Pictures:
-    """Return pictures of a dive, or of an environment that the simulator renders, in colour and of this width."""
+    """Return colour pictures of this width, from a dive or rendered of an environment."""
     height_px = round(width_px * ASPECT)
     if source.endswith(".mcap"):
         return spread((_in_colour(picture, width_px, height_px) for picture in stored_pictures(source)), count, source)

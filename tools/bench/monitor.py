@@ -1,8 +1,8 @@
-"""What the monitor costs: its server's CPU and memory with viewers, the solver's latency beside it, the page's weight.
+"""The monitor's cost: CPU and memory of its server with viewers, the solver's latency meanwhile, the page's size.
 
-A simulated dive of candidates is played at 30 Hz, over and over, through a hub and the solver; pictures of two nodes
-come twice a second. Viewers are connections as the page makes them, which take all and draw nothing; with a browser
-(playwright and Chromium) the time until the page shows the scene is measured as well.
+A simulated dive of candidates is played at 30 Hz in a loop, through a hub and the solver, with pictures of two nodes
+twice a second. A viewer is a connection like the page's, which receives everything and draws nothing. With a browser
+(playwright and Chromium) the time until the page shows the scene is measured too.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ PREVIEW_S: Final = 0.5
 PREVIEW_PX: Final = (410, 308)
 WINDOW_S: Final = 30.0
 READY_S: Final = 60.0
-# What starting a monitor costs is not what it costs while it runs.
+# Time after a monitor's start that does not count.
 SETTLE_S: Final = 5.0
-# As long as the page draws its first picture in software.
+# The page draws its first picture in software, which may take this long.
 BROWSER_MS: Final = 120_000
 SOLVED: Final = "the solver finds the pose"
 CHROMIUM_FLAGS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Return the page's weight, the latency by turns with and without a monitor, and what monitors take."""
+    """Return the page's size, the latency with and without a monitor by turns, and the servers' CPU and memory."""
     if args.minutes < 1 or min(args.viewers) < 1 or args.rounds < 0:
         raise BuddylineError("--minutes: 1 or more; --viewers: 1 or more; --rounds: 0 or more")
     endpoint = free_endpoint()
@@ -71,7 +71,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 @contextmanager
 def playing(directory: Path, endpoint: str) -> Iterator[Bus]:
-    """Run hub, solver and a dive over and over, with previews; give a bus to listen on once poses come."""
+    """Run hub, solver and a dive in a loop, with previews; yield a bus to listen on when the first pose has come."""
     dive = str(directory / "dive.mcap")
     made = [sys.executable, "-P", "-m", "buddyline", "simulate", dive, "--rate", str(RATE_HZ), "--seconds", str(DIVE_S)]
     subprocess.run([*made, "--undisturbed", "--range-max", "8"], check=True, capture_output=True)
@@ -110,7 +110,7 @@ def _previews(bus: Bus, stop: threading.Event) -> None:
 
 
 class Latencies:
-    """How long each pose takes to come after the later of its two candidates, as a third party hears both."""
+    """The time of each pose after the later of its two Candidates messages, as a third process receives them."""
 
     def __init__(self) -> None:
         self._frames_ns: dict[int, list[int]] = {}
@@ -124,7 +124,7 @@ class Latencies:
             self._poses_ns[envelope.message.trigger] = envelope.time_ns
 
     def seconds(self) -> list[float]:
-        """Return all so far. Threads take frames and poses in any order, so they are matched here."""
+        """Return all latencies so far. Frames and poses come from two threads, in any order; they are matched here."""
         return [
             (pose_ns - max(frames_ns)) / 1e9
             for trigger, pose_ns in self._poses_ns.items()
@@ -133,7 +133,7 @@ class Latencies:
 
 
 def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dict[str, list[float]]:
-    """Return candidates-to-pose medians (s) of turns without and with the monitor and a viewer, one after another."""
+    """Return the candidates-to-pose medians and p99, s, of rounds without and with a monitor and a viewer, by turns."""
     result: dict[str, list[float]] = {"without_s": [], "with_s": [], "without_p99_s": [], "with_p99_s": []}
     for _ in range(rounds):
         for name in ("without", "with"):
@@ -160,7 +160,7 @@ def measure_latency(bus: Bus, endpoint: str, rounds: int, round_s: float) -> dic
 
 @contextmanager
 def monitor(endpoint: str) -> Iterator[tuple[Child, str]]:
-    """Run a monitor; give it and the page's address once that answers."""
+    """Run a monitor; yield it and its page's address when the page answers."""
     port = free_port()
     address = f"127.0.0.1:{port}"
     with Child("monitor", "--connect", endpoint, "--port", str(port)) as child:
@@ -179,7 +179,7 @@ def monitor(endpoint: str) -> Iterator[tuple[Child, str]]:
 
 @contextmanager
 def viewer(address: str) -> Iterator[list[int]]:
-    """Look at a page as its own client does, taking all that comes; give the bytes so far, in a list of one."""
+    """Connect to a page as its client does, and receive everything; yield a list with the number of bytes so far."""
     try:
         import msgspec
         import viser
@@ -211,9 +211,9 @@ def viewer(address: str) -> Iterator[list[int]]:
 
 
 def measure_servers(endpoint: str, viewers: list[int], minutes: float) -> list[dict[str, float]]:
-    """Return CPU (share of a core), memory (MiB) and traffic of monitors with so many viewers, early and late.
+    """Return CPU (share of a core), memory (MiB) and traffic of monitors, after one minute and after `minutes`.
 
-    All of them run at once, each a process of its own.
+    viewers: number of viewers of each monitor. All monitors run at once, each in its own process.
     """
     rows: list[dict[str, float]] = []
     with ExitStack() as stack:
@@ -241,7 +241,7 @@ def measure_servers(endpoint: str, viewers: list[int], minutes: float) -> list[d
 
 
 def measure_page(endpoint: str) -> dict[str, float]:
-    """Return the page's weight as served, and, with a browser, the seconds until it has the scene."""
+    """Return the page's size as served and, with a browser, the seconds until it shows the scene."""
     with monitor(endpoint) as (_, address):
         request = urllib.request.Request(f"http://{address}", headers={"Accept-Encoding": "gzip"})
         with urllib.request.urlopen(request, timeout=30) as page:
@@ -254,7 +254,7 @@ def measure_page(endpoint: str) -> dict[str, float]:
 
 
 def _first_scene_s(address: str) -> float | None:
-    """Return how long Chromium takes until the page shows the pair; None without it, or where it takes for ever."""
+    """Return the seconds until the page shows the pair in Chromium; None without Chromium, or after a time-out."""
     chromium = shutil.which("chromium")
     try:
         from playwright.sync_api import TimeoutError as TooLate

@@ -1,10 +1,10 @@
-"""What a whole node costs: from a picture in memory to its candidates on the bus, processor, memory, log.
+"""The cost of a whole node: time from a picture in memory to its candidates on the bus, processor, memory, log.
 
-A node as on a Pi, in this process: pictures of the simulated camera at each trigger, an inertial unit at 100 Hz with
-its attitude filter, depth at 20 Hz, detector, log, recorded pictures and previews, and a real hub on loopback. The
-pictures are rendered before, by another process, and are copied out of memory as the camera's driver does: a time
-begins where that copy does, and ends when the bus has taken the candidates. Exposure, readout and the camera's own
-pipeline come on top.
+The node runs in this process as on a Pi: a picture at each trigger, an inertial unit at 100 Hz with its attitude
+filter, depth at 20 Hz, detector, log, recorded pictures and previews, and a real hub on loopback. Another process has
+rendered the pictures before; each is copied from memory, as the camera's driver does. The measured time begins with
+that copy, and ends when the bus has taken the candidates. Exposure, readout and the camera's own pipeline are not in
+it.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Run one node for so long; return its figures."""
+    """Run one node for --seconds; return its figures."""
     if args.seconds < 2 or args.rate <= 0 or args.width < 64:
         raise BuddylineError("--seconds: at least 2; --rate: above 0; --width: at least 64")
     config = NodeConfig(
@@ -104,7 +104,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 class PreparedCamera:
-    """Gives prepared pictures at the trigger instants, each a copy out of memory. taken_s: when, by stamp."""
+    """Returns prepared pictures at the trigger instants, each a copy. taken_s: start time of each copy, by stamp."""
 
     row_time_ns = 0
     problem = ""
@@ -117,7 +117,7 @@ class PreparedCamera:
         self._number = 0
 
     def info(self) -> None:
-        """The calibration stands in the configuration."""
+        """Return nothing: the calibration is in the configuration."""
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
         """Wait for the next instant."""
@@ -134,7 +134,7 @@ class PreparedCamera:
 
 
 class PreparedImu:
-    """An inertial unit at rest, with noise, at no cost of a bus."""
+    """An inertial unit at rest, with noise, without the cost of a bus."""
 
     name = "prepared"
     problem = ""
@@ -145,14 +145,14 @@ class PreparedImu:
         self._number = 0
 
     def read(self) -> ImuSample:
-        """Return a sample of now."""
+        """Return a sample with the present time."""
         self._number += 1
         accel, gyro, mag = self._noise[self._number % len(self._noise)]
         return ImuSample(time.time_ns(), accel + FORCE_MPS2, gyro, mag + FIELD_T)
 
 
 class NoBus:
-    """Stands for the I2C bus of a device that has none."""
+    """Replaces the I2C bus of a device that needs none."""
 
     retries = 0
 
@@ -161,7 +161,7 @@ class NoBus:
 
 
 class MeasuredNode(NodeService):
-    """A node that takes down how long each frame took. times_s: from a copy's begin until the bus had taken it."""
+    """A node that measures each frame. times_s: from the start of the copy until the bus has taken the candidates."""
 
     def __init__(self, config: NodeConfig, camera: PreparedCamera) -> None:
         super().__init__(config, camera=lambda _config, _clock: camera, sensors=_sensors)
@@ -169,7 +169,7 @@ class MeasuredNode(NodeService):
         self._prepared = camera
 
     def open(self) -> None:
-        """Open as a node does, and listen to what it sends."""
+        """Open as a node does, and measure when candidates are sent."""
         super().open()
         plain = self.outlet.send
 
@@ -197,7 +197,7 @@ def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
     ends_s = time.monotonic() + CONNECT_S
     while not service.outlet.connected:
         if service.stop.wait(0.05) or time.monotonic() > ends_s:
-            raise BuddylineError("the node did not come to its hub")
+            raise BuddylineError("the node did not connect to its hub")
     service.stop.wait(WARM_UP_S)
     first, sent = len(service.times_s), service.outlet.sent.copy()
     began_s, began = time.monotonic(), load_of()
@@ -212,7 +212,7 @@ def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
     rss_mib.append((round(passed_s / 60.0, 1), ended.rss_mib))
     times_ms = 1e3 * np.array(service.times_s[first:])
     if not len(times_ms):
-        raise BuddylineError("not one frame came through")
+        raise BuddylineError("no frame was published")
     return {
         "frames": len(times_ms),
         "median_ms": float(np.median(times_ms)),
@@ -232,7 +232,7 @@ def _prepared(config: NodeConfig, path: Path) -> tuple[NDArray[np.uint8], NodeIn
 
 
 def _render(config: NodeConfig, path: str) -> NodeInfo:
-    """Render what the camera's driver would give: luminance."""
+    """Render the pictures as the camera's driver returns them, in luminance, and save them; return the NodeInfo."""
     import cv2
     from buddyline.node.sim.devices import scenario_of
     from buddyline.node.sim.world import World

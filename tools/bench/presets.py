@@ -1,6 +1,6 @@
-"""How much the detector finds with each environment's preset, and with `auto`, which has to do without one.
+"""The detector's recall with the preset of each environment, and with `auto`, which has no preset.
 
-On the pictures of the dives named, which say where the lights are, or else on rendered ones.
+It is measured on the pictures of the given dives, which need light truth, or on rendered pictures.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "dives", nargs="*", metavar="DIVE.mcap", help="one environment each; default: rendered pictures"
     )
-    parser.add_argument("--truth", nargs="+", metavar="T.mcap", help="one for each dive, where it does not say itself")
+    parser.add_argument("--truth", nargs="+", metavar="T.mcap", help="light truth of each dive, if the dives have none")
     parser.add_argument("--pictures", type=int, default=40, metavar="N", help="of each environment; default: 40")
 
 
 def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the recall within 2 px and the false candidates a picture of each source, by environment set."""
+    """Return each source's recall within 2 px and false candidates per picture, by preset."""
     truths = args.truth or [None] * len(args.dives)
     if args.pictures < 1 or len(truths) != len(args.dives):
         raise BuddylineError("--pictures: at least 1; --truth: as many as dives")
@@ -42,13 +42,13 @@ def measure(args: argparse.Namespace) -> list[dict[str, Any]]:
     for source, truth in zip(args.dives, truths, strict=True):
         pictures, by = load_pictures([source], truth, args.pictures)
         if by != "truth":
-            raise BuddylineError(f"{source}: does not say where the lights are; give --truth")
+            raise BuddylineError(f"{source}: has no light truth; give --truth")
         rows.append(judged(Path(source).stem, pictures))
     return rows or [judged(environment, _rendered(environment, args.pictures)) for environment in RENDERED]
 
 
 def judged(source: str, pictures: Sequence[Picture]) -> dict[str, Any]:
-    """Return the row of these pictures."""
+    """Return the row for these pictures."""
     found = {name: judge(METHODS[0], name, {}, pictures) for name in ENVIRONMENTS}
     return {
         "source": source,

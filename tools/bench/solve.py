@@ -1,8 +1,8 @@
-"""How fast the solver is: milliseconds per trigger, alone and of many, ns per hypothesis, growth with the candidates.
+"""The solver's speed: milliseconds per trigger, solved alone or with many others, ns per hypothesis, growth.
 
-A hypothesis is an assignment of two candidates in A's picture to B's left and right light, and of two in B's to A's.
-The column beside it counts combinations of pairs, whichever of a pair is left: a quarter as many. In the same run:
-Eq. 1 alone, in C and in numpy.
+A hypothesis assigns two candidates in A's picture to B's left and right light, and two in B's picture to A's. The
+column beside it counts combinations of pairs without left and right: a quarter as many. The same run measures the
+paper's Eq. 1 alone, in C and in numpy.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
-    """Return all figures, times as the median over triggers of the fastest repeat."""
+    """Return all figures. A time is the median over triggers of each trigger's fastest repeat."""
     if min(args.candidates) < 2 or max(args.candidates) > 64 or args.repeats < 1:
         raise BuddylineError("--candidates: 2 to 64, as a message holds; --repeats: at least 1")
     rows = [solved(count, args.repeats) for count in sorted(set(args.candidates))]
@@ -65,7 +65,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def solved(count: int, repeats: int) -> dict[str, Any]:
-    """Return the row of triggers with so many candidates a side."""
+    """Return the row for triggers with `count` candidates in each picture."""
     row: dict[str, Any] = {"candidates": count, "hypotheses": (count * (count - 1)) ** 2}
     for name, sensors in (("alone", False), ("sensors", True)):
         rng = np.random.default_rng(count)
@@ -102,12 +102,12 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def eq1_ns(evaluate: Callable[[], object], repeats: int) -> float:
-    """Return the fastest time of one of EVALUATIONS."""
+    """Return the fastest time of one evaluation, ns; evaluate() makes EVALUATIONS of them."""
     return 1e9 * fastest_s(evaluate, repeats) / EVALUATIONS
 
 
 def angles() -> tuple[Floats, Floats]:
-    """Return alpha and beta to evaluate Eq. 1 at."""
+    """Return alpha and beta, rad, for the evaluations of Eq. 1."""
     rng = np.random.default_rng(0)
     return rng.uniform(0.05, 0.5, EVALUATIONS), rng.uniform(-0.5, 0.5, EVALUATIONS)
 

@@ -1,4 +1,4 @@
-"""Simulated triggers with their truth, for the benchmarks: two like nodes face to face, and false candidates."""
+"""Simulated triggers with truth, for the benchmarks: two equal nodes face to face, and false candidates."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ INFO: Final = NodeInfo(
 )
 RIG: Final = rig_of(INFO)
 CAMERA: Final = RIG.camera
-# As in the design's table: roll and pitch 1.4 degrees, yaw 5 and depth 3 cm between the two, 1 sd.
+# Between the two nodes, 1 sd: 1.4 degrees in roll and pitch, 5 in yaw, and 3 cm in depth.
 TILT_SIGMA_RAD: Final = math.radians(1.0)
 HEADING_SIGMA_RAD: Final = math.radians(3.5)
 DEPTH_SIGMA_M: Final = 0.02
@@ -37,7 +37,7 @@ DEPTH_SIGMA_M: Final = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Trigger:
-    """One trigger: what is seen and sensed, and the truth: T_a_b and the true candidates (left, right)."""
+    """One trigger: candidates and sensor readings, and the truth: T_a_b and the indices of the true (left, right)."""
 
     views: tuple[View, View]
     sensed: tuple[Sensed, Sensed]
@@ -47,11 +47,11 @@ class Trigger:
     pair_b: tuple[int, int]
 
     def observed(self, *, sensors: bool) -> Observation:
-        """What is seen, with what is sensed or without."""
+        """Return the candidates, with the sensor readings or without."""
         return Observation(*self.views, *(self.sensed if sensors else (Sensed(), Sensed())))
 
     def solve(self, settings: Settings, *, sensors: bool) -> Fix | NoFix:
-        """Solve it."""
+        """Solve this trigger alone."""
         return solve_triggers([self.observed(sensors=sensors)], RIG, RIG, settings)[0]
 
     def right(self, fix: Fix) -> bool:
@@ -60,7 +60,7 @@ class Trigger:
 
 
 def simulate(rng: np.random.Generator, range_m: tuple[float, float], false: int = 0, sigma_px: float = 1.0) -> Trigger:
-    """Return a trigger with all four lights in view and so many false candidates in each picture."""
+    """Return a trigger with all four lights in view and `false` false candidates in each picture."""
     mount = RIG.R_body_camera
     while True:
         r = rng.uniform(*range_m)
@@ -107,7 +107,7 @@ def images(t_a_b_m: Floats, R_a_b: Floats) -> Floats:
 
 
 def _upright(rng: np.random.Generator, heading_rad: float) -> Floats:
-    """Return a body's rotation to NED: about upright, about that heading."""
+    """Return R_ned_body of a random attitude near upright and near this heading."""
     return _turn(rng.normal((heading_rad, 0.0, 0.0), (0.3, 0.2, 0.2)))
 
 

@@ -1,1 +1,1 @@
-"""Calibration of a node's camera, lights and magnetometer: fits, and when to refuse them."""
+"""Calibration of a node's camera, lights and magnetometer: the fits, and the checks that refuse poor ones."""

@@ -1,4 +1,4 @@
-"""The calibration board: squares with markers between them, and a page to print it from."""
+"""The calibration board: a chessboard with markers in its white squares, and a page to print it from."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.newfile import write_new
 from numpy.typing import NDArray
 
-# Five bits and a border are seven modules; a square of ten leaves a white rim around the marker, and makes the
-# whole board a raster of modules.
+# A marker of five bits with its border has seven modules. A square of ten modules leaves a white rim around it, and
+# makes the whole board a grid of modules.
 SQUARE_MODULES: Final = 10
 MARKER_MODULES: Final = 7
 DICTIONARY: Final = cv2.aruco.DICT_5X5_100
@@ -32,7 +32,7 @@ class Board:
     square_m: float = 0.030
 
     def __post_init__(self) -> None:
-        """Refuse boards that cannot be made."""
+        """Raise BuddylineError for a board that cannot be made."""
         if not (self.columns >= 3 and self.rows >= 3 and self.columns * self.rows // 2 <= MOST_MARKERS):
             raise BuddylineError(f"board of {self.columns} x {self.rows} squares: from 3 x 3 to {2 * MOST_MARKERS}")
         if not 0.005 <= self.square_m <= 0.5:
@@ -55,7 +55,7 @@ class Board:
 
     @property
     def caption(self) -> str:
-        """What stands under the board."""
+        """The text under the board."""
         return (
             f"Buddyline: {self.columns} x {self.rows} squares of {self.square_m * 1e3:g} mm. "
             "Print at 100 %, glue it flat, measure a square."
@@ -75,7 +75,7 @@ class Board:
             edges = np.flatnonzero(np.diff(np.concatenate(([False], line, [False])).astype(np.int8)))
             for begin, end in edges.reshape(-1, 2):
                 x, y = margin + begin * module, margin + height - (row + 1) * module
-                # A hair taller than the module: viewers must not draw seams between two rows.
+                # Slightly taller than the module, so that viewers draw no seams between two rows.
                 drawing.append(f"{x:.4f} {y:.4f} {(end - begin) * module:.4f} {module + 0.01:.4f} re")
         page = (width + 2 * margin, height + 2 * margin)
         return _pdf_of("\n".join([*drawing, "f"]), page)

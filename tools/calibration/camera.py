@@ -1,4 +1,4 @@
-"""A camera's intrinsics out of pictures of the board, and whether they are good enough to dive with."""
+"""Fit a camera's intrinsics to pictures of the board, and check that they are good enough for a dive."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class BoardView:
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Intrinsics, and how good they are.
+    """Intrinsics, and their quality.
 
-    rms_px: of all reprojections. sigma_px: fx, fy, cx, cy, 1 sd. coverage: share of the picture's cells with a
-    corner. tilt_rad: how much the board was tilted, 1 sd. residuals_px: (n, 2) of points_px (n, 2). dropped: names
-    of views left out.
+    size: (width, height) px. rms_px: of all reprojection errors. sigma_px: of fx, fy, cx, cy, 1 sd. coverage: share of
+    the picture's cells with a corner. tilt_rad: tilt of the board over the views, 1 sd. residuals_px: (n, 2), of the
+    corners points_px (n, 2). dropped: names of the views left out.
     """
 
     camera: CameraModel
@@ -65,7 +65,7 @@ class CornerFinder:
         self.size: tuple[int, int] | None = None
 
     def find(self, name: str, image: Image) -> BoardView | None:
-        """Return the corners, None where too few are seen; raise PoorCalibration for another picture size."""
+        """Return the board's corners; None if too few are seen. Raises PoorCalibration for another picture size."""
         size = (image.shape[1], image.shape[0])
         if self.size is not None and size != self.size:
             raise PoorCalibration(f"{name}: {size[0]}x{size[1]}, the others are {self.size[0]}x{self.size[1]}")
@@ -80,9 +80,9 @@ class CornerFinder:
 
 
 def _refined(grey: Image, points: NDArray[np.float32]) -> Floats:
-    """Return corners (n, 2) to a tenth of a pixel; the detector's own are good to half of one.
+    """Return corners (n, 2) with an accuracy of 0.1 px; the detector's own have 0.5 px.
 
-    The window stays clear of the markers' edges, which begin 0.15 of a square away.
+    The search window does not reach the markers' edges, which begin 0.15 squares away.
     """
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -93,7 +93,7 @@ def _refined(grey: Image, points: NDArray[np.float32]) -> Floats:
 
 
 def distinct(views: Iterable[BoardView], width_px: int) -> list[BoardView]:
-    """Return the views in which the board has moved since the one kept before, evenly thinned to a maximum."""
+    """Return the views in which the board has moved since the last kept view; at most MOST_VIEWS, evenly chosen."""
     kept: list[BoardView] = []
     for view in views:
         if not kept or _moved_px(kept[-1], view) > MOVED_SHARE * width_px:
@@ -111,11 +111,11 @@ def _moved_px(one: BoardView, other: BoardView) -> float:
 
 
 def calibrate(views: list[BoardView], size: tuple[int, int], board: Board) -> CameraFit:
-    """Fit a pinhole with OpenCV's k1 k2 p1 p2 k3; raise PoorCalibration where the views do not tell it."""
+    """Fit a pinhole with OpenCV's k1 k2 p1 p2 k3; raise PoorCalibration if the views do not determine it well."""
     require(
         (
             len(views) >= LEAST_VIEWS,
-            f"the board is found in {len(views)} different views, {LEAST_VIEWS} are needed: "
+            f"the board is found in {len(views)} different views, but {LEAST_VIEWS} are needed: "
             "move and tilt it between pictures, with all of it sharp and lit",
         )
     )
@@ -132,7 +132,7 @@ def calibrate(views: list[BoardView], size: tuple[int, int], board: Board) -> Ca
     require(
         (
             found.rms_px <= MOST_RMS_PX,
-            f"reprojection error {found.rms_px:.2f} px, {MOST_RMS_PX:.1f} px at most: "
+            f"reprojection error {found.rms_px:.2f} px, allowed are {MOST_RMS_PX:.1f} px: "
             "is the board flat and sharp, and --columns, --rows and --square-mm those of the print?",
         ),
         (
@@ -154,12 +154,12 @@ def calibrate(views: list[BoardView], size: tuple[int, int], board: Board) -> Ca
 
 
 def coverage(points_px: Floats, size: tuple[int, int]) -> float:
-    """Return the share of the picture's cells that have a corner."""
+    """Return the share of the picture's cells with at least one corner. size: (width, height) px."""
     return float((cells(points_px, size) > 0).mean())
 
 
 def cells(points_px: Floats, size: tuple[int, int]) -> NDArray[np.int64]:
-    """Return how many corners are in each cell of the picture, (rows, columns)."""
+    """Return the number of corners in each cell of the picture, (rows, columns)."""
     columns, rows = GRID
     column = np.clip((points_px[:, 0] + 0.5) / size[0] * columns, 0, columns - 1).astype(int)
     row = np.clip((points_px[:, 1] + 0.5) / size[1] * rows, 0, rows - 1).astype(int)
@@ -179,7 +179,7 @@ def _solve(
             objects, images, size, np.eye(3), np.zeros(5)
         )
     except cv2.error as error:
-        raise PoorCalibration(f"the views do not tell the camera: {error.err}") from error
+        raise PoorCalibration(f"the views do not determine the camera: {error.err}") from error
     residuals = [
         image - cv2.projectPoints(points, turn, shift, K, distortion)[0].reshape(-1, 2)
         for points, image, turn, shift in zip(objects, images, turns, shifts, strict=True)
@@ -210,13 +210,13 @@ def _solve(
 
 
 def _tilt(turns: Any) -> float:
-    """Return how much the board's normal varied (rad, 1 sd), in the direction in which it varied least."""
+    """Return the variation of the board's normal, rad, 1 sd, in the direction of its least variation."""
     normals = np.array([cv2.Rodrigues(turn)[0][:2, 2] for turn in turns])
     return float(np.sqrt(max(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0], 0.0)))
 
 
 def draw(found: CameraFit, enlarged: float = 20.0) -> Image:
-    """Return a picture of the corners used, each with its residual enlarged; cells without any are dark."""
+    """Return a picture of the corners, each with its enlarged residual; cells without corners are dark."""
     empty = (cells(found.points_px, found.size) == 0).astype(np.uint8)
     shade = 255 - 105 * cv2.resize(empty, found.size, interpolation=cv2.INTER_NEAREST)
     picture = np.repeat(np.asarray(shade, np.uint8)[..., None], 3, axis=2)

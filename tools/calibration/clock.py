@@ -1,7 +1,7 @@
-"""The offset between two nodes' clocks, out of their beacons: ways there and back, the quickest count most.
+"""The offset between two nodes' clocks, from their beacons: one-way times in both directions, weighted by quickness.
 
-B's clock minus A's is half the difference of a way there and a way back, as their stamps have them; it is off by at
-most half their sum, the round trip, however unequal they truly are (Mills, RFC 5905, section 8).
+B's clock minus A's is half the difference of the one-way times from A to B and back, as stamped. Its error is at most
+half their sum, the round trip, however unequal the true one-way times are (Mills, RFC 5905, section 8).
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import ClockBeacon
 from numpy.typing import NDArray
 
-# A way there and a way back within this time are one exchange: clocks that drift by 40 ppm move by 40 us meanwhile.
+# A beacon there and one back within this time form an exchange. Clocks that drift by 40 ppm move by 40 us meanwhile.
 APART_NS: Final = 1 * S_NS
-# Two crystals, each off by 50 ppm and slewed a little by chrony. A clock that moves faster was set.
+# Fastest drift: two crystals, each off by 50 ppm, and slewed by chrony. A faster change shows that a clock was set.
 FASTEST: Final = 200e-6
 SLACK_S: Final = 50e-6
 GAP_S: Final = 10.0
 WINDOW_S: Final = 60.0
 MIN_EXCHANGES: Final = 8
-# 1 sd of the quickest exchange: threads that wait for one another take the stamps.
+# 1 sd of the quickest exchange, because the threads that take the stamps wait for each other.
 QUICKEST_SIGMA_S: Final = 20e-6
 NEXT_FEW: Final = 3
 MIN_DRIFT_SPAN_S: Final = 5.0
@@ -32,7 +32,10 @@ MIN_DRIFT_SPAN_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Exchanges:
-    """Pairs of a way there and a way back, by time. stamp_ns: (N,) int64, A's clock. offset_s: (N,) B minus A."""
+    """Pairs of a beacon there and one back, sorted by time.
+
+    stamp_ns: (N,) int64, A's clock. offset_s: (N,), B's clock minus A's. round_trip_s: (N,).
+    """
 
     stamp_ns: NDArray[np.int64]
     offset_s: NDArray[np.float64]
@@ -42,16 +45,16 @@ class Exchanges:
         return len(self.stamp_ns)
 
     def part(self, begin: int, end: int) -> Exchanges:
-        """Return those from begin to end."""
+        """Return the exchanges from index begin to before index end."""
         return Exchanges(self.stamp_ns[begin:end], self.offset_s[begin:end], self.round_trip_s[begin:end])
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """B's clock minus A's at stamp_ns (A's clock), of exchanges from begin_ns to end_ns.
+    """B's clock minus A's at stamp_ns (A's clock), from the exchanges between begin_ns and end_ns.
 
-    sigma_s: 1 sd, with what the two ways may differ by; scatter_s: 1 sd without it. bound_s: half the quickest round
-    trip. drift: of B's clock against A's, seconds a second; None where the time was too short to tell.
+    sigma_s: 1 sd, including unequal one-way times. scatter_s: 1 sd without them. bound_s: half the quickest round trip,
+    the greatest possible error. drift: of B's clock against A's, s/s; None if the time was too short.
     """
 
     stamp_ns: int
@@ -67,7 +70,7 @@ class OffsetEstimate:
 
 
 class OneWayTimes:
-    """Ways from node to node as their beacons tell them, each once."""
+    """Collects the one-way times between nodes from their beacons, each once."""
 
     def __init__(self) -> None:
         self._ways: dict[tuple[str, str], dict[int, int]] = {}
@@ -83,7 +86,7 @@ class OneWayTimes:
         return sorted((a, b) for a, b in self._ways if a < b and (b, a) in self._ways)
 
     def exchanges(self, node_a: str, node_b: str) -> Exchanges:
-        """Pair each way back with the nearest way there, by A's clock alone: B's may be off by years."""
+        """Pair each beacon back with the nearest beacon there. Only A's clock is compared: B's may be off by years."""
         there = np.array(sorted(self._ways.get((node_a, node_b), {}).items()), np.int64).reshape(-1, 2)
         back = np.array(sorted(self._ways.get((node_b, node_a), {}).items(), key=lambda way: way[1]), np.int64)
         back = back.reshape(-1, 2)
@@ -101,9 +104,9 @@ class OneWayTimes:
 
 
 def steps(exchanges: Exchanges) -> list[int]:
-    """Return before which exchanges one of the clocks was set: two neighbours that cannot both be true.
+    """Return the indices of exchanges before which a clock was set: their offset is impossible after their neighbour's.
 
-    A round trip that took less than no time is one of them.
+    A negative round trip is impossible too.
     """
     passed_s = np.diff(exchanges.stamp_ns) / S_NS
     bounds_s = np.abs(exchanges.round_trip_s) / 2
@@ -114,7 +117,7 @@ def steps(exchanges: Exchanges) -> list[int]:
 
 
 def windows(exchanges: Exchanges) -> list[Exchanges]:
-    """Cut at gaps and where a clock was set, and what is left into a minute at most; too few exchanges are left out."""
+    """Split exchanges at gaps, where a clock was set, and after a minute; leave out parts with too few exchanges."""
     gaps = np.flatnonzero(np.diff(exchanges.stamp_ns) > GAP_S * S_NS) + 1
     cuts = sorted({0, len(exchanges), *gaps.tolist(), *steps(exchanges)})
     found = []
@@ -129,15 +132,15 @@ def windows(exchanges: Exchanges) -> list[Exchanges]:
 
 
 def estimate(exchanges: Exchanges) -> OffsetEstimate:
-    """Fit offset and drift to exchanges without a step; raise ValueError where there are none.
+    """Fit offset and drift to exchanges without a step; raise ValueError if there are none.
 
-    Each is weighted by how much longer than the quickest it took: half of that may be its error. What the quickest
-    one's two ways differ by nobody can see: sigma_s takes any share of the round trip as equally likely.
+    An exchange weighs less, the longer it took beyond the quickest one: half of the difference may be its error. The
+    asymmetry of the quickest one cannot be observed; sigma_s assumes a uniform distribution over its round trip.
     """
     if not len(exchanges):
         raise ValueError("no exchanges")
     quickest_s = max(float(exchanges.round_trip_s.min()), 0.0)
-    # The quickest itself was late by about as much as the next few were later still.
+    # The delay of the quickest exchange itself is estimated from the spread of the next few.
     next_s = float(np.sort(exchanges.round_trip_s)[: NEXT_FEW + 1][-1]) - quickest_s
     sigmas_s = QUICKEST_SIGMA_S + (next_s + (exchanges.round_trip_s - quickest_s).clip(0)) / 2
     weights = sigmas_s**-2.0
@@ -171,14 +174,14 @@ def estimate(exchanges: Exchanges) -> OffsetEstimate:
 
 
 def _spread(weights: NDArray[np.float64], residuals_s: NDArray[np.float64], sigmas_s: NDArray[np.float64]) -> float:
-    """Return the sd of a weighted sum: as the residuals have it, or as expected where one exchange outweighs all."""
+    """Return the sd of a weighted sum: from the residuals or from the expected sigmas, whichever is greater."""
     return math.sqrt(max(float(weights**2 @ residuals_s**2), float(weights**2 @ sigmas_s**2)))
 
 
 def drift_between(first: OffsetEstimate, last: OffsetEstimate) -> tuple[float, float]:
-    """Return the drift from one estimate to a later one, and its sd.
+    """Return the drift from one estimate to a later one, and its sd, s/s.
 
-    Ways that differ alike in both cancel; by what one's quickest round trip is longer, its ways may differ by more.
+    An equal asymmetry of the one-way times cancels. The difference of the quickest round trips may add to it.
     """
     passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
     longer_s = (first.bound_s - last.bound_s) / math.sqrt(3)

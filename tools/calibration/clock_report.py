@@ -1,4 +1,4 @@
-"""`buddyline calibrate clock`: listens to a running pair, or reads a dive's logs, and says how the clocks stand."""
+"""`buddyline calibrate clock`: listen to a running pair, or read a dive's logs, and report the clocks' offset."""
 
 from __future__ import annotations
 
@@ -27,20 +27,23 @@ log = logging.getLogger(__name__)
 
 HUB_WITHIN_S: Final = 5.0
 SILENT_S: Final = 2.0
-# At half a radian a second a light moves by a candidate's own noise in this time.
+# At a turn rate of 0.5 rad/s a light moves by about a candidate's noise in this time.
 LIMIT_S: Final = 2e-3
 
 
 @dataclass
 class Heard:
-    """What two nodes said of their clocks. statuses: the first and the last of each node that has chrony's figures."""
+    """The nodes' messages about their clocks. statuses: each node's first and last NodeStatus with chrony's figures.
+
+    last_s: time of each node's last beacon, since the start.
+    """
 
     ways: OneWayTimes = field(default_factory=OneWayTimes)
     statuses: dict[str, tuple[NodeStatus, NodeStatus]] = field(default_factory=dict)
     last_s: dict[str, float] = field(default_factory=dict)
 
     def add(self, message: Message, now_s: float = 0.0) -> None:
-        """Take a beacon or a status; others are passed over."""
+        """Take a beacon or a status; other messages are ignored."""
         if isinstance(message, ClockBeacon):
             self.ways.add(message)
             self.last_s[message.node] = now_s
@@ -50,13 +53,13 @@ class Heard:
 
 
 def listen(config: ClientConfig, seconds: float, connect_within_s: float = HUB_WITHIN_S) -> Heard:
-    """Hear the bus for this long; raise BuddylineError where there is no hub, or a node falls silent meanwhile."""
+    """Listen to the bus for this time; raise BuddylineError if there is no hub, or a node becomes silent."""
     with open_bus_within(config, connect_within_s) as bus:
         return hear(bus, seconds)
 
 
 def hear(bus: Bus, seconds: float) -> Heard:
-    """Hear a bus for this long; raise BuddylineError where a node falls silent meanwhile."""
+    """Listen to a connected bus for this time; raise BuddylineError if a node becomes silent."""
     heard, began_s = Heard(), time.monotonic()
     refusals = Refusals("calibrate clock")
 
@@ -76,13 +79,13 @@ def hear(bus: Bus, seconds: float) -> Heard:
     for node, last_s in heard.last_s.items():
         if seconds - last_s > SILENT_S:
             raise BuddylineError(
-                f"node {node} fell silent {last_s:.1f} s after the beginning: measure again when it is back"
+                f"node {node} became silent {last_s:.1f} s after the start: measure again when it is back"
             )
     return heard
 
 
 def read(paths: list[str]) -> Heard:
-    """Return what a dive's logs hold of the clocks."""
+    """Return the messages about clocks of a dive's logs."""
     heard = Heard()
     with Dive(paths) as dive:
         for envelope in dive.messages(CLOCK.name, NODE_STATUS.name):
@@ -92,7 +95,7 @@ def read(paths: list[str]) -> Heard:
 
 @dataclass(frozen=True)
 class Report:
-    """The clocks of a pair: estimates by time, and how often one was set."""
+    """The clocks of a pair: estimates in order of time, and the stamps (A's clock, ns) at which a clock was set."""
 
     node_a: str
     node_b: str
@@ -100,12 +103,12 @@ class Report:
     set_times: list[int]
 
     def problem(self) -> str:
-        """Say what stands against trusting the pair's clocks, "" where nothing does."""
+        """Return why the pair's clocks are not to be trusted; "" if they are."""
         last = self.offsets[-1]
         if self.set_times:
             return f"a clock was set during the measurement ({len(self.set_times)} times): let chrony settle, repeat"
         if last.sigma_s > LIMIT_S:
-            return f"the link is too slow to tell: the clocks may differ by {1e3 * last.bound_s:.1f} ms more"
+            return f"the link is too slow to measure: the clocks may differ by {1e3 * last.bound_s:.1f} ms more"
         if abs(last.offset_s) > LIMIT_S:
             return (
                 f"the clocks differ by more than {1e3 * LIMIT_S:g} ms: let chrony bring them together before the dive"
@@ -114,7 +117,7 @@ class Report:
 
 
 def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
-    """Compare the clocks of each pair; raise BuddylineError where there is nothing to compare."""
+    """Compare the clocks of each pair; raise BuddylineError if there is none. nodes: one pair; None: all."""
     pairs = heard.ways.pairs() if nodes is None else [(nodes[0], nodes[1])]
     found = []
     for a, b in pairs:
@@ -131,12 +134,12 @@ def reports(heard: Heard, nodes: list[str] | None) -> list[Report]:
         raise BuddylineError(f"only node {present[0]}'s clock was heard: it takes two nodes, or both nodes' logs")
     raise BuddylineError(
         f"nodes {', '.join(present)} did not hear each other long enough to compare their clocks; after a dive in "
-        "which they moved, `buddyline align` finds the offset out of the dive itself"
+        "which they moved, `buddyline align` finds the offset from the dive itself"
     )
 
 
 def as_json(found: Iterable[Report], heard: Heard) -> str:
-    """Return everything as one JSON object."""
+    """Return all figures as one JSON object."""
     pairs = [
         {
             "node_a": one.node_a,
@@ -152,7 +155,7 @@ def as_json(found: Iterable[Report], heard: Heard) -> str:
 
 
 def as_text(found: Iterable[Report], heard: Heard) -> str:
-    """Return it for a person: first and last comparison, the drift between, and what chrony says."""
+    """Return the figures for a person: first and last comparison, the drift between them, and chrony's figures."""
     lines = []
     for one in found:
         first, last = one.offsets[0], one.offsets[-1]

@@ -1,8 +1,8 @@
-"""A magnetometer's hard and soft iron: the ellipsoid that its readings lie on, made a sphere.
+"""Calibrate a magnetometer for hard and soft iron: map the ellipsoid of its readings to a sphere.
 
-The readings of a rig that is turned every way lie on an ellipsoid. The rig's own magnetism shifts it; soft iron and
-unequal axes squeeze it. Nine numbers describe it. The sphere leaves one rotation open; the accelerometer gives it,
-because the Earth's field keeps its angle to gravity.
+The readings of a rig that is turned in all directions lie on an ellipsoid. The rig's own magnetism (hard iron) shifts
+it; soft iron and unequal axes deform it. Nine numbers describe it. They leave one rotation undetermined; the
+accelerometer determines it, because the angle between the Earth's field and gravity is constant.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ MOST_RESIDUAL: Final = 0.04
 MOST_HEADING_SIGMA_RAD: Final = np.radians(1.0)
 CELLS: Final = 72
 CELL_RAD: Final = np.radians(20.0)
-NO_ELLIPSOID: Final = "the readings tell no ellipsoid: turn the rig through all directions, upside down as well"
+NO_ELLIPSOID: Final = "the readings determine no ellipsoid: turn the rig in all directions, upside down as well"
 
 
 @dataclass(frozen=True)
 class EllipsoidFit:
     """field_t = matrix @ (reading - offset_t), body frame.
 
-    residual: rms of the field's strength, as a share of it. coverage: share of all directions that were seen.
-    heading_sigma_rad: how far the fit itself can turn the heading of a level rig (1 sd, the worst heading).
-    directions: (n, 3) unit vectors of the readings used; errors: (n,) of their strength, as a share.
+    residual: rms error of the field's strength, as a share of it. coverage: share of all directions with readings.
+    heading_sigma_rad: error of a level rig's heading from the fit alone, 1 sd, at the worst heading.
+    directions: (n, 3), unit vectors of the readings used. errors: (n,), of their strength, as a share. turned: whether
+    the accelerometer has determined the open rotation.
     """
 
     offset_t: Floats
@@ -48,7 +49,7 @@ class EllipsoidFit:
 
 
 def spread_out(readings_t: Floats) -> NDArray[np.intp]:
-    """Return the indices of readings that are each a few degrees from the one kept before."""
+    """Return the indices of readings, each at least APART_RAD from the kept reading before it."""
     middle_t = (readings_t.max(axis=0) + readings_t.min(axis=0)) / 2
     arms = readings_t - middle_t
     arms /= np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-12)
@@ -61,10 +62,10 @@ def spread_out(readings_t: Floats) -> NDArray[np.intp]:
 
 
 def fit(readings_t: Floats, accels_mps2: Floats, norm_t: float | None = None) -> EllipsoidFit:
-    """Fit (n, 3) readings in T, with the accelerometer's (n, 3) of the same moments.
+    """Fit readings (n, 3), T, with the accelerometer's readings (n, 3) at the same times.
 
-    norm_t: strength of the Earth's field where it is known; None keeps the readings' mean scale.
-    Raises PoorCalibration where the readings do not tell the ellipsoid, or not well enough.
+    norm_t: strength of the Earth's field, if known; None keeps the readings' mean scale.
+    Raises PoorCalibration if the readings do not determine the ellipsoid well enough.
     """
     kept = spread_out(readings_t)
     readings_t, accels_mps2 = readings_t[kept], accels_mps2[kept]
@@ -123,7 +124,7 @@ def fit(readings_t: Floats, accels_mps2: Floats, norm_t: float | None = None) ->
 
 
 def coverage(directions: Floats) -> float:
-    """Return which share of evenly spread cells has a direction, of (n, 3), within 20 degrees of its centre."""
+    """Return the share of evenly spread cells with one of the directions (n, 3) within 20 degrees of the centre."""
     i = np.arange(CELLS) + 0.5
     z, around = 1 - 2 * i / CELLS, np.pi * (1 + 5**0.5) * i
     flat = np.sqrt(1 - z * z)
@@ -139,13 +140,13 @@ def _offset_and_shape(state: Floats) -> tuple[Floats, Floats]:
 
 
 def _errors(x: Floats, state: Floats) -> Floats:
-    """Return how far readings (n, 3), made a sphere, are from a radius of 1."""
+    """Return the radius minus 1, (n,), of readings (n, 3) after the mapping to the sphere."""
     offset, shape = _offset_and_shape(state)
     return np.asarray(np.linalg.norm((x - offset) @ shape, axis=1) - 1.0)
 
 
 def _algebraic(x: Floats) -> Floats:
-    """Return a first state (9,) by linear least squares of the quadric."""
+    """Return a first state (9,) from a linear least-squares fit of the quadric."""
     a, b, c = x.T
     design = np.column_stack([a * a, 2 * a * b, 2 * a * c, b * b, 2 * b * c, c * c, 2 * a, 2 * b, 2 * c])
     solution = np.linalg.lstsq(design, np.ones(len(x)), rcond=None)[0]
@@ -161,7 +162,7 @@ def _algebraic(x: Floats) -> Floats:
 
 
 def _refined(x: Floats) -> tuple[Floats, Floats]:
-    """Return the state (9,) that fits readings (n, 3) best, and the errors' Jacobian (n, 9) there."""
+    """Return the state (9,) with the least squared errors of readings (n, 3), and the errors' Jacobian (n, 9) there."""
     state, J = gauss_newton(lambda state: _errors(x, state), _algebraic(x))
     _, shape = _offset_and_shape(state)
     require((bool(np.isfinite(shape).all() and (np.linalg.eigvalsh(shape) > 0).all()), NO_ELLIPSOID))
@@ -169,7 +170,7 @@ def _refined(x: Floats) -> tuple[Floats, Floats]:
 
 
 def _turn(field: Floats, accels_mps2: Floats) -> Floats | None:
-    """Return the small rotation (3, 3) that lets the field keep its angle to gravity; None where it is not told."""
+    """Return the small rotation (3, 3) that makes the field's angle to gravity constant; None if not determined."""
     strength = np.linalg.norm(accels_mps2, axis=1)
     still = np.abs(strength - GRAVITY_MPS2) < STILL_MPS2
     if still.sum() < LEAST_READINGS:
@@ -186,7 +187,7 @@ def _turn(field: Floats, accels_mps2: Floats) -> Floats | None:
 
 
 def _heading_sigma(directions: Floats, accels_mps2: Floats, state: Floats, covariance: Floats) -> float:
-    """Return the heading's 1 sd by the fit's own covariance (9, 9), of a level rig, for the worst heading."""
+    """Return the heading's 1 sd, rad, of a level rig at the worst heading, from the fit's covariance (9, 9)."""
     up = accels_mps2 / np.maximum(np.linalg.norm(accels_mps2, axis=1, keepdims=True), 1e-9)
     sine = float(np.clip(np.median(-(directions * up).sum(axis=1)), -0.99, 0.99))
     cosine = np.sqrt(1 - sine * sine)
@@ -197,7 +198,7 @@ def _heading_sigma(directions: Floats, accels_mps2: Floats, state: Floats, covar
     readings = np.linalg.solve(shape, field.T).T + offset
 
     def turned(other: Floats) -> Floats:
-        """Return by how much another state turns the headings, rad."""
+        """Return the change of the headings, rad, with another state."""
         offset, shape = _offset_and_shape(other)
         return np.asarray((sides * ((readings - offset) @ shape)).sum(axis=1) / cosine)
 

@@ -1,4 +1,4 @@
-"""What calibrations are made of, out of dive logs and pictures."""
+"""Read the measurements of a calibration from dive logs and pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LEAST_FIXES: Final = 5
 
 
 def pictures(paths: list[str], node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """Yield (name, picture) of folders, pictures and dive logs; raise BuddylineError for what is none."""
+    """Yield (name, picture) from pictures, folders and dive logs; raise BuddylineError for any other path."""
     for text in paths:
         path = Path(text)
         if path.suffix == ".mcap":
@@ -45,7 +45,7 @@ def _dive_pictures(path: Path, node: str | None) -> Iterator[tuple[str, NDArray[
 
 
 def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
-    """Return the node, its magnetometer's readings (n, 3) in T and the accelerometer's (n, 3) in m/s2."""
+    """Return the node's id, its magnetometer's readings (n, 3), T, and its accelerometer's (n, 3), m/s^2."""
     mags, accels = [], []
     with Dive(paths) as dive:
         wanted = _one_node(dive, node, "imu")
@@ -73,7 +73,7 @@ def places(
 ) -> tuple[list[TapedPlace], tuple[NodeInfo, NodeInfo]]:
     """Return a place for each tape (begin s, end s, distance m) of a solved dive, and both nodes' calibrations.
 
-    nodes: the pair; None where the dive has one.
+    nodes: the pair; None if the dive has only one.
     """
     with Dive(paths) as dive:
         infos = dive.infos()

@@ -1,4 +1,4 @@
-"""Least squares for small problems, and the refusal of measurements that do not determine the answer."""
+"""Nonlinear least squares for small problems, and the error for measurements that do not determine the result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONVERGED: Final = 1e-9
 
 
 class PoorCalibration(BuddylineError):  # noqa: N818
-    """Measurements that do not determine the answer well enough; the text says what to do."""
+    """The measurements do not determine the result well enough; the text says what to do."""
 
 
 def require(*conditions: tuple[bool, str]) -> None:
@@ -36,7 +36,7 @@ def jacobian(function: Callable[[Floats], Floats], x: Floats) -> Floats:
 def gauss_newton(residuals: Callable[[Floats], Floats], x: Floats) -> tuple[Floats, Floats]:
     """Return the x (k,) with the least sum of squared residuals (n,), and their Jacobian (n, k) there.
 
-    x: a first guess. The covariance of the result is inv(J^T J) where the residuals are in sigmas.
+    x: the initial guess. If the residuals are in sigmas, the covariance of the result is inv(J^T J).
     """
     for _ in range(ROUNDS):
         step = np.linalg.lstsq(jacobian(residuals, x), -residuals(x), rcond=None)[0]

@@ -1,8 +1,8 @@
-"""Where a pair's four lights are on their rigs: both nodes look at each other, at rest, at taped distances.
+"""Calibrate the positions of a pair's four lights. Both nodes look at each other, at rest, at taped distances.
 
-Each place of the pair gives eight image coordinates and a distance, and has six unknowns. The rest determines the
-twelve coordinates of the lights; places that differ in distance, turn and tilt determine them best. The entered
-positions are measurements too, good to about a centimetre.
+Each place of the pair gives nine measurements (eight image coordinates and a distance) for the six unknowns of its
+pose. The surplus determines the twelve coordinates of the lights, best with places of different distance, turn and
+tilt. The entered positions are measurements too, with a sigma of about a centimetre.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_BAR_SIGMA_M: Final = 0.003
 class TapedPlace:
     """The pair at rest. pixels_a: (2, 2), B's left and right light in A's picture; pixels_b likewise.
 
-    t_a_b_m, R_a_b: first pose, from the entered lights. distance_m: taped, from camera to camera.
+    t_a_b_m, R_a_b: initial pose, solved with the entered lights. distance_m: taped, from camera to camera.
     """
 
     name: str
@@ -37,7 +37,7 @@ class TapedPlace:
 
 @dataclass(frozen=True)
 class CalibrationNoise:
-    """Standard deviations of the measurements."""
+    """Standard deviations of the measurements: image coordinates, taped distances, entered light positions."""
 
     pixel_px: float = 0.5
     tape_m: float = 0.005
@@ -48,8 +48,8 @@ class CalibrationNoise:
 class LightsFit:
     """Both nodes' lights (2, 2, 3): A's left and right, then B's, each in its own camera frame; sigma_m likewise.
 
-    bar_sigma_m: of the distance between each node's lights, which ranges hang on. chi2: of a degree of freedom,
-    about 1 where the noise is as stated. tape_gaps_m: (n,) fitted minus taped. pixel_rms_px: (n,), of each place.
+    bar_sigma_m: 1 sd of each node's baseline, which scales all ranges. chi2: per degree of freedom, about 1 if the
+    noise is as stated. tape_gaps_m: (n,), fitted minus taped distance. pixel_rms_px: (n,), of each place.
     """
 
     lights_m: Floats
@@ -66,7 +66,7 @@ def fit(
     entered: tuple[Floats, Floats],
     noise: CalibrationNoise | None = None,
 ) -> LightsFit:
-    """Fit both nodes' lights, from entered (2, 3) each; raise PoorCalibration where the places do not tell them."""
+    """Fit both nodes' lights; raise PoorCalibration if the places do not determine them. entered: (2, 3) each, m."""
     noise = noise or CalibrationNoise()
     n = len(places)
     require((n >= LEAST_PLACES, f"{n} places, {LEAST_PLACES} are needed, at different distances, turned and tilted"))
@@ -80,12 +80,12 @@ def fit(
     bearings = np.array([bearing for bearing, _ in rays]).reshape(n, 4, 3)
     tangents = np.array([tangent for _, tangent in rays]).reshape(n, 4, 2, 3)
     if not np.isfinite(bearings).all():
-        raise PoorCalibration("a light's picture is outside of what the camera's calibration covers")
+        raise PoorCalibration("a light in a picture is outside the field that the camera's calibration covers")
 
     def residuals(x: Floats) -> Floats:
-        """Return residuals in sigmas: of each place eight pixels and the tape, then the rulers' twelve.
+        """Return residuals in sigmas: for each place eight pixels and the tape, then twelve entered coordinates.
 
-        x: by how much the twelve coordinates of the lights move, then each pose: shift (3) and turn (3).
+        x: corrections of the twelve coordinates of the lights, then of each pose: shift (3) and rotation (3).
         """
         moved = x[:12].reshape(4, 3)
         lights, poses = first_lights + moved, x[12:].reshape(n, 6)
@@ -108,7 +108,7 @@ def fit(
         lights_m=lights_m,
         sigma_m=np.sqrt(np.diag(covariance)).reshape(2, 2, 3),
         bar_sigma_m=(_bar_sigma(lights_m[0], covariance[:6, :6]), _bar_sigma(lights_m[1], covariance[6:, 6:])),
-        # The rulers' residuals are twelve more, for the twelve coordinates of the lights.
+        # The entered coordinates count as measurements: twelve residuals, as many as their unknowns.
         chi2=float(left @ left) / (len(left) - len(x)),
         pixel_rms_px=np.sqrt((of_places[:, :8] ** 2).mean(axis=1)) * noise.pixel_px,
         tape_gaps_m=of_places[:, 8] * noise.tape_m,
@@ -131,7 +131,7 @@ def fit(
 
 
 def _bar_sigma(lights_m: Floats, covariance: Floats) -> float:
-    """Return the 1 sd of the distance between two lights (2, 3), of their covariance (6, 6)."""
+    """Return the 1 sd of the distance between two lights (2, 3), from their covariance (6, 6)."""
     along = lights_m[1] - lights_m[0]
     slope = np.concatenate((-along, along)) / np.linalg.norm(along)
     return float(np.sqrt(slope @ covariance @ slope))

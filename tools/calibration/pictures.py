@@ -1,4 +1,4 @@
-"""Pictures that show whether a calibration is good; drawn with OpenCV, written as PNG or JPEG."""
+"""Pictures that show the quality of a calibration; drawn with OpenCV, written as PNG or JPEG."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BLUE: Final = (190, 110, 20)
 
 
 def write_picture(path: Path, picture: Image) -> None:
-    """Write a new picture; raise BuddylineError where one exists, or where it cannot be written."""
+    """Write a new picture; raise BuddylineError if the file exists or cannot be written."""
     try:
         _, data = cv2.imencode(path.suffix, picture)
     except cv2.error as error:
@@ -33,9 +33,9 @@ def write_picture(path: Path, picture: Image) -> None:
 
 
 def draw_magnetometer(found: EllipsoidFit) -> Image:
-    """Return both halves of the sphere of directions, seen from below and above, coloured by error.
+    """Return both halves of the sphere of directions, from below and from above, coloured by the error of strength.
 
-    Blue: right strength; red: 3 % off and more. White where nothing was seen.
+    Blue: no error. Red: 3 % or more. White: no readings.
     """
     size = 2 * DISC_PX + 40
     picture = np.full((size + 40, 2 * size, 3), 255, np.uint8)
@@ -61,7 +61,7 @@ def draw_magnetometer(found: EllipsoidFit) -> Image:
 
 
 def draw_lights(found: LightsFit, places: list[TapedPlace]) -> Image:
-    """Return each place's pixel residual (blue) and tape gap (red) as bars."""
+    """Return a bar chart of each place's pixel residual (blue) and tape gap (red)."""
     width, left = 760, 200
     picture = np.full((ROW_PX * (len(places) + 2), width, 3), 255, np.uint8)
     _text(picture, "pixels rms (blue, full: 2 px)   tape gap (red, full: 20 mm)", (10, 20))

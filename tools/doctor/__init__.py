@@ -1,1 +1,1 @@
-"""What a diver would forget, checked: pure judgements, and a shell that gathers what they judge."""
+"""The checks before a dive: gather facts about machine, bus and devices, and judge them."""

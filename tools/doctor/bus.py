@@ -18,13 +18,13 @@ from buddyline.tools.health.pair import START_SOLVER, reported
 from buddyline.tools.live import NoHubError, follow, open_bus_within
 
 HUB_WITHIN_S: Final = 3.0
-# A node says how it is once a second.
+# A node sends its status once a second.
 LISTEN_S: Final = 1.5
 
 
 @dataclass
 class Seen:
-    """Who is on the bus. error: why this machine is not, "" where it is; no_hub: that none answered."""
+    """The nodes on the bus. error: why this machine cannot connect, "" if it can. no_hub: whether no hub answered."""
 
     error: str = ""
     no_hub: bool = False
@@ -40,12 +40,12 @@ class Seen:
             self.statuses[envelope.node] = envelope.message
 
     def alive_changed(self, name: str, alive: bool) -> None:
-        """Take note of who comes and goes."""
+        """Note that a process has started or ended."""
         (self.alive.add if alive else self.alive.discard)(name)
 
 
 def look(client: ClientConfig, own: str | None) -> Seen:
-    """Connect for a moment and see who is there. own: this machine's node, whose certificate it must be."""
+    """Connect and listen for LISTEN_S. own: this machine's node, to which the certificate must belong; None: none."""
     try:
         if client.tls is not None and own is not None:
             check_identity(client.tls, node_name(own))
@@ -58,7 +58,7 @@ def look(client: ClientConfig, own: str | None) -> Seen:
 
 
 def watch(bus: Bus, seconds: float) -> Seen:
-    """See who is on a bus for this long."""
+    """Listen to a connected bus for this time."""
     seen, refusals = Seen(), Refusals("doctor")
     for topic in (INFO, NODE_STATUS):
         follow(bus, topic.key_any(), refusals, seen.take)
@@ -68,7 +68,7 @@ def watch(bus: Bus, seconds: float) -> Seen:
 
 
 def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
-    """Judge hub and nodes. own: this machine's node, None for a laptop."""
+    """Judge hub and nodes. own: this machine's node; None for a laptop."""
     if seen.error:
         nodes = Finding("nodes", "skipped", "nobody is seen without a hub")
         if seen.no_hub:

@@ -1,4 +1,4 @@
-"""`buddyline doctor`: what a diver would forget, a line each: OK, warning or problem, and what to do about it."""
+"""`buddyline doctor`: check everything before a dive; a line each: OK, warning or problem, and what to do about it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check everything, within ten seconds; return 1 where there is a problem."""
+    """Check everything within ten seconds; return 1 if there is a problem."""
     from buddyline.tools.doctor.diagnosis import diagnose, load
 
     node, client = load(args.config)
@@ -42,6 +42,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def lines_of(finding: Finding) -> list[str]:
-    """Return a finding as a person reads it."""
+    """Return the printed lines of a finding."""
     lines = [f"{MARKS[finding.level]:<8} {finding.name:<12} {finding.text}"]
     return lines + ([f"{'':<21} -> {finding.advice}"] if finding.advice else [])

@@ -1,4 +1,4 @@
-"""The doctor's facts, gathered and judged: this machine, the bus, and, where no node has them in use, the devices."""
+"""Run the doctor's checks: this machine, the bus, and the devices if no node uses them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def load(path: str | None) -> tuple[NodeConfig | None, ClientConfig]:
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        table = {"node": ""}  # the loader says what is wrong with it
+        table = {"node": ""}  # load_node_config reports what is wrong with the file
     if "node" not in table:
         config = load_config(path, ClientConfig)
         return None, replace(config, tls=config.tls and config.tls.beside(path))
@@ -42,7 +42,7 @@ def load(path: str | None) -> tuple[NodeConfig | None, ClientConfig]:
 
 
 def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
-    """Check the machine and the bus, then, where no node has them in use already, camera and sensors."""
+    """Check the machine and the bus, then camera and sensors if no node uses them."""
     ends_s, own = time.monotonic() + WITHIN_S, None if node is None else node.node
     seen = bus.Seen(error=f"{client.connect} did not answer")
 
@@ -82,14 +82,14 @@ def check_machine(node: NodeConfig | None) -> list[Finding]:
 
 
 def together(tasks: dict[str, Check], ends_s: float) -> list[Finding]:
-    """Do all at once, each in a thread of its own; one that is not done in time is a problem, not waited for."""
+    """Run all checks at once, each in a thread of its own; a check that is not done at ends_s becomes a problem."""
     results: dict[str, list[Finding] | Exception] = {}
     changed = threading.Condition()
 
     def do(name: str, task: Check) -> None:
         try:
             result: list[Finding] | Exception = task()
-        except Exception as error:  # a check that fails must not hide what the others found
+        except Exception as error:  # a check that fails must not hide the others' findings
             result = error
         with changed:
             results[name] = result

@@ -1,4 +1,4 @@
-"""Facts about this machine, out of its files where it has them."""
+"""Facts about this machine, read from its files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ ROOT = Path("/")
 
 
 def temperature_degc(root: Path = ROOT) -> float | None:
-    """Return the hottest thermal zone's temperature, None where there is none."""
+    """Return the temperature of the hottest thermal zone; None if there is none."""
     found = []
     for file in root.glob("sys/class/thermal/thermal_zone*/temp"):
         try:
@@ -24,9 +24,9 @@ def temperature_degc(root: Path = ROOT) -> float | None:
 
 
 def throttled(root: Path = ROOT) -> int | None:
-    """Return a Pi's bits of undervoltage and throttling, None on another machine.
+    """Return a Pi's bits of undervoltage and throttling; None on another machine.
 
-    The firmware's file, else vcgencmd, else the kernel's rpi_volt, which knows of undervoltage alone.
+    Source: the firmware's file, else vcgencmd, else the kernel's rpi_volt, which has undervoltage only.
     """
     for file in root.glob("sys/devices/platform/soc*/soc*:firmware/get_throttled"):
         try:
@@ -52,12 +52,12 @@ def throttled(root: Path = ROOT) -> int | None:
 
 
 def timesyncd(root: Path = ROOT) -> bool:
-    """Return whether systemd-timesyncd says that the clock is synchronised."""
+    """Return whether systemd-timesyncd reports a synchronised clock."""
     return (root / "run/systemd/timesync/synchronized").exists()
 
 
 def space(directory: Path) -> tuple[int, str]:
-    """Return the bytes free where directory is or will be, and why nothing can be written there, "" where it can."""
+    """Return the free bytes at directory's place, and why it cannot be written, "" if it can. It need not exist yet."""
     place = directory.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent

@@ -1,4 +1,4 @@
-"""Tries a node's camera and sensors for a few seconds, with the node's own drivers."""
+"""Try a node's camera and sensors for a few seconds, with the node's own drivers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from msgspec.structs import replace
 FRAMES: Final = 3
 FRAMES_WITHIN_S: Final = 5.0
 LISTEN_S: Final = 3.0
-# Longer than the search for the chips and the two seconds of samples that a surface zero takes.
+# Longer than the search for the chips plus the two seconds of samples that the surface pressure needs.
 SENSE_S: Final = 4.0
 
 
@@ -75,7 +75,7 @@ def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...
 
 
 def check_sensors(config: NodeConfig) -> list[Finding]:
-    """Open the sensors and listen to each for a few seconds; the surface that a node found is not touched."""
+    """Open the sensors and read each for a few seconds; a node's stored surface pressure is not changed."""
     if config.sensors.name == "none":
         return [Finding("sensors", "skipped", "none are configured")]
     with tempfile.TemporaryDirectory(prefix="buddyline-doctor-") as work:
