@@ -11,7 +11,8 @@ import threading
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-END_S = 5.0
+# How long an event may take on the slowest and most loaded machine. Whoever waits for one goes on as soon as it comes.
+PATIENCE_S = 180.0
 
 
 def free_endpoint() -> str:
@@ -21,7 +22,7 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def buddyline(*words: str, timeout: float = 60.0, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def buddyline(*words: str, timeout: float = PATIENCE_S, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """Run one command to its end."""
     return subprocess.run(
         [sys.executable, "-P", "-m", "buddyline", *map(str, words)],
@@ -73,14 +74,14 @@ class Process:
         with self._changed:
             self._changed.notify_all()
 
-    def wait_for(self, text: str, timeout: float = 20.0) -> str:
+    def wait_for(self, text: str, timeout: float = PATIENCE_S) -> str:
         """Wait for a line of stderr with text in it."""
         with self._changed:
             found = self._changed.wait_for(lambda: next((line for line in self.lines if text in line), None), timeout)
         assert found, f"{text!r} did not come; stderr: {self.lines}"
         return found
 
-    def wait(self, timeout: float = 30.0) -> int:
+    def wait(self, timeout: float = PATIENCE_S) -> int:
         """Wait for its end; return the exit status."""
         status = self._child.wait(timeout)
         self._reader.join(timeout)
@@ -90,7 +91,7 @@ class Process:
         """Send a signal."""
         self._child.send_signal(number)
 
-    def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = END_S) -> int:
+    def end(self, number: signal.Signals = signal.SIGTERM, timeout: float = PATIENCE_S) -> int:
         """Ask it to end; kill it where it does not; return the exit status."""
         if self._child.poll() is None:
             self._child.send_signal(number)
@@ -101,7 +102,7 @@ class Process:
             self._child.wait()
             raise
         finally:
-            self._reader.join(END_S)
+            self._reader.join(PATIENCE_S)
             self._child.stderr.close()
         return status
 

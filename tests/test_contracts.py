@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.imports import FOLDERS, circles, imported_by, modules
-from tests.processes import REPOSITORY
+from tests.processes import PATIENCE_S, REPOSITORY
 
 GEOMETRY = "buddyline.solver_service.geometry"
 
@@ -72,7 +72,7 @@ def lint(tree) -> str:
         [script, "--config", tree / "pyproject.toml", "--cache-dir", tree / "cache"],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=PATIENCE_S,
         check=False,
         cwd=tree / "names",
     )

@@ -9,7 +9,7 @@ import cv2
 import pytest
 
 from tests.golden.logs import read_log
-from tests.processes import REPOSITORY, Process, free_endpoint
+from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint
 
 EXAMPLES = REPOSITORY / "examples"
 DATA = REPOSITORY / "tests" / "data" / "golden"
@@ -22,7 +22,7 @@ def run(name, *words, folder=None):
         [sys.executable, "-W", "error", EXAMPLES / name, *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE_S,
         check=False,
         cwd=folder,
         env={**os.environ, "PYTHONPATH": ""},
@@ -129,7 +129,7 @@ class Example:
 
     def end(self):
         """Wait for its end; return the rest of stdout."""
-        out, errors = self._child.communicate(timeout=60)
+        out, errors = self._child.communicate(timeout=PATIENCE_S)
         assert self._child.returncode == 0, errors
         return out
 

@@ -10,7 +10,7 @@ from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import Candidates, Rejected, RelativePose, SolverStatus
 from msgspec.structs import replace
 
-from tests.processes import REPOSITORY, Process, buddyline, free_endpoint
+from tests.processes import PATIENCE_S, REPOSITORY, Process, buddyline, free_endpoint
 from tests.solver_service.conftest import assert_same_outcomes, dive_messages
 
 PAIRS = {("a", "b"), ("a", "c"), ("b", "c")}
@@ -94,8 +94,8 @@ def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):
         assert len(poses) > 0.8 * len(outcomes[pair])
 
 
-def wait_for_outcomes(path: Path, expected, seconds=30.0):
-    ends_s = time.monotonic() + seconds
+def wait_for_outcomes(path: Path, expected):
+    ends_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < ends_s:
         found = log_of(path)
         if all(set(found[0][pair]) >= set(expected[pair]) for pair in PAIRS):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.processes import REPOSITORY
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 FOLDERS = ("tools", "node", "protocol", "solver_service", "buddyline")
 
@@ -17,7 +17,7 @@ FOLDERS = ("tools", "node", "protocol", "solver_service", "buddyline")
 def run(*words, cwd):
     """Run a program without this repository on its path; return the finished process."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return subprocess.run(words, capture_output=True, text=True, timeout=240, check=False, cwd=cwd, env=environment)
+    return subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, cwd=cwd, env=environment)
 
 
 @pytest.fixture(scope="module")

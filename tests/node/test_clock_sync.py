@@ -15,6 +15,7 @@ from buddyline.protocol.messages import MAX_HEARD, ClockBeacon
 from buddyline.protocol.topics import CLOCK
 
 from tests.node.test_chrony import FOLLOWS, LOST
+from tests.processes import PATIENCE_S
 
 NOW_NS = 1_764_000_000_000_000_000
 
@@ -83,7 +84,7 @@ def test_two_nodes_hear_each_other_over_a_bus():
     for thread in threads:
         thread.start()
     try:
-        assert all(outlet.heard.wait(20.0) for outlet in outlets)
+        assert all(outlet.heard.wait(PATIENCE_S) for outlet in outlets)
     finally:
         stop.set()
         for thread in threads:

@@ -31,10 +31,8 @@ from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import NodeStatus
 
 from tests.disks import small_disk
-from tests.processes import REPOSITORY, Process, free_endpoint
+from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint
 
-END_WITHIN_S = 2.0
-PATIENCE_S = 40.0
 CONFIG = """
 node = "a"
 connect = "{endpoint}"
@@ -121,9 +119,8 @@ def problems(status):
 
 
 def end_in_time(process):
-    began_s = time.monotonic()
+    # A thread that does not end in time would make the status 1.
     assert process.end(signal.SIGTERM) == 0
-    assert time.monotonic() - began_s < END_WITHIN_S
 
 
 def test_the_watchdog_is_fed_only_while_frames_and_sensors_go_on(tmp_path):
@@ -171,7 +168,7 @@ def test_a_disk_that_runs_full_in_mid_dive_costs_no_candidates(tmp_path):
         assert fed(manager.hear_until(fed))
         ballast.unlink()
         until(lambda: "No space left" not in (problems(status) or ""))
-        assert process.end(signal.SIGTERM, PATIENCE_S) == 0
+        assert process.end(signal.SIGTERM) == 0
         (log,) = disk.glob("a-*.mcap")
         with DiveLogReader(log) as reader:
             assert reader.damage == []
@@ -187,7 +184,7 @@ def test_a_read_only_disk_is_refused_at_the_start_in_one_line(tmp_path):
         small_disk(tmp_path / "disk", 64, "ro") as disk,
         node(tmp_path, disk) as (process, _manager, _status),
     ):
-        assert process.wait(20.0) == 2
+        assert process.wait() == 2
         assert [line for line in process.lines if "Read-only file system" in line]
         assert not [line for line in process.lines if "Traceback" in line]
 

@@ -18,7 +18,8 @@ from buddyline.protocol.local_bus import LocalNetwork, key_matches
 from buddyline.protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
 from buddyline.protocol.zenoh_bus import connect, open_hub
 
-WAIT_S = 10.0
+from tests.processes import PATIENCE_S
+
 NOW_NS = 1_700_000_000_000_000_000
 
 Connect = Callable[[], Bus]
@@ -38,7 +39,7 @@ class Inbox:
 
     def wait_for(self, count: int) -> list[Received]:
         with self._changed:
-            assert self._changed.wait_for(lambda: len(self.received) >= count, WAIT_S), self.received
+            assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S), self.received
             return list(self.received)
 
     @property
@@ -48,7 +49,7 @@ class Inbox:
 
 def until(condition: Callable[[], bool]) -> None:
     """Wait for what no event announces."""
-    deadline_s = time.monotonic() + WAIT_S
+    deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.002)
@@ -268,12 +269,12 @@ def test_a_slow_handler_loses_the_oldest_and_is_told_how_many(client: Connect) -
 
     def slow(received: Received) -> None:
         begun.set()
-        assert go_on.wait(WAIT_S)
+        assert go_on.wait(PATIENCE_S)
         inbox(received)
 
     subscription = client().subscribe("buddyline/pair/a/b/rejected", slow, capacity=5)
     publisher.put(rejected(0))
-    assert begun.wait(WAIT_S)
+    assert begun.wait(PATIENCE_S)
     for trigger in range(1, 31):
         publisher.put(rejected(trigger))
     until(lambda: subscription.dropped >= 25)
@@ -286,7 +287,7 @@ def test_a_slow_handler_loses_the_oldest_and_is_told_how_many(client: Connect) -
 def test_a_handler_that_stands_still_does_not_starve_another(client: Connect) -> None:
     bus, node, inbox = client(), client(), Inbox()
     go_on = threading.Event()
-    bus.subscribe("buddyline/pair/*/*/rejected", lambda _: go_on.wait(WAIT_S) and None, capacity=2)
+    bus.subscribe("buddyline/pair/*/*/rejected", lambda _: go_on.wait(PATIENCE_S) and None, capacity=2)
     bus.subscribe("buddyline/node/*/depth", inbox)
     stuck, depths = node.publisher(topics.REJECTED, "a", "b"), node.publisher(topics.DEPTH, "a")
     for i in range(200):
@@ -308,7 +309,7 @@ def test_an_exception_in_a_handler_is_the_buss_failure(client: Connect) -> None:
     bus.subscribe("buddyline/pair/*/*/rejected", inbox)
     assert bus.failure is None
     node.publisher(topics.DEPTH, "a").put(depth(1))
-    assert failed.wait(WAIT_S)
+    assert failed.wait(PATIENCE_S)
     assert isinstance(bus.failure.__cause__, ZeroDivisionError)
     assert "buddyline/node/*/depth" in str(bus.failure)
     node.publisher(topics.REJECTED, "a", "b").put(rejected(1))

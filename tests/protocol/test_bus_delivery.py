@@ -10,7 +10,7 @@ from buddyline.protocol.bus import cache_depth
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.delivery import Delivery, FailureLatch, RateCap
 
-WAIT_S = 10.0
+from tests.processes import PATIENCE_S
 
 
 def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,12 +19,12 @@ def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> Non
 
     def handle(item: str) -> None:
         begun.set()
-        assert go_on.wait(WAIT_S)
+        assert go_on.wait(PATIENCE_S)
         handled.append(item)
 
     queue = Delivery("test", handle, capacity=1000, failures=FailureLatch())
     queue.offer("first", 60)
-    assert begun.wait(WAIT_S)
+    assert begun.wait(PATIENCE_S)
     for item in ("a", "b", "c"):
         queue.offer(item, 60)
     # One alone may be bigger than the bound, or it could never be had.
@@ -40,7 +40,7 @@ def test_a_handler_that_never_ends_does_not_hold_up_closing(caplog: pytest.LogCa
 
     def handle(item: int) -> None:
         handled.append(item)
-        go_on.wait(WAIT_S)
+        go_on.wait(PATIENCE_S)
 
     queue = Delivery("stuck", handle, capacity=10, failures=FailureLatch())
     for item in range(5):
@@ -61,7 +61,7 @@ def test_a_handler_may_close_its_own_queue() -> None:
 
     queue = Delivery("own", handle, capacity=10, failures=FailureLatch())
     queue.offer(1)
-    assert closed.wait(WAIT_S)
+    assert closed.wait(PATIENCE_S)
 
 
 def test_the_first_death_is_kept() -> None:

@@ -21,10 +21,8 @@ from buddyline.protocol.messages import Mark
 from buddyline.protocol.security import RefusedError, Tls, refusal
 from buddyline.protocol.zenoh_bus import ZenohBus, connect, open_hub
 
-from tests.processes import Process, buddyline, free_endpoint
+from tests.processes import PATIENCE_S, Process, buddyline, free_endpoint
 from tests.tools.identities import copy_of, expired, make_keys, tls
-
-WAIT_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +52,7 @@ class Inbox:
 
     def wait_for(self, key: str) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: key in self.keys, WAIT_S), self.keys
+            assert self._changed.wait_for(lambda: key in self.keys, PATIENCE_S), self.keys
 
 
 def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
@@ -159,7 +157,7 @@ def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> No
         solver.subscribe(topics.CANDIDATES.key_any(), take)
         for k in range(50, 60):
             publisher.put_bytes(b'{"stamp_ns":%d}' % k)
-        assert done.wait(WAIT_S), len(received)
+        assert done.wait(PATIENCE_S), len(received)
         assert received == [b'{"stamp_ns":%d}' % k for k in range(60)]
 
 
@@ -237,7 +235,7 @@ def listener(endpoint: str, answer: Callable[[socket.socket], object]) -> Iterat
             except OSError:
                 return
             with link:
-                link.settimeout(WAIT_S)
+                link.settimeout(PATIENCE_S)
                 if link.recv(4096):
                     answer(link)
             calls.release()
@@ -249,7 +247,7 @@ def listener(endpoint: str, answer: Callable[[socket.socket], object]) -> Iterat
     finally:
         listening.shutdown(socket.SHUT_RDWR)
         listening.close()
-        thread.join(WAIT_S)
+        thread.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize(
@@ -284,15 +282,15 @@ def test_a_hub_that_closes_in_mid_handshake_is_tried_again_until_it_is_well(keys
         with listener(endpoint, lambda _: None) as calls:
             client.start()
             for _ in range(6):
-                assert calls.acquire(timeout=WAIT_S), "it gave up"
+                assert calls.acquire(timeout=PATIENCE_S), "it gave up"
             assert not joined
         with open_hub(endpoint, tls=tls(keys, "hub")):
-            client.join(WAIT_S)
+            client.join(PATIENCE_S)
             assert len(joined) == 1
             joined[0].close()
     finally:
         stop.set()
-        client.join(WAIT_S)
+        client.join(PATIENCE_S)
 
 
 def test_marks_and_stored_dives_reach_a_secured_hub_with_the_right_certificate_alone(

@@ -16,11 +16,11 @@ from buddyline.protocol.spool import Spool
 from buddyline.tools.dives import Dive
 
 from tests.disks import small_disk
+from tests.processes import PATIENCE_S
 
 MIB = 1024 * 1024
 PICTURE = "buddyline/node/a/image"
 DEPTH = "buddyline/node/a/depth"
-PATIENCE_S = 10.0
 
 
 @pytest.fixture(autouse=True)

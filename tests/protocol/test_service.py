@@ -9,7 +9,7 @@ import pytest
 from buddyline.protocol import service as module
 from buddyline.protocol.service import STUCK_S, Service, StuckError
 
-from tests.processes import REPOSITORY
+from tests.processes import PATIENCE_S, REPOSITORY
 
 
 def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
@@ -36,7 +36,7 @@ def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
         """
     )
     ended = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False, cwd=REPOSITORY
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=REPOSITORY
     )
     assert ended.returncode == 1
     assert "node a: thread detect is stuck" in ended.stderr
@@ -56,7 +56,7 @@ def test_a_process_that_holds_on_when_stuck_is_ended_anyway():
         """
     )
     ended = subprocess.run(
-        [sys.executable, "-c", program], timeout=30, check=False, cwd=REPOSITORY, capture_output=True
+        [sys.executable, "-c", program], timeout=PATIENCE_S, check=False, cwd=REPOSITORY, capture_output=True
     )
     assert ended.returncode == 1
 
@@ -71,7 +71,7 @@ def watched(monkeypatch):
     monkeypatch.setattr(module.faulthandler, "dump_traceback", lambda _: None)
     said, stop = threading.Event(), threading.Event()
     service.spawn("w", lambda: (service.heartbeat(), said.set(), stop.wait()))
-    assert said.wait(10.0)
+    assert said.wait(PATIENCE_S)
     yield service
     stop.set()
 
@@ -106,5 +106,5 @@ with service.stop._cond:
         pass
 service.wait()
 """
-    ended = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    ended = subprocess.run([sys.executable, "-c", program], timeout=PATIENCE_S, check=False)
     assert ended.returncode == 0

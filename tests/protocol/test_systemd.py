@@ -7,6 +7,8 @@ import pytest
 from buddyline.protocol.service import Service
 from buddyline.protocol.systemd import MAX_TEXT, Notifier
 
+from tests.processes import PATIENCE_S
+
 
 @pytest.fixture(params=["path", "abstract"])
 def manager(request, tmp_path, monkeypatch):
@@ -14,7 +16,7 @@ def manager(request, tmp_path, monkeypatch):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         name = str(tmp_path / "notify") if request.param == "path" else f"@buddyline-{secrets.token_hex(8)}"
         listening.bind("\0" + name[1:] if name[0] == "@" else name)
-        listening.settimeout(5.0)
+        listening.settimeout(PATIENCE_S)
         monkeypatch.setenv("NOTIFY_SOCKET", name)
         yield listening
 

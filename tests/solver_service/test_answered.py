@@ -16,6 +16,7 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
 
+from tests.processes import PATIENCE_S
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 
@@ -132,7 +133,7 @@ def payload_trigger(received):
 
 
 def until(condition):
-    ends_s = time.monotonic() + 20.0
+    ends_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < ends_s
         time.sleep(0.005)

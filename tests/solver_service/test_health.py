@@ -12,6 +12,7 @@ from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.service import SolverService
 
+from tests.processes import PATIENCE_S
 from tests.solver_service.conftest import dive_messages
 
 S_NS = 1_000_000_000
@@ -91,9 +92,9 @@ def test_the_solver_says_at_once_that_a_nodes_process_is_gone():
         for message in messages:
             if isinstance(message, NodeInfo):
                 node.publisher(INFO, message.node).put_bytes(encode(message))
-        deadline_s = time.monotonic() + 10.0
+        deadline_s = time.monotonic() + PATIENCE_S
         while not service.core.pairs and time.monotonic() < deadline_s:
             service.stop.wait(0.01)
         node.close()
         with said:
-            assert said.wait_for(lambda: heard("node b is gone"), 10.0), problems
+            assert said.wait_for(lambda: heard("node b is gone"), PATIENCE_S), problems

@@ -21,6 +21,8 @@ from buddyline.tools.survey.derive import Derived
 from buddyline.tools.survey.project import About, AdjustSettings, Leg, Project
 from msgspec.structs import replace
 
+from tests.processes import PATIENCE_S
+
 PERIOD_NS = 500_000_000
 START_NS = 1_777_629_600_000_000_000  # 2026-05-01T10:00:00Z
 WIDTH, HEIGHT = 820, 616
@@ -337,7 +339,7 @@ def cavern(directory, text, name="survey.svx"):
     """Run the real cavern: its warnings, (H, V) of its loop or None, and coordinates by station."""
     (directory / name).write_text(text, newline="")
     done = subprocess.run(
-        ["cavern", "-w", "-q", name], cwd=directory, capture_output=True, text=True, timeout=60, check=False
+        ["cavern", "-w", "-q", name], cwd=directory, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     said = [row for row in (done.stdout + done.stderr).splitlines() if "warning" in row or "error" in row]
     stem = name.rpartition(".")[0]
@@ -348,7 +350,7 @@ def cavern(directory, text, name="survey.svx"):
 
 def coordinates(file):
     """Return the stations of a .3d file by their last name (survex writes them to the centimetre)."""
-    dump = subprocess.run(["dump3d", str(file)], capture_output=True, text=True, timeout=60, check=True).stdout
+    dump = subprocess.run(["dump3d", str(file)], capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
     found = {}
     for row in dump.splitlines():
         if row.startswith("NODE"):

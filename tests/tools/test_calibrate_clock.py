@@ -232,7 +232,7 @@ def test_a_node_that_falls_silent_meanwhile_is_named(monkeypatch):
         thread = threading.Thread(target=say_once)
         thread.start()
         with pytest.raises(BuddylineError, match="node b became silent"):
-            clock_report.hear(tool, 1.0)
+            clock_report.hear(tool, 2.0)
         ended.set()
         thread.join()
 

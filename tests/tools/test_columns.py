@@ -13,7 +13,7 @@ from buddyline.tools.columns import in_order
 
 from tests.golden.logs import read_log, write_log
 from tests.golden.references import FOLDER
-from tests.processes import REPOSITORY
+from tests.processes import PATIENCE_S, REPOSITORY
 
 DATA = REPOSITORY / "tests" / "data" / "golden"
 CAVERN = DATA / "cavern.mcap"
@@ -199,7 +199,9 @@ def test_every_public_name_is_there_and_described():
 
 def test_importing_the_library_imports_nothing_else():
     program = "import sys; before = set(sys.modules); import buddyline; print(*sorted(set(sys.modules) - before))"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    )
     imported = done.stdout.split()
     assert "buddyline" in imported
     ours = {name for name in imported if name.startswith("buddyline")}

@@ -58,7 +58,7 @@ def test_a_method_ends_where_half_of_the_triggers_give_no_pose():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 def test_a_quick_run_writes_a_report_that_needs_nothing_else(tmp_path, capsys):
     folder = tmp_path / "report"
     assert main(["experiments", "-o", str(folder), "--quick"]) == 0

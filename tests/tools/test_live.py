@@ -15,7 +15,7 @@ from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import LiveClient, NoHubError, open_bus_within
 from buddyline.tools.measure.children import Child, end_all, free_endpoint
 
-from tests.processes import Process, buddyline
+from tests.processes import PATIENCE_S, Process, buddyline
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_a_command_without_a_hub_ends_when_its_time_is_over(tmp_path, words):
     for module in {"ros2": ["rosbags"], "monitor": ["viser"]}.get(words[0], []):
         pytest.importorskip(module)
     endpoint = free_endpoint()
-    done = buddyline(*words, "--connect", endpoint, "--seconds", "0.5", timeout=30.0, cwd=tmp_path)
+    done = buddyline(*words, "--connect", endpoint, "--seconds", "0.5", cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert f"no hub at {endpoint} within 0.5 s" in done.stderr
 
@@ -42,7 +42,7 @@ def test_ctrl_c_ends_the_wait_for_a_hub(tmp_path):
     with Process("record", tmp_path / "out.mcap", "--connect", free_endpoint()) as record:
         record.wait_for("waiting for it")
         record.send(signal.SIGINT)
-        assert record.wait(timeout=10.0) == 130
+        assert record.wait() == 130
 
 
 def test_a_hub_that_does_not_answer_in_time_is_an_error():
@@ -54,7 +54,7 @@ def test_time_over_with_a_hub_is_no_error(monkeypatch):
     endpoint = free_endpoint()
     monkeypatch.setattr(LiveClient, "handle_signals", lambda self: None)
     with Child("hub", "--listen", endpoint):
-        open_bus_within(ClientConfig(connect=endpoint), 20.0).close()
+        open_bus_within(ClientConfig(connect=endpoint), PATIENCE_S).close()
         client = LiveClient("test", ClientConfig(connect=endpoint), seconds=1.0)
         assert client.run(lambda bus: client.wait()) == 0
 
@@ -75,7 +75,7 @@ def test_a_child_says_how_it_died_and_what_it_takes():
         assert death.startswith("second ended with status 2: ")
         assert "none.toml" in death
     finally:
-        assert end_all([child, dead], within_s=20.0) == []
+        assert end_all([child, dead], within_s=PATIENCE_S) == []
 
 
 def children_named(pid: int) -> dict[str, int]:
@@ -94,9 +94,9 @@ def children_named(pid: int) -> dict[str, int]:
 def test_a_demo_whose_solver_dies_says_so_and_ends():
     demo = Process("demo", "--environment", "basin", "--rate", "4")
     try:
-        demo.wait_for(" s  ", timeout=60.0)
+        demo.wait_for(" s  ")
         os.kill(children_named(demo.pid)["solver"], signal.SIGKILL)
-        assert demo.wait(timeout=20.0) == 2
+        assert demo.wait() == 2
         assert "solver ended with status -9" in demo.lines[-1]
         assert children_named(demo.pid) == {}
     finally:
@@ -117,7 +117,9 @@ def test_a_demo_whose_hub_cannot_start_ends_with_the_reason(tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         program = STUB.format(port=taken.getsockname()[1])
-        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        )
     assert done.returncode == 2
     assert "hub ended with status 2" in done.stderr.splitlines()[-1]
 
@@ -126,7 +128,11 @@ def test_nothing_in_the_current_folder_takes_the_place_of_the_program(tmp_path):
     for name in ("protocol", "tools", "node", "numpy"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('not me')\n")
     script = Path(sys.executable).with_name("buddyline")
-    words = [script, "demo", "--environment", "basin", "--rate", "4", "--seconds", "5", "--json"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
+    # A loaded machine may need longer until the first pose.
+    for seconds in ("5", "60"):
+        words = [script, "demo", "--environment", "basin", "--rate", "4", "--seconds", seconds, "--json"]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=tmp_path)
+        if done.returncode == 0:
+            break
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["poses"] > 0

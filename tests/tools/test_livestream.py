@@ -14,7 +14,7 @@ from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import NoHubError
 from buddyline.tools.livestream import LiveStream
 
-from tests.processes import free_endpoint
+from tests.processes import PATIENCE_S, free_endpoint
 
 
 def depth(number, node="a"):
@@ -78,9 +78,9 @@ def test_stop_from_another_thread_ends_a_loop_that_waits(network):
 
         thread = threading.Thread(target=loop)
         thread.start()
-        assert begun.wait(10)
+        assert begun.wait(PATIENCE_S)
         depths.stop()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert ended.is_set()
         assert list(depths) == []
 

@@ -16,7 +16,7 @@ from buddyline.protocol.messages import Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
 
-from tests.processes import free_endpoint
+from tests.processes import PATIENCE_S, free_endpoint
 from tests.tools.evaluated import INFOS, pose, track
 from tests.tools.watched import at, attitude, depth
 
@@ -168,11 +168,13 @@ def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any
             subscriber = receiver.declare_subscriber("3/**", take)
             # What is sent before the sender knows of the receiver goes nowhere, as in ROS.
             sent = 0
-            while not enough.wait(0.02) and sent < 500:
+            while not enough.wait(0.02) and sent < PATIENCE_S / 0.02:
                 graph.publish(first)
                 sent += 1
             assert enough.is_set()
-            tokens = sorted(str(reply.ok.key_expr) for reply in receiver.liveliness().get("@ros2_lv/**", timeout=5.0))
+            tokens = sorted(
+                str(reply.ok.key_expr) for reply in receiver.liveliness().get("@ros2_lv/**", timeout=PATIENCE_S)
+            )
             subscriber.undeclare()
         finally:
             sender.close()
@@ -220,14 +222,16 @@ def test_a_secured_hub_lets_the_bridge_publish_for_ros_and_nobody_else(store: An
                 sessions["viewer"].declare_subscriber(expression, take)
             graph = RosGraph(sessions["ros2"], store, ManualClock(5), domain=0)
             sent = 0
-            while not enough.wait(0.02) and sent < 500:
+            while not enough.wait(0.02) and sent < PATIENCE_S / 0.02:
                 # What is denied goes first, so that it would come before.
                 for name, key in (("node-a", "0/buddyline/a/depth/x/y"), ("ros2", "team/buddyline/pair/a/b/pose")):
                     sessions[name].put(key, b"no")
                 graph.publish(first)
                 sent += 1
             assert enough.is_set()
-            tokens = [str(one.ok.key_expr) for one in sessions["viewer"].liveliness().get("@ros2_lv/**", timeout=5.0)]
+            tokens = [
+                str(one.ok.key_expr) for one in sessions["viewer"].liveliness().get("@ros2_lv/**", timeout=PATIENCE_S)
+            ]
         finally:
             for session in sessions.values():
                 session.close()

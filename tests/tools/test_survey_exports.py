@@ -17,6 +17,7 @@ from buddyline.tools.survey.project import Edit, FixedPoint, Place
 from buddyline.tools.survey.sheet import Sheet
 from msgspec.structs import replace
 
+from tests.processes import PATIENCE_S
 from tests.tools import survey_world as world
 
 CAVERN = pytest.mark.skipif(shutil.which("cavern") is None, reason="survex is not installed")
@@ -136,7 +137,9 @@ def test_therion_compiles(tmp_path, place):
     project, adjusted = survey(world.line, **PLACES[place])
     (tmp_path / "survey.th").write_text(survex.th(Sheet(project, adjusted)))
     (tmp_path / "thconfig").write_text("source survey.th\nexport model -o survey.3d -fmt survex\n")
-    done = subprocess.run(["therion", "-q"], cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    done = subprocess.run(
+        ["therion", "-q"], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 0, done.stdout[-500:]
     found = world.coordinates(tmp_path / "survey.3d")
     assert max(differences(adjusted, found)) <= SAME_M

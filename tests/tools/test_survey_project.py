@@ -20,6 +20,7 @@ from buddyline.tools.survey.live import Watch
 from buddyline.tools.survey.project import MARKER, load_project
 from msgspec.structs import replace
 
+from tests.processes import PATIENCE_S
 from tests.tools import survey_world as world
 
 COURSE = world.line(np.random.default_rng(2), 3)
@@ -231,5 +232,5 @@ def test_live_alarms_go_out_on_the_bus(messages):
                 publishers[topic, ids] = nodes.publisher(topic, *ids)
             off = isinstance(message, Depth) and message.node == "b"
             publishers[topic, ids].put(replace(message, depth_m=message.depth_m + 3.0) if off else message)
-        assert came.wait(20), [one.note for one in heard]
+        assert came.wait(PATIENCE_S), [one.note for one in heard]
     assert {one.kind for one in heard} == {"alarm"}
