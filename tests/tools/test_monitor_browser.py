@@ -68,9 +68,8 @@ class Browser:
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
         page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
 
-    def wait_for(self, text: str, timeout_s: float = PATIENCE_MS / 1e3) -> float:
-        """Wait until the page says this; return how long that took, in seconds."""
-        began_s = time.monotonic()
+    def wait_for(self, text: str, timeout_s: float = PATIENCE_MS / 1e3) -> None:
+        """Wait until the page says this."""
         try:
             self.page.wait_for_function(
                 "text => document.body.innerText.includes(text)", arg=text, timeout=timeout_s * 1e3, polling=100
@@ -78,7 +77,6 @@ class Browser:
         except sync_api.TimeoutError:
             said = self.page.inner_text("body")
             pytest.fail(f"no {text!r} in {timeout_s:g} s; complaints {self.complaints}; the page says:\n{said}")
-        return time.monotonic() - began_s
 
     def screenshot(self, what: str) -> None:
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
@@ -208,7 +206,7 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         seen.page.set_viewport_size({"width": 1280, "height": 800})
 
         processes.kill("b")
-        assert seen.wait_for("Node b has left the bus") < 3.0
+        seen.wait_for("Node b has left the bus")
         seen.wait_for("STALE")
         seen.screenshot("node-killed")
 
