@@ -287,6 +287,7 @@ class RelativePose(Message, frozen=True, kw_only=True):
     Candidates (-1: that light was not seen); blobs_b likewise. skew_ns: stamp_a - stamp_b.
     With attitude only: t_ned_m, azimuth_rad (from north, clockwise), inclination_rad (up positive), and their sigmas
     (1 sd), which count the error of A's attitude as well as the pose's.
+    heading_gap_rad: with both attitudes, what is to be added to B's heading for both to agree with the pose.
     """
 
     node_a: NodeId
@@ -314,6 +315,7 @@ class RelativePose(Message, frozen=True, kw_only=True):
     sigma_azimuth_rad: NonNegative | UnsetType = UNSET
     inclination_rad: float | UnsetType = UNSET
     sigma_inclination_rad: NonNegative | UnsetType = UNSET
+    heading_gap_rad: float | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check the quaternion's norm."""

@@ -9,6 +9,7 @@ import math
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.solver_service.geometry.compasses import MOST_APART_RAD
 from buddyline.solver_service.geometry.observation import Heading
 
 # After this time without a pose the estimate is dropped: the bias may have changed.
@@ -61,7 +62,9 @@ class HeadingOffset:
             self._variance = predicted + JUMP_VARIANCE
             return
         gain = predicted / total
-        self._offset_rad = math.remainder(self._offset_rad + gain * off_rad, 2.0 * math.pi)
+        # Compasses point aside, not backwards: poses that say so must not be learned from.
+        offset_rad = math.remainder(self._offset_rad + gain * off_rad, 2.0 * math.pi)
+        self._offset_rad = min(max(offset_rad, -MOST_APART_RAD), MOST_APART_RAD)
         self._variance = (1.0 - gain) * predicted
         noise = self._noise + (1.0 - MEMORY) * (off_rad * off_rad - total)
         self._noise = min(max(noise, LEAST_NOISE), MOST_NOISE)

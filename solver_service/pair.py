@@ -112,7 +112,7 @@ class PairSolver:
         try:
             found = readings.decide(place, self._prior.predict(stamp_ns), self._headings.predict(stamp_ns))
             if isinstance(found, Fix):
-                self._remember(matched, found, readings.heading_offset(place, found))
+                self._remember(matched, found)
         except (ArithmeticError, ValueError) as error:
             return self._out_of_range(matched, error)
         return found
@@ -122,12 +122,12 @@ class PairSolver:
         nodes = f"{matched.frame_a.node} or {matched.frame_b.node}"
         return NoFix("degenerate", f"values from {nodes} are out of numeric range ({error})")
 
-    def _remember(self, matched: Matched, fix: Fix, heading_offset: tuple[float, float] | None) -> None:
+    def _remember(self, matched: Matched, fix: Fix) -> None:
         if not math.isfinite(fix.T_a_b.t_m.sum() + fix.covariance.sum()):
             raise ValueError("the pose is not finite")
         self._prior.update(matched.stamp_ns, fix)
-        if heading_offset is not None and fix.method != "three_lights":
-            self._headings.update(matched.stamp_ns, *heading_offset)
+        if fix.heading is not None and fix.method != "three_lights":
+            self._headings.update(matched.stamp_ns, fix.heading.gap_rad, fix.heading.variance)
         if self.alignment is not None:
             stamp_a_ns, stamp_b_ns = matched.frame_a.stamp_ns, matched.frame_b.stamp_ns
             infos, rigs = (matched.info_a, matched.info_b), (matched.rig_a, matched.rig_b)

@@ -90,6 +90,7 @@ def relative_pose(frame_a: Candidates, frame_b: Candidates, rig_a: Rig, sensed_a
         method=fix.method,
         checks=list(fix.checks),
         skew_ns=frame_a.stamp_ns - frame_b.stamp_ns,
+        heading_gap_rad=UNSET if fix.heading is None else fix.heading.gap_rad,
     )
     if sensed_a.q_ned_body_xyzw is None or sensed_a.sigma_rad is None:
         return pose

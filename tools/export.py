@@ -33,6 +33,7 @@ _CSV_FIELDS: Final = (
     *_PLACE_FIELDS,
     *("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "checks", "skew_ns"),
     *_NED_SD_FIELDS,
+    "heading_gap_rad",
 )
 _REASON_FIELDS: Final = ("reason", "detail")
 _TRACK_FIELDS: Final = (
@@ -137,6 +138,7 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
         name: getattr(result, name)
         for name in ("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "skew_ns")
     }
+    row["heading_gap_rad"] = "" if result.heading_gap_rad is UNSET else result.heading_gap_rad
     row["checks"] = " ".join(result.checks)
     return row
 

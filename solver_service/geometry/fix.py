@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from buddyline.solver_service.geometry.compasses import HeadingGap
 from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
@@ -16,6 +17,7 @@ class Fix:
     covariance: (6, 6), position in A's camera frame, then the small rotation w with R_true = exp(w) R_a_b, in
     A's camera frame. pair_a: indices into view A of B's (left, right) light, -1 where it was not seen; pair_b
     likewise. chi2: of the picture coordinates, two degrees of freedom. probability: against chance and others.
+    heading: against both headings, None without attitudes.
     """
 
     T_a_b: SE3
@@ -31,6 +33,7 @@ class Fix:
     method: str
     checks: tuple[str, ...]
     probability: float
+    heading: HeadingGap | None = None
 
     @property
     def t_a_b_m(self) -> Floats:

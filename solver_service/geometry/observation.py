@@ -17,6 +17,7 @@ Reason: TypeAlias = Literal[
     "twist_gap",
     "attitude",
     "depth",
+    "heading",
     "out_of_range",
     "ambiguous",
     "degenerate",

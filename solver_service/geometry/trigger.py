@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.compasses import HeadingGap, compare_headings
 from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT, false_light_odds
 from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.four_lights import FourLights, read_four_lights
@@ -140,7 +141,7 @@ class _Batched:
         found: Fix | NoFix
         if why is None:
             four = weigh_readings(self.four.read, trigger, past, settings, three=False)
-            found = self._choose(trigger, four)
+            found = self._choose(trigger, four, heading)
         else:
             found = NoFix(*why)
         if settings.method != "refined" or not _is_doubtful(found, four):
@@ -151,9 +152,9 @@ class _Batched:
         if not read.readings.sound[read.places_of(trigger)].any():
             return found
         three = weigh_readings(read, trigger, past, settings, three=True)
-        return self._choose(trigger, three if four is None else four.joined(three))
+        return self._choose(trigger, three if four is None else four.joined(three), heading)
 
-    def _choose(self, trigger: int, weighed: Weighed) -> Fix | NoFix:
+    def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None) -> Fix | NoFix:
         """Publish the likeliest reading where it stands alone."""
         settings, others = self.batch.settings, weighed.others
         k = int(weighed.log_ratio.argmax())
@@ -187,7 +188,12 @@ class _Batched:
         if short:
             required = max(required, _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY)
         if probability >= required:
-            return self._fix(trigger, weighed, k, widened * _spread(weighed, k, same), probability)
+            covariance = widened * _spread(weighed, k, same)
+            against = self._against_headings(trigger, weighed, k, covariance, learned)
+            if against is not None and against.contradicts:
+                off_deg = math.degrees(abs(against.gap_rad))
+                return NoFix("heading", f"what agrees, at {range_m:.3g} m, is {off_deg:.0f} deg off both headings")
+            return self._fix(trigger, weighed, k, covariance, probability, against)
         tilt_chi2, depth_chi2 = float(readings.tilt_chi2[place]), float(readings.depth_chi2[place])
         what = f"the best of the hypotheses, at {range_m:.3g} m,"
         if tilt_chi2 > AGREES:
@@ -200,6 +206,18 @@ class _Batched:
         if rivals[rival] > weighed.log_ratio[k] - _RIVAL:
             why = f"another stands at {math.hypot(*t[rival].tolist()):.3g} m"
         return NoFix("ambiguous", f"{what} is {probability:.0%} likely: {why} (chi2 {chi2:.1f})")
+
+    def _against_headings(
+        self, trigger: int, weighed: Weighed, k: int, covariance: Floats, learned: Heading | None
+    ) -> HeadingGap | None:
+        """Compare pose k with both headings, None where they are not known or may not speak."""
+        sensors = self.batch.sensors
+        if not sensors.known[trigger].all() or "attitude" not in self.batch.settings.checks:
+            return None
+        R_ned_a, R_ned_b = sensors.R_ned_bar[trigger] @ self.batch.rigs.R_bar_camera
+        gap_rad, variance = heading_offset(weighed.T_a_b[k], covariance, R_ned_a, R_ned_b)
+        follows = bool(weighed.log_prior[k] > 0.0)
+        return compare_headings(gap_rad, variance, float(sensors.heading_variance[trigger]), learned, follows=follows)
 
     def _checks(self, trigger: int, readings: Readings, place: int) -> tuple[str, ...]:
         """Name what speaks for the pose."""
@@ -216,7 +234,15 @@ class _Batched:
             checks.append("depth")
         return tuple(checks)
 
-    def _fix(self, trigger: int, weighed: Weighed, k: int, covariance: Floats, probability: float) -> Fix:
+    def _fix(
+        self,
+        trigger: int,
+        weighed: Weighed,
+        k: int,
+        covariance: Floats,
+        probability: float,
+        heading: HeadingGap | None,
+    ) -> Fix:
         """Publish reading k."""
         method = self.batch.settings.method
         readings, place = weighed.sources[k]
@@ -240,8 +266,9 @@ class _Batched:
             pair_a=(b_left, b_right),
             pair_b=(a_left, a_right),
             method=method if min(b_left, b_right, a_left, a_right) >= 0 else "three_lights",
-            checks=self._checks(trigger, readings, place),
+            checks=(*self._checks(trigger, readings, place), *(("heading",) if heading and heading.agrees else ())),
             probability=probability,
+            heading=heading,
         )
 
 
@@ -290,13 +317,3 @@ class TriggerReadings:
         if self.readings is None:
             return self.why or NoFix("degenerate", "")
         return self.readings.decide(trigger, prior, heading)
-
-    def heading_offset(self, trigger: int, fix: Fix) -> tuple[float, float] | None:
-        """Give what is to be added to B's heading to agree with a fix, and its variance; None without attitudes."""
-        if self.readings is None:
-            return None
-        batch = self.readings.batch
-        if not batch.sensors.known[trigger].all():
-            return None
-        R_ned_a, R_ned_b = batch.sensors.R_ned_bar[trigger] @ batch.rigs.R_bar_camera
-        return heading_offset(fix.T_a_b, fix.covariance, R_ned_a, R_ned_b)

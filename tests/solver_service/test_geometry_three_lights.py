@@ -55,7 +55,7 @@ def test_three_lights_and_perfect_sensors_give_the_pose(missing, rigs):
         expected[2 - 2 * (missing // 2) + 1] = 1
         assert (*fix.pair_a, *fix.pair_b) == tuple(expected)
         assert np.linalg.norm(error(fix, scene)[:3]) < 0.01 * np.linalg.norm(scene.t)
-        assert fix.checks == ("attitude", "depth")
+        assert fix.checks == ("attitude", "depth", "heading")
     # Which of its two lights the other saw, heading alone cannot always tell.
     assert solved >= 4
 

@@ -134,9 +134,9 @@ def test_sensors_name_themselves_among_the_checks():
     scene = facing()
     (a, _), (b, _) = scene.views()
     assert solve(scene, (a, b)).checks == ("range", "twist", "upright_assumed")
-    assert solve(scene, (a, b), scene.sensed()).checks == ("range", "twist", "attitude", "depth")
+    assert solve(scene, (a, b), scene.sensed()).checks == ("range", "twist", "attitude", "depth", "heading")
     without_depth = [replace(s, depth_m=None) for s in scene.sensed()]
-    assert solve(scene, (a, b), without_depth).checks == ("range", "twist", "attitude")
+    assert solve(scene, (a, b), without_depth).checks == ("range", "twist", "attitude", "heading")
 
 
 def test_gravity_tells_left_from_right():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.messages import Attitude, Candidates, RelativePose
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.compasses import MOST_APART_RAD
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.sensors import heading_offset
@@ -32,8 +33,7 @@ def test_a_drifting_bias_is_followed_and_the_variance_is_true():
     for sigma_deg in (1.5, 3.0, 6.0):
         headings = HeadingOffset()
         for k in range(1500):
-            # Two thirds of a turn to start with: the angle comes round.
-            bias_rad = 4.2 + math.radians(8.0) * math.sin(0.02 * k)
+            bias_rad = 1.4 + math.radians(8.0) * math.sin(0.02 * k)
             told_rad = math.remainder(bias_rad + math.radians(sigma_deg) * rng.normal(), 2.0 * math.pi)
             heading = headings.predict(k * STEP_NS)
             if k > 100:
@@ -59,6 +59,12 @@ def test_one_wrong_pose_moves_nothing_and_steel_is_followed():
     fed([0.1] * 20, headings, 51)
     fed([1.5] * 10, headings, 71)
     assert headings.predict(81 * STEP_NS).offset_rad == pytest.approx(1.5, abs=0.1)
+
+
+def test_half_a_turn_is_not_learned():
+    for start in ([], [0.1] * 50):
+        headings = fed([3.0] * 500, fed(start), len(start))
+        assert abs(headings.predict((500 + len(start)) * STEP_NS).offset_rad) <= MOST_APART_RAD
 
 
 def test_what_a_pose_tells_is_the_error_of_the_heading():

@@ -1,0 +1,51 @@
+"""Heading as a check of its own: can two compasses, and how far they may disagree, explain a pose?
+
+Two nodes that look at a third party's two lights from equal range get a pose that passes range, twist, tilt and depth.
+It has them face each other. Their compasses tell the true angle theta between their lines of sight: against such a pose
+they are 180 degrees less theta off, whatever the fields of view. A compass is also off by its bias; which is which
+follows from how far a compass may be off, and from what earlier poses have told of it. Without earlier poses a third
+party's bar that is seen from more than 80 degrees apart cannot be told from a compass beside steel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from buddyline.solver_service.geometry.evidence import AGREES
+from buddyline.solver_service.geometry.observation import Heading
+
+# Two compasses disagree by no more than this: one near steel points aside, not backwards. The rest of a quarter turn is
+# for the noise of a reading. Lines of sight within 80 degrees of each other are then never taken for opposite ones.
+MOST_APART_RAD: Final = math.radians(100.0)
+# What has been learned of both compasses changes by less than this until the next pose, unless the motion shows that
+# the pose is right.
+MOST_CHANGED_RAD: Final = math.radians(60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class HeadingGap:
+    """How a pose stands to both headings.
+
+    gap_rad: to be added to B's heading for both to agree with the pose. variance: of it by the pose, rad^2. agrees:
+    whether the compasses' noise explains it, after what is learned of them. contradicts: whether nothing does.
+    """
+
+    gap_rad: float
+    variance: float
+    agrees: bool
+    contradicts: bool
+
+
+def compare_headings(
+    gap_rad: float, variance: float, sensors_variance: float, learned: Heading | None, *, follows: bool
+) -> HeadingGap:
+    """Judge a gap; sensors_variance: of both headings' difference, rad^2; follows: earlier poses foretell this one."""
+    agrees = gap_rad * gap_rad < AGREES * (sensors_variance + variance)
+    changed = False
+    if learned is not None:
+        off_rad = abs(math.remainder(gap_rad - learned.offset_rad, 2.0 * math.pi))
+        agrees = agrees or off_rad * off_rad < AGREES * (learned.variance + variance)
+        changed = off_rad > MOST_CHANGED_RAD and not follows
+    return HeadingGap(gap_rad, variance, agrees, not agrees and (abs(gap_rad) > MOST_APART_RAD or changed))
