@@ -1,15 +1,16 @@
-"""Trigger instants met by a camera that runs freely: which frame is nearest, and how its phase is locked.
+"""Trigger instants and a free-running camera: choice of the nearest frame, lock of the phase.
 
-The instants t_k = k * period since the epoch are the same for every node whose clock is right; nobody says
-"now". Each node moves its own frames onto them, by giving a single frame another duration.
+The instants t_k = k * period since the epoch are the same for every node whose clock is right; no message triggers a
+frame. Each node moves its own frames onto them, by giving a single frame another duration.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from statistics import median
 from typing import Final
 
-from buddyline.protocol.clock import MS_NS, trigger_index
+from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
 
 PHASES: Final = 5
 SETTLING_FRAMES: Final = 6
@@ -17,15 +18,19 @@ LATENCY_FRAMES: Final = 10  # of a picamera2 control, with six buffers
 MAX_DRIFT: Final = 1e-3
 LOCKED_NS: Final = 300_000
 LONGEST_FRAME_NS: Final = 100 * MS_NS
+FOLLOWED_WITHIN_NS: Final = (
+    15 * S_NS
+)  # libcamera's server sends its time every second or so, and the client then adjusts
+FOLLOWED_FRAMES: Final = 9
 
 
 def frames_per_trigger(trigger_period_ns: int) -> int:
-    """Return how many frames to take a trigger: so many that locking takes less than two seconds."""
+    """Return the frames per trigger: enough for a lock within two seconds."""
     return -(-trigger_period_ns // LONGEST_FRAME_NS)
 
 
 class FrameChooser:
-    """Picks the frame that is nearest to each instant, once it is sure that no later one will be nearer."""
+    """Picks the frame nearest to each instant."""
 
     def __init__(self, trigger_period_ns: int, frame_period_ns: int) -> None:
         self._trigger_period_ns = trigger_period_ns
@@ -45,14 +50,40 @@ class FrameChooser:
         return True
 
 
+class FollowerWatch:
+    """Checks that the frames of a camera whose phase something else locks are on the instants.
+
+    problem: what is wrong, "" during the first FOLLOWED_WITHIN_NS and where nothing is.
+    """
+
+    def __init__(self, trigger_period_ns: int) -> None:
+        self.problem = ""
+        self._trigger_period_ns = trigger_period_ns
+        self._began_ns: int | None = None
+        self._residuals_ns: deque[int] = deque(maxlen=FOLLOWED_FRAMES)
+
+    def update(self, stamp_ns: int) -> None:
+        """Take the stamp of a frame that is nearest to its instant."""
+        if self._began_ns is None or stamp_ns < self._began_ns:
+            self._began_ns = stamp_ns
+        trigger = trigger_index(stamp_ns, self._trigger_period_ns)
+        self._residuals_ns.append(abs(stamp_ns - trigger * self._trigger_period_ns))
+        if stamp_ns - self._began_ns < FOLLOWED_WITHIN_NS or len(self._residuals_ns) < FOLLOWED_FRAMES:
+            return
+        off_ns = median(self._residuals_ns)
+        self.problem = (
+            "" if off_ns <= LOCKED_NS else f"frames are {off_ns / MS_NS:.1f} ms away from the trigger instants"
+        )
+
+
 class PhaseLock:
     """Brings the frames' middles of exposure onto the grid of the instants, and keeps them there.
 
-    Measures phase and drift over a few frames, asks for one frame of another duration, and waits until that must
-    have come through. A frame lasts a whole number of lines, and clocks differ: the drift that is left is aimed
-    off for, so that the phase is none in the middle between two corrections.
-    frames: how many a trigger period. min_frame_ns: the shortest that the camera can. line_ns: time of a line.
-    residual_ns: phase last measured, None before that.
+    Measures phase and drift over a few frames, requests one frame of another duration, and waits until that frame
+    must have come. A frame lasts a whole number of lines, and clocks differ: each correction includes half of the drift
+    expected until the next one, so that the phase is zero midway between two corrections.
+    frames: per trigger period. min_frame_ns: the camera's shortest. line_ns: time of a line. residual_ns: the phase
+    measured last, None before that.
     """
 
     def __init__(
@@ -78,7 +109,7 @@ class PhaseLock:
 
     @property
     def duration_ns(self) -> int:
-        """Duration to ask for while nothing is to be corrected."""
+        """Duration to request while no correction is needed."""
         return self._request_ns(self._lines)
 
     @property
@@ -151,5 +182,5 @@ class PhaseLock:
         return self._request_ns(whole)
 
     def _request_ns(self, lines: int) -> int:
-        """Return a duration that a camera makes so many lines of, whether it cuts or rounds."""
+        """Return a duration that gives this many lines, whether the camera truncates or rounds."""
         return round((lines + 0.25) * self._line_ns)

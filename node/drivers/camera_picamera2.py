@@ -25,7 +25,7 @@ from buddyline.node.drivers.readout import (
     wall_offset_ns,
 )
 from buddyline.node.drivers.samples import AbsentError, DeviceError
-from buddyline.node.trigger import FrameChooser, PhaseLock, frames_per_trigger
+from buddyline.node.trigger import FollowerWatch, FrameChooser, PhaseLock, frames_per_trigger
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import NodeInfo
 from numpy.typing import NDArray
@@ -162,6 +162,7 @@ class Picamera2Camera:
         self._timer.update(shortest_us)
         self._lock = PhaseLock(self._trigger_period_ns, self._frames, shortest_us * 1000, self._timer.line_ns)
         self._chooser = FrameChooser(self._trigger_period_ns, self._frame_period_ns)
+        self._follower = FollowerWatch(self._trigger_period_ns)
         if self._frame_period_ns < shortest_us * 1000 or self._frame_period_ns <= config.exposure_us * 1000:
             raise DeviceError(
                 f"camera: a frame each {self._frame_period_ns / 1e6:.1f} ms cannot be had (mode: "
@@ -226,7 +227,7 @@ class Picamera2Camera:
         finally:
             # Controls given to set_controls ride on the request that is released next.
             request.release()
-        self._health.update("")
+        self._health.update(self._follow(stamp_ns))
         return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])))
 
     def _wait_request(self, stop: threading.Event) -> Any:
@@ -270,6 +271,15 @@ class Picamera2Camera:
         duration_ns = self._lock.update(stamp_ns)
         if duration_ns is not None:
             self._camera.set_controls({"FrameDurationLimits": _limits(duration_ns)})
+
+    def _follow(self, stamp_ns: int) -> str:
+        """Return why the frames of a sync client are not locked, "" where they are or this is none."""
+        if self._config.sync != "client":
+            return ""
+        self._follower.update(stamp_ns)
+        if not self._follower.problem:
+            return ""
+        return f"{self._follower.problem}: camera.sync = 'client' needs a node with 'server' that runs on the same link"
 
     def _copy(self, request: Any) -> NDArray[np.uint8]:
         """Return a copy of the picture: the camera's buffer is overwritten once the request is released."""

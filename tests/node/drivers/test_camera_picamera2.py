@@ -380,6 +380,22 @@ def test_software_sync_leaves_the_clients_phase_to_libcamera(sensor, sync, numbe
     assert (len({active["FrameDurationLimits"] for active in seen}) > 1) == locks
 
 
+@pytest.mark.parametrize("phase_ms", [0, 12])
+def test_a_client_without_its_server_says_that_it_is_not_locked(sensor, phase_ms):
+    """Frames of 5000 lines last a trigger period: the phase that they begin with is kept."""
+    sensor.controls.add("SyncMode")
+    sensor.line_ns = 20_000.0
+    first_ns = (137_531_000 + 1231 * 10_000 - 2_000_000) % PERIOD_NS  # of the middle row's middle of exposure
+    sensor.clock.set_ns(START_NS // PERIOD_NS * PERIOD_NS + PERIOD_NS - first_ns + phase_ms * MS_NS)
+    sensor.start_ns = sensor.clock.now_ns()
+    camera = make(sensor, CameraConfig(sync="client", colour=False))
+    frames(camera, 140)
+    assert camera.problem == ""
+    frames(camera, 30)
+    assert ("12.0 ms away" in camera.problem and "'server'" in camera.problem) == (phase_ms == 12)
+    assert (camera.problem == "") == (phase_ms == 0)
+
+
 def test_without_picamera2_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "picamera2", None)
     with pytest.raises(DeviceError, match="apt install python3-picamera2"):
