@@ -1,4 +1,4 @@
-"""A node's configuration: one TOML file, strict, with defaults for all that can have one."""
+"""A node's configuration: one TOML file, strict, with defaults where possible."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ from msgspec.structs import replace
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
-# How far a principal point may be from the middle, of the picture's size: real lenses stay within a third of that.
+# Filters and reading add up to some milliseconds; a tenth of a second is a wrong unit.
+MAX_IMU_DELAY_NS = 100_000_000
+# Largest distance of a principal point from the middle, of the picture's size: real lenses stay within a third of it.
 OFF_CENTRE = 0.15
 
 
 class CameraConfig(Config, frozen=True, kw_only=True):
-    """[camera]: which one, and its fixed settings. path: pictures of the `stored` camera.
+    """[camera]: its name and fixed settings. path: pictures of the `stored` camera.
 
     colour: of the Pi's camera. Luminance alone is a third of the memory; in caverns and lakes it loses lights.
     """
@@ -62,7 +64,10 @@ class SensorsConfig(Config, frozen=True, kw_only=True):
 
 
 class CalibrationConfig(Config, frozen=True, kw_only=True):
-    """[calibration]: what NodeInfo carries. Metres and the camera frame: x right, y down, z forward."""
+    """[calibration]: what NodeInfo carries. Metres and the camera frame: x right, y down, z forward.
+
+    imu_m: place of the inertial unit. imu_delay_ns: stamp of an inertial sample minus its true time.
+    """
 
     camera: CameraModel
     light_left_m: Vector3
@@ -70,6 +75,8 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
     sigma_px: Positive = 0.7
     q_body_camera_xyzw: Quaternion = (0.5, 0.5, 0.5, 0.5)
     depth_port_m: Vector3 = (0.0, 0.0, 0.0)
+    imu_m: Vector3 | None = None
+    imu_delay_ns: Annotated[int, Meta(ge=-MAX_IMU_DELAY_NS, le=MAX_IMU_DELAY_NS)] | None = None
     declination_rad: float = 0.0
     tags: list[ArTag] = field(default_factory=list)
 
@@ -95,7 +102,7 @@ class PreviewConfig(Config, frozen=True, kw_only=True):
 
 
 class SimulationConfig(Config, frozen=True, kw_only=True):
-    """[simulation]: the world that the simulated camera and sensors are in; the same for both nodes."""
+    """[simulation]: the world of the simulated camera and sensors; the same for both nodes."""
 
     environment: str = "cavern"
     seed: Annotated[int, Meta(ge=0)] = 1
@@ -105,7 +112,7 @@ class SimulationConfig(Config, frozen=True, kw_only=True):
 
 
 class NodeConfig(Config, frozen=True, kw_only=True):
-    """A whole node. status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py)."""
+    """A whole node. status_file: its health report; "": in the runtime directory (protocol/statusfile.py)."""
 
     node: NodeId
     connect: str = "tcp/127.0.0.1:7447"
@@ -132,14 +139,14 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         return None if position_deg is None else earth_field(*position_deg, stamp_ns)
 
     def declination_rad(self, stamp_ns: int) -> float:
-        """Return what headings are corrected by: of position and day, else as configured."""
+        """Return the declination: from position and day, else as configured."""
         here = self.earth_field(stamp_ns)
         if here is not None:
             return here.declination_rad
         return self.calibration.declination_rad if self.calibration else 0.0
 
     def _check_resolution(self, camera: CameraModel) -> None:
-        """Refuse intrinsics of pictures of another size, which their principal point gives away."""
+        """Refuse intrinsics of pictures of another size, detected by their principal point."""
         for name, found_px, size_px in (
             ("cx_px", camera.cx_px, self.camera.width_px),
             ("cy_px", camera.cy_px, self.camera.height_px),
@@ -151,7 +158,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
                 )
 
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
-        """Return NodeInfo out of [calibration]; raise ConfigError where there is none."""
+        """Return NodeInfo from [calibration]; raise ConfigError where there is none."""
         calibration = self.calibration
         if calibration is None:
             raise ConfigError(
@@ -172,6 +179,8 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             row_time_ns=row_time_ns,
             q_body_camera_xyzw=calibration.q_body_camera_xyzw,
             depth_port_m=calibration.depth_port_m,
+            imu_m=UNSET if calibration.imu_m is None else calibration.imu_m,
+            imu_delay_ns=UNSET if calibration.imu_delay_ns is None else calibration.imu_delay_ns,
             declination_rad=self.declination_rad(stamp_ns),
             software=software,
             config_sha256=sha256,

@@ -18,9 +18,8 @@ LATENCY_FRAMES: Final = 10  # of a picamera2 control, with six buffers
 MAX_DRIFT: Final = 1e-3
 LOCKED_NS: Final = 300_000
 LONGEST_FRAME_NS: Final = 100 * MS_NS
-FOLLOWED_WITHIN_NS: Final = (
-    15 * S_NS
-)  # libcamera's server sends its time every second or so, and the client then adjusts
+# libcamera's server sends its time every 30 frames by default.
+FOLLOWED_WITHIN_NS: Final = 15 * S_NS
 FOLLOWED_FRAMES: Final = 9
 
 

@@ -1,10 +1,14 @@
-"""A node's configuration: a calibration of pictures of another size is refused."""
+"""A node's configuration: what of its calibration goes into NodeInfo, and what is refused."""
 
 import pytest
-from buddyline.node.config import CalibrationConfig, CameraConfig, NodeConfig
+from buddyline.node.config import CalibrationConfig, CameraConfig, NodeConfig, load_node_config
+from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.config import ConfigError
-from buddyline.protocol.messages import CameraModel
+from buddyline.protocol.messages import CameraModel, NodeInfo
+from msgspec import UNSET
 from msgspec.structs import replace
+
+from tests.processes import REPOSITORY
 
 CAMERA = CameraModel(model="pinhole", fx_px=1808.0, fy_px=1808.0, cx_px=830.0, cy_px=600.0, distortion=[0.0] * 5)
 
@@ -27,3 +31,21 @@ def test_a_calibration_of_another_resolution_is_refused(size):
 
 def test_a_principal_point_a_little_off_is_a_lens():
     assert config(replace(CAMERA, cx_px=900.0), 1640, 1232).node_info(1, "", "", 0)
+
+
+def test_the_inertial_units_place_and_delay_go_into_node_info():
+    plain = config(CAMERA, 1640, 1232)
+    assert plain.node_info(1, "", "", 0).imu_m is UNSET
+    assert plain.node_info(1, "", "", 0).imu_delay_ns is UNSET
+    calibration = replace(plain.calibration, imu_m=(0.03, -0.06, -0.08), imu_delay_ns=7_000_000)
+    info = decode(encode(replace(plain, calibration=calibration).node_info(1, "", "", 0)), NodeInfo)
+    assert (info.imu_m, info.imu_delay_ns) == ((0.03, -0.06, -0.08), 7_000_000)
+
+
+@pytest.mark.parametrize("line", ["imu_delay_ns = 7_000_000_000", "imu_m = [0.1, 0.2]", "imu_m = 'left'"])
+def test_an_absurd_place_or_delay_is_refused_with_its_name(tmp_path, line):
+    path = tmp_path / "a.toml"
+    example = (REPOSITORY / "node/examples/pi.toml").read_text()
+    path.write_text(example.replace("sigma_px = 0.7", f"sigma_px = 0.7\n{line}"))
+    with pytest.raises(ConfigError, match=line.split()[0]):
+        load_node_config(path)

@@ -174,7 +174,15 @@ def test_a_calibrated_magnetometer_that_is_silent_is_a_problem(mag_t, level, mon
     monkeypatch.setattr(rig, "open_sensors", lambda *_: [Chips(msgspec.structs.replace(REST, mag_t=mag_t))])
     sensors = msgspec.structs.replace(CALIBRATION.sensors, magnetometer_offset_t=(1e-6, 0.0, 0.0))
     found = rig.check_sensors(msgspec.structs.replace(CALIBRATION, sensors=sensors))
-    assert levels(found) == {"imu": "ok", "compass": level}
+    assert levels(found) == {"imu": "ok", "compass": level, "imu place": "warning"}
+
+
+def test_the_place_of_an_inertial_unit_is_asked_for():
+    entered = CALIBRATION.calibration
+    assert judge_rig.imu_place(entered, chips=False).level == "skipped"
+    missing = judge_rig.imu_place(entered, chips=True)
+    assert (missing.level, "imu_m" in missing.advice) == ("warning", True)
+    assert judge_rig.imu_place(msgspec.structs.replace(entered, imu_m=(0.0, -0.05, 0.1)), chips=True).level == "ok"
 
 
 def test_the_files_of_a_pi(tmp_path, monkeypatch):
@@ -280,7 +288,13 @@ def test_a_simulated_rig_is_well(name, monkeypatch):
         # The other node swims: at this instant it is in view.
         patched.setattr(rig, "SystemClock", lambda: ManualClock(1_764_000_002 * S_NS))
         assert levels(rig.check_camera(config)) == {"camera": "ok", "calibration": "ok", "lights": "ok"}
-    assert levels(rig.check_sensors(config)) == {"attitude": "ok", "depth": "ok", "imu": "ok", "compass": "skipped"}
+    assert levels(rig.check_sensors(config)) == {
+        "attitude": "ok",
+        "depth": "ok",
+        "imu": "ok",
+        "compass": "skipped",
+        "imu place": "skipped",
+    }
 
 
 def test_a_pi_without_anything_attached_names_each():
@@ -289,7 +303,7 @@ def test_a_pi_without_anything_attached_names_each():
     found = rig.check_camera(config)
     assert levels(found) == {"camera": "problem", "calibration": "warning", "lights": "skipped"}
     sensors = rig.check_sensors(config)
-    assert levels(sensors) == {"imu": "problem", "depth": "problem", "compass": "warning"}
+    assert levels(sensors) == {"imu": "problem", "depth": "problem", "compass": "warning", "imu place": "warning"}
     assert "no /dev/i2c-250" in sensors[0].text
 
 

@@ -90,12 +90,13 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
             source.close()
     sensors = config.sensors
     given = [message for messages in heard.values() for message in messages if isinstance(message, Imu)]
+    chips = sensors.name == "i2c" and sensors.imu != "none"
     compass = judge.magnetometer(
         calibrated=any(sensors.magnetometer_offset_t),
-        chips=sensors.name == "i2c" and sensors.imu != "none",
+        chips=chips,
         heard=any(message.mag_t is not UNSET for message in given),
     )
-    return [*findings, compass]
+    return [*findings, compass, judge.imu_place(config.calibration, chips)]
 
 
 def _listen(sources: list[Source]) -> dict[str, list[Message]]:

@@ -1,4 +1,4 @@
-"""What is said of a node's rig: calibration, camera, lights, sensors. What they gave goes in, findings come out."""
+"""Judges a node's rig: calibration, camera, lights, sensors. Input: what they gave; output: findings."""
 
 from __future__ import annotations
 
@@ -113,6 +113,17 @@ def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
         return text, "" if -1.0 < message.depth_m < 300.0 else f"{text}: not where a diver is"
     sigma_deg = np.degrees(max(message.sigma_rad))
     return f"attitude within {sigma_deg:.0f} degrees", ""
+
+
+def imu_place(entered: CalibrationConfig | None, chips: bool) -> Finding:
+    """Judge whether the inertial unit's place is known; chips: real ones, whose place no simulation tells."""
+    if not chips:
+        return Finding("imu place", "skipped", "not a real one")
+    if entered is None or entered.imu_m is None:
+        advice = "measure it by ruler, calibration.imu_m: node/README.md, Calibrate"
+        return Finding("imu place", "warning", "not known: the track needs it, and has to estimate it", advice)
+    x_m, y_m, z_m = entered.imu_m
+    return Finding("imu place", "ok", f"{x_m:.3f}, {y_m:.3f}, {z_m:.3f} m in the camera's frame")
 
 
 def magnetometer(calibrated: bool, chips: bool, heard: bool) -> Finding:
