@@ -93,7 +93,7 @@ def _ned_words(estimate: Estimate) -> str:
     if estimate.sigma_ned_m is UNSET:
         return ": " + ", ".join(f"{name} {x:+.2f} m" for name, x in named) + f", ± {length_words(sigma_m(estimate))}"
     both = zip(named, estimate.sigma_ned_m, strict=True)
-    return ": " + ", ".join(f"{name} {x:+.2f} ± {sigma:.2f} m" for (name, x), sigma in both)
+    return ": " + ", ".join(f"{name} {x:+.2f} ± {sigma:.2g} m" for (name, x), sigma in both)
 
 
 def _origin(estimate: Estimate) -> str:
