@@ -120,9 +120,9 @@ def _scales(columns: Sequence[Floats]) -> Any:
     """
     values = np.concatenate(columns)
     least, most = float(np.nanmin(values)), float(np.nanmax(values))
-    step = 10.0 ** math.floor(math.log10(max(most - least, 1e-3 * abs(most), 1e-3)))
-    low, high = step * math.floor(least / step), step * math.ceil(most / step)
-    return {"x": {"time": False, "range": (-PLOTTED_S, 0.0)}, "y": {"range": (low, max(high, low + step))}}
+    step = 10.0 ** math.floor(math.log10(max(most - least, 1e-3 * abs(most), 1e-3))) / 2
+    low, high = step * math.floor(least / step - 0.1), step * math.ceil(most / step + 0.1)
+    return {"x": {"time": False, "range": (-PLOTTED_S, 0.0)}, "y": {"range": (low, high)}}
 
 
 def _series(label: str, colour: str, dot_px: int, line_px: int) -> dict[str, Any]:
