@@ -1,4 +1,4 @@
-"""`buddyline detect`: candidates out of stored pictures, or out of a dive's pictures."""
+"""`buddyline detect`: find candidates in stored pictures, or in the pictures of a dive."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ log = logging.getLogger(__name__)
 
 DEFAULT_METHOD = METHODS[0]
 FOLDER_PERIOD_NS = 100_000_000
-# What was solved or detected before is left out.
+# Topics that are copied: all but earlier candidates and the solver's results.
 DERIVED_FROM = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CANDIDATES)
 
 
 @dataclass
 class DiveDetector:
-    """Candidates for the pictures of a dive: one detector a node, each with its own memory."""
+    """Finds candidates in the pictures of a dive, with a detector for each node."""
 
     method: str
     environment: str
@@ -47,7 +47,7 @@ class DiveDetector:
     last: tuple[Frame, list[Detection]] | None = None
 
     def candidates(self, envelope: Envelope) -> Envelope | None:
-        """Detect in one picture; None where it cannot be used, with a warning that says why."""
+        """Return the candidates of one picture; None if it cannot be used, and the reason is reported as a loss."""
         image, node = envelope.message, envelope.node
         if not isinstance(image, CompressedImage):
             return None
@@ -77,7 +77,7 @@ class DiveDetector:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Detect in pictures or in a dive."""
+    """Find candidates in pictures or in a dive; return the exit status."""
     cv2.setNumThreads(1)
     if args.draw:
         new_folder(args.draw)

@@ -1,4 +1,4 @@
-"""`buddyline keys`: a small authority of one's own, and certificates for everyone on the bus."""
+"""`buddyline keys`: create an authority of your own, and certificates for every process on the bus."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
 
-# Whose certificate a command makes, and what it is for.
+# The role of each certificate, and what it is for.
 ROLES: Final = {
     "solver": "make the solver's certificate, which may publish poses",
     "viewer": "make the certificate of everything that only reads: record, monitor",
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make keys; never over others."""
+    """Make keys and certificates; never overwrite a file."""
     try:
         from buddyline.tools.authority import Authority
     except ImportError as error:
@@ -110,7 +110,7 @@ def _tls_table(name: str) -> str:
 
 
 def _admit(path: Path, node: str) -> None:
-    """Add a node to the hub's list, in its place, leaving all else as it is."""
+    """Add a node to the list in the hub's file, and change nothing else."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError:

@@ -1,4 +1,4 @@
-"""`buddyline plan`: how far two nodes will measure well, before anyone is in the water."""
+"""`buddyline plan`: predict, before a dive, up to which range two nodes measure well."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from buddyline.tools.newfile import check_new
 
 RANGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0)
 FIELD_OF_VIEW_RAD: Final = math.radians(48.8)
-# A black object is lost at 2 % contrast (Koschmieder): visibility times the beam's attenuation is ln 50.
+# A black object is visible down to 2 % contrast (Koschmieder): visibility times attenuation is ln 50.
 _KOSCHMIEDER: Final = math.log(50.0)
-# How much brighter a dive lamp is at 1 m than the faintest light that a detector takes; see `light_reach_m`.
+# Light of a dive lamp at 1 m over the faintest light that a detector finds; see `light_reach_m`.
 LAMP_MARGIN: Final = 1e6
-# Divers hold bars and heads about this straight towards each other, and each other this near to the middle (1 sd).
+# Divers face each other with about this error in rotation, and with this tangent off the picture's centre (1 sd).
 _TILT_RAD: Final = math.radians(12.0)
 _ASIDE: Final = 0.06
 _ATTITUDES: Final = 16
@@ -34,9 +34,10 @@ _ATTITUDES: Final = 16
 
 @dataclass(frozen=True)
 class PlannedRange:
-    """What to expect at one range: RMS errors. azimuth_rad: compass and picture; in_view: all lights fit the picture.
+    """The expected RMS errors at one range. azimuth_error_rad: of compass and picture together.
 
-    lit: the lights are bright enough for the water. within: whether all tolerances are met, lights seen.
+    in_view: both lights fit into the picture. lit: the lights are bright enough for the water. within: all tolerances
+    are met, in_view and lit.
     """
 
     range_m: float
@@ -51,10 +52,11 @@ class PlannedRange:
 
 @dataclass(frozen=True)
 class Plan:
-    """Errors by range, and where each tolerance ends: None where it holds as far as was looked, 0 where nowhere.
+    """Errors by range, and the ranges up to which the tolerances are met.
 
-    ends_m: by "range", "position", "azimuth"; reach_m: where the lights become too faint. near_m: nearer than
-    that the lights do not both fit the picture. far_m, limit: the first of these ends, and which.
+    ends_m: for "range", "position" and "azimuth": the range at which the error exceeds the tolerance; None if it never
+    does up to the last range, 0 if it does at the first. reach_m: where the lights become too faint. near_m: at shorter
+    ranges the lights do not both fit into the picture. far_m, limit: the smallest of these ends, and its name.
     """
 
     rows: list[PlannedRange]
@@ -98,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def described(path: str | None) -> NodeInfo:
-    """Return the camera's NodeInfo out of a node's configuration, a JSON file or a log; or the default one."""
+    """Return the camera's NodeInfo from a node's configuration, a JSON file or a log; None: the default camera."""
     if path is not None and Path(path).suffix != ".toml":
         return load_info(path)
     width_px, height_px = 820, 616
@@ -129,17 +131,18 @@ def described(path: str | None) -> NodeInfo:
 
 
 def with_baseline(info: NodeInfo, baseline_m: float) -> NodeInfo:
-    """Return the node with its lights on the camera's x axis, so far apart."""
+    """Return the node with its lights on the camera's x axis, baseline_m apart."""
     half_m = baseline_m / 2
     return msgspec.structs.replace(info, light_left_m=(-half_m, 0.0, 0.0), light_right_m=(half_m, 0.0, 0.0))
 
 
 def light_reach_m(visibility_m: float) -> float:
-    """Return where a lamp becomes too faint: its light falls as exp(-c r) / r^2 (Allard), c = ln 50 / visibility.
+    """Return the range at which a lamp becomes too faint, m.
 
-    In clear water the square of the range dims it, in turbid water attenuation does. LAMP_MARGIN stands for lamp,
-    exposure and detector together, and is a round guess: ten times more light gains a seventh of the range where
-    the water is turbid. Simulated lakes, where scattered light arrives too, let lights be found 1.5 times as far.
+    Its light falls as exp(-c r) / r^2 (Allard), with c = ln 50 / visibility. In clear water the square of the range
+    dominates, in turbid water the attenuation. LAMP_MARGIN covers lamp, exposure and detector, and is a rough guess:
+    in turbid water ten times more light gives a seventh more range. In simulated lakes, where scattered light also
+    arrives, lights are found 1.5 times as far away.
     """
     attenuation_per_m = _KOSCHMIEDER / visibility_m
     near_m, far_m = 0.01, 1e3
@@ -153,9 +156,9 @@ def light_reach_m(visibility_m: float) -> float:
 
 
 def expected(info: NodeInfo, sigma_px: float, ranges_m: Floats) -> Floats:
-    """Return RMS errors at ranges (n,), (n, 4): range, position (m), bearing across, rotation (rad).
+    """Return RMS errors (n, 4) at ranges (n,): range and position (m), bearing across and rotation (rad).
 
-    By the Cramér-Rao bound of two like nodes that look at each other, over the attitudes that divers hold.
+    They are Cramér-Rao bounds for two equal nodes that face each other, averaged over typical attitudes of divers.
     """
     rng = np.random.default_rng(7)
     direction = np.column_stack([rng.normal(0.0, _ASIDE, (_ATTITUDES, 2)), np.ones(_ATTITUDES)])
@@ -175,11 +178,11 @@ def expected(info: NodeInfo, sigma_px: float, ranges_m: Floats) -> Floats:
 
 
 def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, tolerances: dict[str, float]) -> Plan:
-    """Return the plan of two like nodes; tolerances: RMS, of "range" and "position" (m) and "azimuth" (rad)."""
+    """Return the plan for two equal nodes. tolerances: RMS, of "range" and "position" (m) and "azimuth" (rad)."""
     length_m = math.dist(info.light_left_m, info.light_right_m)
     near_m = 1.1 * length_m / 2 / math.tan(math.atan(info.width_px / 2 / info.camera.fx_px))
     errors = expected(info, sigma_px, np.array(RANGES_M))
-    # The compass adds to the bearing across.
+    # The azimuth has the compass's error and the bearing's.
     errors[:, 2] = np.hypot(errors[:, 2], compass_rad)
     rows = []
     for range_m, (along_m, position_m, azimuth_rad, rotation_rad) in zip(RANGES_M, errors.tolist(), strict=True):
@@ -196,7 +199,7 @@ def plan(info: NodeInfo, sigma_px: float, compass_rad: float, reach_m: float, to
 
 
 def _end_m(errors: list[float], tolerance: float) -> float | None:
-    """Return the range at which errors pass the tolerance, between RANGES_M by powers; None: beyond them."""
+    """Return the range at which errors exceed the tolerance, log-interpolated in RANGES_M; None if they never do."""
     if errors[0] > tolerance:
         return 0.0
     for i in range(1, len(errors)):
@@ -207,7 +210,7 @@ def _end_m(errors: list[float], tolerance: float) -> float | None:
 
 
 def as_dict(chosen: Plan, spacings: dict[float, Plan]) -> dict[str, Any]:
-    """Return the plan as JSON takes it; no reach is null."""
+    """Return the plan as JSON values; an infinite reach is null."""
 
     def plain(one: Plan) -> dict[str, Any]:
         return asdict(one) | {"reach_m": one.reach_m if math.isfinite(one.reach_m) else None}

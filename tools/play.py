@@ -1,4 +1,4 @@
-"""`buddyline play`: send stored dives over the bus, as if they happened now."""
+"""`buddyline play`: send stored dives over the bus at the speed at which they were recorded, or another."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# A solver on the bus makes its results anew. What the clocks were then says nothing of those that are on the bus now.
+# Results are not sent, because a solver on the bus computes them again. Clock beacons are not sent, because they say
+# nothing about the clocks of the nodes that are on the bus now.
 SENT: Final = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CLOCK)
-# Pictures go out as previews: the bus is for what the solver needs.
+# Pictures are sent as previews only, to leave the bus to the solver's data.
 IMAGES_HZ: Final = 2.0
-# At --speed 0, how far the dive may run ahead of what a solver on the bus has resolved, in the dive's time: less than
-# a solver waits for a node that is silent (2 s), so that a sample which is fetched late does not count as lost ...
+# At --speed 0, the dive may run ahead of the solver's outcomes by this much of the dive's time. It is less than the
+# solver's wait for a silent node (2 s), so that a sample which is fetched late does not count as lost ...
 AHEAD_NS: Final = 1_500_000_000
-# ... and more where the dive itself has nothing of a node for so long, since there it does wait.
+# ... and more where a node is silent in the dive itself, because there the solver does wait.
 AHEAD_OF_SILENT_NS: Final = 2_200_000_000
-# A solver that is silent for this long waits for something that the dive does not hold.
+# A solver without outcomes for this time waits for something that the dive does not have.
 SOLVER_SILENT_S: Final = 5.0
-# Calibration goes ahead of the frames, which have a higher priority on the bus.
+# The calibration is sent this long before the frames, which have a higher priority on the bus.
 INFO_AHEAD_S: Final = 0.3
 
 
@@ -71,7 +72,7 @@ class SolverFollower:
             self._changed.notify_all()
 
     def wait_to_send(self, node: str, stamp_ns: int, stop: threading.Event) -> None:
-        """Wait until the solver is close behind a frame at stamp_ns that goes out next; not at all without a solver."""
+        """Wait until the solver's outcomes are close to stamp_ns, of the next frame; no wait without a solver."""
         with self._changed:
             if self._resolved_ns < 0:
                 # Everything before the first frame counts as resolved.
@@ -89,7 +90,7 @@ class SolverFollower:
 
 
 class Player:
-    """Sends a dive's records in order, each when its time has come."""
+    """Sends a dive's messages in order, each at its time."""
 
     def __init__(self, bus: Bus, nodes: Iterable[str], speed: float, clock: Clock, stop: threading.Event) -> None:
         self.sent = 0
@@ -117,7 +118,7 @@ class Player:
         self._stop.wait(INFO_AHEAD_S)
 
     def send(self, envelope: Envelope, shift_triggers: int = 0, period_ns: int = S_NS) -> None:
-        """Wait for a message's time, and send it, so many triggers later than it was recorded."""
+        """Wait for a message's time, and send it with its stamp moved on by shift_triggers triggers."""
         time_ns = envelope.time_ns + shift_triggers * period_ns
         if self._first_ns is None:
             self._first_ns, self._began_ns = time_ns, self._clock.now_ns()
@@ -144,7 +145,7 @@ class Player:
 
 
 def _shifted(message: Message, triggers: int, period_ns: int) -> Message:
-    """Return a message as it would be so many triggers later."""
+    """Return a message with its stamp and trigger moved on by `triggers`."""
     shift_ns = triggers * period_ns
     if isinstance(message, CompressedImage):
         stamp_ns = message.stamp_ns + shift_ns
@@ -201,7 +202,7 @@ def _span(dive: Dive, start_s: float, end_s: float | None) -> tuple[int, int]:
 
 
 def _selected(dive: Dive, start_ns: int, stop_ns: int) -> Iterator[Envelope]:
-    """Yield what is sent of a dive; calibration from before the start comes too."""
+    """Yield the messages to send, between start_ns and stop_ns, and calibrations from before start_ns."""
     for envelope in dive.messages(*SENT):
         if envelope.time_ns >= stop_ns:
             return

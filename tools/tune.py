@@ -1,7 +1,7 @@
-"""`buddyline tune`: propose a detector's values from a site's own pictures, and mark the pictures they were judged on.
+"""`buddyline tune`: propose a detector's values from a site's own pictures, and write those pictures with marks.
 
-The values are judged by the dive's light truth where there is any. Otherwise the default detector's likely candidates
-take its place, and the proposed values are the strictest that keep them.
+The values are judged by the dive's light truth, if it has any. Otherwise the likely candidates of the default detector
+take its place, and the proposed values are the strictest ones that keep these candidates.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class Picture:
 
 @dataclass(frozen=True)
 class Judged:
-    """How a set of values does: share of lights near one of the first candidates, false candidates a picture.
+    """The quality of a set of values. recall: share of lights near one of the first candidates.
 
-    close: share of lights within 2 px of any candidate.
+    false: false candidates per picture. close: share of lights within 2 px of any candidate.
     """
 
     recall: float
@@ -73,7 +73,7 @@ class Judged:
 
     @property
     def worth(self) -> float:
-        """One figure for both."""
+        """Recall, reduced for false candidates."""
         return self.recall - COST_OF_FALSE * self.false
 
 
@@ -111,9 +111,9 @@ def run(args: argparse.Namespace) -> int:
 def propose(
     method: str, environment: str, present: Values, pictures: Sequence[Picture]
 ) -> tuple[Values, Judged, Judged]:
-    """Try one value after the other on its grid; return the best set, and how the present and the best one do.
+    """Try one value after the other on its grid; return the best set, and the quality of the present and the best one.
 
-    A value changes only where that is of use: of equals, the present one stays.
+    A value changes only where that improves the result.
     """
     best = dict(present)
     before = judged = judge(method, environment, best, pictures)
@@ -135,7 +135,7 @@ def propose(
 
 
 def judge(method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Judged:
-    """Return how a set of values does on these pictures."""
+    """Return the quality of a set of values on these pictures."""
     detector = make_detector(method, environment, values)
     found = close = lights = false = 0
     for picture in pictures:
@@ -151,7 +151,7 @@ def judge(method: str, environment: str, values: Values, pictures: Sequence[Pict
 
 
 def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple[list[Picture], str]:
-    """Return the pictures to judge by, and by what."""
+    """Return the pictures with their lights, and the source of the lights in words."""
     dives = [name for name in inputs if Path(name).suffix == ".mcap"]
     if dives and len(dives) != len(inputs):
         raise BuddylineError("give either pictures or dive logs, not both at once")
@@ -176,7 +176,7 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
 
 
 def _truths(paths: Sequence[str]) -> dict[tuple[str, int], Points]:
-    """Return the visible lights of each node's picture at each trigger, as far as these logs say."""
+    """Return the visible lights (L, 2), px, by node and trigger, from the logs' LightTruth."""
     known = {}
     with Dive(list(paths)) as dive:
         for envelope in dive.messages(LIGHT_TRUTH.name):
@@ -219,7 +219,7 @@ def _files(inputs: Sequence[str]) -> list[Path]:
 
 
 def _readable(files: Iterable[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]:
-    """Yield the pictures that can be used; the others are losses."""
+    """Yield the pictures that can be read; report the others as losses."""
     for file in files:
         try:
             yield file, decode_picture(file.read_bytes(), str(file))
@@ -232,7 +232,7 @@ def _spread(items: list[Any], limit: int) -> list[Any]:
 
 
 def _write(folder: Path, method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> None:
-    """Write every picture with what the proposed values find in it, the lights it was judged by as crosses."""
+    """Write every picture with the candidates found by the proposed values, and its lights as crosses."""
     detector = make_detector(method, environment, values)
     for picture in pictures:
         marked = mark_candidates(

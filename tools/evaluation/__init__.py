@@ -1,5 +1,5 @@
-"""The one place where errors are computed: poses and candidates measured against truth.
+"""Compare poses, tracks and candidates with truth. This is the only place in the project that computes errors.
 
-`result.evaluate` is a pure function of messages; `logs` reads them, `report` and `plots` show what came out. It
-shares no geometry with the solver or the simulator, so that a mistake of theirs cannot cancel here.
+`result.evaluate` is a pure function of messages; `logs` reads them, and `report` prints the results. It shares no
+geometry with the solver or the simulator, so that an error of theirs cannot cancel here.
 """

@@ -1,4 +1,4 @@
-"""How good the candidates are, picture by picture, where it is known where the lights are."""
+"""The quality of the candidates in each picture with known lights."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 CLOSE_PX: Final = 2.0
 FIRST: Final = (3, 5, 8)
-# Median of |x| of a standard normal: what the median of honest normalized errors comes to.
+# Median of |x| of a standard normal: the median of normalized errors if the sigmas are true.
 _NORMAL_MEDIAN: Final = 0.6745
 
 
@@ -23,11 +23,11 @@ class DetectionFigures:
     """Figures over the pictures of both nodes that have LightTruth.
 
     "Near" is within the tolerance of `lights.tolerance_px` (1 % of the width, at least 3 px).
-    lost_pictures: without Candidates; their lights count as missed. recall_*: of the visible lights. both_first: of
-    the pictures with both lights visible, those with two candidates among the first n near one light each (0: among
-    all). false_per_picture: candidates near neither light, seen or hidden. error_*_px: of the nearest candidate where
-    near. normalized_rms: of its error over its sigma_px, per axis; 1 is honest; normalized_robust: the same from the
-    median, blind to outliers.
+    lost_pictures: number without Candidates; their lights count as missed. recall_*: share of the visible lights found.
+    both_first: share of the pictures with both lights visible that have a candidate near each light among the first n
+    candidates (0: among all). false_per_picture: candidates near neither light, visible or hidden. error_*_px: of the
+    nearest candidate, where it is near. normalized_rms: RMS of its error over its sigma_px, per axis; 1 if sigma_px is
+    true. normalized_robust: the same from the median, insensitive to outliers.
     """
 
     pictures: int
@@ -46,7 +46,7 @@ class DetectionFigures:
 
 
 def _both_among(near: NDArray[np.bool_]) -> bool:
-    """Whether two different candidates stand near the left and the right light; near: (n, 2)."""
+    """Return whether two different candidates are near the left and the right light; near: (n, 2)."""
     left, right = near[:, 0], near[:, 1]
     return bool(left.any() and right.any() and (left | right).sum() >= 2)
 
@@ -54,7 +54,7 @@ def _both_among(near: NDArray[np.bool_]) -> bool:
 def detection_figures(
     lights: Mapping[tuple[str, int], TrueLights], blobs: Mapping[tuple[str, int], Blobs]
 ) -> DetectionFigures | None:
-    """Measure candidates against the marked lights; None where there is nothing to measure."""
+    """Compare candidates with the lights of LightTruth; None if there is nothing to compare."""
     marked = {key: true for key, true in lights.items() if true.marked}
     if not any(key in blobs for key in marked):
         return None

@@ -1,4 +1,4 @@
-"""Where the other node's lights truly are in a picture, and whether a pose took the right ones."""
+"""The true places of the other node's lights in a picture, and whether a pose used the right candidates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAMES: Final = ("left", "right")
 
 
 def tolerance_px(width_px: int) -> float:
-    """Return how far a candidate may stand from a light and still be taken for it: 3 px, or 1 % of the width."""
+    """Return the greatest distance of a candidate that counts as a light: 3 px or 1 % of the width, the greater."""
     return max(3.0, 0.01 * width_px)
 
 
@@ -25,8 +25,8 @@ def tolerance_px(width_px: int) -> float:
 class TrueLights:
     """The other node's left and right light in one picture.
 
-    pixels: (2, 2), NaN where a light has no place in it. visible: (2,). marked: from LightTruth; else projected
-    from the true pose, which knows nothing of what stands in between. range_m: the true one, NaN where unknown.
+    pixels: (2, 2), NaN for a light without a projection. visible: (2,). marked: from LightTruth; else projected from
+    the true pose, without regard to obstacles. range_m: the true range, NaN if unknown.
     """
 
     pixels: Floats
@@ -51,7 +51,7 @@ class Blobs:
         return cls(pixels, sigma_px, tolerance_px(frame.width_px))
 
     def distances_px(self, lights: TrueLights) -> Floats:
-        """Return how far each candidate is from the left and the right light, (N, 2), infinite where unknown."""
+        """Return the distance of each candidate from the left and the right light, (N, 2); inf where unknown."""
         away = np.linalg.norm(self.pixels[:, None, :] - lights.pixels[None, :, :], axis=-1)
         known: Floats = np.where(np.isnan(away), np.inf, away)
         return known
@@ -60,13 +60,13 @@ class Blobs:
 def project(points_c_m: Floats, camera: CameraModel) -> Floats:
     """Project points (N, 3) of the camera frame to distorted pixels (N, 2) by OpenCV's model.
 
-    NaN behind the camera, and beyond the fold where a lens polynomial leads back into the picture.
+    NaN behind the camera, and beyond the fold, where the distortion polynomial leads back into the picture.
     """
     matrix = np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
     distortion = np.array(camera.distortion)
     ahead = points_c_m[:, 2] > 1e-6
     normalized = points_c_m[:, :2] / np.where(ahead, points_c_m[:, 2], 1.0)[:, None]
-    # The way from the centre out to each point: an honest image moves outward all along it.
+    # Along the line from the centre to a point within the fold, the image moves outward everywhere.
     steps = np.linspace(0.0, 1.0, 33)[1:]
     way = np.ones((len(points_c_m), len(steps), 3))
     way[:, :, :2] = normalized[:, None, :] * steps[:, None]
@@ -86,7 +86,7 @@ def project(points_c_m: Floats, camera: CameraModel) -> Floats:
 def _projected(
     frames: Sequence[Candidates], track: TruthTrack, own: NodeInfo, other: NodeInfo, *, is_a: bool
 ) -> Iterator[tuple[Candidates, TrueLights]]:
-    """Yield the frames of one node at which the true pose is known, with the other node's lights."""
+    """Yield the frames of one node with a known true pose, with the other node's projected lights."""
     known = [(frame, pose) for frame in frames if (pose := track.at(frame.stamp_ns, frame.trigger)) is not None]
     t = np.array([pose[0] for _, pose in known]).reshape(-1, 1, 3)
     q = np.array([pose[1] for _, pose in known]).reshape(-1, 1, 4)
@@ -120,7 +120,7 @@ def true_lights(
     infos: Mapping[str, NodeInfo],
     track: TruthTrack,
 ) -> dict[tuple[str, int], TrueLights]:
-    """Return the true lights by node and trigger, from LightTruth; for a node without any, projected."""
+    """Return the true lights by node and trigger: from LightTruth, or projected for a node without it."""
     lights = {(truth.node, truth.trigger): _marked(truth, track) for truth in light_truths if truth.node in nodes}
     marked = {node for node, _ in lights}
     if not all(node in infos for node in nodes):
@@ -136,9 +136,9 @@ def true_lights(
 def is_right_pair(
     pose: RelativePose, blobs: Mapping[tuple[str, int], Blobs], lights: Mapping[tuple[str, int], TrueLights]
 ) -> bool | None:
-    """Whether a pose took the other node's lights in both pictures, left as left and right as right.
+    """Return whether a pose used the other node's true lights in both pictures, left as left and right as right.
 
-    None where the candidates or the true lights of a picture are not known.
+    None if the candidates or the true lights of a picture are not known.
     """
     for node, taken in ((pose.node_a, pose.blobs_a), (pose.node_b, pose.blobs_b)):
         seen, true = blobs.get((node, pose.trigger)), lights.get((node, pose.trigger))

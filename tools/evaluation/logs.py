@@ -1,4 +1,4 @@
-"""Reads what is to be evaluated, or exported, out of dive logs."""
+"""Read the messages to evaluate, or to export, from dive logs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from buddyline.tools.evaluation.truth import inverted
 from buddyline.tools.pairs import Pair, pair_words, wanted_pair
 
 _RESULTS: Final = (POSE, REJECTED)
-# Where a log has no result of the solver's: poses from tags are measured as any others.
+# Used where a log has no results of the solver: poses from tags are evaluated in the same way.
 _TAGS: Final = (ARTAG,)
 _TRACKS: Final = (TRACK, TRACK_LAG)
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH, NET_TRUTH)
@@ -72,7 +72,7 @@ def _choose_pair(dives: Sequence[Dive], wanted: Pair | None) -> Pair:
 
 
 def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
-    """Sort one message in; those of other nodes and pairs are dropped, and of two NodeInfo the first stays."""
+    """Store one message; messages of other nodes and pairs are dropped, and the first NodeInfo of a node is kept."""
     nodes = recorded.nodes
     if isinstance(message, Truth):
         if ids == nodes:
@@ -105,8 +105,8 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
 def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:
     """Read one pair's messages.
 
-    Poses, rejections and track are those of the first log named that holds poses or rejections. Truth comes from
-    truth_paths alone where they hold it. Of Candidates and NodeInfo of several logs, the first named stand first.
+    Poses, rejections and tracks are those of the first listed log with poses or rejections. Truth is taken only from
+    truth_paths if they have it. Candidates and NodeInfo come in the order of the listed logs.
     """
     with ExitStack() as stack:
         logs = open_each(paths, stack)
@@ -132,7 +132,7 @@ def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | Non
 
 
 def load_for_evaluation(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:
-    """Read one pair's messages; raise BuddylineError where nothing can be compared with truth."""
+    """Read one pair's messages; raise BuddylineError if nothing can be compared with truth."""
     recorded = load(paths, truth_paths, pair)
     named = ", ".join([*paths, *truth_paths])
     answered = recorded.poses or recorded.rejected

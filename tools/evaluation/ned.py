@@ -1,4 +1,4 @@
-"""Whether what poses and tracks say in north-east-down is as good as their sigmas say: against true NED."""
+"""Compare poses and tracks in NED with the truth, to check their sigmas in NED."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from msgspec import UNSET
 
 @dataclass(frozen=True)
 class NedHonesty:
-    """Mean squares of errors over their own sigmas: 1 where the sigmas are honest.
+    """Mean squares of errors over their sigmas: 1 if the sigmas are true.
 
-    samples: with true NED. A compass errs alike for minutes, so that a short dive scatters widely about 1.
+    samples: number with true NED. A compass has nearly the same error for minutes, so the values of a short dive
+    scatter widely about 1.
     """
 
     samples: int
@@ -28,7 +29,7 @@ class NedHonesty:
 
 
 def wrapped(angle_rad: Floats) -> Floats:
-    """Return angles from -pi to pi."""
+    """Return angles wrapped to -pi..pi."""
     within: Floats = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
     return within
 
@@ -42,9 +43,9 @@ def angles_of(t_ned: Floats) -> tuple[Floats, Floats]:
 def ned_honesty(
     found: Sequence[tuple[RelativePose | Track, Floats]], ned_camera_a: PoseHistory | None
 ) -> NedHonesty | None:
-    """Judge poses, or samples of a track, each with its true t_a_b_m (3,); None where none has sigmas in NED.
+    """Compare poses, or samples of a track, each with its true t_a_b_m (3,); None if none has sigmas in NED.
 
-    ned_camera_a: A's camera in NED, as it truly was.
+    ned_camera_a: A's true camera poses in NED.
     """
     if ned_camera_a is None:
         return None

@@ -1,4 +1,4 @@
-"""Whether the triggers that show all four lights end as a pose with the right pair."""
+"""How many triggers that show all four lights give a pose from the right candidates."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from buddyline.tools.evaluation.statistics import share
 
 @dataclass(frozen=True)
 class Pairing:
-    """Triggers at which both pictures show both lights of the other node.
+    """The outcomes of the triggers at which both pictures show both lights of the other node.
 
-    marked: visible by LightTruth; else: the projected lights fall inside both pictures, whatever stands in between.
-    right: of them, those that ended as a pose with the right pair; other_pair: as a pose with another; partial: as a
-    pose from fewer than four lights; wrong: as a wrong pose, whatever its pair; ended: how the rest ended, by reason
-    ("no result" among them). detected: of them, with a candidate near all four lights, and of these right_detected.
-    None where candidates or results are not known.
+    marked: visible by LightTruth; if false, the projected lights are inside both pictures, without regard to obstacles.
+    Numbers of these triggers: right: a pose from the right pair. other_pair: a pose from another pair. partial: a pose
+    from fewer than four lights. wrong: a wrong pose, from any pair. ended: the others, by reason (also "no result").
+    detected: with a candidate near all four lights. right_detected: right ones among these. None where candidates or
+    results are not known.
     """
 
     marked: bool
@@ -34,12 +34,12 @@ class Pairing:
 
     @property
     def right_share(self) -> float | None:
-        """The share of visible triggers that ended as a pose with the right pair."""
+        """Share of the visible triggers with a pose from the right pair."""
         return None if self.right is None else share(self.right, self.visible)
 
     @property
     def right_detected_share(self) -> float | None:
-        """The same, of the triggers at which all four lights were detected."""
+        """Share of the triggers with all four lights detected that have a pose from the right pair."""
         return (
             None if self.right_detected is None or self.detected is None else share(self.right_detected, self.detected)
         )
@@ -66,7 +66,7 @@ def visible_triggers(
     blobs: Mapping[tuple[str, int], Blobs],
     wrong: Collection[int],
 ) -> list[VisibleTrigger]:
-    """Return the triggers at which both pictures show both lights; wrong: the triggers of wrong poses."""
+    """Return the triggers at which both pictures show both lights. wrong: trigger numbers of wrong poses."""
     pose_at = {pose.trigger: pose for pose in poses}
     reason_at = {rejection.trigger: rejection.reason for rejection in rejected}
     answered = bool(blobs and (poses or rejected))
@@ -96,7 +96,7 @@ def visible_triggers(
 
 
 def pairing_figures(found: Sequence[VisibleTrigger]) -> Pairing | None:
-    """Return the figures of these triggers, None where there are none."""
+    """Return the figures of these triggers; None if there are none."""
     if not found:
         return None
     judged = all(one.right is not None for one in found)

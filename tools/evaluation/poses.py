@@ -1,4 +1,4 @@
-"""Errors of poses against truth, a value a pose."""
+"""Errors of poses against truth, one value per pose."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-# A pose is wrong where its position is off by more than this share of the true range.
+# A pose is wrong if its position error is above this share of the true range.
 WRONG_SHARE: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Poses that have truth, in order of time; N values each, NaN where one cannot be known.
+    """The errors of N poses with truth, in order of time; NaN where a value is not known.
 
     t_m, true_t_m: (N, 3), in A's camera frame. range_m, azimuth_rad, inclination_rad: published minus true.
-    bearing_rad: angle between the published and the true direction to B. azimuth and inclination: against true NED
-    where the dive has A's true poses in it, else against the truth turned by A's measured attitude, so that the
-    compass's own error is in neither.
-    nees6, nees3: squared error in units of the published covariance, of all six and of the position;
-    an honest covariance makes their means 6 and 3. right_pair: 1, 0 or NaN.
+    bearing_rad: angle between the published and the true direction to B. azimuth and inclination: compared with true
+    NED if the dive has A's true poses in it; else with the truth rotated by A's measured attitude, and then they do not
+    contain the compass's own error.
+    nees6, nees3: NEES of the pose and of the position; their means are 6 and 3 if the covariance is true. right_pair:
+    1, 0 or NaN.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -60,7 +60,7 @@ def nees(errors: Floats, covariances: Floats) -> Floats:
     if not len(errors):
         return result
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-    # Metres and radians share the matrix: scaled to a unit diagonal, definiteness does not hang on the units.
+    # The matrix has metres and radians: scaled to a unit diagonal, the test of definiteness does not depend on units.
     diagonal = np.diagonal(symmetric, axis1=1, axis2=2)
     positive = np.asarray((diagonal > 0.0).all(axis=1))
     scale = 1.0 / np.sqrt(np.where(positive[:, None], diagonal, 1.0))
@@ -74,7 +74,7 @@ def nees(errors: Floats, covariances: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """How n poses differ from the truth; t_m, true_t_m (n, 3), the others (n,), as in PoseErrors."""
+    """Differences of n poses from the truth; t_m, true_t_m (n, 3), the others (n,), as in PoseErrors."""
 
     t_m: Floats
     true_t_m: Floats
@@ -115,7 +115,7 @@ def _published(values: Sequence[object]) -> Floats:
 
 
 def _ned_of_a(poses: Sequence[RelativePose], ned_camera_a: PoseHistory | None) -> Floats:
-    """Return q_ned_camera (N, 4) of node a at each pose, NaN where unknown."""
+    """Return q_ned_camera (N, 4) of node a at each pose; NaN where unknown."""
     q_ned_camera = np.full((len(poses), 4), np.nan)
     for i, pose in enumerate(poses if ned_camera_a is not None else ()):
         known = ned_camera_a.at(pose.stamp_ns + pose.skew_ns // 2) if ned_camera_a is not None else None

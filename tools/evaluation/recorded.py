@@ -1,4 +1,4 @@
-"""What dive logs hold of one pair of nodes: what is evaluated, or exported."""
+"""The messages of one pair of nodes, as evaluated or exported."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from buddyline.tools.pairs import Pair
 
 @dataclass
 class Recorded:
-    """One pair's messages; truths are of T_a_b whichever way the log has them.
+    """One pair's messages. truths are of T_a_b, also if the log has T_b_a.
 
-    nodes: a and b. ned_truths_a: node a's true poses in NED, for azimuth and inclination; attitudes_a: its attitudes,
-    where these are not known. problems: for a person, a line each.
-    doubled: second outcomes of a trigger, which the logs hold and this does not.
-    environment: the water, where a log names it.
+    nodes: a and b. ned_truths_a: node a's true poses in NED, for azimuth and inclination. attitudes_a: its attitudes,
+    used if there are no true poses. problems: lines for a person. doubled: number of second outcomes of a trigger that
+    were left out. environment: the water, if a log names it.
     """
 
     nodes: Pair

@@ -1,4 +1,4 @@
-"""A result as text for a person and as plain values for a program."""
+"""Format a result: as text for a person, and as plain values for a program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DEGREES = 180.0 / math.pi
 
 
 def as_dict(result: Result) -> dict[str, Any]:
-    """Return the figures as JSON takes them: no NaN, no infinity, null for what is not known."""
+    """Return the figures as JSON values: unknown ones are null; there is no NaN and no infinity."""
     return {key: value for key, value in _plain(result).items() if key != "errors"}
 
 
@@ -145,7 +145,7 @@ def _track_text(track: TrackFigures) -> str:
 
 
 def _ned_text(ned: NedHonesty | None) -> str:
-    """Return a line to append, empty where there is nothing to say."""
+    """Return a line about the sigmas in NED; "" without figures."""
     if ned is None:
         return ""
     figures = ", ".join(

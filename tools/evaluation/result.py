@@ -1,4 +1,4 @@
-"""Poses, rejections and candidates of one pair of nodes, measured against truth."""
+"""Compare the poses, rejections, tracks and candidates of one pair of nodes with truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NEES3_GATE: Final = 7.815
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Errors of some poses; see PoseErrors. honest6, honest3: the share inside the 95 % gate of the covariance."""
+    """Errors of some poses; see PoseErrors. honest6, honest3: share with a NEES below its 95 % point."""
 
     poses: int
     wrong: int
@@ -68,7 +68,7 @@ def _share_within(values: Floats, gate: float) -> float | None:
 
 @dataclass(frozen=True)
 class RangeBin:
-    """The same by true range, from_m <= range < to_m; pairing is None where no trigger showed all lights."""
+    """The figures of one bin of true range, from_m <= range < to_m. pairing: None if no trigger showed all lights."""
 
     from_m: float
     to_m: float
@@ -78,9 +78,9 @@ class RangeBin:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that is measured of one pair. without_truth: poses that could not be compared. tracks: one a mode.
+    """All figures of one pair. without_truth: number of poses that could not be compared. tracks: one for each mode.
 
-    ned: of the poses, None without true NED. environment: the water, empty where the logs do not name it.
+    ned: of the poses; None without true NED. environment: the water; empty if the logs do not name it.
     """
 
     node_a: str
@@ -109,9 +109,9 @@ def _bins(errors: PoseErrors, visible: Sequence[VisibleTrigger]) -> list[RangeBi
 
 
 def evaluate(recorded: Recorded) -> Result:
-    """Measure one pair's poses, rejections and candidates.
+    """Compare one pair's messages with truth.
 
-    Of several Candidates of one node and trigger the first counts; those of other nodes are left out.
+    Of several Candidates of one node and trigger the first counts. Candidates of other nodes are left out.
     """
     nodes, poses, rejected, infos = recorded.nodes, recorded.poses, recorded.rejected, recorded.infos
     track = TruthTrack(recorded.truths)
@@ -127,7 +127,7 @@ def evaluate(recorded: Recorded) -> Result:
         lambda pose: is_right_pair(pose, blobs, lights),
         ned_of_camera(recorded.ned_truths_a, recorded.attitudes_a, infos.get(nodes[0])),
     )
-    # By attitudes alone, what they err by would be in neither: such sigmas are judged by true poses only.
+    # Sigmas in NED are compared only with true poses: a comparison by attitudes would not contain their errors.
     true_ned_a = ned_of_camera(recorded.ned_truths_a, [], None)
     compared = [(pose, known[0]) for pose in poses if (known := track.at(pose.stamp_ns, pose.trigger)) is not None]
     seen = visible_triggers(nodes, poses, rejected, lights, blobs, set(errors.trigger[errors.wrong].tolist()))

@@ -1,4 +1,4 @@
-"""Unit quaternions (x, y, z, w), many at once: of the evaluation's own, apart from what it measures."""
+"""Unit quaternions (x, y, z, w), many at once. The evaluation has its own, apart from the code that it evaluates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def conjugate(q_xyzw: Floats) -> Floats:
 
 
 def multiply(p_xyzw: Floats, q_xyzw: Floats) -> Floats:
-    """Return the rotations (..., 4) that turn by q first and by p after it."""
+    """Return the products p q (..., 4): the rotation q first, then p."""
     p, q = p_xyzw[..., :3], q_xyzw[..., :3]
     pw, qw = p_xyzw[..., 3:], q_xyzw[..., 3:]
     vector = pw * q + qw * p + np.cross(p, q)
@@ -30,7 +30,7 @@ def multiply(p_xyzw: Floats, q_xyzw: Floats) -> Floats:
 
 
 def rotate(q_xyzw: Floats, points: Floats) -> Floats:
-    """Return points (..., 3) turned by unit quaternions (..., 4)."""
+    """Return points (..., 3) rotated by unit quaternions (..., 4)."""
     axis, w = q_xyzw[..., :3], q_xyzw[..., 3:]
     across = np.cross(axis, points)
     turned: Floats = points + 2.0 * (w * across + np.cross(axis, across))
@@ -38,7 +38,7 @@ def rotate(q_xyzw: Floats, points: Floats) -> Floats:
 
 
 def rotation_vector(q_xyzw: Floats) -> Floats:
-    """Return the small rotations w (..., 3), rad, at most pi long, with exp(w) = q."""
+    """Return the rotation vectors w (..., 3), rad, of length pi at most, with exp(w) = q."""
     q = np.where(q_xyzw[..., 3:] < 0.0, -q_xyzw, q_xyzw)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., 3:])
@@ -47,7 +47,7 @@ def rotation_vector(q_xyzw: Floats) -> Floats:
 
 
 def interpolate(q0_xyzw: Floats, q1_xyzw: Floats, share: float) -> Floats:
-    """Return the rotation (4,) at `share` of the shorter way from q0 to q1."""
+    """Return the rotation (4,) at the share 0-1 of the shorter rotation from q0 to q1."""
     step = rotation_vector(multiply(q1_xyzw, conjugate(q0_xyzw))) * share
     half = 0.5 * float(np.linalg.norm(step))
     turn = np.append(0.5 * np.sinc(half / np.pi) * step, np.cos(half))

@@ -1,4 +1,4 @@
-"""Figures of a sample of errors."""
+"""Statistics of a sample of errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Stats:
-    """count: finite values; median and p95: of their absolute values; rmse; mean: signed (the bias)."""
+    """Statistics of errors. count: of finite values. median, p95: of absolute values. rmse. mean: signed, the bias."""
 
     count: int
     median: float | None = None
@@ -23,7 +23,7 @@ class Stats:
 
     @classmethod
     def of(cls, errors: Floats) -> Stats:
-        """Return the figures of errors (N,); NaN stands for one that is not known."""
+        """Return the statistics of errors (N,); NaN for an unknown one."""
         known = errors[np.isfinite(errors)]
         if not len(known):
             return cls(0)
@@ -38,11 +38,11 @@ class Stats:
 
 
 def share(part: int | float, whole: int | float) -> float | None:
-    """Return part / whole, None where there is no whole."""
+    """Return part / whole; None if whole is 0."""
     return part / whole if whole else None
 
 
 def in_bins(edges: Sequence[float], values: Floats) -> Iterator[tuple[float, float, NDArray[np.bool_]]]:
-    """Yield each bin's edges and which of the values (N,) lie in it: start <= value < end."""
+    """Yield each bin's edges, and a mask (N,) of the values in it: start <= value < end."""
     for start, end in pairwise(edges):
         yield start, end, (values >= start) & (values < end)

@@ -1,4 +1,4 @@
-"""The fused track of one pair, measured against truth: coverage, errors inside and outside gaps, honesty."""
+"""Compare the track of one pair with truth: coverage, errors inside and outside gaps, NEES."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from buddyline.tools.evaluation.statistics import Stats, share
 from buddyline.tools.evaluation.truth import PoseHistory, TruthTrack
 
 COVERED_SHARE: Final = TRACK_SIGMA_SHARE
-"""A track covers an instant where its position's sigma is below this share of the range."""
+"""A track covers an instant if the sigma of its position is below this share of the range."""
 WRONG_SIGMAS: Final = 3.0
-"""A track is wrong where it is off by more than WRONG_SHARE of the range and by more than this many sigma."""
+"""A track is wrong if its position error is above WRONG_SHARE of the range and above this many sigmas."""
 GAP_S: Final = NO_LIGHT_S
-"""A track is in a gap where it has used no light for longer than this."""
+"""A track is in a gap after it has used no light for longer than this."""
 
 
 @dataclass(frozen=True)
 class TrackFigures:
-    """One mode of a pair's track. samples: that have truth; wrong_in_gaps: of the wrong ones, those in a gap.
+    """The figures of one mode of a pair's track. samples: number with truth. wrong_in_gaps: wrong samples in a gap.
 
-    covered: share of the time from the first to the last pose. worst_m: largest error of position. nees6, nees3: mean
-    6 and 3 where the covariance is honest. in_gaps_m, outside_m: position errors in and outside gaps. ned: None
-    without true NED.
+    covered: share of the time from the first to the last pose that it covers. worst_m: largest position error. nees6,
+    nees3: means are 6 and 3 if the covariance is true. in_gaps_m, outside_m: position errors in and outside gaps. ned:
+    None without true NED.
     """
 
     mode: TrackMode
@@ -53,9 +53,9 @@ def tracks_figures(
     truth: TruthTrack,
     ned_camera_a: PoseHistory | None = None,
 ) -> list[TrackFigures]:
-    """Measure each mode that stands among the tracks, in the order of the modes' first samples.
+    """Return the figures of each mode among the tracks, in the order of the modes' first samples.
 
-    ned_camera_a: node a's camera in NED, as it truly was.
+    ned_camera_a: node a's true camera poses in NED.
     """
     modes = dict.fromkeys(track.mode for track in tracks)
     return [
@@ -94,7 +94,7 @@ def _figures(
 def covered_share(tracks: Sequence[Track], poses: Sequence[RelativePose]) -> float | None:
     """Return the share of the time from the first to the last pose that the track covers; None without poses.
 
-    Time is counted in the track's own median period, so that a sample that is missing counts as not covered.
+    Time is counted in the track's median period, so a missing sample counts as not covered.
     """
     if len(poses) < 2 or len(tracks) < 2:
         return None if not poses else 0.0

@@ -1,4 +1,4 @@
-"""What became of the triggers, how often they came, and how the nodes' clocks stood."""
+"""The outcomes of the triggers, their rate, and the difference of the nodes' stamps."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from buddyline.tools.evaluation.statistics import share
 
 @dataclass(frozen=True)
 class Triggers:
-    """What became of the triggers: each is to end as one pose or one rejection.
+    """The outcomes of the triggers. Each trigger should have exactly one pose or one rejection.
 
-    unanswered: with Candidates, without a result; None where the logs hold no Candidates. doubled: second results,
-    which do not count. gap_s: the longest time between two poses.
+    unanswered: number with Candidates and without an outcome; None if the logs have no Candidates. doubled: number of
+    second outcomes, which do not count. gap_s: the longest time between two poses.
     """
 
     total: int
@@ -32,7 +32,7 @@ class Triggers:
 
 @dataclass(frozen=True)
 class Skew:
-    """stamp_a - stamp_b over the poses; drift: its slope, 1e-6, with one standard deviation."""
+    """stamp_a - stamp_b over the poses. drift: its slope in ppm, with 1 sd."""
 
     median_s: float
     p95_s: float
@@ -44,7 +44,7 @@ class Skew:
 def trigger_figures(
     poses: Sequence[RelativePose], rejected: Sequence[Rejected], frames: Sequence[Candidates], doubled: int = 0
 ) -> Triggers:
-    """Return what became of all triggers, those of frames without a result among them."""
+    """Return the outcomes of all triggers, including frames without an outcome."""
     stamps_ns = {frame.trigger: frame.stamp_ns for frame in frames}
     stamps_ns |= {rejection.trigger: rejection.stamp_ns for rejection in rejected}
     stamps_ns |= {pose.trigger: pose.stamp_ns for pose in poses}
@@ -65,7 +65,7 @@ def trigger_figures(
 
 
 def skew_figures(poses: Sequence[RelativePose]) -> Skew | None:
-    """Return how the stamps of matched frames differ, None where there is no pose."""
+    """Return the difference of the stamps of matched frames; None without poses."""
     if not poses:
         return None
     skew_s = np.array([pose.skew_ns for pose in poses]) / 1e9

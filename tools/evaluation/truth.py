@@ -1,4 +1,4 @@
-"""The true pose at an instant, and the measured attitude at one."""
+"""The true pose, and the measured attitude, at any instant."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from buddyline.tools.evaluation.rotation import Floats, conjugate, interpolate, 
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# Divers turn and move within a second, not within half of one: across longer gaps a straight line is a guess.
+# Longest gap to interpolate: divers move and turn little within half a second, but not within a second.
 MAX_GAP_NS: Final = 500_000_000
-# Beside a lone truth, this is how far two clocks of one dive may stand apart.
+# The greatest distance in time at which a single truth is still used: the clocks of one dive may differ by this.
 NEAREST_NS: Final = 20_000_000
 
 
 def inverted(truth: Truth) -> Truth:
-    """Return T_b_a as truth where T_a_b is given."""
+    """Return the truth of T_b_a for a truth of T_a_b."""
     q = conjugate(normalized(np.array(truth.q_a_b_xyzw)))
     x, y, z = (-rotate(q, np.array(truth.t_a_b_m))).tolist()
     return replace(truth, t_a_b_m=(x, y, z), q_a_b_xyzw=tuple(q.tolist()))
 
 
 class PoseHistory:
-    """Rotations, and positions where there are any, over time: between its samples it interpolates."""
+    """Rotations, and positions if there are any, over time; interpolated between samples."""
 
     def __init__(self, stamps_ns: Sequence[int], t_m: Floats, q_xyzw: Floats) -> None:
         order = sorted(range(len(stamps_ns)), key=stamps_ns.__getitem__)
@@ -42,7 +42,7 @@ class PoseHistory:
         return cls([sample.stamp_ns for sample in samples], np.zeros((len(samples), 3)), q)
 
     def at(self, stamp_ns: int) -> tuple[Floats, Floats] | None:
-        """Return t (3,) and q (4,) at stamp_ns; None where no sample is near enough."""
+        """Return t (3,) and q (4,) at stamp_ns; None if no sample is near enough."""
         after = bisect_left(self.stamps_ns, stamp_ns)
         if 0 < after < len(self.stamps_ns):
             start_ns, end_ns = self.stamps_ns[after - 1], self.stamps_ns[after]
@@ -60,7 +60,7 @@ class PoseHistory:
 def ned_of_camera(
     truths: Sequence[NodePose], attitudes: Sequence[Attitude], info: NodeInfo | None
 ) -> PoseHistory | None:
-    """Return a camera in NED over time: truly where truths has it, else by attitudes, with their errors."""
+    """Return a camera's poses in NED over time: the true ones if there are any, else from the measured attitudes."""
     if truths:
         return PoseHistory(
             [truth.stamp_ns for truth in truths],
@@ -75,7 +75,7 @@ def ned_of_camera(
 
 
 class TruthTrack:
-    """True T_a_b: by trigger where the truth names it, else by time."""
+    """True T_a_b: by trigger if the truth has trigger numbers, else by time."""
 
     def __init__(self, truths: Sequence[Truth]) -> None:
         t = np.array([truth.t_a_b_m for truth in truths]).reshape(-1, 3)
@@ -86,10 +86,10 @@ class TruthTrack:
         }
 
     def at(self, stamp_ns: int, trigger: int) -> tuple[Floats, Floats] | None:
-        """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,); None where they are not known."""
+        """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,); None if they are not known."""
         named = self._by_trigger.get(trigger)
         return named if named is not None else self.interpolated(stamp_ns)
 
     def interpolated(self, stamp_ns: int) -> tuple[Floats, Floats] | None:
-        """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,) by time alone."""
+        """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,) by time only."""
         return self._track.at(stamp_ns)

@@ -1,1 +1,1 @@
-"""The experiments of the paper, again, with ours beside them: one command, one report."""
+"""The paper's experiments, repeated with the paper's method and with ours: one command, one report."""

@@ -1,4 +1,4 @@
-"""`buddyline experiments`: the paper's figures and numbers, again, with ours beside them."""
+"""`buddyline experiments`: repeat the paper's experiments, with the paper's method and with ours."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         raise BuddylineError(f"{args.output}: cannot be made: {error.strerror}") from error
     cv2.setNumThreads(1)
-    # What the commands say one by one is in the report, or of no interest.
+    # The log messages of the single commands are not shown: the report has the results.
     logging.getLogger("buddyline").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory() as folder:
         found = measure(QUICK if args.quick else FULL, Path(folder), args.output, args.tag_video)
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     (args.output / "headline.md").write_text(markdown_table(numbers.HEAD, rows))
     (args.output / "report.html").write_text(report(found, rows, args.output), encoding="utf-8")
     if args.readme is not None:
-        # Read again: a run takes minutes, and the file may have been edited meanwhile.
+        # The file is read again, because it may have been edited during the run, which takes minutes.
         text = readme.with_table(readme.read_readme(args.readme), markdown_table(numbers.HEAD, rows), code_hash)
         args.readme.write_text(text, encoding="utf-8")
     print(args.output / "report.html")
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def measure(size: Size, folder: Path, output: Path, video: Path | None) -> dict[str, Any]:
-    """Run all experiments, write the pictures into output, and return the figures."""
+    """Run all experiments, write the pictures into `output`, and return the figures. folder: for temporary dives."""
     dives: list[Rendered] = []
     truths, starts = {}, {}
     found: dict[str, Any] = {"paper": numbers.PAPER_REPORTS, "seed": SEED, "reach": {}}
@@ -134,12 +134,12 @@ def measure(size: Size, folder: Path, output: Path, video: Path | None) -> dict[
 
 
 def named(environment: str) -> str:
-    """Return an environment's name for a person."""
+    """Return an environment's name in words."""
     return environment.replace("_", " ")
 
 
 def curves_of(dive: Rendered) -> list[ErrorCurve]:
-    """Return the sound poses of a dive, out of lights and out of tags."""
+    """Return the error curves of a dive's poses from lights and from tags, without wrong poses."""
     return [
         ErrorCurve(method, errors.select(~errors.wrong), colour, marker)
         for method, colour, marker in ((OURS, "tab:blue", "."), (TAGS, "tab:orange", "x"))
@@ -149,7 +149,7 @@ def curves_of(dive: Rendered) -> list[ErrorCurve]:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Return a figure, or a dash where there is none."""
+    """Return a figure as text; a dash for None."""
     return "-" if value is None else f"{value:.{digits}f}" if isinstance(value, float) else str(value)
 
 

@@ -1,4 +1,4 @@
-"""The experiments' figures, as JSON takes them, and the table that a reader looks at first."""
+"""The experiments' figures as JSON values, and the table with the main results."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from buddyline.tools.measure.tables import percent
 
 HEAD: Final = ("", "ours", "the paper's method (or AR tags) here", "the paper reports")
 EDGES_M: Final = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.5, 15.0, 17.5, 20.0)
-# What the paper reports.
+# The results that the paper reports.
 PAPER_REPORTS: Final = {
     "right_pairs_camera": 0.724,
     "right_pairs_all_sensors": 0.8446,
     "error_1.5_to_4_m": 0.08,
     "tags_end_m": 5.0,
 }
-# Beyond the last bin that gives this share of poses, a method has ended.
+# A method reaches as far as the last bin in which at least this share of triggers gave a pose.
 _ENDS_AT: Final = 0.5
 
 
 def by_range(errors: PoseErrors) -> list[dict[str, Any]]:
-    """Return position errors by true range, bins without poses left out."""
+    """Return position errors by true range, without bins that have no poses."""
     rows = []
     for start_m, end_m, inside in in_bins(EDGES_M, errors.true_range_m):
         if not inside.any():
@@ -54,7 +54,7 @@ def by_range(errors: PoseErrors) -> list[dict[str, Any]]:
 
 
 def bounds(errors: PoseErrors, track: TruthTrack, infos: Mapping[str, NodeInfo], sigma_px: float) -> Floats:
-    """Return the Cramér-Rao bound of the position's RMS error at each pose (N,), NaN where a light is out of view."""
+    """Return the Cramér-Rao bound on the position's RMS error at each pose, (N,), m; NaN if a light is out of view."""
     known = [track.at(*one) for one in zip(errors.stamp_ns.tolist(), errors.trigger.tolist(), strict=True)]
     t_m = np.array([one[0] for one in known if one is not None]).reshape(-1, 3)
     q = np.array([one[1] for one in known if one is not None]).reshape(-1, 4)
@@ -64,7 +64,7 @@ def bounds(errors: PoseErrors, track: TruthTrack, infos: Mapping[str, NodeInfo],
 
 
 def over_bound(errors: PoseErrors, bound_m: Floats) -> dict[str, dict[str, float]]:
-    """Return by range the RMS of position error over its bound (1: nothing better is possible) and the bound itself."""
+    """Return, by range, the RMS of the position error over its bound (1 is the best possible), and the bound."""
     rows = {}
     for start_m, end_m, in_bin in in_bins(EDGES_M, errors.true_range_m):
         inside = in_bin & np.isfinite(bound_m) & ~errors.wrong
@@ -78,9 +78,9 @@ def over_bound(errors: PoseErrors, bound_m: Floats) -> dict[str, dict[str, float
 
 
 def reach(truth_ranges_m: Floats, truth_triggers: Sequence[int], errors: PoseErrors) -> dict[str, Any]:
-    """Return the share of triggers that became poses by range, the farthest pose, and where a method ends.
+    """Return the share of triggers with a pose by range, the farthest pose, and the range that a method reaches.
 
-    ends_m: the far edge of the last bin in which half of the triggers, in view or not, gave a pose.
+    ends_m: the far edge of the last bin in which half of the triggers gave a pose; all count, in view or not.
     """
     solved = set(errors.trigger[~errors.wrong].tolist())
     got = np.array([trigger in solved for trigger in truth_triggers])
@@ -101,7 +101,7 @@ def near_share(errors: PoseErrors) -> float | None:
 
 
 def pairs(dives: Sequence[Rendered]) -> dict[str, dict[str, Any]]:
-    """Return, by method and environment, how the triggers that show all four lights ended; "all": of them together."""
+    """Return the outcomes of the triggers that show all four lights, by method and environment; "all": summed."""
     table: dict[str, dict[str, Any]] = {}
     for name in (OURS, OURS_CAMERA, PAPER, PAPER_CAMERA):
         counts: dict[str, list[int]] = {}
@@ -120,7 +120,7 @@ def _pair_row(visible: int, right: int, other_pair: int, wrong: int) -> dict[str
 
 
 def environments(dives: Sequence[Rendered]) -> dict[str, Any]:
-    """Return everything that evaluate tells, by environment and method."""
+    """Return all figures of `evaluate`, by environment and method."""
     return {dive.environment: {name: as_dict(result) for name, result in dive.results.items()} for dive in dives}
 
 

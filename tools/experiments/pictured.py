@@ -1,4 +1,4 @@
-"""Pictures of one trigger, for the report: what a camera saw, what was found, and what was chosen."""
+"""Pictures of one trigger for the report: raw, with the candidates, and with the chosen pair."""
 
 from __future__ import annotations
 

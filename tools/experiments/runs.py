@@ -1,4 +1,4 @@
-"""The dives of the experiments, and what each method makes of them, by the program's own commands."""
+"""Simulate the dives of the experiments, and solve them by each method, with the program's own commands."""
 
 from __future__ import annotations
 
@@ -31,14 +31,17 @@ _SOLVES: Final[Mapping[str, tuple[str, str, str]]] = {
     PAPER: ("paper", "paper", "range,attitude,depth"),
     PAPER_CAMERA: ("paper", "paper", "range"),
 }
-"""Detector, method and checks. The paper tests the range gap, and with sensors attitude and depth."""
+"""Detector, method and checks of each. The paper checks the range gap and, with sensors, attitude and depth."""
 
 _LONG_METHODS: Final = {OURS: "refined", "paper's": "paper", "paper's text, literally": "paper_literal"}
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is simulated. seconds, rate_hz: of each rendered dive; long_*: of the dive of candidates to 20 m."""
+    """The lengths of the simulated dives. seconds, rate_hz: of each rendered dive. long_*: of the dive out to 20 m.
+
+    tank_step: every tank_step-th picture of the tank's video is used.
+    """
 
     seconds: float
     rate_hz: float
@@ -52,23 +55,23 @@ QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.
 
 
 def call(name: str, *words: str) -> None:
-    """Run one command of the program, without its summary; raise BuddylineError where it fails."""
+    """Run one command of the program, without its output; raise BuddylineError if it fails."""
     command = next(command for command in COMMANDS if command.name == name)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         status = command.run(words)
-    # Tags that no picture shows are a result, too.
+    # `artag` also returns 1 if no picture shows a tag, which is a result here.
     if status and name != "artag":
         raise BuddylineError(f"buddyline {name} {' '.join(words)}: ended with {status}")
 
 
 def measured(path: Path) -> Result:
-    """Return a solved log's errors."""
+    """Return the evaluation of a solved log."""
     return evaluate(load_for_evaluation([str(path)]))
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """One environment's dive of pictures. logs, results: by method."""
+    """One environment's dive with pictures. logs, results: by method."""
 
     environment: str
     dive: Path
@@ -77,7 +80,7 @@ class Rendered:
 
 
 def rendered(environment: str, size: Size, directory: Path) -> Rendered:
-    """Simulate a dive of pictures with tags, detect, and solve it by every method."""
+    """Simulate a dive with pictures and tags, detect lights in it, and solve it by every method."""
     dive = directory / f"{environment}.mcap"
     words = ["--environment", environment, "--seconds", str(size.seconds), "--rate", str(size.rate_hz)]
     seed = SEED + ENVIRONMENTS.index(environment)
@@ -96,7 +99,7 @@ def rendered(environment: str, size: Size, directory: Path) -> Rendered:
 
 
 def has_poses(path: Path) -> bool:
-    """Whether a log has any result: tags may have none at all."""
+    """Return whether a log has any outcome; a log from tags may have none."""
     with Dive([path]) as dive:
         return bool(dive.ids("pose", "rejected", "artag"))
 

@@ -1,6 +1,6 @@
-"""AR tags on a real tank's floor: the yardstick in real water, against the layout that its project states.
+"""AR tags on the floor of a real tank: the accuracy of poses from tags in real water, against the published layout.
 
-Tags, camera and video: github.com/mark-belbin/underwater-apriltags (MIT). Its video is given by the user.
+Tags, camera and video: github.com/mark-belbin/underwater-apriltags (MIT). The user provides the video.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _CENTRES_M: Final = {
 
 
 def layout() -> Layout:
-    """Return the floor's tags: x and y along the floor, as stated; z up."""
+    """Return the floor's tags in metres: x and y along the floor, as published; z up."""
     corners_m = np.array([(0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)]) * _SIDE_M
     flat = {tag_id: corners_m + centre_m for tag_id, centre_m in _CENTRES_M.items()}
     return Layout(_FAMILY, {tag_id: np.column_stack([corners, np.zeros(4)]) for tag_id, corners in flat.items()})
 
 
 def poses_of(video: Path, step: int) -> tuple[int, int, list[TagPose]]:
-    """Return how many pictures (every step-th) there are, how many show two tags or more, and the poses."""
+    """Return the number of pictures used (every step-th), the number with two or more tags, and the poses."""
     floor = layout()
     finder = TagFinder(floor)
     capture = cv2.VideoCapture(str(video))

@@ -1,4 +1,4 @@
-"""What things cost on this machine: processor time of one thread, so that other work does not count."""
+"""Run times on this machine, as processor time of one thread, so that other processes do not count."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def equation_1() -> float:
 
 
 def trigger(found: Path) -> dict[str, float]:
-    """Return the time of whole triggers, matching and messages included, by the candidates of a log, ms."""
+    """Return the time per trigger of a log of candidates, ms, including matching and messages."""
     core = SolverCore(SolveConfig().settings("experiments"), [("a", "b")])
     taken_ms = []
     with Dive([found]) as dive:
@@ -44,7 +44,7 @@ def trigger(found: Path) -> dict[str, float]:
             message = envelope.message
             matched, began_s = core.matched, time.process_time()
             core.handle(message)
-            # Most messages resolve nothing: those that do are the triggers.
+            # Most messages complete no trigger; only those that do are timed.
             if core.matched > matched:
                 taken_ms.append((time.process_time() - began_s) * 1e3 / (core.matched - matched))
             if len(taken_ms) >= _TRIGGERS and isinstance(message, Candidates):
@@ -53,7 +53,7 @@ def trigger(found: Path) -> dict[str, float]:
 
 
 def frame(dive: Path) -> dict[str, float]:
-    """Return the time of detection in one picture by each detector, ms, the median over pictures of a dive."""
+    """Return each detector's time per picture, ms: the median over pictures of a dive."""
     pictures = list(islice(stored_pictures(dive), _PICTURES))
     times = {}
     for method in ("source", "paper"):
