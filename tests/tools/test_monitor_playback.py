@@ -127,7 +127,13 @@ class TestReport:
         assert [address for address in outside.found if not address.startswith(("data:", "#"))] == []
         assert "default-src 'none'" in page
         assert not re.search(r"https?://", page)
-        for text in ("570 (95%)", "for 3.0 s: more than one arrangement fits (30)", "light spacing", "3.00 to 3.00 m"):
+        for text in (
+            "570 (95%)",
+            "the log holds no track of this pair",
+            "for 3.0 s: more than one arrangement fits (30)",
+            "light spacing",
+            "3.00 to 3.00 m",
+        ):
             assert text in page
 
     def test_the_replay_has_the_poses(self, dive: str) -> None:

@@ -148,7 +148,11 @@ def _maps(summary: Summary) -> str:
     depths_a = summary.depths.get(summary.picture.ends()[0] or "", [])
     plan = inline_svg(dive_figures.plan(summary.points, summary.tracks), "plan")
     profile = inline_svg(dive_figures.profile(summary.points, summary.tracks, depths_a), "profile")
-    said = "Dots: poses. Line: the track, with 95 % ellipses now and then" if summary.tracks else "Line: poses"
+    said = (
+        "Dots: poses. Line: the track, with 95 % ellipses now and then"
+        if summary.tracks
+        else "Line: poses; the log holds no track of this pair"
+    )
     by_compass = any(known(point.estimate, "sigma_azimuth_rad") for point in summary.tracks)
     compass = ", the compass's error in them" if by_compass else ""
     return f'<div class="two">{plan}{profile}</div><p class="dim">{said}{compass}.</p>'
