@@ -9,12 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
-from buddyline.protocol.messages import Candidates, NodeInfo, Truth
+from buddyline.protocol.messages import Candidates, NodeInfo, NodePose, Truth
 from buddyline.tools.cli import main
 from buddyline.tools.evaluation.lights import Blobs, is_right_pair, true_lights
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
 
-from tests.tools.evaluated import FIRST, INFOS, frame, info, light_truth, pose, rejection, truth, write_log
+from tests.tools.evaluated import (
+    FIRST,
+    INFOS,
+    PERIOD_NS,
+    frame,
+    info,
+    light_truth,
+    pose,
+    rejection,
+    truth,
+    write_log,
+)
 
 DIVES = Path(__file__).parents[3] / "shared" / "data" / "dives"
 
@@ -64,6 +75,45 @@ def test_table_says_what_a_person_asks(tmp_path, capsys):
     for words in ("3 poses of 4 triggers", "1 ambiguous", "75.0 %", "position, m", "NEES", "recall within 2 px"):
         assert words in text
     assert "nan" not in text
+
+
+def test_what_poses_say_in_ned_is_judged_by_true_ned_alone(tmp_path, capsys):
+    # A looks north, B is 3 m ahead: truly at (3, 0, 0).
+    north = [
+        NodePose(
+            net="main",
+            node="a",
+            stamp_ns=(FIRST + k) * PERIOD_NS,
+            p_m=(0.0, 0.0, 10.0),
+            q_xyzw=(0.5, 0.5, 0.5, 0.5),
+            v_mps=(0.0, 0.0, 0.0),
+            covariance=[0.0] * 36,
+            fixed=False,
+            mode="truth",
+            age_s=0.0,
+        )
+        for k in range(4)
+    ]
+    said = pose(
+        0,
+        t_ned_m=(3.1, 0.2, -0.1),
+        sigma_ned_m=(0.05, 0.1, 0.1),
+        azimuth_rad=2 * np.pi - 0.06,
+        sigma_azimuth_rad=0.02,
+        inclination_rad=0.03,
+        sigma_inclination_rad=0.06,
+    )
+    solved = write_log(tmp_path / "o.mcap", *INFOS.values(), said, pose(1), *TRUTHS, *north)
+    ned = evaluated(capsys, solved)["ned"]
+    assert ned.pop("samples") == 1
+    assert ned == pytest.approx({"north": 4.0, "east": 4.0, "down": 1.0, "azimuth": 9.0, "inclination": 0.25})
+    assert main(["evaluate", solved]) == 0
+    line = (
+        "error over sigma against true NED, mean of squares (honest: 1): north 4.00, east 4.00, down 1.00, azimuth 9.00"
+    )
+    assert line in capsys.readouterr().out
+    without = write_log(tmp_path / "w.mcap", *INFOS.values(), said, pose(1), *TRUTHS)
+    assert evaluated(capsys, without)["ned"] is None
 
 
 def test_candidates_and_truth_may_stand_in_further_logs(tmp_path, capsys):
