@@ -1,12 +1,13 @@
-"""Heading: a gyroscope's drift held down by a compass that is believed only where it can be.
+"""Heading: a compass corrects the gyroscope's drift, and is used only where it is plausible.
 
-Iron near the rig turns a compass by tens of degrees, often without changing the field's strength or dip. So
-the compass is weighed against the gyroscope by a Kalman filter of two states: the angle from the gyroscope's
-frame to magnetic north, and the rate at which the gyroscope drifts away. What strength, dip or the filter's own
-expectation contradicts is left out, and the standard deviation grows meanwhile.
+Iron near the rig turns a compass by tens of degrees, often without a change of the field's strength or dip. A Kalman
+filter with two states therefore weighs the compass against the gyroscope: the angle from the gyroscope's frame to
+magnetic north, and the gyroscope's drift. A reading that contradicts strength, dip or the filter's prediction is not
+used, and the standard deviation grows meanwhile.
 
-A field that stays the same while the node turns is the Earth's; one that turns with it is the rig's. This
-confirms what was learned at the start, and ends a disagreement that the gyroscope began.
+A field that stays the same while the node turns is the Earth's; a field that turns with the node is the rig's. The
+former confirms what was learned at the start, and ends a disagreement that the gyroscope caused. Without a known place
+and before that, the strength and dip of the last steady twenty seconds are expected.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ DIP_TOLERANCE_RAD: Final = math.radians(6.0)
 GATE_SIGMAS: Final = 3.0
 
 COMPASS_SIGMA_RAD: Final = math.radians(2.0)
-COMPASS_CORRELATION_S: Final = 3.0  # tilt errors in swell make neighbouring readings err alike
+COMPASS_CORRELATION_S: Final = 3.0  # tilt errors in swell correlate neighbouring readings
 SMOOTHING_S: Final = 0.5
-# On a rig that turns, iron's field is now and then in line with the Earth's: that is not yet its end.
+# On a rig that turns, a disturbance lines up with the Earth's field now and then; that does not end it.
 PROBATION_S: Final = 8.0
 GYRO_WALK_RAD: Final = math.radians(0.02)  # after one second
 DRIFT_CORRELATION_S: Final = 60.0
 
-# What averaging does not take away: calibration, mount and declination together.
+# What averaging does not remove: calibration, mount and declination together.
 RESIDUAL_SIGMA_RAD: Final = math.radians(2.0)
 UNCONFIRMED_SIGMA_RAD: Final = math.radians(15.0)
 UNCALIBRATED_SIGMA_RAD: Final = math.radians(30.0)
@@ -51,18 +52,21 @@ def wrap(angle_rad: float) -> float:
 
 
 class _Steady:
-    """Whether the field has stayed alike while the node turned; its mean since it has."""
+    """Detects a field that stays the same while the node turns.
+
+    seconds: how long it has. norm_t, dip_rad, delta_rad: its mean over that time.
+    """
 
     def __init__(self) -> None:
         self._restart(math.nan, math.nan, math.nan)
 
     def _restart(self, norm_t: float, dip_rad: float, delta_rad: float) -> None:
-        self._seconds = 0.0
+        self.seconds = 0.0
         self._low_rad = self._high_rad = self._turned_rad = 0.0
         self.norm_t, self.dip_rad, self.delta_rad = norm_t, dip_rad, delta_rad
 
     def update(self, dt_s: float, turn_rad: float, norm_t: float, dip_rad: float, delta_rad: float) -> bool:
-        """Take a reading; return True once it has been alike for long enough, over enough of a turn."""
+        """Take a reading; return True once the field was the same for long enough, over enough of a turn."""
         alike = (
             abs(norm_t - self.norm_t) <= STEADY_NORM * self.norm_t
             and abs(dip_rad - self.dip_rad) <= STEADY_DIP_RAD
@@ -70,22 +74,22 @@ class _Steady:
         )
         if not alike:
             self._restart(norm_t, dip_rad, delta_rad)
-        self._seconds += dt_s
+        self.seconds += dt_s
         self._turned_rad += turn_rad
         self._low_rad = min(self._low_rad, self._turned_rad)
         self._high_rad = max(self._high_rad, self._turned_rad)
-        share = dt_s / self._seconds
+        share = dt_s / self.seconds
         self.norm_t += share * (norm_t - self.norm_t)
         self.dip_rad += share * (dip_rad - self.dip_rad)
         self.delta_rad += share * wrap(delta_rad - self.delta_rad)
-        return self._seconds >= STEADY_S and self._high_rad - self._low_rad >= STEADY_TURN_RAD
+        return self.seconds >= STEADY_S and self._high_rad - self._low_rad >= STEADY_TURN_RAD
 
 
 class HeadingFilter:
-    """Finds delta: the angle, about up, from the gyroscope's level frame to the magnetic one (y north).
+    """Estimates delta: the angle, about up, from the gyroscope's level frame to the magnetic one (y north).
 
-    reference: the field that is expected here; None learns its strength and dip from the first readings.
-    problem: why the compass is not believed, "" where it is.
+    reference: the expected field; None learns its strength and dip. problem: why the compass is not used, "" where it
+    is used.
     """
 
     def __init__(self, reference: EarthField | None = None, calibrated: bool = True) -> None:
@@ -131,6 +135,9 @@ class HeadingFilter:
             self._norm_t, self._dip_rad = norm_t, dip_rad
         if self._steady.update(dt_s, turn_rad, norm_t, dip_rad, delta_rad):
             self._adopt()
+        elif self._steady.seconds >= STEADY_S and not self._known and not self._confirmed:
+            # Twenty steady seconds are a better reference than the first reading, which may be of a deck.
+            self._norm_t, self._dip_rad = self._steady.norm_t, self._steady.dip_rad
         self.problem = self._strange(norm_t, dip_rad) or self._off(delta_rad)
         self._sound_s = 0.0 if self.problem else self._sound_s + dt_s
         if not self.problem and self._sound_s < PROBATION_S:
@@ -141,7 +148,7 @@ class HeadingFilter:
         self._doubt_rad = abs(wrap(delta_rad - self.delta_rad)) if doubtful else 0.0
 
     def widen(self, turned_rad: float) -> None:
-        """Take note that the node may have turned unseen by so much, 1 sd."""
+        """Add an unobserved rotation with this standard deviation."""
         p00, p01, p11 = self._p
         self._p = (p00 + turned_rad**2, p01, p11)
         self._smooth_t = None
@@ -160,7 +167,7 @@ class HeadingFilter:
         )
 
     def _adopt(self) -> None:
-        """Take the steady field for the Earth's, unless its strength and dip are known to be others."""
+        """Take the steady field as the Earth's, unless the place is known and contradicts it."""
         steady = self._steady
         strange = self._strange(steady.norm_t, steady.dip_rad)
         if strange and self._known:
@@ -178,7 +185,7 @@ class HeadingFilter:
         self._started = True
 
     def _off(self, delta_rad: float) -> str:
-        """Say where the compass is further from what is expected than it can be."""
+        """Return a text where the compass is further from its prediction than the gate allows, else ""."""
         if not self._started:
             return ""
         off_rad = abs(wrap(delta_rad - self.delta_rad))
@@ -200,7 +207,7 @@ class HeadingFilter:
         self._p = (p00 - k0 * p00, p01 - k0 * p01, p11 - k1 * p01)
 
     def sigma_rad(self, tilt_sigma_rad: float) -> float:
-        """Return the heading's standard deviation. tilt_sigma_rad: it turns the vertical field into the horizon."""
+        """Return the heading's standard deviation. tilt_sigma_rad: a tilt adds a part of the vertical field."""
         if not self._started:
             return UNKNOWN_SIGMA_RAD
         total = self._p[0] + RESIDUAL_SIGMA_RAD**2 + (tilt_sigma_rad * math.tan(self._dip_rad)) ** 2

@@ -23,9 +23,10 @@ def level_field(delta_rad: float, norm_t: float = 48e-6, dip_rad: float = DIP_RA
 
 
 class Node:
-    """A node that turns to and fro by 100 deg every 20 s, and a compass with 0.8 uT of noise."""
+    """A node that turns to and fro by 100 deg (twice swing_rad) every 20 s, and a compass with 0.8 uT of noise."""
 
-    def __init__(self, heading: HeadingFilter, seed: int = 1) -> None:
+    def __init__(self, heading: HeadingFilter, seed: int = 1, swing_rad: float = math.radians(50)) -> None:
+        self._swing_rad = swing_rad
         self.heading = heading
         self.t_s = 0.0
         self.yaw_rad = 0.0
@@ -38,7 +39,7 @@ class Node:
         for _ in range(round(seconds / DT_S)):
             self.t_s += DT_S
             delta_rad += drift_radps * DT_S
-            yaw_rad = math.radians(50) * math.sin(2 * math.pi * self.t_s / 20.0)
+            yaw_rad = self._swing_rad * math.sin(2 * math.pi * self.t_s / 20.0)
             reading = level_field(delta_rad, **field) + rig_t * np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0])
             self.heading.predict(DT_S, BIAS_SIGMA)
             self.heading.update(DT_S, reading + self._rng.normal(0, 0.8e-6, 3), yaw_rad - self.yaw_rad)
@@ -119,6 +120,18 @@ def test_started_beside_steel_it_finds_back_without_knowing_the_place():
     assert node.heading.problem == ""
     assert node.off_deg(1.0) < 1.5
     assert math.degrees(node.heading.sigma_rad(TILT_SIGMA)) < 5
+
+
+def test_a_first_reading_that_was_a_little_off_is_no_alarm_for_the_whole_dive():
+    """Started on a deck, 10 % and 4 deg from the field of the place; the node hardly turns."""
+    node = Node(HeadingFilter(None), swing_rad=math.radians(10))
+    node.run(3, 1.0, norm_t=43e-6, dip_rad=DIP_RAD + 0.07)
+    node.run(5, 1.0)
+    assert "disturbed" in node.heading.problem
+    node.run(30, 1.0)
+    assert node.heading.problem == ""
+    assert node.off_deg(1.0) < 2.0
+    assert math.degrees(node.heading.sigma_rad(TILT_SIGMA)) > 15  # nothing has confirmed it
 
 
 def test_a_steady_field_of_another_strength_is_not_adopted_where_the_place_is_known():
