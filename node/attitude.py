@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -18,6 +19,8 @@ from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration
 from buddyline.node.heading import HeadingFilter, wrap
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import Attitude, Imu
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 SAMPLE_S: Final = 0.01
@@ -62,6 +65,15 @@ class AttitudeEstimate:
     sigma_rad: tuple[float, float, float]
     problem: str = ""
 
+    def message(self, node: str) -> Attitude:
+        """Return it as a node's message."""
+        return Attitude(
+            node=node,
+            stamp_ns=self.stamp_ns,
+            q_ned_body_xyzw=self.q_ned_body_xyzw,
+            sigma_rad=self.sigma_rad,
+        )
+
 
 class AttitudeEstimator(Protocol):
     """Estimates attitudes from samples given in order of time."""
@@ -93,6 +105,20 @@ def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[f
     nx, ny, nz, nw = h * (w + z), h * (w - z), h * (y - x), -h * (x + y)
     c, s = math.cos(turn_rad / 2), math.sin(turn_rad / 2)
     return c * nx - s * ny, c * ny + s * nx, c * nz + s * nw, c * nw - s * nz
+
+
+def attitudes(samples: Iterable[Imu], estimator: AttitudeEstimator) -> Iterator[Attitude]:
+    """Yield one node's attitudes from its inertial samples, in order of time, live or from a log.
+
+    Imu.mag_t is the uncalibrated reading, so that a log gives better attitudes with a later calibration. With the
+    calibration of the dive they are the recorded ones, except after full scale, which a log does not tell.
+    """
+    for message in samples:
+        mag_t = None if message.mag_t is UNSET else np.array(message.mag_t)
+        sample = ImuSample(message.stamp_ns, np.array(message.accel_mps2), np.array(message.gyro_radps), mag_t)
+        estimate = estimator.update(sample)
+        if estimate is not None:
+            yield estimate.message(message.node)
 
 
 class _RestWatch:

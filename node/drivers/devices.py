@@ -18,7 +18,7 @@ from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_
 from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
 from buddyline.node.geomagnetism import MagnetometerCalibration
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
-from buddyline.protocol.messages import Attitude, Depth, Imu, Message, Vector3
+from buddyline.protocol.messages import Depth, Imu, Message, Vector3
 from msgspec import UNSET
 
 log = logging.getLogger(__name__)
@@ -107,14 +107,7 @@ class ImuSource:
         estimate = self._attitude.update(sample)
         if estimate is not None:
             self._compass.update(estimate.problem)
-            messages.append(
-                Attitude(
-                    node=self._node,
-                    stamp_ns=estimate.stamp_ns,
-                    q_ned_body_xyzw=estimate.q_ned_body_xyzw,
-                    sigma_rad=estimate.sigma_rad,
-                )
-            )
+            messages.append(estimate.message(self._node))
         return messages
 
     def close(self) -> None:

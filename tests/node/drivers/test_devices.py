@@ -8,9 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from buddyline.node.attitude import VqfAttitude, attitudes
 from buddyline.node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
 from buddyline.node.drivers.devices import Metronome, open_sensors
 from buddyline.node.drivers.ms5837 import compensate_30ba
+from buddyline.node.geomagnetism import MagnetometerCalibration
 from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
@@ -86,6 +88,17 @@ def test_imu_and_attitude_at_100_hz(config, clock, board, gauge):
     assert abs(x) + abs(y) < 0.02
     for source in (imu, depth):
         source.close()
+
+
+def test_a_log_gives_the_recorded_attitudes_again(config, clock, board, gauge):
+    imu, _ = open_sensors(config, clock)
+    messages = collect(imu, clock, 6.0)
+    imu.close()
+    samples = [m for m in messages if isinstance(m, Imu)]
+    recorded = [m for m in messages if isinstance(m, Attitude)]
+    again = list(attitudes(samples, VqfAttitude(MagnetometerCalibration.none())))
+    assert recorded
+    assert again == recorded
 
 
 def test_depth_follows_once_the_surface_is_found(config, clock, board, gauge):
