@@ -1,0 +1,74 @@
+"""`make install` keeps constraints, the editable installation, and what was added before."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.processes import PATIENCE_S, REPOSITORY
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+FAKE = '#!/bin/sh\necho "$(basename "$0") $*" >> "$(dirname "$0")/said"\n'
+
+
+class Checkout:
+    """A copy of what make reads, with a pip and a program that only note how they are called."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+            shutil.copy(REPOSITORY / name, folder)
+        self.programs = folder / ".venv" / "bin"
+        self.programs.mkdir(parents=True)
+        for name in ("pip", "buddyline", "python", "fake_python"):
+            (self.programs / name).write_text(FAKE)
+            (self.programs / name).chmod(0o755)
+
+    def make(self, *words: str) -> list[str]:
+        """Run make; return the calls of its programs since the last time."""
+        said = self.programs / "said"
+        said.unlink(missing_ok=True)
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+        done = subprocess.run(
+            ["make", f"PYTHON={self.programs}/fake_python", *words],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+            cwd=self.folder,
+            env=environment,
+        )
+        assert done.returncode == 0, done.stderr
+        return said.read_text().splitlines() if said.exists() else []
+
+    def installs(self, *words: str) -> list[str]:
+        """Run make; return what pip was asked for, from its constraints on."""
+        return [call.partition("-c ")[2] for call in self.make(*words) if call.startswith("pip install")]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def test_extras_add_up_and_stay(checkout: Checkout) -> None:
+    assert checkout.installs("install") == ["constraints.txt -e ."]
+    assert checkout.installs("install", "EXTRAS=keys,monitor") == ["constraints.txt -e .[keys,monitor]"]
+    assert checkout.installs("install", "EXTRAS=plots") == ["constraints.txt -e .[keys,monitor,plots]"]
+    assert checkout.make("demo", "ARGS=--seconds 3") == ["buddyline demo --seconds 3"]
+    # A pull that changes what is needed leaves nothing out.
+    os.utime(checkout.folder / "pyproject.toml", (4e9, 4e9))
+    assert checkout.installs("demo") == ["constraints.txt -e .[keys,monitor,plots]"]
+
+
+def test_a_pi_sees_the_systems_packages_and_keeps_its_constraints(checkout: Checkout) -> None:
+    other = "CONSTRAINTS=node/examples/bookworm.txt"
+    calls = checkout.make("install", "EXTRAS=pi", other)
+    assert calls[0] == "fake_python -m venv --system-site-packages .venv"
+    assert calls[1].endswith("-c node/examples/bookworm.txt -e .[pi]")
+    assert checkout.installs("install", "EXTRAS=keys") == ["node/examples/bookworm.txt -e .[keys,pi]"]
+    assert (REPOSITORY / "node/examples/bookworm.txt").exists()
