@@ -26,7 +26,8 @@ _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 class CandidateBearings:
     """The usable candidates of T triggers, N in all: by trigger, A's picture before B's.
 
-    triggers: T. image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
+    triggers: T. counts: (T, 2) how many in A's and in B's picture.
+    image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
     picture's candidates begin. index: (N,) into the view. bearing: (3, N), bar frame. frames: (N, 3, 3) bearing and
     both tangents, px per rad over sigma_px, bar frame. place: (2, N) over the picture's width and height. variance:
     (N,) of the bearing, rad^2 per axis. disc2: (N,) square of the radius of a disc of its area, rad^2. sigma_px (N,).
@@ -34,6 +35,7 @@ class CandidateBearings:
     """
 
     triggers: int
+    counts: Indices
     image: Indices
     starts: Indices
     index: Indices
@@ -46,11 +48,6 @@ class CandidateBearings:
     dt_s: Floats
     log_score: Floats
     log_area: Floats
-
-    @property
-    def counts(self) -> Indices:
-        """(T, 2) in A's and in B's picture."""
-        return (self.starts[1:] - self.starts[:-1]).reshape(-1, 2)
 
 
 def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> CandidateBearings:
@@ -78,10 +75,12 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
     usable = np.isfinite(frames[:, 0].sum(1) + pixels.sum(1) + variance + area_px + dt_s)
     image = image[usable]
     frames, pixels, area_px = frames[usable], pixels[usable], area_px[usable]
+    counts = np.bincount(image, minlength=len(views))
     return CandidateBearings(
         triggers=len(observations),
+        counts=counts.reshape(-1, 2),
         image=image,
-        starts=starts_of(np.bincount(image, minlength=len(views))),
+        starts=starts_of(counts),
         index=index[usable],
         bearing=np.ascontiguousarray(frames[:, 0].T),
         frames=frames,
@@ -90,7 +89,7 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
         disc2=area_px / (math.pi * px2_per_sr[usable]),
         sigma_px=sigma_px[usable],
         dt_s=dt_s[usable],
-        log_score=_log_score(joined("score")[usable], image, len(views)),
+        log_score=_log_score(joined("score")[usable], image, counts),
         log_area=np.log(area_px),
     )
 
@@ -106,10 +105,10 @@ def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Float
     return frames, px2_per_sr
 
 
-def _log_score(score: Floats, image: Indices, images: int) -> Floats:
+def _log_score(score: Floats, image: Indices, counts: Indices) -> Floats:
     """Turn scores into log likelihood ratios, one on each picture's average; an unknown score is no evidence."""
     odds = np.clip(np.where(np.isfinite(score), score, 0.5), _LEAST_SCORE, 1.0 - _LEAST_SCORE)
     weight = _SCORE_WEIGHT * np.log(odds / (1.0 - odds))
-    count, total = np.bincount(image, minlength=images), np.bincount(image, np.exp(weight), minlength=images)
-    balanced: Floats = weight - np.log(total / np.maximum(count, 1))[image]
+    total = np.bincount(image, np.exp(weight), minlength=len(counts))
+    balanced: Floats = weight - np.log(total / np.maximum(counts, 1))[image]
     return balanced

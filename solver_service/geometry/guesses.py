@@ -128,7 +128,7 @@ def _combinations(batch: Batch, wanted: NDArray[np.bool_]) -> _Combinations:
     """Give pairs and single lights that lie in opposite elevations."""
     seen, pairs, rigs, sensors = batch.candidates, batch.pairs, batch.rigs, batch.sensors
     counts = pairs.counts * seen.counts[:, ::-1]
-    wanted = wanted & sensors.both & np.isfinite(sensors.depth_m) & (2 * counts.sum(1) <= _MAX_COMBINATIONS)
+    wanted = wanted & (2 * counts.sum(1) <= _MAX_COMBINATIONS)
     chosen = np.flatnonzero(wanted[pairs.trigger])
     opposite = pairs.image[chosen] ^ 1
     owner, place = places(seen.counts.ravel()[opposite])

@@ -33,7 +33,8 @@ _LEAST_COS2: Final = 1e-6
 class Pairs:
     """P pairs by picture.
 
-    image: (P,) as in CandidateBearings. ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and
+    image: (P,) as in CandidateBearings, trigger: (P,). counts: (T, 2) in A's and in B's picture.
+    ends: (2, P) candidates, first and second. c, w: (3, P) unit bisector and
     unit chord, first to second, bar frame. key: ln(alpha cos(beta) d) with its alpha^2 term. twist_rad: from one's
     own bar to the direction first -> second. variance: of ln alpha and of the twist. chord: 2 sin(alpha / 2).
     log_weight: how rarely chance puts two candidates so near each other. tan2_beta: (T,) of each trigger's widest.
@@ -42,6 +43,8 @@ class Pairs:
     """
 
     image: Indices
+    trigger: Indices
+    counts: Indices
     ends: Indices
     c: Floats
     w: Floats
@@ -53,16 +56,6 @@ class Pairs:
     tan2_beta: Floats
     gravity_rad: Floats
     gravity_across_sight: Floats
-
-    @property
-    def trigger(self) -> Indices:
-        """(P,)."""
-        return self.image >> 1
-
-    @property
-    def counts(self) -> Indices:
-        """(T, 2) in A's and in B's picture."""
-        return np.bincount(self.image, minlength=2 * len(self.tan2_beta)).reshape(-1, 2)
 
     def of_node(self, node: int) -> Indices:
         """Give the pairs in A's pictures (0) or in B's (1)."""
@@ -92,6 +85,7 @@ def find_pairs(candidates: CandidateBearings, rigs: RigPair, down: Floats, setti
         variance[keep],
         node[keep],
     )
+    trigger = image >> 1
     one, two = seen.bearing[:, ends].swapaxes(0, 1)
     # One glow may give several candidates: within it, that two are near each other is no rarity.
     crowded2 = np.maximum(chord2, seen.disc2[ends].sum(0))
@@ -108,6 +102,8 @@ def find_pairs(candidates: CandidateBearings, rigs: RigPair, down: Floats, setti
     across = falls[1] * c[2] - falls[2] * c[1]
     return Pairs(
         image=image,
+        trigger=trigger,
+        counts=np.bincount(image, minlength=2 * seen.triggers).reshape(-1, 2),
         ends=ends,
         c=c,
         w=w / chord,
@@ -116,7 +112,7 @@ def find_pairs(candidates: CandidateBearings, rigs: RigPair, down: Floats, setti
         variance=variance,
         chord=chord,
         log_weight=-np.log(crowded2 * np.maximum(room[0] * room[1], _LEAST_IN_VIEW)),
-        tan2_beta=largest(image >> 1, 1.0 / cos_beta2, seen.triggers, 1.0) - 1.0,
+        tan2_beta=largest(trigger, 1.0 / cos_beta2, seen.triggers, 1.0) - 1.0,
         gravity_rad=np.arctan2(across, along),
         gravity_across_sight=np.sqrt((along * along + across * across) / cos_beta2),
     )

@@ -75,10 +75,9 @@ class Read:
     starts: Indices
     readings: Readings
 
-    def poses_of(self, trigger: int) -> Poses:
-        """Give one trigger's poses."""
-        first, last = self.pose_starts[trigger : trigger + 2].tolist()
-        return self.poses[first:last]
+    def poses_of(self, trigger: int) -> slice:
+        """Give the places of one trigger's poses."""
+        return slice(*self.pose_starts[trigger : trigger + 2].tolist())
 
     def places_of(self, trigger: int) -> slice:
         """Give the places of one trigger's readings."""

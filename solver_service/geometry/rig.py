@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
 
 # Camera to body for the nominal mount: x forward is z, y right is x, z down is y.
@@ -110,6 +110,23 @@ class RigPair:
         """The product of both solid angles."""
         return float(self.solid_angle_sr.prod())
 
+    @cached_property
+    def R_body_bar(self) -> Floats:
+        """From the bar frames to the bodies (2, 3, 3)."""
+        return np.array([rig.R_body_camera for rig in self.in_bar_frames])
+
+    @cached_property
+    def R_magnetic_ned(self) -> Floats:
+        """From the north that each node's headings are given from to the magnetic one (2, 3, 3)."""
+        return rotation_exp(np.array([(0.0, 0.0, -rig.declination_rad) for rig in self.rigs]))
+
+    @cached_property
+    def _camera_step(self) -> Floats:
+        """From a step in A's bar frame, with a residual, to one in its camera's (7, 7)."""
+        turn = np.eye(7)
+        turn[:3, :3] = turn[3:6, 3:6] = self.R_bar_camera[0]
+        return turn
+
     def between_cameras(self, T_a_b: SE3) -> SE3:
         """Bring poses from the bar frames into the cameras'."""
         turn_a, turn_b = self.R_bar_camera
@@ -117,9 +134,7 @@ class RigPair:
 
     def by_camera_step(self, rows: Floats) -> Floats:
         """Turn rows (..., 7), derivatives by a step in A's bar frame, into those by a step in its camera's."""
-        turn = np.eye(7)
-        turn[:3, :3] = turn[3:6, 3:6] = self.R_bar_camera[0]
-        by_step: Floats = rows @ turn
+        by_step: Floats = rows @ self._camera_step
         return by_step
 
 

@@ -22,7 +22,7 @@ _IDENTITY: Final[Floats] = np.eye(3)
 _SERIES: Final = 1e-4
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(eq=False, slots=True)
 class SE3:
     """T_a_b: rotation R (..., 3, 3) and translation t_m (..., 3); leading axes are a batch.
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.observation import Observation, Sensed
 from buddyline.solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, RigPair
-from buddyline.solver_service.geometry.rotation import Floats, inner, quat_to_matrix, rotation_exp
+from buddyline.solver_service.geometry.rotation import Floats, inner, quat_to_matrix
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
@@ -30,12 +30,14 @@ class Sensors:
     """Attitudes and depths at T triggers; the second axis holds A's value first.
 
     R_ned_bar: (T, 2, 3, 3) from the bar frames to magnetic north, east, down; upright where the attitude is unknown.
-    known: (T, 2) whether the attitude is. tilt_variance: (T, 2) rad^2 per axis. heading_variance: (T,) of both
+    known: (T, 2) whether the attitude is, both: (T,) whether both are.
+    tilt_variance: (T, 2) rad^2 per axis. heading_variance: (T,) of both
     headings' difference. depth_m: (T,) of B's port below A's, NaN where unknown. depth_variance: (T,).
     """
 
     R_ned_bar: Floats
     known: NDArray[np.bool_]
+    both: NDArray[np.bool_]
     tilt_variance: Floats
     heading_variance: Floats
     depth_m: Floats
@@ -45,11 +47,6 @@ class Sensors:
     def down(self) -> Floats:
         """(T, 2, 3) in each bar frame."""
         return self.R_ned_bar[:, :, 2]
-
-    @property
-    def both(self) -> NDArray[np.bool_]:
-        """(T,) whether both attitudes are known."""
-        return self.known[:, 0] & self.known[:, 1]
 
 
 def find_sensors(observations: Sequence[Observation], rigs: RigPair) -> Sensors:
@@ -61,21 +58,20 @@ def find_sensors(observations: Sequence[Observation], rigs: RigPair) -> Sensors:
     known = inner(q, q) > 0.25
     q[~known] = (0.0, 0.0, 0.0, 1.0)
     sigma = np.where(np.isfinite(sigma).all(-1, keepdims=True), sigma, _DEFAULT_SIGMA_RAD)
-    R_body_bar = np.array([rig.R_body_camera for rig in rigs.in_bar_frames])
     # Headings corrected to true north, and not: both count alike.
-    to_magnetic = rotation_exp(np.array([(0.0, 0.0, -rig.declination_rad) for rig in rigs.rigs]))
-    R_ned_body = to_magnetic @ quat_to_matrix(q)
-    R_ned_bar = R_ned_body @ R_body_bar
+    R_ned_body = rigs.R_magnetic_ned @ quat_to_matrix(q)
+    R_ned_bar = R_ned_body @ rigs.R_body_bar
     R_ned_bar[~known] = NOMINAL_R_BODY_CAMERA
     # Roll turns about the body's x axis, pitch about the horizontal across it, yaw about the vertical.
     steep2 = R_ned_body[:, :, 2, 0] ** 2
-    roll2, pitch2, yaw2 = np.moveaxis(sigma * sigma, -1, 0)
+    roll2, pitch2, yaw2 = (sigma * sigma).transpose(2, 0, 1)
     tilt = 0.5 * (pitch2 + roll2 * (1.0 - steep2)) + _MOUNT_SIGMA_RAD**2
     heading = yaw2 + roll2 * steep2 + _HEADING_SIGMA_RAD**2
     below_m = depth[:, 1, 0] - depth[:, 0, 0]
     return Sensors(
         R_ned_bar=R_ned_bar,
         known=known,
+        both=known[:, 0] & known[:, 1],
         tilt_variance=np.where(known, tilt, _UPRIGHT_SIGMA_RAD**2),
         heading_variance=heading.sum(1),
         depth_m=np.where(known.any(1) & np.isfinite(below_m), below_m, np.nan),

@@ -32,10 +32,17 @@ _STEPS: Final = 4
 UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 
 
+def three_lights_tell(batch: Batch) -> NDArray[np.bool_]:
+    """Tell in which triggers (T,) three lights can give a pose: where attitudes and depths are known and may speak."""
+    sensors, settings = batch.sensors, batch.settings
+    if settings.method != "refined" or not settings.checks >= {"attitude", "depth"}:
+        return np.zeros(batch.triggers, dtype=bool)
+    told: NDArray[np.bool_] = sensors.both & np.isfinite(sensors.depth_m)
+    return told
+
+
 def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
-    """Give the best readings of three lights of the triggers wanted (T,), where the sensors support any."""
-    if not batch.settings.checks >= {"attitude", "depth"}:
-        wanted = np.zeros(batch.triggers, dtype=bool)
+    """Give the best readings of three lights of the triggers wanted (T,), of those in which three lights can tell."""
     guesses = guess(batch, wanted)
     seen, rigs, settings = batch.candidates, batch.rigs, batch.settings
     trigger, lights = guesses.trigger, guesses.lights

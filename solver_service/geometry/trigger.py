@@ -33,7 +33,7 @@ from buddyline.solver_service.geometry.readings import Read, Readings
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.sensors import heading_offset
-from buddyline.solver_service.geometry.three_lights import read_three_lights
+from buddyline.solver_service.geometry.three_lights import read_three_lights, three_lights_tell
 from buddyline.solver_service.geometry.weighing import Weighed, weigh_readings
 from numpy.typing import NDArray
 
@@ -111,30 +111,38 @@ def read_triggers(observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, s
 
 @dataclass(eq=False, slots=True)
 class _Batched:
-    """The readings of T triggers; tried: (T,) where those of three lights have been asked for."""
+    """The readings of T triggers.
+
+    oriented: whether both attitudes are known. three_told: where they and the depths make three lights tell a pose;
+    tried: (T,) where those have been asked for.
+    """
 
     batch: Batch
     bearing_variance: Floats
     four: FourLights
     three: Read | None
     tried: NDArray[np.bool_]
+    oriented: list[bool]
+    three_told: list[bool]
 
     @staticmethod
     def of(batch: Batch) -> _Batched:
         """Read all; of many triggers, with three lights where four may not be enough."""
         four = read_four_lights(batch)
+        told = three_lights_tell(batch)
         tried = np.zeros(batch.triggers, dtype=bool)
-        if batch.triggers > 1 and batch.settings.method == "refined":
-            tried = four.doubtful(batch)
+        if batch.triggers > 1 and told.any():
+            tried = told & four.doubtful(batch)
         seen, triggers = batch.candidates, batch.triggers
         total = np.bincount(seen.image >> 1, seen.variance, minlength=triggers)
         mean = total / np.maximum(seen.counts.sum(1), 1)
-        return _Batched(batch, mean, four, read_three_lights(batch, tried) if tried.any() else None, tried)
+        three = read_three_lights(batch, tried) if tried.any() else None
+        return _Batched(batch, mean, four, three, tried, batch.sensors.both.tolist(), told.tolist())
 
     def decide(self, trigger: int, prior: Prior | None, heading: Heading | None) -> Fix | NoFix:
         """Apply the past to one trigger, and choose."""
         settings = self.batch.settings
-        if not self.batch.sensors.known[trigger].all():
+        if not self.oriented[trigger]:
             heading = None
         past = Past.of(prior, heading, self.bearing_variance[trigger], self.batch.rigs, settings)
         four, why = None, self.four.why[trigger]
@@ -144,7 +152,7 @@ class _Batched:
             found = self._choose(trigger, four, heading)
         else:
             found = NoFix(*why)
-        if settings.method != "refined" or not _is_doubtful(found, four):
+        if not self.three_told[trigger] or not _is_doubtful(found, four):
             return found
         read = self.three
         if read is None or not self.tried[trigger]:
@@ -212,7 +220,7 @@ class _Batched:
     ) -> HeadingGap | None:
         """Compare pose k with both headings, None where they are not known or may not speak."""
         sensors = self.batch.sensors
-        if not sensors.known[trigger].all() or "attitude" not in self.batch.settings.checks:
+        if not self.oriented[trigger] or "attitude" not in self.batch.settings.checks:
             return None
         R_ned_a, R_ned_b = sensors.R_ned_bar[trigger] @ self.batch.rigs.R_bar_camera
         gap_rad, variance = heading_offset(weighed.T_a_b[k], covariance, R_ned_a, R_ned_b)
@@ -225,7 +233,7 @@ class _Batched:
         checks: list[str] = []
         if int(readings.lights[place].min()) >= 0:
             checks += [name for name in ("range", "twist") if name in settings.checks]
-        if not sensors.known[trigger].all() or "attitude" not in settings.checks:
+        if not self.oriented[trigger] or "attitude" not in settings.checks:
             checks.append("upright_assumed")
         elif readings.tilt_chi2[place] <= AGREES:
             checks.append("attitude")

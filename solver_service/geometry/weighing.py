@@ -64,12 +64,13 @@ class Weighed:
 
 def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, three: bool) -> Weighed:
     """Apply the past to the readings of one trigger; three: of three lights, so that no gap is left."""
-    poses, places = read.poses_of(trigger), read.places_of(trigger)
-    log_prior = past.weigh(poses.T_a_b)
+    poses, of_trigger, places = read.poses, read.poses_of(trigger), read.places_of(trigger)
+    log_prior = past.weigh(poses.T_a_b[of_trigger])
     log_past = log_prior
     if past.heading is not None and "attitude" in settings.checks:
-        log_past = log_prior + past.weigh_heading(poses.turn, poses.log_heading, poses.turn_variance)
-    so_far = poses.log_ratio + log_past
+        turned = poses.turn[:, of_trigger], poses.log_heading[of_trigger], poses.turn_variance[of_trigger]
+        log_past = log_prior + past.weigh_heading(*turned)
+    so_far = poses.log_ratio[of_trigger] + log_past
     chosen = _likeliest(so_far, places.stop - places.start)
     others = 0.0
     if not three and len(chosen) < len(so_far):
