@@ -240,11 +240,15 @@ def live_tracks(
     config: str | Path | None = None,
     pair: tuple[str, str] | None = None,
     seconds: float | None = None,
+    lag: bool = False,
 ) -> LiveStream[Track]:
-    """Follow the fused estimate, which goes on between poses; arguments as of live_poses."""
+    """Follow the fused estimate, which goes on between poses; arguments as of live_poses.
+
+    lag: the estimate that comes a second later and is better.
+    """
     from buddyline.protocol.messages import Track
-    from buddyline.protocol.topics import TRACK
+    from buddyline.protocol.topics import TRACK, TRACK_LAG
     from buddyline.tools.client import client_config_of
     from buddyline.tools.livestream import LiveStream
 
-    return LiveStream(TRACK, Track, client_config_of(config, connect), ids=pair, seconds=seconds)
+    return LiveStream(TRACK_LAG if lag else TRACK, Track, client_config_of(config, connect), ids=pair, seconds=seconds)

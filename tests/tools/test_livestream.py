@@ -2,19 +2,21 @@
 
 import threading
 
+import buddyline
 import pytest
 from buddyline.protocol.bus import Received
 from buddyline.protocol.codec import encode
 from buddyline.protocol.delivery import ThreadDiedError
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Depth
-from buddyline.protocol.topics import DEPTH
+from buddyline.protocol.topics import DEPTH, TRACK, TRACK_LAG
 from buddyline.tools import livestream
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import NoHubError
 from buddyline.tools.livestream import LiveStream
 
 from tests.processes import PATIENCE_S, free_endpoint
+from tests.tools.evaluated import track
 
 
 def depth(number, node="a"):
@@ -56,6 +58,15 @@ def test_only_one_nodes_where_it_is_named(bus):
         bus.publisher(DEPTH, "a").put(depth(1))
         bus.publisher(DEPTH, "b").put(depth(2, "b"))
         assert next(iter(depths)).node == "b"
+
+
+def test_tracks_come_at_once_or_a_second_later_and_better(bus):
+    live, late = bus.publisher(TRACK, "a", "b"), bus.publisher(TRACK_LAG, "a", "b")
+    with buddyline.live_tracks() as now, buddyline.live_tracks(pair=("a", "b"), lag=True) as later:
+        late.put(track(0, mode="lag"))
+        live.put(track(1, mode="filter"))
+        assert next(iter(now)).mode == "filter"
+        assert next(iter(later)).mode == "lag"
 
 
 def test_what_was_said_before_is_not_given(bus):
