@@ -62,6 +62,8 @@ class Estimate:
 
     evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
 
+    agreed_s: when a fix last agreed with it; inf where none ever bore on it.
+
     detection (2, 2): by observer and light, how likely the light is found where it is in the picture.
     """
 
@@ -90,6 +92,7 @@ class Estimate:
     bars: int = 0
     told_by: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
+    agreed_s: float = np.inf
 
 
 def alike(one: Estimate, other: Estimate) -> bool:

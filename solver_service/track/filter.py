@@ -116,6 +116,7 @@ class TrackFilter(TrackSteps):
         for estimate in self._estimates():
             if self._agrees(estimate, t_s, fix):
                 agreed = True
+                estimate.agreed_s = t_s
         if agreed:
             return
         started = self._start(t_s, fix)
@@ -151,7 +152,7 @@ class TrackFilter(TrackSteps):
                     "nodes a and b: attitudes and fixes contradict each other: another's lights, or a wrong mount"
                 )
             return None
-        estimate = Estimate(t_s, state, covariance, t_s)
+        estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s
         estimate.light_s = t_s
@@ -191,8 +192,9 @@ class TrackFilter(TrackSteps):
             for challenger in self.challengers:
                 gained = main.evidence - challenger.baseline
                 if challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL:
-                    main.end_s = challenger.start_s
-                    main.steps = [step for step in main.steps if step.t_s < main.end_s]
+                    # What went wrong did so after the last fix that agreed.
+                    main.end_s = min(challenger.start_s, main.agreed_s)
+                    main.steps = [step for step in main.steps if step.t_s <= main.end_s]
                     self.finished.append(main)
                     self.main = challenger
                     self.challengers = []

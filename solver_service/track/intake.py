@@ -71,7 +71,7 @@ class TrackIntake:
             self._report(f"node {'ab'[node]}: attitude sigmas of nothing are taken for unknown")
         t_s = self.seconds(node, seen.stamp_ns)
         bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
-        self._turning[node].add(t_s, self.level_camera(node, seen))
+        self._turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
 
     def add_depth(self, node: int, seen: DepthSeen) -> None:
         """Take a depth message."""

@@ -27,6 +27,9 @@ MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
 WITHOUT_RAD: Final = 0.03
+# How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
+# 0.7 of its sigma in half a second.
+WANDER_PER_ROOT_S: Final = 1.0
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
@@ -54,8 +57,16 @@ class TrackSteps(TrackIntake):
         return parts[0], parts[1]
 
     def _noises(self, t_s: float) -> tuple[Noise, Noise]:
-        a, b = (self.samples[node].noise(t_s).scaled(self.unrest) for node in (0, 1))
+        a, b = (self._noise(node, t_s) for node in (0, 1))
         return a, b
+
+    def _noise(self, node: int, t_s: float) -> Noise:
+        noise = self.samples[node].noise(t_s).scaled(self.unrest)
+        stated = self._turning[node].stated(t_s)
+        if stated is None:
+            return noise
+        tilt, heading = (WANDER_PER_ROOT_S * sigma for sigma in stated)
+        return replace(noise, gap_tilt_rad=tilt, gap_heading_rad=heading)
 
     def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
         span_s = t_s - estimate.t_s

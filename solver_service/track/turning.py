@@ -19,19 +19,29 @@ class Turning:
     def __init__(self) -> None:
         self._t: list[float] = []
         self._R: list[Floats] = []
+        self._sigma: list[Floats] = []
         self._white_s = -np.inf
         self._white = np.full(3, 0.008)
 
-    def add(self, t_s: float, R_level_camera: Floats) -> None:
-        """Take one attitude."""
+    def add(self, t_s: float, R_level_camera: Floats, sigma_rad: Floats) -> None:
+        """Take one attitude and its stated sigmas (3,) of roll, pitch and yaw."""
         at = bisect.bisect_right(self._t, t_s)
         self._t.insert(at, t_s)
         self._R.insert(at, R_level_camera)
+        self._sigma.insert(at, sigma_rad)
 
     def forget_before(self, t_s: float) -> None:
         """Drop attitudes older than t_s."""
         first = bisect.bisect_left(self._t, t_s)
-        del self._t[:first], self._R[:first]
+        del self._t[:first], self._R[:first], self._sigma[:first]
+
+    def stated(self, t_s: float) -> tuple[float, float] | None:
+        """Give the last stated sigmas of tilt and heading at or before t_s, rad; None before the first."""
+        last = bisect.bisect_right(self._t, t_s)
+        if last == 0:
+            return None
+        roll, pitch, heading = self._sigma[last - 1].tolist()
+        return max(roll, pitch), heading
 
     def at(self, t_s: float, known_s: float) -> tuple[Floats, Floats] | None:
         """Give R_level_camera at t_s and the variances (3,) of what is new in it, rad^2, camera axes.

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buddyline.solver_service.track.dive import filter_of, last_ns, smooth
+from buddyline.solver_service.track.dive import NodeRecord, filter_of, last_ns, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
@@ -110,17 +110,31 @@ def test_lag_is_better_than_the_filter(dive: Dive) -> None:
     assert 0.3 < judged.nees < 2.0
 
 
-def test_without_inertial_units(dive: Dive) -> None:
+def bare_of(dive: Dive) -> tuple[NodeRecord, NodeRecord]:
+    """The records without inertial samples."""
     none = np.zeros((0, 3))
-    bare = [
+    a, b = (
         replace(record, imu_stamps_ns=np.zeros(0, np.int64), accel_mps2=none, gyro_radps=none)
         for record in dive.records
-    ]
+    )
+    return a, b
+
+
+def test_without_inertial_units(dive: Dive) -> None:
+    bare = bare_of(dive)
     for records in ((bare[0], bare[1]), (dive.records[0], bare[1]), (bare[0], dive.records[1])):
         judged = score(dive, smooth(records, dive.fixes, dive.stamps_ns).rows)
         assert judged.covered >= 0.97
         assert judged.wrong == 0
         assert judged.nees < 2.5
+
+
+def test_compasses_that_wander_within_seconds_give_no_wrong_track() -> None:
+    """Where each node sees one lamp for seconds, lateral place, heading and range are told by attitudes alone."""
+    dive = make(301, Setting(seconds=40.0, near_m=4.0, far_m=8.0))
+    judged = score(dive, smooth(bare_of(dive), dive.fixes, dive.stamps_ns).rows)
+    assert judged.wrong == 0
+    assert judged.nees < 1.6
 
 
 def test_two_seconds_of_darkness() -> None:
