@@ -29,6 +29,7 @@ Bools: TypeAlias = NDArray[np.bool_]
 
 # The specific force of a node that does not accelerate, level axes.
 _AT_REST_MPS2: Final = np.array((0.0, 0.0, -9.80665))
+_IDENTITY: Final[Floats] = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ def integrate(
     """
     R0 = state.R[node]
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
-    mount = rotation_exp(state.mount_rad[node]) if told.any() else np.eye(3)
+    mount = rotation_exp(state.mount_rad[node]) if told.any() else _IDENTITY
     w = (rate_radps - state.gyro_bias_radps[node]) @ mount.T
     f = (force_mps2 - state.accel_bias_mps2[node]) @ mount.T
     h = np.diff(grid_s)
@@ -111,10 +112,12 @@ def integrate(
     # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
     whole_told = bool(told.all())
     lever = state.lever_m[node] if whole_told else np.zeros(3)
-    arm0, arm1 = R0 @ (skew(w[0]) @ lever), R @ (skew(w[-1]) @ lever)
+    spin0, spin1 = np.array((R0, R)) @ skew(w[[0, -1]])
+    arm0, arm1 = spin0 @ lever, spin1 @ lever
+    swing = R @ lever - R0 @ lever - arm0 * span
     dv, dp = weights @ u
     dv = dv - (arm1 - arm0)
-    dp = dp - (R @ lever - R0 @ lever - arm0 * span)
+    dp = dp - swing
 
     # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
     R_unmounted = R_mid @ mount
@@ -129,28 +132,27 @@ def integrate(
     force_error[:, :, 3:6] -= R_mid @ skew(f_mid)
     force_error[:, :, 6] += (R_mid @ ((f[1:] - f[:-1]) / np.maximum(h, 1e-9)[:, None])[:, :, None])[:, :, 0]
     of_force = weights * told
-    both = np.tensordot(of_force, force_error, axes=(1, 0))
-    by_bias = -np.tensordot(of_force, R_unmounted, axes=(1, 0))
-    turned = of_force @ u
+    both = (of_force @ force_error.reshape(len(h), 21)).reshape(2, 3, 7)
+    by_bias = -(of_force @ R_unmounted.reshape(len(h), 9)).reshape(2, 3, 3)
+    # An error of attitude at the start turns all that the samples say, the lever arm's part excepted.
+    by_turn = skew(np.array((arm1 - arm0, swing)) - of_force @ u)
 
     J = np.zeros((9, SIZE))
-    J[0:3, PHI[node]] = np.eye(3)
+    J[0:3, PHI[node]] = _IDENTITY
     J[0:3, GYRO_BIAS[node]] = whole[-1, :, :3]
     J[0:3, MOUNT[node]] = whole[-1, :, 3:6]
     J[0:3, DELAY[node]] = (R @ w[-1] - R0 @ w[0]) * whole_told
     for row, block in ((3, 0), (6, 1)):
         rows = slice(row, row + 3)
-        J[rows, PHI[node]] = -skew(turned[block])
+        J[rows, PHI[node]] = by_turn[block]
         J[rows, GYRO_BIAS[node]] = both[block][:, :3]
         J[rows, MOUNT[node]] = both[block][:, 3:6]
         J[rows, DELAY[node]] = both[block][:, 6]
         J[rows, ACCEL_BIAS[node]] = by_bias[block]
     # The lever arm's part is a difference of end points; of its errors, its own and the attitude's count.
     if whole_told:
-        J[3:6, LEVER[node]] = -(R @ skew(w[-1]) - R0 @ skew(w[0]))
-        J[6:9, LEVER[node]] = -(R - R0 - R0 @ skew(w[0]) * span)
-    J[3:6, PHI[node]] += skew(arm1 - arm0)
-    J[6:9, PHI[node]] += skew(R @ lever - R0 @ lever - arm0 * span)
+        J[3:6, LEVER[node]] = spin0 - spin1
+        J[6:9, LEVER[node]] = R0 + spin0 * span - R
     gap = float(h @ ~told)
     return Increment(R, dv, dp, J, gap, w[-1])
 
@@ -171,8 +173,8 @@ def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -
     F[R_] = b.jacobian[6:9] - a.jacobian[6:9]
     F[V_] = b.jacobian[3:6] - a.jacobian[3:6]
     F[PHI[0]], F[PHI[1]] = a.jacobian[0:3], b.jacobian[0:3]
-    F[R_, R_] = F[V_, V_] = np.eye(3)
-    F[R_, V_] = span_s * np.eye(3)
+    F[R_, R_] = F[V_, V_] = _IDENTITY
+    F[R_, V_] = span_s * _IDENTITY
     F[:, :NAV] = F[:, :NAV] @ plain_of_invariant(state)
     return after, invariant_of_plain(after) @ F
 
@@ -183,7 +185,6 @@ def process_noise(
     """Give what a step adds to the covariance: of the moving errors (NAV, NAV), and of each other error (SIZE-NAV,)."""
     Q = np.zeros((NAV, NAV))
     walk = np.zeros(SIZE)
-    eye = np.eye(3)
     force = 0.0
     for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
         force += noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * part.gap_s
@@ -194,11 +195,11 @@ def process_noise(
         else:
             turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s
             walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
-        Q[PHI[node], PHI[node]] = turn * eye
+        Q[PHI[node], PHI[node]] = turn * _IDENTITY
         walk[ACCEL_BIAS[node]] = noise.accel_bias_mps2**2 * span_s
-    Q[V_, V_] = force * eye
-    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * eye
-    Q[R_, R_] = span_s * span_s / 3.0 * force * eye
+    Q[V_, V_] = force * _IDENTITY
+    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * _IDENTITY
+    Q[R_, R_] = span_s * span_s / 3.0 * force * _IDENTITY
     T = invariant_of_plain(after)
     return T @ Q @ T.T, walk[NAV:]
 
