@@ -1,4 +1,4 @@
-"""Attitude in simulated swell, with truth: tilt, heading, their sigmas, and what throws them off."""
+"""Attitude in simulated swell, with truth: tilt, heading, their sigmas, and disturbances."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_heading_sigma_shrinks_once_a_turn_has_confirmed_the_field():
     assert np.degrees(run.sigmas_rad[-1, 2]) < 5
 
 
-def test_without_a_magnetometer_the_heading_is_anything():
+def test_without_a_magnetometer_the_heading_may_be_any_angle():
     dive = swell.simulate(12.0)
     estimator = VqfAttitude(SOUND, HERE)
     out = None

@@ -1,4 +1,4 @@
-"""chronyc's reports as chrony 4.3 prints them, and everything else that may stand there under that name."""
+"""chronyc's reports as chrony 4.3 prints them, and other outputs of a program of that name."""
 
 import pytest
 from buddyline.node.chrony import ChronyError, decode_tracking, read_tracking
@@ -69,7 +69,7 @@ def test_a_chronyd_that_does_not_run(chronyc):
         read_tracking(10.0)
 
 
-def test_a_chronyc_that_fails_without_a_word(chronyc):
+def test_a_chronyc_that_fails_without_output(chronyc):
     chronyc("exit 3")
     with pytest.raises(ChronyError, match="status 3"):
         read_tracking(10.0)

@@ -48,7 +48,7 @@ def test_own_forged_and_broken_beacons_are_not_heard():
     assert a.refusals.count == 2
 
 
-def test_no_crowd_makes_a_beacon_that_nobody_takes():
+def test_a_beacon_stays_valid_with_too_many_nodes():
     a = Beacons("a", "boot")
     for number in range(3 * MAX_HEARD):
         a.hear(received(of(f"n{number}", NOW_NS)), 0.0)

@@ -1,4 +1,4 @@
-"""A clock that is set is told from one that drifts or is slewed."""
+"""A clock that is set is distinguished from one that drifts or is slewed."""
 
 import pytest
 from buddyline.node.clock_watch import ClockWatch

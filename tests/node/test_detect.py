@@ -1,4 +1,4 @@
-"""Every detector: what it takes, what it gives, what it refuses."""
+"""Every detector: its input, its output, and what it refuses."""
 
 import numpy as np
 import pytest
@@ -61,7 +61,7 @@ def test_candidates_lie_inside_a_picture_full_of_noise(method):
         assert d.blob.sigma_px > 0
 
 
-def test_what_is_unknown_is_refused_with_the_choices():
+def test_an_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(BuddylineError, match="source"):
         make_detector("sauce")
     with pytest.raises(BuddylineError, match="night_reef"):

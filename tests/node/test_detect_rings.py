@@ -42,7 +42,7 @@ def test_rays_that_find_no_edge_are_open_and_those_that_leave_the_picture_are_no
     assert shapes.edge_px[0, 0, 0, leftward] == pytest.approx(20.5, abs=1.0)
 
 
-def test_what_lies_inside_an_earlier_one_is_left_out():
+def test_a_place_that_overlaps_an_earlier_one_is_left_out():
     centre_px = np.array([[100.0, 100.0], [104.0, 100.0], [120.0, 100.0], [100.0, 130.0], [200.0, 200.0]])
     radius_px = np.array([10.0, 1.0, 1.0, 50.0, 1.0])
     assert distinct(centre_px, radius_px, 9) == [0, 2, 4]

@@ -1,4 +1,4 @@
-"""The default detector on rendered lamps: where the source is, how sure, in which order, in which picture."""
+"""The default detector on rendered lamps: the place of the source, its sigma, the order, sizes of pictures."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ def test_a_small_lamp_is_found_to_a_fraction_of_a_pixel(offset, grey):
     assert error_px(make_detector().detect(image), 200 + offset, 150 - offset) < 0.2
 
 
-def test_the_source_of_a_clipped_leaning_glow_is_not_the_middle_of_what_is_clipped():
+def test_the_source_of_a_leaning_glow_is_not_the_centre_of_its_clipped_core():
     image = lamp_picture([(205.0, 154.0)], core=400.0, core_px=3.0, glow=8000.0, lean=0.6, noise=1.0)
     clipped = np.argwhere(image.min(axis=2) >= 250)
     middle_off_px = float(clipped[:, 1].mean() - 205.0)
@@ -37,7 +37,7 @@ def test_the_source_of_a_clipped_leaning_glow_is_not_the_middle_of_what_is_clipp
     assert error_px(make_detector().detect(image), 205.0, 154.0) < 0.5 * middle_off_px
 
 
-def test_sigma_grows_with_what_the_extrapolation_cannot_know():
+def test_sigma_is_larger_for_a_large_clipped_core():
     small = lamp_picture([(205.0, 154.0)], core=180.0, core_px=1.6, noise=1.0)
     large = lamp_picture([(205.0, 154.0)], core=400.0, core_px=3.0, glow=5000.0, lean=0.6, noise=1.0)
     sigma_small = nearest(make_detector().detect(small), 205, 154).sigma_px
@@ -83,7 +83,7 @@ def test_a_view_into_a_padded_buffer_is_as_good_as_a_picture():
     assert seen[0] == seen[1]
 
 
-def test_a_crowd_of_lamps_hides_none():
+def test_many_lamps_are_all_found():
     lamps = [(60.0 + 95 * column, 60.0 + 85 * row) for row in range(3) for column in range(4)]
     found = make_detector().detect(lamp_picture(lamps, core=300.0, core_px=1.8, glow=40.0))
     assert max(error_px(found, *lamp) for lamp in lamps) < 1.0
@@ -112,7 +112,7 @@ def test_noise_of_a_high_gain_is_no_light():
     assert all(d.blob.score < 0.5 for d in found)
 
 
-def test_other_sizes_in_between_leave_no_trace():
+def test_pictures_of_other_sizes_in_between_change_nothing():
     detector = make_detector("source", "cavern")
     image = lamp_picture([(150.0, 100.0)], size=(320, 240))
     before = [d.blob for d in detector.detect(image)]

@@ -1,4 +1,4 @@
-"""Declination, dip and strength of the Earth's field, and the rig's own field taken off."""
+"""Declination, dip and strength of the Earth's field, and the removal of the rig's own field."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_declination_moves_with_the_date_and_goes_on_past_the_model():
 
 
 @pytest.mark.parametrize(("latitude", "longitude"), [(91.0, 0.0), (0.0, 200.0), (float("nan"), 0.0)])
-def test_a_position_that_is_none_is_refused(latitude, longitude):
+def test_a_position_out_of_range_is_refused(latitude, longitude):
     with pytest.raises(BuddylineError, match="position"):
         earth_field(latitude, longitude, NOV_2025_NS)
 
@@ -65,7 +65,7 @@ def test_calibration_undoes_what_the_rig_does():
     assert not calibration.is_none
 
 
-def test_none_changes_nothing():
+def test_the_empty_calibration_changes_nothing():
     none = MagnetometerCalibration.none()
     assert none.is_none
     assert none.apply(np.array([1e-5, 2e-5, 3e-5])) == pytest.approx([1e-5, 2e-5, 3e-5])

@@ -1,4 +1,4 @@
-"""The gated compass on its own: what it believes, what it leaves out, and how sure it says it is."""
+"""The gated compass alone: what it uses, what it leaves out, and its sigma."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_a_steady_field_of_another_strength_is_not_adopted_where_the_place_is_kn
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
 
 
-def test_a_turn_not_seen_opens_the_gate():
+def test_an_unmeasured_turn_opens_the_gate():
     node = Node(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.heading.widen(math.radians(30))

@@ -26,7 +26,7 @@ def test_rows_have_their_own_times():
     assert [blob.dt_ns for blob in blobs] == [-50_000, 0, 50_000]
 
 
-def test_what_is_outside_is_left_out_and_what_is_too_much_counted():
+def test_blobs_outside_the_picture_are_left_out_and_surplus_ones_counted():
     blobs, truncated = blobs_of([detection(-0.6, 5.0), detection(5.0, 100.6), detection(199.4, 100.4)], frame())
     assert [(blob.u_px, blob.v_px) for blob in blobs] == [(199.4, 100.4)]
     assert truncated == 0

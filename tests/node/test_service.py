@@ -1,4 +1,4 @@
-"""A node as systemd and a diver meet it: ready, watched, stopped, on a disk that runs full, on a clock that is set."""
+"""A whole node: ready, watched, stopped, with a disk that fills up, with a clock that is set."""
 
 import contextlib
 import json

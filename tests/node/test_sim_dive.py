@@ -39,7 +39,7 @@ def test_a_dive_holds_every_topic_at_its_rate_in_order_of_time():
     assert all(encode(message) for _, _, message in entries)
 
 
-def test_triggers_are_those_of_the_contract_and_exposures_stray():
+def test_triggers_follow_the_protocol_and_exposures_have_jitter():
     period_ns = DivePlan(rate_hz=8).period_ns
     entries = _dive(DivePlan(seconds=10, rate_hz=8, lost_share=0.1))
     frames = [m for _, _, m in entries if isinstance(m, Candidates) and m.node == "a"]

@@ -168,7 +168,7 @@ def test_a_passer_hides_the_light_that_truth_calls_hidden():
     assert checked >= 3
 
 
-def test_lights_that_stand_close_are_told_to_merge():
+def test_lights_that_are_close_are_marked_as_merged():
     for baseline_m, merged in ((0.05, True), (0.88, False)):
         world = World(Scenario(environment="cavern", seed=1, baseline_b_m=baseline_m, **QUIET))
         truth = world.light_truth("a", 4 * S_NS, 0)
@@ -177,7 +177,7 @@ def test_lights_that_stand_close_are_told_to_merge():
 
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(1640, 1232), (333, 211), (64, 48)])
-def test_any_picture_size_will_do(width_px, height_px):
+def test_any_picture_size_works(width_px, height_px):
     world = World(Scenario(environment="basin", width_px=width_px, height_px=height_px))
     image = world.render("b", 3 * S_NS)
     assert image.shape == (height_px, width_px, 3)

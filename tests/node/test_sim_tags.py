@@ -1,4 +1,4 @@
-"""AR tags in simulated pictures, found by OpenCV where the truth says that they are."""
+"""AR tags in simulated pictures, found by OpenCV at their true places."""
 
 import cv2
 import numpy as np

@@ -131,7 +131,7 @@ def test_true_poses_in_ned_are_those_of_the_pair_also_with_clocks_apart():
     np.testing.assert_allclose(later.p_m, np.add(b.p_m, np.array(b.v_mps) / 100), atol=1e-3)
 
 
-def test_two_worlds_agree_whatever_the_order_of_questions():
+def test_two_worlds_agree_in_any_order_of_calls():
     one, two = (World(Scenario(environment="basin", seed=9, start_ns=START_NS)) for _ in range(2))
     stamps = [START_NS + k * 700_000_001 for k in range(12)]
 
@@ -256,7 +256,7 @@ def _euler(R):
     return np.array([np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(R[2, 0]), np.arctan2(R[1, 0], R[0, 0])])
 
 
-def test_attitude_and_depth_are_as_good_as_they_say():
+def test_attitude_and_depth_errors_match_their_sigmas():
     """Normalized errors over many seeds: their mean square is 1."""
     squares = []
     for seed in range(40):
@@ -288,7 +288,7 @@ def test_a_clock_offset_shifts_what_b_sees_and_not_the_truth():
     assert shifted.lights == good.light_truth("b", stamp_ns, 0).lights
 
 
-def test_candidates_are_as_noisy_as_they_say():
+def test_candidate_errors_match_their_sigmas():
     scenario = Scenario(seed=8, gross_share=0.0, miss_share=0.0, false_lights=0, other_lamps=0, sigma_px=0.5)
     world = World(scenario)
     errors = []

@@ -1,4 +1,4 @@
-"""Stored pictures: what can be used, what is said of the rest."""
+"""Stored pictures: those that can be used, and the reports of the others."""
 
 import threading
 
@@ -85,7 +85,7 @@ def test_a_dive_keeps_its_own_times(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["", "/nonexistent", "empty"])
-def test_nothing_to_show_is_said(tmp_path, path):
+def test_a_source_without_pictures_is_reported(tmp_path, path):
     if path == "empty":
         path = str(tmp_path)
     with pytest.raises(ConfigError, match=r"camera\.path"):

@@ -130,7 +130,7 @@ def test_a_clock_that_is_set_is_locked_onto_again(step_ns):
     assert lock.locked
 
 
-def test_residual_is_told_before_and_after():
+def test_residual_is_reported_before_and_after_the_lock():
     camera = FreeCamera()
     lock = lock_for(camera)
     assert lock.residual_ns is None

@@ -1,4 +1,4 @@
-"""The contract that every bus keeps: within one process, and over Zenoh with a real hub on loopback."""
+"""The contract of every bus: within one process, and over Zenoh with a real hub on loopback."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_a_late_joiner_gets_several_keys_messages_by_their_stamps_and_then_both(
     assert [payload_stamp_ns(r.payload) for r in inbox.received] == list(range(102))
 
 
-def test_what_was_said_last_is_known_when_who_said_it_is_gone(client: Connect) -> None:
+def test_the_newest_message_is_known_after_its_publisher_is_gone(client: Connect) -> None:
     solver, reader = client(), client()
 
     def known() -> list[tuple[str, int]]:
@@ -319,7 +319,7 @@ def test_an_exception_in_a_handler_is_the_buss_failure(client: Connect) -> None:
     assert late == [bus.failure]
 
 
-def test_the_living_are_known_and_the_gone_too(client: Connect) -> None:
+def test_processes_that_start_and_end_are_reported(client: Connect) -> None:
     first, second, watcher, messages = client(), client(), client(), Inbox()
     changes: list[tuple[str, bool]] = []
     watcher.subscribe(topics.EVERYTHING, messages)
@@ -336,7 +336,7 @@ def test_the_living_are_known_and_the_gone_too(client: Connect) -> None:
     assert messages.received == []
 
 
-def test_a_second_of_the_same_name_is_noticed(client: Connect) -> None:
+def test_another_process_of_the_same_name_is_alive(client: Connect) -> None:
     first, second = client(), client()
     changes: list[tuple[str, bool]] = []
     assert not first.is_alive("node/a")
@@ -354,7 +354,7 @@ def test_a_second_of_the_same_name_is_noticed(client: Connect) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "node/*", "node//a", "a/", "@x"])
-def test_a_name_that_is_no_key_is_refused(client: Connect, name: str) -> None:
+def test_an_alive_name_that_cannot_be_a_key_is_refused(client: Connect, name: str) -> None:
     with pytest.raises(ValueError, match="alive name"):
         client().declare_alive(name)
 
@@ -382,7 +382,7 @@ def test_previews_are_capped_and_never_kept(client: Connect) -> None:
     assert [r.key for r in late.wait_for(1)] == ["buddyline/node/a/depth"]
 
 
-def test_what_is_closed_sends_nothing_and_leaves_no_thread(client: Connect) -> None:
+def test_a_closed_bus_sends_nothing_and_leaves_no_thread(client: Connect) -> None:
     before = set(threading.enumerate())
     bus = client()
     publisher = bus.publisher(topics.DEPTH, "a")
@@ -396,7 +396,7 @@ def test_what_is_closed_sends_nothing_and_leaves_no_thread(client: Connect) -> N
     assert set(threading.enumerate()) - before == set()
 
 
-def test_closing_lets_the_handler_finish_what_has_come(client: Connect) -> None:
+def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(200):
         publisher.put(rejected(trigger))

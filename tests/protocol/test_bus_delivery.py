@@ -64,7 +64,7 @@ def test_a_handler_may_close_its_own_queue() -> None:
     assert closed.wait(PATIENCE_S)
 
 
-def test_the_first_death_is_kept() -> None:
+def test_the_first_failure_is_kept() -> None:
     failures = FailureLatch()
     failures.report("one", KeyError("x"))
     failures.report("two", KeyError("y"))
@@ -94,7 +94,7 @@ def test_a_rate_cap_outlives_pauses_and_a_clock_set_back() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan")])
-def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
+def test_a_rate_cap_of_zero_or_less_is_refused(rate_hz: float) -> None:
     with pytest.raises(ValueError, match="max_rate_hz"):
         RateCap(rate_hz, ManualClock())
 

@@ -1,4 +1,4 @@
-"""Order out of what comes: laws over random losses, and the cases by hand."""
+"""Samples in order, each once: laws over random losses, and single cases."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Listener:
     st.lists(st.tuples(st.sampled_from([A, B]), st.booleans(), st.booleans()), max_size=60),
     st.lists(st.integers(0, 5), max_size=60),
 )
-def test_all_that_can_be_had_comes_in_order_and_once(
+def test_all_available_samples_come_in_order_and_once(
     samples: list[tuple[tuple[str, int], bool, bool]], delays: list[int]
 ) -> None:
     """Some samples are lost on their way, some of those are still held; fetching takes a while."""
@@ -70,7 +70,7 @@ def test_all_that_can_be_had_comes_in_order_and_once(
     assert listener.sequence.missed <= counted
 
 
-def test_what_follows_a_gap_waits_for_it_and_other_publishers_do_not() -> None:
+def test_samples_after_a_gap_wait_and_other_publishers_do_not() -> None:
     listener = Listener()
     listener.accept(A, 0)
     gap = listener.accept(A, 3)
@@ -83,7 +83,7 @@ def test_what_follows_a_gap_waits_for_it_and_other_publishers_do_not() -> None:
     assert listener.sequence.missed == 1
 
 
-def test_a_gap_behind_a_gap_is_closed_in_its_turn() -> None:
+def test_a_second_gap_is_closed_after_the_first() -> None:
     listener = Listener()
     listener.accept(A, 0)
     first = listener.accept(A, 2)
@@ -96,7 +96,7 @@ def test_a_gap_behind_a_gap_is_closed_in_its_turn() -> None:
     assert listener.sequence.missed == 2
 
 
-def test_what_was_before_a_publisher_was_heard_of_is_fetched_and_not_missed() -> None:
+def test_samples_before_a_publishers_first_are_fetched_and_not_counted_as_missed() -> None:
     listener = Listener()
     gap = listener.accept(A, 5)
     assert gap == Gap(A, "key", range(5), known=False)
@@ -118,7 +118,7 @@ def test_duplicates_and_latecomers_are_dropped() -> None:
     assert listener.numbers() == [0, 1, 2, 3, 4]
 
 
-def test_without_recovery_losses_are_counted_and_passed_over() -> None:
+def test_without_recovery_losses_are_counted_and_skipped() -> None:
     listener = Listener()
     for number in (10, 11, 14):
         assert listener.accept(A, number, recover=False) is None

@@ -173,7 +173,9 @@ def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> No
         ("a node's", "sound", "certificate of the hub at .* is not for this end"),
     ],
 )
-def test_a_refusal_says_which_and_why(keys: Path, tmp_path: Path, hub_is: str, client_is: str, says: str) -> None:
+def test_a_refusal_names_the_certificate_and_the_reason(
+    keys: Path, tmp_path: Path, hub_is: str, client_is: str, says: str
+) -> None:
     own = copy_of(keys, tmp_path / "own")
     other = make_keys(tmp_path / "other", "a")
     sound = {"hub": tls(own, "hub"), "client": tls(own, "node-a")}
@@ -263,9 +265,7 @@ def listener(endpoint: str, answer: Callable[[socket.socket], object]) -> Iterat
     ],
     ids=["closed", "reset", "half a record", "zenoh", "http", "alert: internal error", "alert: handshake failure"],
 )
-def test_what_is_no_verdict_on_a_certificate_is_waited_for(
-    keys: Path, answer: Callable[[socket.socket], object]
-) -> None:
+def test_only_a_rejected_certificate_ends_the_wait(keys: Path, answer: Callable[[socket.socket], object]) -> None:
     endpoint = tls_endpoint()
     with listener(endpoint, answer):
         assert refusal(endpoint, tls(keys, "node-a")) is None

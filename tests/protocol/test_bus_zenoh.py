@@ -1,4 +1,4 @@
-"""What only the bus between processes can do wrong: a hub that is absent, taken, killed; sockets; stdout."""
+"""Faults that only the bus between processes can have: a hub that is absent, in use, killed; sockets; stdout."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def hub_process(endpoint: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def test_a_hub_that_is_not_there_yet_is_waited_for_and_said_once() -> None:
+def test_a_missing_hub_is_waited_for_and_reported_once() -> None:
     endpoint, said, waiting = free_endpoint(), [], threading.Event()
     connected: list[Bus | None] = []
 
@@ -166,14 +166,14 @@ def test_waiting_for_a_hub_ends_with_stop(listener: str) -> None:
 @pytest.mark.parametrize(
     "endpoint", ["", "localhost:7447", "tcp/7447", "udp/127.0.0.1:7447", "tcp/127.0.0.1:99999", "tcp/a b:1"]
 )
-def test_an_endpoint_that_is_none_is_refused(endpoint: str) -> None:
+def test_an_invalid_endpoint_is_refused(endpoint: str) -> None:
     with pytest.raises(BuddylineError, match="tcp/<host>:<port>"):
         connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
     with pytest.raises(BuddylineError, match="tcp/<host>:<port>"):
         open_hub(endpoint)
 
 
-def test_a_port_in_use_is_said() -> None:
+def test_a_port_in_use_is_reported() -> None:
     endpoint = free_endpoint()
     with open_hub(endpoint), pytest.raises(BuddylineError, match=f"{endpoint} is in use"):
         open_hub(endpoint)
@@ -202,7 +202,7 @@ def test_namespaces_keep_two_systems_apart() -> None:
         assert second.newest(topics.POSE) == []
 
 
-def test_the_hub_remembers_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_hub_retains_a_bounded_number_of_messages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MAX_RETAINED", 2)
     with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
         poses = {name: bus.publisher(topics.POSE, "a", name) for name in ("x", "y", "z")}
@@ -297,7 +297,7 @@ def test_closing_does_not_wait_for_a_hub_that_is_gone_or_frozen() -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/fd"), reason="needs /proc")
-def test_a_connection_that_hears_nothing_is_made_anew(
+def test_a_connection_that_receives_nothing_is_cut_and_made_again(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Half a connection, as Zenoh may leave it: here its other end stands still for less than the lease."""
@@ -361,7 +361,7 @@ def test_nothing_listens_but_the_hub_and_stdout_is_ours() -> None:
         assert sockets("client") == [[[], 1], [[], 2]]
 
 
-def test_samples_that_never_came_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_samples_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foreign publisher whose numbers jump, and who cannot be asked for what is missing."""
     monkeypatch.setattr(subscription_module, "FETCHES", 2)
     inbox = Inbox()

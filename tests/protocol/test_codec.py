@@ -1,4 +1,4 @@
-"""Bytes and messages: what decodes is sound, and nothing unsound goes out."""
+"""Bytes and messages: every decoded message is valid, and no invalid message is encoded."""
 
 import contextlib
 import math
@@ -23,7 +23,7 @@ def test_unknown_fields_are_ignored():
     assert decode(payload, Depth) == Depth(node="a", stamp_ns=7, depth_m=3.0, sigma_m=1.0)
 
 
-def test_nothing_unsound_goes_out():
+def test_no_invalid_message_is_encoded():
     with pytest.raises(MessageError, match="depth_m"):
         encode(Depth(node="a", stamp_ns=0, depth_m=math.nan, sigma_m=0.02))
     with pytest.raises(MessageError, match="node"):
@@ -56,7 +56,7 @@ def test_any_bytes_decode_or_are_refused(payload):
             assert isinstance(decode(payload, schema), schema)
 
 
-def test_a_payload_tells_its_stamp_whatever_its_kind():
+def test_every_kind_of_payload_has_its_stamp():
     depth = Depth(node="a", stamp_ns=1_764_000_000_000_000_001, depth_m=3.0, sigma_m=1.0)
     time = FoxgloveTime(sec=1_764_000_000, nsec=2)
     image = CompressedImage(timestamp=time, frame_id="a_camera", data=b"x", format="jpeg")

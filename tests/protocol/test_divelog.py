@@ -1,4 +1,4 @@
-"""Dive logs: what is written comes back, whole or damaged, in order of time."""
+"""Dive logs: written messages are read back in order of time, also from damaged logs."""
 
 import os
 import random
@@ -90,7 +90,7 @@ def test_cut_at_any_byte_loses_only_the_chunk_in_progress(tmp_path):
     assert kept == 50
 
 
-def test_damaged_chunk_is_left_out_and_said(tmp_path):
+def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
     write(tmp_path / "a.mcap", range(50), flush_every=10)
     data = bytearray((tmp_path / "a.mcap").read_bytes())
     with DiveLogReader(tmp_path / "a.mcap") as reader:
@@ -121,7 +121,7 @@ def test_chunks_are_cut_by_the_second_of_log_time(tmp_path):
                 assert damaged.damage
 
 
-def test_a_log_says_what_it_is_before_its_first_message(tmp_path):
+def test_a_log_is_readable_before_its_first_message(tmp_path):
     writer = DiveLogWriter(tmp_path / "a.mcap", metadata={"node": "a"})
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "a.mcap").read_bytes())
     writer.close()
@@ -146,7 +146,7 @@ def test_an_index_that_is_damaged_hides_no_chunk(tmp_path):
 @pytest.mark.parametrize(
     ("content", "says"), [(b"", "is empty"), (b"just some text\n", "not a dive log"), (None, "cannot be read")]
 )
-def test_what_is_no_log_is_said_so(tmp_path, content, says):
+def test_a_file_that_is_no_log_is_refused(tmp_path, content, says):
     if content is not None:
         (tmp_path / "x.mcap").write_bytes(content)
     with pytest.raises(BuddylineError, match=says) as refused:

@@ -1,4 +1,4 @@
-"""The one door: what comes through it is sound and of who its key says; the rest is refused, counted and named."""
+"""Decoding: a message is valid and of its key's node, or it is refused, counted and reported."""
 
 import logging
 
@@ -15,7 +15,7 @@ DEPTH_A = Depth(node="a", stamp_ns=5, depth_m=3.0, sigma_m=0.1, pressure_pa=2e5,
 DEPTH_KEY = "buddyline/node/a/depth"
 
 
-def test_an_envelope_says_what_its_key_says():
+def test_an_envelope_has_the_topic_and_ids_of_its_key():
     payload = encode(DEPTH_A)
     envelope = open_envelope(DEPTH_KEY, payload, 7)
     assert (envelope.key, envelope.topic, envelope.ids, envelope.node) == (DEPTH_KEY, DEPTH, ("a",), "a")
@@ -54,12 +54,12 @@ def test_a_picture_of_another_node_is_refused_and_a_frame_of_any_other_name_is_n
 
 
 @pytest.mark.parametrize("key", ["", "buddyline/node/a/unknown", "buddyline/node/A/depth", "elsewhere/node/a/depth"])
-def test_a_key_that_is_none_of_ours_is_refused(key):
+def test_a_key_that_is_no_topic_is_refused(key):
     with pytest.raises(MessageError, match="not a Buddyline topic"):
         open_envelope(key, encode(DEPTH_A))
 
 
-def test_refusals_are_counted_by_key_with_the_first_reason_and_said_ever_less_often(caplog):
+def test_refusals_are_counted_by_key_and_logged_less_and_less_often(caplog):
     refusals = Refusals("test")
     sound = Received(DEPTH_KEY, encode(DEPTH_A), 1, "")
     with caplog.at_level(logging.WARNING):

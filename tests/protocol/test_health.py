@@ -1,4 +1,4 @@
-"""The limits that everyone judges by, and the columns of the topic table that they come from."""
+"""The limits of health, and the columns of the topic table from which they are derived."""
 
 import ast
 import dataclasses

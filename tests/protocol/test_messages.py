@@ -1,4 +1,4 @@
-"""The contract's messages: what is not sound is refused, and named."""
+"""The messages: an invalid field is refused and named."""
 
 import json
 import math
@@ -66,7 +66,7 @@ def dumps(message: object) -> bytes:
         (NodeInfo, INFO, {"trigger_period_ns": 0}, "trigger_period_ns"),
     ],
 )
-def test_unsound_is_refused_and_named(schema, sound, change, named):
+def test_an_invalid_field_is_refused_and_named(schema, sound, change, named):
     decode(dumps(sound), schema)
     with pytest.raises(MessageError) as refused:
         decode(dumps(sound | change), schema)

@@ -219,7 +219,7 @@ def _refuse(*_args, **_kwargs):
     raise OSError(errno.EIO, "Input/output error")
 
 
-def test_a_spool_goes_on_in_the_middle_of_a_write(tmp_path, monkeypatch):
+def test_a_spool_continues_a_partial_write(tmp_path, monkeypatch):
     plain = os.write
     allowed = [3]
 

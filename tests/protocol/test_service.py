@@ -43,7 +43,7 @@ def test_a_stuck_thread_ends_its_process_with_its_name_and_a_status():
     assert "in detect" in ended.stderr
 
 
-def test_a_process_that_holds_on_when_stuck_is_ended_anyway():
+def test_a_stuck_process_that_does_not_end_is_ended_by_force():
     program = textwrap.dedent(
         """
         import threading
@@ -76,7 +76,7 @@ def watched(monkeypatch):
     stop.set()
 
 
-def test_a_thread_has_its_time(watched):
+def test_a_silent_thread_is_stuck_after_its_time(watched):
     watched._look_for_stuck(100.0 + STUCK_S - 0.1, 0.0)
     assert watched.failure is None
     watched._look_for_stuck(100.0 + STUCK_S + 0.1, 0.0)

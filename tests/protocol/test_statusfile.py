@@ -1,4 +1,4 @@
-"""The status file: where it is, what is in it, and that a disk which refuses it costs nothing."""
+"""The status file: where it is, what is in it, and a disk that refuses it, which stops nothing."""
 
 import json
 import logging
@@ -22,7 +22,7 @@ STATUS = NodeStatus(
         ("", {}, None),
     ],
 )
-def test_its_place(monkeypatch, configured, variables, path):
+def test_the_path_of_the_status_file(monkeypatch, configured, variables, path):
     for name in ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
@@ -46,7 +46,7 @@ def test_it_is_whole_and_goes_with_the_service(tmp_path):
     file.remove()
 
 
-def test_a_place_that_cannot_be_written_is_said_once(tmp_path, caplog):
+def test_a_path_that_cannot_be_written_is_reported_once(tmp_path, caplog):
     (tmp_path / "file").write_text("")
     file = StatusFile(tmp_path / "file" / "node-a.json")
     with caplog.at_level(logging.WARNING):

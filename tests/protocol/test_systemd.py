@@ -1,4 +1,4 @@
-"""What is said to systemd: datagrams of a real socket, and nothing where nobody listens."""
+"""Notifications to systemd: datagrams on a real socket, and none if nobody listens."""
 
 import secrets
 import socket
@@ -21,7 +21,7 @@ def manager(request, tmp_path, monkeypatch):
         yield listening
 
 
-def test_each_word_is_a_datagram(manager):
+def test_each_notification_is_a_datagram(manager):
     notifier = Notifier()
     notifier.ready()
     notifier.tell("all is\nwell", feed_watchdog=True)
@@ -31,7 +31,7 @@ def test_each_word_is_a_datagram(manager):
     assert said == ["READY=1", "WATCHDOG=1\nSTATUS=all is well", f"STATUS={'x' * MAX_TEXT}", "STOPPING=1"]
 
 
-def test_a_service_says_when_it_is_ready_goes_on_and_stops(manager):
+def test_a_service_reports_ready_alive_and_stopping(manager):
     service = Service("hub")
     service.wait(0.0)
     assert service.join() == 0
@@ -55,7 +55,7 @@ def test_a_service_that_does_not_progress_leaves_the_watchdog_alone(manager):
 
 
 @pytest.mark.parametrize("address", [None, "", "vsock:2:1234", "/nowhere/at/all"])
-def test_without_a_manager_nothing_is_said(monkeypatch, address):
+def test_without_a_manager_nothing_is_sent(monkeypatch, address):
     if address is None:
         monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     else:

@@ -1,4 +1,4 @@
-"""The table of topics agrees with itself and with the contract."""
+"""The table of topics is consistent with itself and with the protocol."""
 
 import json
 
