@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -146,11 +147,20 @@ def test_live_examples_follow_the_solver(hub):
     with (
         Process("solver", "--connect", hub),
         Process("play", DATA / "cavern.mcap", "--connect", hub, "--loop", "--speed", "4") as player,
-        Example("10_warn_when_far.py", hub) as far,
+        ExitStack() as stack,
     ):
-        assert " m away" in far.first_line()
-        with Example("09_live_poses.py", hub, "2") as live:
-            lines = live.end().splitlines()
+        # It ends after two seconds without a pose, which a loaded machine may well need until the first.
+        for _ in range(10):
+            far = stack.enter_context(Example("10_warn_when_far.py", hub))
+            if " m away" in (line := far.first_line()):
+                break
+        assert " m away" in line
+        # On a loaded machine two seconds may pass without a pose.
+        for seconds in ("2", "30"):
+            with Example("09_live_poses.py", hub, seconds) as live:
+                lines = live.end().splitlines()
+            if lines:
+                break
         assert lines
         assert all(line.startswith("a/b 17640000") for line in lines)
         player.end()

@@ -82,7 +82,7 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
         _measure(result, processes, viewer, pace, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("a", "b")}
         # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
-        time.sleep(4.0)
+        _settle(viewer)
         statuses["solver"] = processes["solver"].end()
         time.sleep(1.0)
         statuses |= {name: processes[name].end() for name in processes if name not in statuses and name != "hub"}
@@ -93,6 +93,14 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
     _compare(result, directory, viewer.streams)
     _judge_loads(result)
     return result
+
+
+def _settle(viewer: Viewer) -> None:
+    """Wait until no outcome has come for four seconds: a loaded machine has a backlog."""
+    before = None
+    while (now := sum(n for key, n in viewer.counts().items() if key.endswith(("/pose", "/rejected")))) != before:
+        before = now
+        time.sleep(4.0)
 
 
 def _measure(
