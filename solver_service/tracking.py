@@ -53,7 +53,7 @@ class PairTracker:
     """Follows a pair. The past up to a trigger is taken once its outcome is known; what comes later is left out."""
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
-        self.problems: list[str] = []
+        self._problems: list[str] = []
         self._streams = stream_a, stream_b
         self._settings = settings
         self._period_ns = round(S_NS / settings.rate_hz)
@@ -72,6 +72,19 @@ class PairTracker:
         self._told_ns = -1
         self._settled_ns = -1
         self._oriented = False
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong: what was found so far, and the lamps that are dark now."""
+        return self._problems + (self._dark_lamps(self._filter.lamps.dark()) if self._filter is not None else [])
+
+    def _dark_lamps(self, dark: Iterable[tuple[int, int, float]]) -> list[str]:
+        sides = ("left", "right")
+        return [
+            f"{sides[light]} lamp of {self._streams[node].node} has not been seen for {seconds:.0f} s "
+            f"while the {sides[1 - light]} one was"
+            for node, light, seconds in dark
+        ]
 
     def take(self, outcomes: Sequence[Message]) -> list[Message]:
         """Go on to the newest of these outcomes; return the live tracks' messages up to there."""
@@ -120,6 +133,7 @@ class PairTracker:
                 self._start_anew(str(error))
                 return []
         self._note(found.problems)
+        self._note(self._dark_lamps(found.dark))
         return messages + self._messages(found.rows, "smooth")
 
     def _describe(self, stamp_ns: int) -> bool:
@@ -217,7 +231,7 @@ class PairTracker:
         )
 
     def _note(self, problems: Iterable[str]) -> None:
-        self.problems += [problem for problem in problems if problem not in self.problems]
+        self._problems += [problem for problem in problems if problem not in self._problems]
 
     def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> list[Message]:
         node_a, node_b = (stream.node for stream in self._streams)

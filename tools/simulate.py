@@ -52,6 +52,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--lost", type=float, default=plan.lost_share, metavar="SHARE", help="frames lost")
     faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
     faults.add_argument("--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong")
+    faults.add_argument(
+        "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
+    )
     faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
 
 
@@ -85,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         clock_offset_ns=round(args.clock_offset_ms * MS_NS),
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
         inertial=args.inertial,
+        dead_lamps=tuple(args.dead_lamp),
     )
     plan = DivePlan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}

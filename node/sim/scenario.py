@@ -80,7 +80,7 @@ class Scenario:
     other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
     magnetometer_off_rad: constant error of B's heading that its sigma does not include. inertial: quality of the
-    inertial units.
+    inertial units. dead_lamps: lights that are dark for the whole dive, such as "b.left".
     """
 
     environment: Environment = "cavern"
@@ -110,6 +110,7 @@ class Scenario:
     clock_offset_ns: int = 0
     magnetometer_off_rad: float = 0.0
     inertial: InertialGrade = "good"
+    dead_lamps: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise BuddylineError, naming the field, for what cannot be simulated."""
@@ -124,6 +125,10 @@ class Scenario:
         ):
             if getattr(self, name) not in known:
                 raise BuddylineError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
+        lamps = [f"{node}.{side}" for node in (self.node_a, self.node_b) for side in ("left", "right")]
+        for lamp in self.dead_lamps:
+            if lamp not in lamps:
+                raise BuddylineError(f"dead_lamps: {lamp!r} is none of {', '.join(lamps)}")
         for name, lowest in _LOWEST.items():
             if not getattr(self, name) >= lowest:
                 raise BuddylineError(f"{name}: {getattr(self, name)} is below {lowest}")

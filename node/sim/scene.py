@@ -98,6 +98,10 @@ class Scene:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.motion = PairMotion(scenario)
+        nodes = scenario.node_a, scenario.node_b
+        self._dead = {
+            (i, s) for i, node in enumerate(nodes) for s in (LEFT, RIGHT) if _named(node, s) in scenario.dead_lamps
+        }
         self.rigs: tuple[SimulatedRig, SimulatedRig] = (build(scenario, 0), build(scenario, 1))
         rng = generator(scenario.seed, "divers")
         self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
@@ -138,7 +142,7 @@ class Scene:
         return LightSource(
             placement.position_ned_m + R_ned_camera @ rig.lights_m[side],
             R_ned_camera @ rig.aims[side],
-            float(rig.intensities[side]),
+            0.0 if (index, side) in self._dead else float(rig.intensities[side]),
             float(rig.beams_rad[side]),
         )
 
@@ -230,6 +234,10 @@ def _passing(seed: int, index: int, window: int) -> _Passing | None:
         angle_rad=float(rng.uniform(-math.pi, math.pi)),
     )
     return passing if rng.random() < PASSING_SHARE else None
+
+
+def _named(node: str, side: int) -> str:
+    return f"{node}.{'right' if side == RIGHT else 'left'}"
 
 
 class _Diver:

@@ -45,13 +45,18 @@ class NodeRecord:
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """A dive's track. constants: the last state, which holds what was learned of the units and clocks."""
+    """A dive's track.
+
+    constants: the last state, which holds what was learned of the units and clocks. dark: lamps that were dark at the
+    end: node, light, for how long (s).
+    """
 
     rows: list[TrackRow]
     constants: State | None
     clock_offset_s: float
     clock_sigma_s: float
     problems: list[str]
+    dark: list[tuple[int, int, float]] = field(default_factory=list)
 
 
 def filter_of(
@@ -163,4 +168,4 @@ def rows_of(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[
         return Smoothed([], None, track.clock_ns * 1e-9, math.inf, track.problems)
     state, P = last
     clock_s = track.clock_ns * 1e-9 + state.clock_s
-    return Smoothed(rows, state, clock_s, math.sqrt(P[CLOCK, CLOCK]), track.problems)
+    return Smoothed(rows, state, clock_s, math.sqrt(P[CLOCK, CLOCK]), track.problems, track.lamps.dark())

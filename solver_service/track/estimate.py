@@ -64,7 +64,8 @@ class Estimate:
 
     agreed_s: when a fix last agreed with it; inf where none ever bore on it.
 
-    detection (2, 2): by observer and light, how likely the light is found where it is in the picture.
+    detection (2, 2): by observer and light, how likely the light is found where it is in the picture. last_seen (2,):
+    the probability that each light is among the last picture's candidates, None where not both should be in it.
     """
 
     t_s: float
@@ -93,6 +94,7 @@ class Estimate:
     told_by: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
     agreed_s: float = np.inf
+    last_seen: Floats | None = None
 
 
 def alike(one: Estimate, other: Estimate) -> bool:

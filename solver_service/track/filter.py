@@ -14,6 +14,7 @@ from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate, alike
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
+from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import Sight, light_positions, residuals
 from buddyline.solver_service.track.output import TrackRow, at_one_time, pose_of, row_of
 from buddyline.solver_service.track.search import starts
@@ -62,6 +63,7 @@ class TrackFilter(TrackSteps):
         self.challengers: list[Estimate] = []
         self.finished: list[Estimate] = []
         self.restarts = True
+        self.lamps = LampWatch()
         self._waiting: list[Estimate] = []
         self._searched_s = -np.inf
         self._fix_s = -np.inf
@@ -105,6 +107,8 @@ class TrackFilter(TrackSteps):
                 if estimate.unseen_by == sight.node and not estimate.confirmed:
                     self._fork(estimate, t_s, sight)
                 self._step(estimate, t_s, sight)
+                if estimate is self.main and estimate.confirmed and estimate.last_seen is not None:
+                    self.lamps.take(1 - sight.node, t_s, estimate.last_seen)
         self._judge(t_s)
         self._search(t_s, sight)
 

@@ -154,6 +154,7 @@ class TrackSteps(TrackIntake):
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
+        estimate.last_seen = found.seen if all(inside) and not wide else None
         for light in (0, 1):
             if inside[light]:
                 old = estimate.detection[observer, light]

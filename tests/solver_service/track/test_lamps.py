@@ -1,0 +1,61 @@
+"""A lamp that is dark for a dive is named in the solver's status; working lamps never are."""
+
+import numpy as np
+import pytest
+from buddyline.node.sim.dive import messages
+from buddyline.node.sim.scenario import ENVIRONMENTS, DivePlan, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import LightTruth, NodePose, Truth
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track.lamps import LampWatch
+from buddyline.solver_service.tracking import TrackSettings
+
+START_NS = 1_764_000_000_000_000_000
+
+
+def status_problem(seed, seconds, *dead_lamps, mode="filter"):
+    """What the status says at the end of a simulated dive."""
+    scenario = Scenario(ENVIRONMENTS[seed % 5], seed=300 + seed, start_ns=START_NS, dead_lamps=dead_lamps)
+    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset((mode,))))
+    for _, _, message in messages(World(scenario), DivePlan(seconds=seconds, imu=True)):
+        if not isinstance(message, Truth | LightTruth | NodePose):
+            core.handle(message)
+    if mode == "smooth":
+        core.flush()
+    return core.report(0, 0, 0, [])[0].problem
+
+
+@pytest.mark.parametrize(("seed", "lamp"), [(0, "b.left"), (1, "b.right"), (2, "a.left"), (3, "b.left")])
+def test_a_dead_lamp_is_named_within_ten_seconds(seed, lamp):
+    node, side = lamp.split(".")
+    problem = status_problem(seed, 10.0, lamp)
+    assert f"{side} lamp of {node} has not been seen for" in problem
+    assert problem.count("lamp of") == 1
+
+
+def test_a_dead_lamp_is_named_offline():
+    assert "left lamp of b has not been seen for" in status_problem(0, 10.0, "b.left", mode="smooth")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lamps_that_work_are_not_named(seed):
+    assert "lamp of" not in status_problem(seed, 15.0)
+
+
+def test_a_lamp_that_comes_back_is_no_longer_named_and_one_false_candidate_hides_no_dead_one():
+    watch = LampWatch()
+    for k in range(100):
+        watch.take(1, 0.1 * k, np.array((0.99 if k == 30 else 0.02, 0.99)))
+    [(node, light, duration_s)] = watch.dark()
+    assert (node, light) == (1, 0)
+    assert duration_s == pytest.approx(9.9)
+    for k in range(100, 110):
+        watch.take(1, 0.1 * k, np.array((0.99, 0.99)))
+    assert watch.dark() == []
+
+
+def test_a_lamp_of_nobody_is_refused():
+    with pytest.raises(BuddylineError, match="dead_lamps: 'c"):
+        Scenario(dead_lamps=("c.left",))
