@@ -110,11 +110,13 @@ def smooth(
     told = sum(part.told for part in parts)
     if told > 100:
         second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
+    # A track that has just begun has not yet learned how much its units shake.
+    strain = max(part.strain for part in parts)
     for part in parts:
         results = smoothed(part.steps)
         guide_by(second, part.steps, results)
         state = replace(results[0][0], clock_s=0.0)
-        second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state))
+        second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state), strain)
     second.advance(end_ns)
     return rows_of(second, parts_of(second), outputs_ns)
 

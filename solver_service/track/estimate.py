@@ -60,6 +60,7 @@ class Guide:
 class Estimate:
     """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
 
+    strain: by how much the units' noise is greater than their samples show, learned from the lights' residuals.
     evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
 
     agreed_s: when a fix last agreed with it; inf where none ever bore on it.
@@ -83,6 +84,7 @@ class Estimate:
     depth_s: float = -np.inf
     steps: list[Step] = field(default_factory=list)
     confirmed: bool = False
+    strain: float = 1.0
     surprise: float = 0.0
     told: int = 0
     end_s: float = np.inf

@@ -172,10 +172,10 @@ class TrackFilter(TrackSteps):
         noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
         return float(y @ np.linalg.solve(noise + H @ P @ H.T, y)) < CONTRADICTS
 
-    def begin(self, t_s: float, end_s: float, state: State, P: Floats) -> None:
+    def begin(self, t_s: float, end_s: float, state: State, P: Floats, strain: float) -> None:
         """Start from a state that is known beforehand, confirmed; a later one takes over at its time."""
         estimate = Estimate(
-            t_s, state, P, t_s, confirmed=True, end_s=end_s, skip_s=0.0, evidence=CONFIRMED, light_s=t_s
+            t_s, state, P, t_s, confirmed=True, end_s=end_s, skip_s=0.0, evidence=CONFIRMED, light_s=t_s, strain=strain
         )
         self._open(estimate)
         self._waiting.append(estimate)

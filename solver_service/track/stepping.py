@@ -30,6 +30,14 @@ WITHOUT_RAD: Final = 0.03
 # How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
 # 0.7 of its sigma in half a second.
 WANDER_PER_ROOT_S: Final = 1.0
+# How fast the strain of a track follows its residuals' chi^2, of which one residual counts at most MOST_CHI2: with
+# four lights ten times a second it settles within some seconds.
+STRAIN_GAIN: Final = 0.005
+MOST_CHI2: Final = 9.0
+MOST_STRAIN: Final = 50.0
+# Shaking lasts for some tenths of a second, and so moves a track farther than white noise of the same residuals: found
+# on simulated dives, so that the normalized errors of shaken units are near 1.
+COLOURED: Final = 2.0
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
@@ -56,12 +64,12 @@ class TrackSteps(TrackIntake):
             parts.append(replace(part, without=True) if without else part)
         return parts[0], parts[1]
 
-    def _noises(self, t_s: float) -> tuple[Noise, Noise]:
-        a, b = (self._noise(node, t_s) for node in (0, 1))
+    def _noises(self, t_s: float, strain: float) -> tuple[Noise, Noise]:
+        a, b = (self._noise(node, t_s, 1.0 + COLOURED * (strain - 1.0)) for node in (0, 1))
         return a, b
 
-    def _noise(self, node: int, t_s: float) -> Noise:
-        noise = self.samples[node].noise(t_s).scaled(self.unrest)
+    def _noise(self, node: int, t_s: float, strain: float) -> Noise:
+        noise = self.samples[node].noise(t_s).scaled(self.unrest, strain)
         stated = self._turning[node].stated(t_s)
         if stated is None:
             return noise
@@ -71,7 +79,7 @@ class TrackSteps(TrackIntake):
     def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
         span_s = t_s - estimate.t_s
         parts = self.increments(estimate, t_s)
-        noises = self._noises(t_s)
+        noises = self._noises(t_s, estimate.strain)
         after, F = propagate(estimate.state, parts, span_s)
         Q, walk = process_noise(after, parts, noises, span_s)
         for node, part in enumerate(parts):
@@ -202,7 +210,11 @@ class TrackSteps(TrackIntake):
         rows_H = np.zeros((len(rows_y), SIZE))
         rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in found.chosen])
         noise = np.diag(np.repeat([variance for _, _, variance in found.chosen], 2))
-        estimate.surprise += self._apply(estimate, rows_H, rows_y, noise)
+        chi2 = self._apply(estimate, rows_H, rows_y, noise)
+        # Residuals that are too large say that the units shake or drift more than their samples show by themselves.
+        excess = min(chi2, MOST_CHI2 * len(rows_y)) - len(rows_y)
+        estimate.strain = float(np.clip(estimate.strain * np.exp(STRAIN_GAIN * excess), 1.0, MOST_STRAIN))
+        estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
         estimate.trigger = [seen for seen in estimate.trigger if sight.t_s - seen[0] < 0.03]
@@ -277,5 +289,5 @@ class TrackSteps(TrackIntake):
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)
-        Q, walk = process_noise(after, parts, self._noises(t_s), span_s)
+        Q, walk = process_noise(after, parts, self._noises(t_s, estimate.strain), span_s)
         return after, predicted(estimate.covariance, F, Q, walk)

@@ -52,12 +52,16 @@ class Noise:
     gyro_bias_radps: float = 1e-4
     accel_bias_mps2: float = 1e-3
 
-    def scaled(self, unrest: float) -> Noise:
-        """Return the same with the guessed motion's densities times unrest."""
-        if unrest == 1.0:
+    def scaled(self, unrest: float, strain: float) -> Noise:
+        """Return the same with the guessed motion's densities times unrest, and the unit's own times strain."""
+        if unrest == strain == 1.0:
             return self
         return replace(
             self,
+            gyro_rad=strain * self.gyro_rad,
+            accel_mps=strain * self.accel_mps,
+            gyro_bias_radps=strain * self.gyro_bias_radps,
+            accel_bias_mps2=strain * self.accel_bias_mps2,
             gap_accel_mps=unrest * self.gap_accel_mps,
             gap_rate_radps=unrest * self.gap_rate_radps,
             gap_gyro_rad=unrest * self.gap_gyro_rad,
