@@ -117,6 +117,8 @@ def smooth(
         guide_by(second, part.steps, results)
         state = replace(results[0][0], clock_s=0.0)
         second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state), strain)
+    # Every step of the first pass holds a covariance: both passes at once take twice the memory.
+    del first, parts, part, learned, results
     second.advance(end_ns)
     return rows_of(second, parts_of(second), outputs_ns)
 
