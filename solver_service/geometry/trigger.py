@@ -189,7 +189,8 @@ class _Batched:
             return NoFix("ambiguous", f"three lights give {range_m:.3g} m to {sigma_m:.2g} m only")
         # A false candidate in a light's place is off by as much as the covariance has been widened for.
         false_light = ratio * float(readings.lone_odds[place]) * math.exp(-float(weighed.log_past[k]))
-        if unsure:
+        # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
+        if unsure or widened > 1.0:
             false_light = ratio * float(false_light_odds(weighed.chi2[k], readings.clutter[place]))
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         required = settings.min_probability
@@ -209,6 +210,10 @@ class _Batched:
         if depth_chi2 > AGREES:
             return NoFix("depth", f"{what} is {math.sqrt(depth_chi2):.1f} sigma off the depths")
         why = "one light may be a false candidate" if false_light > CHANCE_ODDS else "chance may give it"
+        if widened > 1.0 and false_light > CHANCE_ODDS + others:
+            in_range = abs(math.log(float(readings.range_m[place, 0] / readings.range_m[place, 1])))
+            reason: Reason = "range_gap" if in_range > abs(float(readings.twist_gap_rad[place])) else "twist_gap"
+            return NoFix(reason, f"{what} does not fit its lights (chi2 {chi2:.1f}): {why}")
         rivals = np.where(same, -np.inf, weighed.log_ratio)
         rival = int(rivals.argmax())
         if rivals[rival] > weighed.log_ratio[k] - _RIVAL:

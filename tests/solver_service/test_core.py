@@ -6,8 +6,11 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
+from buddyline.node.sim.dive import messages as simulated
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
 from buddyline.protocol.clock import MS_NS, S_NS
-from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.matcher import MAX_PENDING
@@ -416,3 +419,16 @@ def test_without_sensors_it_still_solves():
         assert "upright_assumed" in pose.checks
         truth = world.truth(pose.stamp_ns, pose.trigger)
         assert np.linalg.norm(np.subtract(pose.t_a_b_m, truth.t_a_b_m)) < 0.1 * pose.range_m
+
+
+def test_a_false_candidate_that_fits_badly_gives_no_pose_without_attitudes():
+    scenario = Scenario("basin", seed=5008, start_ns=START_NS, miss_share=0.2, other_lamps=3)
+    world = World(scenario)
+    found = [message for _, _, message in simulated(world, DivePlan(seconds=5.0, rate_hz=8))]
+    core = SolverCore(Settings(), [("a", "b")])
+    results = core.handle_many([m for m in found if isinstance(m, NodeInfo | Candidates)]) + core.flush()
+    truths = {m.trigger: m.t_a_b_m for m in found if isinstance(m, Truth)}
+    poses = [one for one in results if isinstance(one, RelativePose)]
+    assert len(poses) > 5
+    for pose in poses:
+        assert np.linalg.norm(np.subtract(pose.t_a_b_m, truths[pose.trigger])) < 0.1 * pose.range_m

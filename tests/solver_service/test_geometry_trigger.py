@@ -357,3 +357,16 @@ def test_scores_are_weak_evidence():
         without += isinstance(solve(scene, views), Fix)
         with_scores += isinstance(solve(scene, scored), Fix)
     assert with_scores > without
+
+
+@pytest.mark.parametrize(("shift_px", "reason"), [((30.0, 0.0), "range_gap"), ((0.0, 30.0), "twist_gap")])
+def test_lights_that_do_not_fit_each_other_give_no_pose(shift_px, reason):
+    """One light is hidden, and a false candidate stands beside its place."""
+    scene = facing()
+    (a, _), (b, _) = scene.views(np.random.default_rng(1), 1.0)
+    assert isinstance(solve(scene, (a, b)), Fix)
+    off = replace(a, pixels=a.pixels + np.array([shift_px, (0.0, 0.0)]))
+    for sensed in (None, scene.sensed()):
+        found = solve(scene, (off, b)) if sensed is None else solve(scene, (off, b), sensed)
+        assert isinstance(found, NoFix)
+        assert found.reason == reason
