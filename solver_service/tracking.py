@@ -126,6 +126,8 @@ class PairTracker:
         with np.errstate(all="ignore"):
             try:
                 messages = self._advance(end_ns)
+                if self._lag is not None:
+                    messages += self._messages(self._lag.finish(), "lag")
                 if "smooth" not in self._settings.modes:
                     return messages
                 found = smooth((self._record(0), self._record(1)), self._fixes, self._due(self._first_ns or 0, end_ns))

@@ -25,6 +25,8 @@ CLOCK_LEFT_S: Final = 0.003
 CLOCK_WITHOUT_S: Final = 0.003
 FAR_CLOCK_S: Final = 0.06
 CLOCK_ROUNDS: Final = 3
+# Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
+FAR_WITHOUT_S: Final = 0.05
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
 BROAD_R_M: Final = 0.5
 BROAD_TURN_RAD: Final = 0.15
@@ -96,7 +98,14 @@ def smooth(
             break
         # So far off, the pass was not linear: once more, from there.
         clock_ns += round(parts[-1].state.clock_s * 1e9)
-    if any(any(part.without) for part in parts):
+    without = any(any(part.without) for part in parts)
+    off_s = (clock_ns - told_ns) * 1e-9 + (
+        0.0 if abs(parts[-1].state.clock_s) < FAR_CLOCK_S else parts[-1].state.clock_s
+    )
+    if abs(parts[-1].state.clock_s) >= FAR_CLOCK_S or (without and abs(off_s) > FAR_WITHOUT_S):
+        said = f"nodes a and b: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
+        return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
+    if without:
         # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
         only = filter_of(records, fixes, told_ns, CLOCK_WITHOUT_S)
         only.advance(end_ns)

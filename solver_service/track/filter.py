@@ -44,6 +44,8 @@ IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
 CONTRADICTS: Final = 33.0
 REFUSED_TO_SAY: Final = 10
+# Clocks further apart than this: the filter is not linear in them, and what it tells meanwhile is not honest.
+FAR_CLOCK_S: Final = 0.15
 # What is older than this is dropped in a live filter.
 MEMORY_S: Final = 5.0
 
@@ -92,6 +94,13 @@ class TrackFilter(TrackSteps):
         if math.isfinite(self._keep_s):
             self._forget_before(end_s - MEMORY_S)
         return rows
+
+    def clocks_apart(self) -> bool:
+        """Whether the clocks prove further apart than a live track bears; `problems` says so then."""
+        apart = self.main is not None and abs(self.main.state.clock_s) > FAR_CLOCK_S
+        if apart:
+            self._report("nodes a and b: their clocks are far apart: no live track")
+        return apart
 
     def _estimates(self) -> list[Estimate]:
         return ([self.main] if self.main else []) + self.challengers
@@ -305,6 +314,8 @@ class TrackFilter(TrackSteps):
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:
             return None
         main = self.main
+        if self.clocks_apart():
+            return None
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)
         state, P = self._predict(main, t_s)

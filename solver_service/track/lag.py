@@ -28,12 +28,19 @@ class TrackLag:
 
     def rows(self) -> list[TrackRow]:
         """Return the rows that have come due; call it after `TrackFilter.advance`, at least every EVERY_S."""
+        return self._rows(LAG_S, EVERY_S)
+
+    def finish(self) -> list[TrackRow]:
+        """Return the rows that are left at the end of a dive, which no later picture will better."""
+        return self._rows(0.0, 0.0)
+
+    def _rows(self, lag_s: float, every_s: float) -> list[TrackRow]:
         main = self._track.main
-        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due:
+        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.clocks_apart():
             return []
-        ready_s = main.t_s - LAG_S
+        ready_s = main.t_s - lag_s
         ready = [stamp for stamp in self._due if self._track.between(stamp) <= ready_s]
-        if not ready or ready_s - self._done_s < EVERY_S:
+        if not ready or ready_s - self._done_s < every_s:
             return []
         self._done_s = ready_s
         self._due = self._due[len(ready) :]

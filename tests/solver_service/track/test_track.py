@@ -103,6 +103,11 @@ def test_lag_is_better_than_the_filter(dive: Dive) -> None:
     for now_ns in range(dive.stamps_ns[0], last_ns(dive.records), 100_000_000):
         track.advance(now_ns)
         rows += lag.rows()
+    late = lag.finish()
+    assert late[0].stamp_ns - rows[-1].stamp_ns == 50_000_000
+    assert late[-1].stamp_ns > dive.stamps_ns[-1] - 200_000_000
+    assert not lag.finish()
+    rows += late
     judged = score(dive, rows)
     causal = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns)
     assert judged.rows > 0.8 * len(dive.stamps_ns)
@@ -235,6 +240,13 @@ def test_clock_and_depth_offset_nobody_told_of() -> None:
     assert judged.wrong == 0
     assert judged.covered >= 0.98
     assert judged.nees < 2.0
+
+
+def test_clocks_far_apart_without_inertial_units_give_no_track() -> None:
+    dive = make(2, replace(SHORT, seconds=20.0, clock_s=0.3))
+    result = smooth(bare_of(dive), dive.fixes, dive.stamps_ns)
+    assert not result.rows
+    assert any("clocks" in problem for problem in result.problems)
 
 
 @pytest.mark.parametrize("fault", ["g", "mount", "clipped"])
