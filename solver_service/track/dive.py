@@ -99,9 +99,7 @@ def smooth(
         # So far off, the pass was not linear: once more, from there.
         clock_ns += round(parts[-1].state.clock_s * 1e9)
     without = any(any(part.without) for part in parts)
-    off_s = (clock_ns - told_ns) * 1e-9 + (
-        0.0 if abs(parts[-1].state.clock_s) < FAR_CLOCK_S else parts[-1].state.clock_s
-    )
+    off_s = (clock_ns - told_ns) * 1e-9
     if abs(parts[-1].state.clock_s) >= FAR_CLOCK_S or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"nodes a and b: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
