@@ -177,7 +177,7 @@ def test_node_and_solver_wait_for_the_hub_and_a_second_node_is_refused(tmp_path)
     first = min(tmp_path.glob("a-*.mcap"))
     with DiveLogReader(first) as reader:
         assert reader.damage == []
-        assert "buddyline/node/a/candidates" in reader.keys
+        assert "buddyline/node/a/info" in reader.keys
 
 
 def test_stored_dive_through_a_node(tmp_path):

@@ -319,7 +319,7 @@ def test_a_connection_that_receives_nothing_is_cut_and_made_again(
         publisher.put_bytes(b"0")
         inbox.wait_for(1)
         hub.send_signal(signal.SIGSTOP)
-        until(lambda: "not heard" in caplog.text)
+        until(lambda: "nothing was received" in caplog.text)
         publisher.put_bytes(b"1")
         hub.send_signal(signal.SIGCONT)
         publisher.put_bytes(b"2")

@@ -134,8 +134,8 @@ def test_whole_dives_are_no_losses(run, name):
 
 def test_200_bytes_inverted_cost_an_export_a_second(run):
     whole, damaged = (len(run("export tum", damage)[2].splitlines()) for damage in (None, "corrupted"))
-    assert whole > 40
-    assert 0 < whole - damaged <= 21  # the bytes may lie across two chunks
+    assert whole > 200
+    assert 0 < whole - damaged <= 101  # 50 rows a second; the bytes may lie across two chunks
 
 
 def split_by_node(source: Path, folder: Path) -> list[str]:
