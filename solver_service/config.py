@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Annotated, cast
 
 from buddyline.protocol.config import Config, ConfigError, load_config
-from buddyline.protocol.messages import NodeId
+from buddyline.protocol.messages import NodeId, TrackMode
 from buddyline.protocol.security import SOLVER, Tls, check_identity
 from buddyline.protocol.topics import check_node_id
-from buddyline.solver_service.choices import CHECKS, METHODS
+from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.solver_service.geometry.observation import Method, Settings
 from buddyline.solver_service.tracking import TrackSettings
 from msgspec import Meta, field
 from msgspec.structs import replace
+
+# Rates of a stored dive's track: one row in ten seconds, and as many as a fast inertial unit has samples.
+LEAST_TRACK_HZ, MOST_TRACK_HZ = 0.1, 1000.0
 
 
 class SolveConfig(Config, frozen=True, kw_only=True):
@@ -44,6 +47,15 @@ class SolveConfig(Config, frozen=True, kw_only=True):
             range_max_m=self.range_max_m,
             skew_sigma_s=self.skew_sigma_s,
         )
+
+
+def track_settings(mode: str, rate_hz: float) -> TrackSettings | None:
+    """Return what the solver takes for a stored dive's one track, None for none; raise ConfigError."""
+    if mode not in TRACKS:
+        raise ConfigError(f"track = {mode!r}: known are {', '.join(TRACKS)}")
+    if not LEAST_TRACK_HZ <= rate_hz <= MOST_TRACK_HZ:
+        raise ConfigError(f"track_hz = {rate_hz:g}: give {LEAST_TRACK_HZ:g} to {MOST_TRACK_HZ:g}")
+    return None if mode == "none" else TrackSettings(frozenset((cast(TrackMode, mode),)), rate_hz)
 
 
 class TrackConfig(Config, frozen=True, kw_only=True):

@@ -20,7 +20,7 @@ from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.dive import NodeRecord, smooth
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
 from msgspec import UNSET
@@ -42,7 +42,7 @@ class TrackSettings:
 class Piece:
     """What one node's stream holds of a stretch of time. imu_values: (N, 6) accelerometer, gyroscope."""
 
-    frames: list[Frame]
+    frames: list[FrameSeen]
     imu_stamps_ns: Stamps
     imu_values: Floats
     attitudes: list[AttitudeSeen]
@@ -103,8 +103,18 @@ class PairTracker:
 
     def _take(self, outcomes: Sequence[Message]) -> list[Message]:
         stamps_ns = [one.stamp_ns for one in outcomes if isinstance(one, RelativePose | Rejected)]
-        if not stamps_ns or not self._describe(max(stamps_ns)):
+        known = [stream.calibration(max(stamps_ns)) for stream in self._streams] if stamps_ns else [None, None]
+        if known[0] is None or known[1] is None:
             return []
+        infos = known[0][0], known[1][0]
+        messages: list[Message] = []
+        if self._infos is not None and not all(map(_same_rig, infos, self._infos)):
+            # The track of the old rigs ends here.
+            messages = self._end(self._settled_ns)
+            self.forget()
+        if self._infos is None:
+            self._infos, self._nodes = infos, (_node_of(*known[0]), _node_of(*known[1]))
+            self._make_filter(self._nodes)
         if self._first_ns is None:
             # However many outcomes come at once, the track begins with the first of them.
             self._first_ns = self._told_ns = min(stamps_ns)
@@ -116,13 +126,16 @@ class PairTracker:
                 self._filter.add_fix(fix)
         if "smooth" in self._settings.modes:
             self._fixes += fixes
-        return self._advance(self._frontier_ns())
+        return messages + self._advance(self._frontier_ns())
 
     def finish(self) -> list[Message]:
         """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one."""
+        return self._end(self._settled_ns + S_NS)
+
+    def _end(self, end_ns: int) -> list[Message]:
+        """Take what is left up to end_ns, and tell what the end of a track tells."""
         if self._nodes is None or self._settled_ns < 0:
             return []
-        end_ns = self._settled_ns + S_NS
         with np.errstate(all="ignore"):
             try:
                 messages = self._advance(end_ns)
@@ -138,23 +151,11 @@ class PairTracker:
         self._note(self._dark_lamps(found.dark))
         return messages + self._messages(found.rows, "smooth")
 
-    def _describe(self, stamp_ns: int) -> bool:
-        """Take both calibrations as of stamp_ns; a changed one starts the track anew. False where one is missing."""
-        known = [stream.calibration(stamp_ns) for stream in self._streams]
-        if known[0] is None or known[1] is None:
-            return False
-        infos = known[0][0], known[1][0]
-        if self._infos is not None and all(map(_same_rig, infos, self._infos)):
-            return True
-        if self._infos is not None:
-            self.forget()
-        self._infos = infos
-        self._nodes = _node_of(*known[0]), _node_of(*known[1])
+    def _make_filter(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         live = self._settings.modes & {"filter", "lag"}
         if live:
-            self._filter = TrackFilter(*self._nodes, keep_s=LAG_S + 2 * EVERY_S if "lag" in live else 0.0)
+            self._filter = TrackFilter(*nodes, keep_s=LAG_S + 2 * EVERY_S if "lag" in live else 0.0)
             self._lag = TrackLag(self._filter) if "lag" in live else None
-        return True
 
     def _frontier_ns(self) -> int:
         """Return up to when everything has come: outcomes, and the samples of the sensors that have not stopped."""
@@ -287,9 +288,9 @@ def _same_rig(info: NodeInfo, other: NodeInfo) -> bool:
     return info is other or info == replace(other, stamp_ns=info.stamp_ns)
 
 
-def _frame_of(view: View) -> Frame:
+def _frame_of(view: View) -> FrameSeen:
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
-    return Frame(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score)
+    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score)
 
 
 def _fix_of(pose: RelativePose) -> FixSeen:

@@ -6,9 +6,6 @@ from collections import defaultdict
 from tests.imports import modules
 from tests.processes import REPOSITORY
 
-# Still to be renamed. This list only ever gets shorter.
-KNOWN_DOUBLES = frozenset({"Frame"})
-
 
 def classes(root):
     """Return the modules that define a class, by its name without a leading underscore."""
@@ -26,12 +23,7 @@ def doubles(root):
 
 
 def test_no_class_name_stands_for_two_things():
-    found = {name: where for name, where in doubles(REPOSITORY).items() if name not in KNOWN_DOUBLES}
-    assert found == {}, "choose another name: one class name, one thing"
-
-
-def test_known_doubles_are_still_there():
-    assert doubles(REPOSITORY).keys() >= KNOWN_DOUBLES, "take the renamed ones from KNOWN_DOUBLES"
+    assert doubles(REPOSITORY) == {}, "choose another name: one class name, one thing"
 
 
 def test_a_double_is_found(tmp_path):

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import cast
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
@@ -18,12 +17,10 @@ from buddyline.protocol.messages import (
     Rejected,
     RelativePose,
     Track,
-    TrackMode,
 )
-from buddyline.solver_service.choices import CHECKS, TRACKS
-from buddyline.solver_service.config import SolveConfig
+from buddyline.solver_service.choices import CHECKS
+from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.tracking import TrackSettings
 from buddyline.tools.columns import (
     Pair,
     PoseColumns,
@@ -72,7 +69,7 @@ def solve_messages(
             raise BuddylineError(f"no NodeInfo of node {node}")
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
     core = SolverCore(
-        settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)}, track=_track_settings(track, track_hz)
+        settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)}, track=track_settings(track, track_hz)
     )
     rest, outcomes = iter(taken), list[Message]()
     # A node's streams keep a minute: what is handed over at once has to be less.
@@ -85,14 +82,6 @@ def solve_messages(
         rejection_columns(sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)),
         track_columns(in_order(one for one in outcomes if isinstance(one, Track))),
     )
-
-
-def _track_settings(mode: str, rate_hz: float) -> TrackSettings | None:
-    if mode not in TRACKS:
-        raise BuddylineError(f"track={mode!r}: one of {', '.join(TRACKS)}")
-    if not 0.1 <= rate_hz <= 1000.0:
-        raise BuddylineError(f"track_hz={rate_hz:g}: give 0.1 to 1000")
-    return None if mode == "none" else TrackSettings(frozenset((cast(TrackMode, mode),)), rate_hz)
 
 
 def solve_logs(

@@ -10,17 +10,16 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations, islice
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Track, TrackMode
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Track
 from buddyline.protocol.topics import TRACK, check_node_id
-from buddyline.solver_service.config import SolveConfig, node_ids
+from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.tracking import TrackSettings
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 
@@ -47,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             settings,
             list(combinations(nodes, 2)),
             {nodes[1]: round(args.clock_offset * 1e9)},
-            track=_track(args.track, args.track_hz),
+            track=track_settings(args.track, args.track_hz),
         )
         began_s = time.monotonic()
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
@@ -145,12 +144,6 @@ def messages_of(
             found = detector.candidates(envelope)
             if found is not None:
                 yield found
-
-
-def _track(mode: str, rate_hz: float) -> TrackSettings | None:
-    if not 0.1 <= rate_hz <= 1000.0:
-        raise ConfigError(f"--track-hz {rate_hz:g}: give 0.1 to 1000")
-    return None if mode == "none" else TrackSettings(frozenset((cast(TrackMode, mode),)), rate_hz)
 
 
 def _write(writer: DiveLogWriter, results: Iterable[Message]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.estimate import Estimate, Guide, Step
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import rows_between, smoothed
@@ -37,7 +37,7 @@ class NodeRecord:
     """All that one node recorded on a dive. Inertial columns: stamps (N,), accel and gyro (N, 3), body frame."""
 
     node: TrackNode
-    frames: Sequence[Frame]
+    frames: Sequence[FrameSeen]
     imu_stamps_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
     accel_mps2: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     gyro_radps: Floats = field(default_factory=lambda: np.zeros((0, 3)))

@@ -26,7 +26,7 @@ class TrackNode:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class FrameSeen:
     """The light candidates of one picture.
 
     pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns; score (K,): how likely each

@@ -9,7 +9,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, Stamps, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lights import Sight, sight_of
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.turning import Turning
@@ -77,7 +77,7 @@ class TrackIntake:
         """Take a depth message."""
         bisect.insort(self._depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
 
-    def add_frame(self, node: int, frame: Frame) -> None:
+    def add_frame(self, node: int, frame: FrameSeen) -> None:
         """Take a picture's candidates."""
         t_s = self.seconds(node, frame.stamp_ns)
         dt_s = np.zeros(len(frame.pixels))

@@ -100,15 +100,26 @@ def test_without_a_pose_there_is_no_track():
     assert tracks_of(blind, "filter", "lag", "smooth")[0] == []
 
 
-def test_absurd_values_start_the_track_anew_and_are_named(inertial_dive):
+def test_a_track_goes_on_after_absurd_values(inertial_dive):
     messages, _ = inertial_dive
     half = len(messages) // 2
     broken = [
         replace(m, depth_m=1e308) if isinstance(m, Depth) and half < i < half + 60 else m
         for i, m in enumerate(messages)
     ]
-    tracks, core = tracks_of(broken, "filter")
-    (pair,) = core.pairs.values()
+    tracks, _ = tracks_of(broken, "filter")
     assert all(np.isfinite(one.covariance).all() for one in tracks)
     assert tracks[-1].stamp_ns > messages[-1].stamp_ns - 2 * S_NS
-    assert not pair.tracker.problems or "out of numeric range" in pair.tracker.problems[0]
+
+
+def test_a_changed_calibration_ends_one_track_and_begins_another(inertial_dive):
+    messages, world = inertial_dive
+    middle_ns = messages[0].stamp_ns + 6 * S_NS
+    info = next(message for message in messages if isinstance(message, NodeInfo) and message.node == "a")
+    moved = replace(info, stamp_ns=middle_ns, sigma_px=2.0 * info.sigma_px, depth_port_m=(0.0, 0.0, 0.01))
+    changed = sorted([*messages, moved], key=lambda message: message.stamp_ns)
+    tracks, _ = tracks_of(changed, "smooth")
+    before, after = ([one for one in tracks if (one.stamp_ns < middle_ns) is early] for early in (True, False))
+    assert len(before) > 80
+    assert len(after) > 80
+    assert np.median(errors_m(tracks, world)) < 0.05

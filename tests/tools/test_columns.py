@@ -84,9 +84,9 @@ def test_a_track_can_be_left_out_and_a_mode_must_be_known():
     assert without.track.mode == ""
     assert without.track.covariance.shape == (0, 6, 6)
     assert len(without.poses) > 100
-    with pytest.raises(buddyline.BuddylineError, match="track='best': one of smooth, lag, filter, none"):
+    with pytest.raises(buddyline.BuddylineError, match="track = 'best': known are smooth, lag, filter, none"):
         buddyline.solve(CAVERN, track="best")
-    with pytest.raises(buddyline.BuddylineError, match="track_hz=0"):
+    with pytest.raises(buddyline.BuddylineError, match="track_hz = 0"):
         buddyline.solve(CAVERN, track_hz=0.0)
 
 

@@ -68,7 +68,8 @@ def test_time_without_a_sample_or_with_a_wide_sigma_is_not_covered():
     half = [track(k, [0, 0, 4.0], sigma_m=0.02 if k < 50 else 0.3) for k in range(100)]
     assert covered_share(half, poses) == pytest.approx(0.5, abs=0.02)
     assert covered_share(half[:50], poses) == pytest.approx(0.5, abs=0.02)
-    assert covered_share([], []) is None
+    assert covered_share([], poses) == 0.0
+    assert covered_share(half, poses[:1]) is None
 
 
 def test_each_mode_has_its_own_figures():

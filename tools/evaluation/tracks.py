@@ -92,12 +92,14 @@ def _figures(
 
 
 def covered_share(tracks: Sequence[Track], poses: Sequence[RelativePose]) -> float | None:
-    """Return the share of the time from the first to the last pose that the track covers; None without poses.
+    """Return the share of the time between first and last pose that is covered; None below two poses.
 
     Time is counted in the track's median period, so a missing sample counts as not covered.
     """
-    if len(poses) < 2 or len(tracks) < 2:
-        return None if not poses else 0.0
+    if len(poses) < 2:
+        return None
+    if len(tracks) < 2:
+        return 0.0
     first_ns, last_ns = min(pose.stamp_ns for pose in poses), max(pose.stamp_ns for pose in poses)
     stamps_ns = np.sort(np.array([track.stamp_ns for track in tracks]))
     period_s = float(np.median(np.diff(stamps_ns))) / S_NS

@@ -9,7 +9,7 @@ from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
 from buddyline.solver_service.track.dive import NodeRecord
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, Frame, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 
 EPOCH_NS = 1_764_000_000_000_000_000
 GRAVITY = np.array((0.0, 0.0, 9.80665))
@@ -139,7 +139,7 @@ def make(seed: int, setting: Setting) -> Dive:
     return Dive((records[0], records[1]), fixes, stamps, (toward @ apart[:, :, None])[:, :, 0], toward @ R_b)
 
 
-def shifted(frame: Frame, clock_s: float) -> Frame:
+def shifted(frame: FrameSeen, clock_s: float) -> FrameSeen:
     """Stamp a frame by a clock that is ahead."""
     return replace(frame, stamp_ns=frame.stamp_ns + round(clock_s * 1e9))
 
@@ -157,11 +157,11 @@ def _frames(
     node: int,
     triggers: Floats,
     setting: Setting,
-) -> list[tuple[Frame | None, Floats]]:
+) -> list[tuple[FrameSeen | None, Floats]]:
     """Each trigger's frame, and which of the other's lights are truly in it (2,); the lights' pixels come first."""
     hidden = rng.uniform(0.0, setting.seconds, (2, 2))
     lengths = rng.uniform(0.5, 2.5, (2, 2))
-    out: list[tuple[Frame | None, Floats]] = []
+    out: list[tuple[FrameSeen | None, Floats]] = []
     for nominal in triggers.tolist():
         t = nominal + rng.normal(0.0, 0.0005)
         at = np.array((t,))
@@ -184,13 +184,13 @@ def _frames(
         if rng.uniform() < 0.02:
             out.append((None, inside))
             continue
-        frame = Frame(EPOCH_NS + round(t * 1e9), pixels, np.full(len(pixels), setting.sigma_px))
+        frame = FrameSeen(EPOCH_NS + round(t * 1e9), pixels, np.full(len(pixels), setting.sigma_px))
         out.append((frame, inside & ~gross))
     return out
 
 
 def _fix(
-    nodes: list[TrackNode], one: tuple[Frame | None, Floats], two: tuple[Frame | None, Floats], motion: Motion
+    nodes: list[TrackNode], one: tuple[FrameSeen | None, Floats], two: tuple[FrameSeen | None, Floats], motion: Motion
 ) -> FixSeen | None:
     """Fit a pose to the eight coordinates of a trigger, from the truth on."""
     assert one[0] is not None
