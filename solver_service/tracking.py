@@ -277,6 +277,7 @@ def _feed(track: TrackFilter, node: int, piece: Piece) -> None:
 
 def _node_of(info: NodeInfo, rig: Rig) -> TrackNode:
     return TrackNode(
+        name=info.node,
         rig=rig,
         imu_m=None if info.imu_m is UNSET else np.array(info.imu_m),
         imu_delay_ns=None if info.imu_delay_ns is UNSET else info.imu_delay_ns,

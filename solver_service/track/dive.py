@@ -101,7 +101,7 @@ def smooth(
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
     if abs(parts[-1].state.clock_s) >= FAR_CLOCK_S or (without and abs(off_s) > FAR_WITHOUT_S):
-        said = f"nodes a and b: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
+        said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
         # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.

@@ -99,7 +99,7 @@ class TrackFilter(TrackSteps):
         """Whether the clocks prove further apart than a live track bears; `problems` says so then."""
         apart = self.main is not None and abs(self.main.state.clock_s) > FAR_CLOCK_S
         if apart:
-            self._report("nodes a and b: their clocks are far apart: no live track")
+            self._report(f"{self.both}: their clocks are far apart: no live track")
         return apart
 
     def _estimates(self) -> list[Estimate]:
@@ -161,9 +161,8 @@ class TrackFilter(TrackSteps):
         if attitudes[1] is not None and not self._faces(state, covariance, attitudes[1][1]):
             self._refused += 1
             if self._refused == REFUSED_TO_SAY:
-                self._report(
-                    "nodes a and b: attitudes and fixes contradict each other: another's lights, or a wrong mount"
-                )
+                why = "another's lights, or a wrong mount"
+                self._report(f"{self.both}: attitudes and fixes contradict each other: {why}")
             return None
         estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s)
         if attitudes[0] is not None:

@@ -14,12 +14,13 @@ Stamps = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class TrackNode:
-    """One node's constants.
+    """One node's constants. name: its id, for problems in words.
 
     imu_m: the inertial unit's place (3,) in the camera frame, None where not told. imu_delay_ns: its stamps minus
     the true time, None where not told.
     """
 
+    name: str
     rig: Rig
     imu_m: Floats | None = None
     imu_delay_ns: int | None = None

@@ -68,7 +68,7 @@ class TrackIntake:
         """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
         if not (seen.sigma_rad > LEAST_SIGMA_RAD).all():
             seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
-            self._report(f"node {'ab'[node]}: attitude sigmas of nothing are taken for unknown")
+            self._report(f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown")
         t_s = self.seconds(node, seen.stamp_ns)
         bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
         self._turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
@@ -87,10 +87,10 @@ class TrackIntake:
         self._push(t_s, 1 + node, sight)
 
     def add_fix(self, fix: FixSeen) -> None:
-        """Take a pose that one trigger's lights gave by themselves; one beyond all measure is left out."""
+        """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""
         numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
         if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
-            self._report("nodes a and b: fixes beyond all measure are left out")
+            self._report(f"{self.both}: fixes out of numeric range are left out")
             return
         self._push(self.between(fix.stamp_ns), 0, fix)
 
@@ -116,12 +116,18 @@ class TrackIntake:
             down = None
             if seen is not None and t_s - seen[0] < 0.5:
                 down = self.level_camera(node, seen[1])[2]
-            fault = fault_of("ab"[node], samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
+            fault = fault_of(self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
             samples.trusted = fault is None
             if fault is not None:
                 self._report(fault)
             if samples.rejected > REJECTED_TO_SAY:
-                self._report(f"node {'ab'[node]}: inertial samples not finite, clipped or sent twice are left out")
+                name = self.nodes[node].name
+                self._report(f"node {name}: inertial samples not finite, clipped or sent twice are left out")
+
+    @property
+    def both(self) -> str:
+        """The two nodes, in words."""
+        return f"nodes {self.nodes[0].name} and {self.nodes[1].name}"
 
     def _report(self, problem: str) -> None:
         """Add a problem, each kind once."""

@@ -101,12 +101,12 @@ def make(seed: int, setting: Setting) -> Dive:
     camera = Camera("pinhole", WIDTH_PX, HEIGHT_PX, FOCAL_PX, FOCAL_PX, 409.5, 307.5)
     nodes = []
     units = []
-    for _ in (0, 1):
+    for name in ("a", "b"):
         lights = np.array(((-0.44, 0.0, 0.0), (0.44, 0.0, 0.0)))
         lights[:, 1:] += rng.normal(0.0, 0.004, (2, 2))
         lever = rng.normal(0.0, 0.06, 3) if setting.poor else np.zeros(3)
         told = lever + (rng.normal(0.0, 0.005, 3) if setting.poor else 0.0)
-        nodes.append(TrackNode(Rig(camera, lights, R_BODY_CAMERA), told))
+        nodes.append(TrackNode(name, Rig(camera, lights, R_BODY_CAMERA), told))
         off = rotation_exp(rng.normal(0.0, np.radians(1.0), 3)) if setting.poor else np.eye(3)
         units.append((lever, off, rng.uniform(0.002, 0.006) if setting.poor else 0.0))
     triggers = np.arange(2, int(setting.seconds * setting.rate_hz)) / setting.rate_hz
