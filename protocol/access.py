@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from buddyline.protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
+from buddyline.protocol.topics import EXPECT, TOPICS, Topic
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
 # The keys that `ros2` publishes: domain, topic, type, and the type's hash. They have more chunks than any Buddyline
@@ -14,11 +15,13 @@ _ROS_KEYS: Final = [
     *("*/buddyline/*/attitude/*/*", "*/buddyline/*/depth/*/*", "*/buddyline/*/*/pose/*/*", "*/tf/*/*"),
     "@ros2_lv/**",
 ]
+# What nodes publish: all topics of a node but those that the solver computes for it.
+_OF_NODES: Final = tuple(topic for topic in TOPICS if topic.id_fields == ("node",) and not topic.solved)
 _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
 
 
 def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
-    """Return Zenoh's `access_control`: a node publishes its own keys, the solver those of pairs; all clients read all.
+    """Return Zenoh's `access_control`: a node publishes its own keys, the solver its results; all clients read all.
 
     A surveyor publishes marks for any node. A player publishes the keys of all nodes of a stored dive. A bridge to ROS
     publishes ROS's keys. Everything else is denied. Zenoh keeps its caches under `@adv`, which `*` and `**` do not
@@ -33,11 +36,15 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
     ]
     policies: list[dict[str, object]] = [{"rules": ["ask", "hear"], "subjects": clients}]
     for name, keys, alive in [
-        *((node_name(node), [f"node/{node}/*"], f"node/{node}") for node in nodes),
-        (SOLVER, ["pair/*/*/*"], "solver"),
+        *((node_name(node), [_short(topic, node) for topic in _OF_NODES], f"node/{node}") for node in nodes),
+        (SOLVER, ["pair/*/*/*", _short(EXPECT, "*")], "solver"),
         (VIEWER, [], "viewer"),
         (SURVEYOR, ["node/*/mark"], "surveyor"),
-        (PLAYER, ["node/*/*", "pair/*/*/truth", "pair/*/*/artag", "net/*/truth/*"], "player"),
+        (
+            PLAYER,
+            [*(_short(topic, "*") for topic in _OF_NODES), "pair/*/*/truth", "pair/*/*/artag", "net/*/truth/*"],
+            "player",
+        ),
     ]:
         own = [f"{root}/@alive/{alive}/**"] + [f"{root}/{key}{end}" for key in keys for end in ("", "/@adv/**")]
         rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))
@@ -51,6 +58,11 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
         "subjects": [{"id": name, "cert_common_names": [name]} for name in clients],
         "policies": policies,
     }
+
+
+def _short(topic: Topic, node: str) -> str:
+    """Return a node topic's key below the root. node: an id, or "*" for all nodes."""
+    return topic.template.removeprefix("buddyline/").format(node=node)
 
 
 def _rule(name: str, flows: list[str], messages: list[str], keys: list[str]) -> dict[str, object]:

@@ -146,7 +146,8 @@ class Candidates(Message, frozen=True, kw_only=True):
     """Light candidates of one frame, the most likely first.
 
     stamp_ns: middle of exposure of the image's middle row. trigger: round(stamp_ns / trigger_period_ns).
-    seq: sequence number, from 0 at each boot. truncated: number of candidates left out.
+    seq: sequence number, from 0 at each boot. truncated: number of candidates left out. elsewhere: only where parts of
+    the picture were not searched: how many candidates the last search of the whole picture found in these parts.
     """
 
     node: NodeId
@@ -158,6 +159,7 @@ class Candidates(Message, frozen=True, kw_only=True):
     height_px: Annotated[int, Meta(ge=1, le=65535)]
     blobs: Annotated[list[Blob], Meta(max_length=MAX_BLOBS)]
     truncated: Count = 0
+    elsewhere: Count | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check that every blob is inside the picture."""
@@ -166,6 +168,41 @@ class Candidates(Message, frozen=True, kw_only=True):
                 raise ValueError(f"blobs[{i}].u_px: {blob.u_px:g} is outside the image, width {self.width_px}")
             if not -0.5 <= blob.v_px <= self.height_px - 0.5:
                 raise ValueError(f"blobs[{i}].v_px: {blob.v_px:g} is outside the image, height {self.height_px}")
+
+
+class ExpectedLight(Struct, frozen=True, kw_only=True):
+    """Where one light should stand in a picture. Pixel centres at integers, distorted image.
+
+    covariance_px2: [uu, uv, vv]. rate_pxps: [u, v], how the place moves. sigma_rate_pxps: by how much the sigma grows
+    with each second after the stamp.
+    """
+
+    side: Literal["left", "right"]
+    u_px: float
+    v_px: float
+    covariance_px2: tuple[Positive, float, Positive]
+    rate_pxps: tuple[float, float]
+    sigma_rate_pxps: NonNegative
+
+    def __post_init__(self) -> None:
+        """Check that the covariance is positive definite."""
+        uu, uv, vv = self.covariance_px2
+        if not uv * uv < uu * vv:
+            raise ValueError("covariance_px2: not positive definite")
+
+
+class Expect(Message, frozen=True, kw_only=True):
+    """Where the solver's track expects the lights of the node `seen` in a later picture of the node `node`.
+
+    stamp_ns: the instant of the prediction, on node's clock; usually that of node's next picture. It serves until
+    valid_ns after the stamp. lights: those that should be in the picture; the others are left out.
+    """
+
+    node: NodeId
+    seen: NodeId
+    stamp_ns: StampNs
+    valid_ns: Annotated[int, Meta(ge=1, le=10_000_000_000)]
+    lights: Annotated[list[ExpectedLight], Meta(max_length=2)]
 
 
 class Imu(Message, frozen=True, kw_only=True):

@@ -79,6 +79,18 @@ CANDIDATES: Final = Topic(
     express=True,
     stale_s=1.0,
 )
+# Older than stale_s an expectation says nothing of where a light is now.
+EXPECT: Final = Topic(
+    "expect",
+    "buddyline/node/{node}/expect",
+    messages.Expect,
+    10.0,
+    "interactive_high",
+    express=True,
+    latest_only=True,
+    stale_s=0.5,
+    solved=True,
+)
 IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0)
 ATTITUDE: Final = Topic(
     "attitude", "buddyline/node/{node}/attitude", messages.Attitude, 100.0, "data_high", express=True, stale_s=2.0
@@ -149,6 +161,7 @@ SOLVER_STATUS: Final = Topic(
 TOPICS: Final = (
     INFO,
     CANDIDATES,
+    EXPECT,
     IMU,
     ATTITUDE,
     DEPTH,

@@ -59,14 +59,15 @@ def track_settings(mode: str, rate_hz: float) -> TrackSettings | None:
 
 
 class TrackConfig(Config, frozen=True, kw_only=True):
-    """[track]: rate of the live track's messages; 0 for no track."""
+    """[track]: rate of the live track's messages; 0 for no track. expect: tell the nodes where to look for lights."""
 
     rate_hz: Annotated[float, Meta(ge=0, le=200)] = 20.0
+    expect: bool = True
 
     @property
     def settings(self) -> TrackSettings | None:
         """The settings of the tracks: one without delay, and a more accurate one a second later."""
-        return TrackSettings(frozenset(("filter", "lag")), self.rate_hz) if self.rate_hz else None
+        return TrackSettings(frozenset(("filter", "lag")), self.rate_hz, self.expect) if self.rate_hz else None
 
 
 class SolverConfig(Config, frozen=True, kw_only=True):

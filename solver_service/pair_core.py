@@ -11,7 +11,7 @@ from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
 from buddyline.protocol.messages import Candidates, Message, Rejected, SolverStatus
-from buddyline.protocol.topics import POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
+from buddyline.protocol.topics import EXPECT, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
 from buddyline.solver_service.matcher import PairMatcher, Unmatched
@@ -23,8 +23,9 @@ from msgspec import UNSET
 
 PairId: TypeAlias = tuple[str, str]
 
-# The topics that a pair publishes.
+# The topics that a pair publishes, and those that it publishes for each of its nodes.
 PUBLISHED: Final = (POSE, REJECTED, TRACK, TRACK_LAG, SOLVER_STATUS)
+PUBLISHED_FOR_NODES: Final = (EXPECT,)
 # The clock offset is reported when its sigma is below this.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 ALIGN_EVERY_NS: Final = 10 * S_NS

@@ -13,11 +13,11 @@ from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, key_of
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, Topic, key_of
 from buddyline.solver_service.answered import Answered
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.pair_core import PUBLISHED, PairId
+from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher, Received
@@ -152,8 +152,11 @@ class SolverService(Service):
         for pair in self.core.pairs.keys() - self._declared:
             log.info("solver: pair %s, %s", *pair)
             self._declared.add(pair)
-            for topic in PUBLISHED:
-                self._publishers[topic.key(*pair)] = self._bus.publisher(topic, *pair)
+            named: list[tuple[Topic, tuple[str, ...]]] = [(topic, pair) for topic in PUBLISHED]
+            named += [(topic, (node,)) for topic in PUBLISHED_FOR_NODES for node in pair]
+            for topic, ids in named:
+                if topic.key(*ids) not in self._publishers:
+                    self._publishers[topic.key(*ids)] = self._bus.publisher(topic, *ids)
 
     def _publish(self, messages: Iterable[Message]) -> None:
         unsaid = self._answered.unsaid(messages)

@@ -12,7 +12,17 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Attitude, Message, NodeInfo, Rejected, RelativePose, Track, TrackMode
+from buddyline.protocol.messages import (
+    Attitude,
+    Expect,
+    ExpectedLight,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    Track,
+    TrackMode,
+)
 from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
@@ -20,6 +30,7 @@ from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.dive import NodeRecord, smooth
 from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
@@ -28,14 +39,17 @@ from msgspec.structs import replace
 
 # A sensor this far behind the frames has stopped: the track goes on without it.
 STOPPED_NS: Final = S_NS
+# For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
+EXPECT_VALID_NS: Final = S_NS // 2
 
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """modes: the tracks to make, at rate_hz rows a second."""
+    """modes: the tracks to make, at rate_hz rows a second. expect: tell both nodes where to look for the lights."""
 
     modes: frozenset[TrackMode]
     rate_hz: float = 20.0
+    expect: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +204,26 @@ class PairTracker:
         if self._lag is not None:
             self._lag.ask(due)
             messages += self._messages(self._lag.rows(), "lag")
+        return messages + (self._expect(self._filter, to_ns) if self._settings.expect else [])
+
+    def _expect(self, track: TrackFilter, to_ns: int) -> list[Message]:
+        """Return where each node's next picture should show the other's lights."""
+        messages: list[Message] = []
+        for node, stream in enumerate(self._streams):
+            if self._infos is None or stream.newest_ns is None:
+                continue
+            stamp_ns = stream.newest_ns + self._infos[node].trigger_period_ns
+            lights = foresee(track, node, to_ns, stamp_ns)
+            if lights:
+                messages.append(
+                    Expect(
+                        node=stream.node,
+                        seen=self._streams[1 - node].node,
+                        stamp_ns=stamp_ns,
+                        valid_ns=EXPECT_VALID_NS,
+                        lights=[_expected_light(light) for light in lights],
+                    )
+                )
         return messages
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
@@ -262,6 +296,18 @@ def track_message(row: TrackRow, node_a: str, node_b: str, mode: TrackMode, *, o
         sigma_azimuth_rad=row.sigma_azimuth_rad if oriented else UNSET,
         inclination_rad=row.inclination_rad if oriented else UNSET,
         sigma_inclination_rad=row.sigma_inclination_rad if oriented else UNSET,
+    )
+
+
+def _expected_light(seen: ForeseenLight) -> ExpectedLight:
+    (uu, uv), (_, vv) = seen.covariance_px2.tolist()
+    return ExpectedLight(
+        side="left" if seen.light == 0 else "right",
+        u_px=float(seen.pixel_px[0]),
+        v_px=float(seen.pixel_px[1]),
+        covariance_px2=(uu, uv, vv),
+        rate_pxps=(float(seen.rate_pxps[0]), float(seen.rate_pxps[1])),
+        sigma_rate_pxps=seen.sigma_rate_pxps,
     )
 
 

@@ -46,6 +46,8 @@ CONTRADICTS: Final = 33.0
 REFUSED_TO_SAY: Final = 10
 # Clocks further apart than this: the filter is not linear in them, and what it tells meanwhile is not honest.
 FAR_CLOCK_S: Final = 0.15
+# Longest step, without a picture, over which a track tells its present state.
+BRIDGED_S: Final = 1.0
 # What is older than this is dropped in a live filter.
 MEMORY_S: Final = 5.0
 
@@ -94,6 +96,19 @@ class TrackFilter(TrackSteps):
         if math.isfinite(self._keep_s):
             self._forget_before(end_s - MEMORY_S)
         return rows
+
+    def present(self, t_s: float) -> tuple[State, Floats, Floats] | None:
+        """Return the confirmed track's state, covariance and turn rates (2, 3) at t_s, up to which all has been added.
+
+        None where there is no such track, or it ends before.
+        """
+        main = self.main
+        if main is None or not main.confirmed or self.clocks_apart() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
+            return None
+        state, P = self._predict(main, t_s)
+        a, b = self.increments(main, t_s) if t_s > main.t_s else (None, None)
+        rates_radps = main.rates_radps if a is None or b is None else np.stack((a.rate_radps, b.rate_radps))
+        return state, P, rates_radps
 
     def clocks_apart(self) -> bool:
         """Whether the clocks prove further apart than a live track bears; `problems` says so then."""

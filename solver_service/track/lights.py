@@ -83,10 +83,25 @@ def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple
 
 
 def in_picture(camera: Camera, X: Floats, margin_px: float = 2.0) -> bool:
-    """Whether a point (3,) of the camera frame is imaged: Newton's method on the inverse model."""
-    if X[2] <= 0.0 and camera.model == "pinhole":
+    """Whether a point (3,) of the camera frame is imaged."""
+    pixel = pixel_of(camera, X)
+    if pixel is None:
         return False
-    pixel = np.array((camera.cx_px, camera.cy_px))
+    u, v = pixel
+    return bool(
+        -0.5 + margin_px <= u <= camera.width_px - 0.5 - margin_px
+        and -0.5 + margin_px <= v <= camera.height_px - 0.5 - margin_px
+    )
+
+
+def pixel_of(camera: Camera, X: Floats) -> Floats | None:
+    """Return where a point (3,) of the camera frame is imaged (2,): Newton's method on the inverse model.
+
+    None where the camera cannot image it; the pixel may be outside of the picture.
+    """
+    if X[2] <= 0.0 and camera.model == "pinhole":
+        return None
+    pixel: Floats = np.array((camera.cx_px, camera.cy_px))
     with np.errstate(all="ignore"):
         tangent_of_angle = np.hypot(X[0], X[1]) / max(abs(float(X[2])), 1e-9)
         if camera.model == "pinhole":
@@ -98,13 +113,9 @@ def in_picture(camera: Camera, X: Floats, margin_px: float = 2.0) -> bool:
             bearings, tangents = camera.rays(pixel[None])
             depth = float(bearings[0] @ X)
             if not np.isfinite(depth) or depth <= 0.0:
-                return False
+                return None
             pixel = pixel + tangents[0] @ X / depth
-    u, v = pixel
-    return bool(
-        -0.5 + margin_px <= u <= camera.width_px - 0.5 - margin_px
-        and -0.5 + margin_px <= v <= camera.height_px - 0.5 - margin_px
-    )
+    return pixel
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,21 @@ SOUND: tuple[m.Message, ...] = (
         height_px=616,
         blobs=[m.Blob(u_px=450.0, v_px=307.0, sigma_px=0.7, area_px=9.0, peak=250.0, elongation=1.0, score=0.5)],
     ),
+    m.Expect(
+        **_NODE,
+        seen="b",
+        valid_ns=500_000_000,
+        lights=[
+            m.ExpectedLight(
+                side="left",
+                u_px=450.0,
+                v_px=307.0,
+                covariance_px2=(9.0, 1.0, 16.0),
+                rate_pxps=(-20.0, 3.0),
+                sigma_rate_pxps=100.0,
+            )
+        ],
+    ),
     m.Imu(**_NODE, accel_mps2=(0.0, 0.0, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, 4e-5)),
     m.Attitude(**_NODE, q_ned_body_xyzw=_UNIT, sigma_rad=(0.02, 0.02, 0.1)),
     m.Depth(**_NODE, depth_m=5.0, sigma_m=0.02, pressure_pa=150000.0, temperature_degc=8.0),

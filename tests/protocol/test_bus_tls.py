@@ -72,11 +72,12 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         watcher.watch_alive(lambda name, here: alive(Received(f"{name} {here}", b"", 0, "")))
         # Denied first, allowed last, of one session and one priority: what is denied would come before.
         for bus, denied, allowed in (
-            (a, [(topics.DEPTH, "b"), (topics.TRUTH, "a", "b")], (topics.DEPTH, "a")),
+            (a, [(topics.DEPTH, "b"), (topics.TRUTH, "a", "b"), (topics.EXPECT, "a")], (topics.DEPTH, "a")),
             (b, [(topics.CANDIDATES, "a"), (topics.POSE, "a", "b")], (topics.CANDIDATES, "b")),
             (solver, [(topics.CANDIDATES, "a")], (topics.POSE, "a", "b")),
+            (solver, [], (topics.EXPECT, "b")),
             (surveyor, [(topics.CANDIDATES, "a"), (topics.INFO, "a"), (topics.TRUTH, "a", "b")], (topics.MARK, "a")),
-            (player, [(topics.POSE, "a", "b"), (topics.REJECTED, "a", "b")], (topics.TRUTH, "a", "b")),
+            (player, [(topics.POSE, "a", "b"), (topics.EXPECT, "a")], (topics.TRUTH, "a", "b")),
         ):
             for topic, *ids in [*denied, allowed]:
                 assert bus.publisher(topic, *ids).put_bytes(b'{"stamp_ns":1}')
@@ -90,7 +91,12 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         for bus, name in ((a, "node/a"), (b, "node/b"), (solver, "solver/a_b"), (viewer, "viewer/v")):
             bus.declare_alive(name)
             alive.wait_for(f"{name} True")
-        said = ["buddyline/node/a/depth", "buddyline/node/a/mark", "buddyline/node/b/candidates"]
+        said = [
+            "buddyline/node/a/depth",
+            "buddyline/node/a/mark",
+            "buddyline/node/b/candidates",
+            "buddyline/node/b/expect",
+        ]
         said += ["buddyline/node/c/candidates", "buddyline/pair/a/b/pose", "buddyline/pair/a/b/truth"]
         for key in said:
             inbox.wait_for(key)

@@ -6,7 +6,7 @@ import math
 import pytest
 from buddyline.protocol.codec import decode
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Attitude, Candidates, NodeInfo
+from buddyline.protocol.messages import Attitude, Candidates, Expect, NodeInfo
 
 ATTITUDE = {
     "node": "a",
@@ -40,6 +40,17 @@ INFO = {
 }
 
 
+LIGHT = {
+    "side": "left",
+    "u_px": 450.0,
+    "v_px": 307.0,
+    "covariance_px2": [9.0, 1.0, 16.0],
+    "rate_pxps": [-20.0, 3.0],
+    "sigma_rate_pxps": 100.0,
+}
+EXPECT = {"node": "a", "seen": "b", "stamp_ns": 5, "valid_ns": 500_000_000, "lights": [LIGHT]}
+
+
 def dumps(message: object) -> bytes:
     return json.dumps(message).encode()
 
@@ -58,6 +69,13 @@ def dumps(message: object) -> bytes:
         (Attitude, ATTITUDE, {"sigma_rad": [0.1, math.inf, 0.1]}, "sigma_rad"),
         (Attitude, ATTITUDE, {"sigma_rad": [0.1, "0.1", 0.1]}, "sigma_rad"),
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], u_px=820.0)]}, "blobs[0].u_px"),
+        (Candidates, CANDIDATES, {"elsewhere": -1}, "elsewhere"),
+        (Expect, EXPECT, {"valid_ns": 0}, "valid_ns"),
+        (Expect, EXPECT, {"lights": [LIGHT] * 3}, "lights"),
+        (Expect, EXPECT, {"lights": [dict(LIGHT, side="top")]}, "side"),
+        (Expect, EXPECT, {"lights": [dict(LIGHT, v_px=math.nan)]}, "v_px"),
+        (Expect, EXPECT, {"lights": [dict(LIGHT, sigma_rate_pxps=-1.0)]}, "sigma_rate_pxps"),
+        (Expect, EXPECT, {"lights": [dict(LIGHT, covariance_px2=[9.0, 12.0, 16.0])]}, "covariance_px2"),
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], v_px=-0.6)]}, "blobs[0].v_px"),
         (Candidates, CANDIDATES, {"blobs": [dict(CANDIDATES["blobs"][0], sigma_px=0.0)]}, "sigma_px"),
         (Candidates, CANDIDATES, {"blobs": CANDIDATES["blobs"] * 65}, "blobs"),

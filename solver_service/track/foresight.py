@@ -1,0 +1,77 @@
+"""Where the track expects the other node's lights in a picture that is still to be taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.lights import COLUMNS, light_positions, pixel_of
+from buddyline.solver_service.track.stepping import HOLD_S
+
+# How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
+TURN_RADPS2: Final = 0.5
+PUSH_MPS2: Final = 0.3
+# A picture further ahead of the track than this is not foretold.
+FURTHEST_S: Final = 0.5
+# A light whose place is worse known than this share of the picture's width is not foretold.
+WORST_SHARE: Final = 0.04
+STEP_S: Final = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ForeseenLight:
+    """A light of the other node, 0 left or 1 right, in a coming picture: pixel_px (2,), covariance_px2 (2, 2).
+
+    rate_pxps (2,): how the place moves. sigma_rate_pxps: by how much its sigma grows with each second.
+    """
+
+    light: int
+    pixel_px: Floats
+    covariance_px2: Floats
+    rate_pxps: Floats
+    sigma_rate_pxps: float
+
+
+def foresee(track: TrackFilter, observer: int, known_ns: int, stamp_ns: int) -> list[ForeseenLight]:
+    """Return the other node's lights that should be in the observer's picture at stamp_ns, on the observer's clock.
+
+    known_ns: up to which the track has been given everything. A light that is dark, outside of the picture, or whose
+    place is poorly known is left out.
+    """
+    now_s = track.seconds(0, known_ns) - HOLD_S
+    ahead_s = track.seconds(observer, stamp_ns) - now_s
+    present = track.present(now_s) if 0.0 < ahead_s <= FURTHEST_S else None
+    if present is None:
+        return []
+    state, P, rates_radps = present
+    rig, other = track.nodes[observer].rig, track.nodes[1 - observer].rig
+    dark = {light for node, light, _ in track.lamps.dark() if node == 1 - observer}
+    times_s = np.array((ahead_s, ahead_s + STEP_S))
+    X, D = light_positions(state, observer, other.lights_m, rates_radps, times_s)
+    found = []
+    for light in sorted({0, 1} - dark):
+        at, later = (pixel_of(rig.camera, X[k, light]) for k in (0, 1))
+        if at is None or later is None or not _inside(rig.camera, at):
+            continue
+        bearing, tangents = (values[0] for values in rig.camera.rays(at[None]))
+        J = tangents @ D[0, light] / float(bearing @ X[0, light])
+        px_per_rad = float(np.linalg.norm(tangents[0]))
+        range_m = float(np.linalg.norm(X[0, light]))
+        # Twice the integral of an unknown acceleration: of the turn, and of the way seen from so far.
+        growth = px_per_rad * float(np.hypot(TURN_RADPS2, PUSH_MPS2 / range_m))
+        covariance = J @ P[np.ix_(COLUMNS, COLUMNS)] @ J.T + (0.5 * growth * ahead_s**2) ** 2 * np.eye(2)
+        worst_px2 = float(np.linalg.eigvalsh(covariance)[-1]) if np.isfinite(covariance).all() else np.inf
+        if not 0.0 < worst_px2 < (WORST_SHARE * rig.camera.width_px) ** 2:
+            continue
+        rate_pxps = (later - at) / STEP_S
+        found.append(ForeseenLight(light, at, covariance, rate_pxps, growth * ahead_s))
+    return found
+
+
+def _inside(camera: Camera, pixel_px: Floats) -> bool:
+    u, v = pixel_px.tolist()
+    return bool(-0.5 <= u <= camera.width_px - 0.5 and -0.5 <= v <= camera.height_px - 0.5)
