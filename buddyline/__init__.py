@@ -196,14 +196,17 @@ def solve_messages(
     )
 
 
-def detect(image: NDArray[np.uint8], *, environment: str = "auto", method: str = "source") -> list[Blob]:
+def detect(
+    image: NDArray[np.uint8], *, environment: str = "auto", method: str = "source", focal_px: float | None = None
+) -> list[Blob]:
     """Find the light candidates of one picture, the likeliest first.
 
-    image: (H, W, 3) BGR or (H, W) grey, 8 bit. Raises BuddylineError where it is neither.
+    image: (H, W, 3) BGR or (H, W) grey, 8 bit. focal_px: the camera's; give it for a cropped picture.
+    Raises BuddylineError for anything else.
     """
     from buddyline.node.detect import make_detector
 
-    return [detection.blob for detection in make_detector(method, environment).detect(image)]
+    return [detection.blob for detection in make_detector(method, environment, focal_px=focal_px).detect(image)]
 
 
 def read_info(path: str | Path) -> NodeInfo:

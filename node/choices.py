@@ -3,4 +3,4 @@
 from typing import Final
 
 DETECTORS: Final = ("source", "paper")
-PRESETS: Final = ("auto", "cavern", "night_reef", "lake", "basin")
+PRESETS: Final = ("auto", "cavern", "night_reef", "lake", "basin", "day_reef")

@@ -98,7 +98,10 @@ class NodeService(Service):
             self.boot,
             info.trigger_period_ns,
             make_detector(
-                self.config.detector.method, self.config.detector.environment, self.config.detector.overrides
+                self.config.detector.method,
+                self.config.detector.environment,
+                self.config.detector.overrides,
+                info.camera.fx_px,
             ),
         )
         path, metadata = self._log_path(), self._log_metadata()

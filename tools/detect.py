@@ -67,7 +67,8 @@ class DiveDetector:
         pipeline = self._pipelines.get(node)
         if pipeline is None:
             period_ns = info.trigger_period_ns if info else FOLDER_PERIOD_NS
-            detector = make_detector(self.method, self.environment)
+            focal_px = info.camera.fx_px if info else None
+            detector = make_detector(self.method, self.environment, focal_px=focal_px)
             pipeline = self._pipelines[node] = Pipeline(node, f"detect-{self.method}", period_ns, detector)
         self.pictures += 1
         frame = Frame(picture, image.stamp_ns, info.row_time_ns if info else 0)

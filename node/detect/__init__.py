@@ -29,11 +29,15 @@ def presets(method: str) -> Mapping[str, Mapping[str, float]]:
 
 
 def make_detector(
-    method: str = "source", environment: str = "auto", overrides: Mapping[str, float] | None = None
+    method: str = "source",
+    environment: str = "auto",
+    overrides: Mapping[str, float] | None = None,
+    focal_px: float | None = None,
 ) -> Detector:
     """Make the detector of one camera.
 
-    overrides: replace values of the environment's preset, under the names that `presets` returns. Raises
+    overrides: replace values of the environment's preset, under the names that `presets` returns. focal_px: of the
+    pictures, for the size of lamps in them; without it, each picture counts as one of 49 degrees across. Raises
     BuddylineError for an unknown method, environment or name, and for a negative or non-finite value.
     """
     known = presets(method)
@@ -45,6 +49,8 @@ def make_detector(
             raise BuddylineError(f"detector value {name!r}: {method} has {', '.join(names)}")
         if not 0 <= value < float("inf"):
             raise BuddylineError(f"detector value {name} = {value}: must be a finite number, 0 or more")
+    if focal_px is not None and not 0 < focal_px < float("inf"):
+        raise BuddylineError(f"focal_px = {focal_px}: must be a finite number above 0")
     if method == "paper":
-        return paper.PaperDetector(environment, overrides or {})
-    return source.SourceDetector(environment, overrides or {})
+        return paper.PaperDetector(environment, overrides or {}, focal_px)
+    return source.SourceDetector(environment, overrides or {}, focal_px)

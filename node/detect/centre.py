@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 _RINGS = 16
 _SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)
 _CLIPPED = 249.0
-_WIDTH_OF_MODEL_PX = 820
+_FOCAL_OF_MODEL_PX = 904.0
 _ROBUST_SD = 3.0
 
 # The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
@@ -73,11 +73,13 @@ class Centres:
     lean: Floats
 
 
-def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str, float] = MODEL) -> Centres:
-    """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture."""
+def locate_sources(
+    image: NDArray[np.uint8], lights: Lights, focal_px: float, model: Mapping[str, float] = MODEL
+) -> Centres:
+    """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture of focal length focal_px."""
     start_px, radius_px, guess_px = lights.centre_px, lights.core_px, lights.guess_px
     prior_px2 = (model["core_share"] * radius_px + 0.5) ** 2
-    growth = _growth(radius_px * (_WIDTH_OF_MODEL_PX / image.shape[1]), lights.ground, model)
+    growth = _growth(radius_px * (_FOCAL_OF_MODEL_PX / focal_px), lights.ground, model)
     equations = _Equations(image, lights, growth, model)
     step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px)
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
@@ -97,7 +99,7 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, model: Mapping[str,
 def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
     """Return the growth d ln w / d ln rho of a flat profile, (N,): smaller in veiled water and for large discs.
 
-    radius_px: (N,), scaled to a picture 820 px wide. ground: (N,), grey levels. A veil (bright ground in the weakest
+    radius_px: (N,), scaled to a focal length of 904 px. ground: (N,), grey levels. A veil (bright ground in the weakest
     channel) shows turbid water: light scattered far from the beam hides the core. Large discs are mostly glow already.
     """
     veil = np.minimum(ground / 40.0, 1.0)

@@ -8,10 +8,12 @@ from typing import Final
 
 import cv2
 import numpy as np
+from buddyline.node.detect.detection import focal_of
 from numpy.typing import NDArray
 
 _OCTAVES = 5
-_BASE_WIDTH_PX = 512
+_BASE_FOCAL_PX = 564.0
+"""Pictures are halved until the focal length is this or less: scales go with angles, not with a picture's width."""
 _CLUTTER_CELL = 4
 _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
@@ -80,7 +82,9 @@ class ProposalFinder:
     contrast of its neighbourhood, the clutter.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, focal_px: float | None = None) -> None:
+        """focal_px: of the pictures; None to take each picture's from its width (see focal_of)."""
+        self._focal_px = focal_px
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
@@ -160,7 +164,8 @@ class ProposalFinder:
         self._halves = []
         height, width = shape[:2]
         self._base_step_px = 1.0
-        while width > _BASE_WIDTH_PX and height >= 2 * _WINDOW:
+        focal_px = self._focal_px or focal_of(width)
+        while focal_px > _BASE_FOCAL_PX * self._base_step_px and min(height, width) >= 2 * _WINDOW:
             height, width = height // 2, width // 2
             self._base_step_px *= 2.0
             self._halves.append(np.empty((height, width), np.uint8))

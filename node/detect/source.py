@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.node.detect.centre import Centres, locate_sources
-from buddyline.node.detect.detection import Detection, check_image
+from buddyline.node.detect.detection import Detection, check_image, focal_of
 from buddyline.node.detect.lights import Lights, distinct, measure_lights
 from buddyline.node.detect.proposals import ProposalFinder
 from buddyline.node.detect.rings import RAY_UV, Floats
@@ -45,9 +45,11 @@ grey, and in real caustics."""
 class SourceDetector:
     """The default detector. With the environment `auto` it adapts to the noise of this picture and those before."""
 
-    def __init__(self, environment: str, overrides: Mapping[str, float]) -> None:
+    def __init__(self, environment: str, overrides: Mapping[str, float], focal_px: float | None = None) -> None:
+        """focal_px: of the pictures; None to take each picture's from its width."""
+        self._focal_px = focal_px
         self._values = {**PRESETS.get(environment, {}), **overrides}
-        self._finder = ProposalFinder()
+        self._finder = ProposalFinder(focal_px)
         self._noise: float | None = None
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
@@ -67,7 +69,8 @@ class SourceDetector:
         ranked = score[order].tolist()
         chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in _KEPT)]
         likely = lights.at(chosen)
-        return _detections(likely, locate_sources(image, likely), score[chosen], image.shape)
+        focal_px = self._focal_px or focal_of(image.shape[1])
+        return _detections(likely, locate_sources(image, likely, focal_px), score[chosen], image.shape)
 
     def _adapt(self) -> float:
         """Return the least contrast of a place, in grey levels: from the noise of this picture and those before."""

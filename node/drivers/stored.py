@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from buddyline.node.config import NodeConfig
 from buddyline.node.devices import Frame
+from buddyline.node.drivers.picture_header import stated_size
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader, read_logs
@@ -32,6 +33,9 @@ log = logging.getLogger(__name__)
 
 PICTURE_SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 
+MOST_PIXELS: Final = 100_000_000
+"""A picture of more pixels is refused by its header: decoded, it would take more than 300 MB of memory."""
+
 
 class PictureError(BuddylineError):
     """A picture that cannot be used."""
@@ -39,8 +43,16 @@ class PictureError(BuddylineError):
 
 def decode_picture(data: bytes, name: str) -> NDArray[np.uint8]:
     """Return a stored picture, BGR (H, W, 3) or grey (H, W); name: what an error calls it."""
+    size = stated_size(data)
+    if size is not None and size[0] * size[1] > MOST_PIXELS:
+        raise PictureError(
+            f"{name}: its header says {size[0]}x{size[1]} px; at most {MOST_PIXELS // 10**6} megapixels are read"
+        )
     raw = np.frombuffer(data, np.uint8)
-    picture = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if raw.size else None
+    try:
+        picture = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if raw.size else None
+    except cv2.error as error:
+        raise PictureError(f"{name}: cannot be decoded: {error.err or error}") from error
     if picture is None:
         raise PictureError(f"{name}: is not a picture, or is cut off")
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-64:]:

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 from buddyline.node.detect import ENVIRONMENTS, METHODS, ImageError, make_detector
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
 from buddyline.protocol.errors import BuddylineError
 
 from tests.node.rendered import lamp_picture
@@ -61,6 +63,21 @@ def test_candidates_lie_inside_a_picture_full_of_noise(method):
         assert d.blob.sigma_px > 0
 
 
+def test_the_papers_thresholds_of_a_sunlit_basin_keep_its_lamps_and_not_its_glitter():
+    world = World(Scenario("basin", seed=31))
+    detector = make_detector("paper", "basin")
+    near, false = 0, 0
+    for i in range(6):
+        stamp_ns = 1_000_000_000 + i * 2_300_000_000
+        lights = [(x.u_px, x.v_px) for x in world.light_truth("a", stamp_ns, i).lights if x.visible]
+        at_px = np.array([(d.blob.u_px, d.blob.v_px) for d in detector.detect(world.render("a", stamp_ns))])
+        close = np.hypot(*(at_px[:, None] - lights).transpose(2, 0, 1)) < 8.2
+        near += close.any(axis=0).sum() - len(lights)
+        false += (~close.any(axis=1)).sum()
+    assert near >= -1
+    assert false / 6 < 3.0
+
+
 def test_an_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(BuddylineError, match="source"):
         make_detector("sauce")
@@ -68,5 +85,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         make_detector("source", "pond")
     with pytest.raises(BuddylineError, match="value_min"):
         make_detector("paper", "lake", {"value_mix": 3.0})
+    with pytest.raises(BuddylineError, match="focal_px = -1"):
+        make_detector(focal_px=-1.0)
     with pytest.raises(BuddylineError, match="finite"):
         make_detector("paper", "lake", {"value_min": float("nan")})

@@ -75,6 +75,14 @@ def test_sizes_of_pictures_do_not_matter(width):
     assert error_px(make_detector().detect(image), *at) < 0.5
 
 
+def test_a_narrow_crop_shows_a_lamp_as_the_whole_picture_does():
+    whole = lamp_picture([(410.0, 308.0)], size=(820, 616), core=900.0, core_px=6.0, glow=2500.0, lean=0.5)
+    crop = np.ascontiguousarray(whole[224:416, 288:512])
+    (seen, *_), (cropped, *_) = (make_detector(focal_px=904.0).detect(image) for image in (whole, crop))
+    assert np.hypot(seen.blob.u_px - 288 - cropped.blob.u_px, seen.blob.v_px - 224 - cropped.blob.v_px) < 0.05
+    assert cropped.blob.score == pytest.approx(seen.blob.score, abs=0.05)
+
+
 def test_a_view_into_a_padded_buffer_is_as_good_as_a_picture():
     image = lamp_picture([(150.0, 100.0)], size=(320, 240))[:, :, 1]
     padded = np.zeros((256, 384), np.uint8)

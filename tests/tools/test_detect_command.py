@@ -71,6 +71,17 @@ def test_a_folder_with_unusable_pictures_among_good_ones(tmp_path, capsys, caplo
     assert len(list((tmp_path / "marked").glob("*.png"))) == 5
 
 
+def test_a_picture_of_absurd_size_is_refused_by_its_header_and_the_rest_is_done(tmp_path, capsys):
+    huge = bytearray(encoded(PICTURE))
+    huge[16:24] = (60000).to_bytes(4, "big") * 2
+    (tmp_path / "1_huge.png").write_bytes(huge)
+    (tmp_path / "2_good.png").write_bytes(encoded(PICTURE))
+    assert main(["detect", str(tmp_path)]) == 1
+    out, err = capsys.readouterr()
+    assert [json.loads(line)["file"] for line in out.splitlines()] == [str(tmp_path / "2_good.png")]
+    assert "1_huge.png: its header says 60000x60000 px; at most 100 megapixels are read" in err
+
+
 def test_only_unusable_pictures_is_a_failure(tmp_path, capsys):
     (tmp_path / "a.png").write_bytes(b"no picture")
     assert main(["detect", str(tmp_path)]) == 1

@@ -55,7 +55,13 @@ def check_camera(config: NodeConfig) -> list[Finding]:
             _calibration(config, info, None),
             Finding("lights", "skipped", "no test frame"),
         ]
-    detector = make_detector(config.detector.method, config.detector.environment, config.detector.overrides)
+    stated = config.calibration or info
+    detector = make_detector(
+        config.detector.method,
+        config.detector.environment,
+        config.detector.overrides,
+        stated.camera.fx_px if stated else None,
+    )
     found = [detector.detect(frame.image) for frame in frames]
     seen = judge.picture(frames[-1].image)
     return [seen, _calibration(config, info, frames[-1].image.shape), judge.lights(found)]
