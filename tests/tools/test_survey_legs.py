@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, stand
@@ -370,3 +371,20 @@ def test_a_second_dive_takes_numbers_of_its_own(messages):
     tied.add(of_messages([*messages, mark]), SurveySettings(), AlarmSettings(), 2)
     assert tied.legs[5].from_ == "3"
     assert {leg.name for leg in tied.legs[6:]}.isdisjoint({leg.name for leg in tied.legs[:5]})
+    assert "taken for station 3 of dive 1" in "".join(problem.text for problem in tied.problems)
+    assert not any("taken for" in problem.text for problem in found.problems)
+
+
+def test_a_mark_by_hand_goes_before_the_log_s_and_equate_joins_stations(messages):
+    plain = derived(messages)
+    leg = plain.legs[2]
+    wrong = Mark(node=leg.to_node, stamp_ns=leg.end_ns, name="T21")
+    right = Mark(node=leg.to_node, stamp_ns=leg.start_ns, name="T12")
+    found = Derived()
+    found.add(of_messages([*messages, wrong]), SurveySettings(), AlarmSettings(), by_hand=[right])
+    assert found.legs[2].to == "T12"
+    found.equate(["T12", found.legs[0].from_])
+    assert found.legs[0].from_ == "T12"
+    assert "T12" in {station.name for station in found.stations()}
+    with pytest.raises(BuddylineError, match="equate of 'T21'"):
+        found.equate(["T12", "T21"])

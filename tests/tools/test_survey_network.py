@@ -1,14 +1,15 @@
 """The network: exact where readings are, honest where they are not, and it names who is wrong."""
 
 import math
+from datetime import date
 
 import numpy as np
 import pytest
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.geodesy import convergence_rad, declination, from_utm, grid_of, to_utm
+from buddyline.tools.survey.geodesy import Projection, declination, grid_of, radii_m, utm_epsg
 from buddyline.tools.survey.lines import bearing_of, line_of
 from buddyline.tools.survey.network import adjust
-from buddyline.tools.survey.project import Edit, FixedPoint, Place, Project
+from buddyline.tools.survey.project import DiveFiles, Edit, FixedPoint, Place, Project
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
@@ -166,12 +167,14 @@ def test_steep_legs_follow_the_clinometers():
 def test_utm_known_place_and_back():
     # The CN Tower, as given in the literature on UTM: zone 17N, 630084 m east, 4833438 m north.
     latitude, longitude = 43 + 38 / 60 + 33.24 / 3600, -(79 + 23 / 60 + 13.7 / 3600)
-    east, north = to_utm(latitude, longitude, "17N")
+    utm = Projection(utm_epsg("17N"))
+    east, north = utm.metres(latitude, longitude)
     assert (round(east), round(north)) == (630084, 4833439)
     for zone, place in (("17N", (latitude, longitude)), ("55S", (-33.2, 149.9)), ("32N", (0.1, 6.5))):
-        np.testing.assert_allclose(from_utm(*to_utm(*place, zone), zone), place, atol=1e-9)
+        grid = Projection(utm_epsg(zone))
+        np.testing.assert_allclose(grid.degrees(*grid.metres(*place)), place, atol=1e-9)
     # Convergence is about the longitude from the central meridian times the latitude's sine.
-    assert convergence_rad(latitude, longitude, "17N") == pytest.approx(
+    assert utm.convergence_rad(latitude, longitude) == pytest.approx(
         math.radians(longitude + 81) * math.sin(math.radians(latitude)), rel=1e-3
     )
 
@@ -183,7 +186,72 @@ def test_declination_is_stated_modelled_or_unknown():
     assert grid_of(world.project_of(legs)).north == "magnetic"
     modelled = declination(world.project_of(legs, place=Place(latitude_deg=45.5, longitude_deg=9.2)))
     # NOAA's calculator gives 3.6 degrees east for northern Italy in May 2026.
-    assert math.degrees(modelled.rad) == pytest.approx(3.6, abs=0.3)
+    assert math.degrees(modelled.rad((45.5, 9.2), date(2026, 5, 1))) == pytest.approx(3.6, abs=0.3)
     assert "2026-05-01" in modelled.source
     stated = declination(world.project_of(legs, place=Place(declination_deg=-2.0)))
-    assert math.degrees(stated.rad) == pytest.approx(-2.0)
+    assert math.degrees(stated.rad(None, date(2026, 5, 1))) == pytest.approx(-2.0)
+
+
+def forgotten_loop(seed):
+    """A loop whose closing mark was forgotten: its last station has a number of its own."""
+    course = world.loop(np.random.default_rng(seed), 14)
+    legs = world.readings_of(course, np.random.default_rng(seed))
+    return [*legs[:-1], replace(legs[-1], to="14")]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_forgotten_closing_mark_is_proposed_and_nothing_else(seed):
+    adjusted = adjust(world.project_of(forgotten_loop(seed)))
+    assert [(one.station, one.other) for one in adjusted.proposals] == [("14", "0")]
+    (proposal,) = adjusted.proposals
+    closed = adjust(
+        world.project_of([replace(leg, to="0" if leg.to == "14" else leg.to) for leg in forgotten_loop(seed)])
+    )
+    assert proposal.ratio == pytest.approx(closed.loops[0].horizontal_ratio, rel=0.3, abs=0.1)
+    assert not closed.proposals
+    assert '[[equate]] stations = ["0", "14"]' in proposal.text
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_open_line_has_no_station_that_may_be_another(seed):
+    course = world.line(np.random.default_rng(seed), 20)
+    assert not adjust(world.project_of(world.readings_of(course, np.random.default_rng(seed)))).proposals
+
+
+def test_height_takes_nothing_of_the_sigma_of_a_place():
+    legs = world.readings_of(world.line(np.random.default_rng(4), 3), np.random.default_rng(1))
+    fix = FixedPoint(station="0", east_m=0.0, north_m=0.0, sigma_m=5.0)
+    for depth, altitude_sigma_m in (("absolute", 0.0), ("readings", 0.0), ("readings", 0.3)):
+        fixed = replace(fix, altitude_m=90.0, altitude_sigma_m=altitude_sigma_m)
+        at = adjust(world.project_of(legs, depth, fix=[fixed])).positions["0"]
+        assert at.sigmas_m[:2] == pytest.approx([5.0, 5.0], rel=0.01)
+        assert at.sigmas_m[2] == pytest.approx(max(altitude_sigma_m, 0.02), abs=0.02)
+
+
+def test_a_leg_has_the_declination_of_its_own_date():
+    pytest.importorskip("pygeomag")
+    legs = world.readings_of(world.line(np.random.default_rng(4), 2), np.random.default_rng(1))
+    later_ns = round(3 * 365.25 * 86400e9)
+    second = replace(legs[1], dive=2, start_ns=legs[1].start_ns + later_ns, end_ns=legs[1].end_ns + later_ns)
+    # Declination changes fast near the magnetic pole.
+    project = world.project_of([legs[0], second], place=Place(latitude_deg=78.2, longitude_deg=15.6))
+    turns_deg = [math.degrees(line.turn_rad) for line in adjust(project).lines]
+    assert 0.5 < abs(turns_deg[1] - turns_deg[0]) < 2.0
+    stated = replace(project, dive=[DiveFiles(logs=[], date=date(2026, 5, 1))] * 2)
+    assert len({line.turn_rad for line in adjust(stated).lines}) == 1
+
+
+def test_a_map_grid_s_scale_counts_for_latitude_and_longitude():
+    legs = world.readings_of(world.line(np.random.default_rng(4), 40), np.random.default_rng(1))
+    place = Place(declination_deg=0.0, utm_zone="32N", latitude_deg=45.5, longitude_deg=9.0)
+    fix = [FixedPoint(station="0", latitude_deg=45.5, longitude_deg=9.0)]
+    utm = adjust(world.project_of(legs, place=place, fix=fix))
+    local = adjust(world.project_of(legs, place=Place(declination_deg=0.0), fix=fix))
+    far = max(
+        utm.positions.values(),
+        key=lambda one: float(np.linalg.norm(one.position_m[:2] - utm.positions["0"].position_m[:2])),
+    )
+    same, other = utm.grid.degrees(far.position_m), local.grid.degrees(local.positions[far.name].position_m)
+    # At the central meridian the grid is 0.04 % too small: 4 cm of a hundred metres.
+    apart_m = np.radians(np.subtract(same, other)) * np.array(radii_m(45.5))[::-1]
+    assert np.linalg.norm(apart_m) < 0.01

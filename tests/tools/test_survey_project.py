@@ -107,7 +107,8 @@ def test_what_people_write_stays_and_the_old_file_is_kept(tmp_path, logs):
     for leg in load_project(path).leg:
         assert leg.distance_m == before[leg.name].distance_m
         assert leg.distance_sigma_m > before[leg.name].distance_sigma_m
-    assert run("adjust", path) == 0
+    # The leg that was taken out leaves the others without a connection.
+    assert run("adjust", path) == 1
 
 
 def test_a_better_calibration_updates_the_survey(tmp_path, logs, messages):
@@ -147,6 +148,13 @@ def test_marks_from_a_table_and_from_the_project(tmp_path, logs):
     path.write_text(path.read_text().replace(MARKER, by_hand))
     run("legs", path)
     assert load_project(path).leg[-1].to == "TIP"
+    # A spreadsheet where a comma is the decimal point: semicolons, and a mark at its beginning.
+    table.write_text(f"\ufefftime;node;name;note\n{seconds:.1f};{last.to_node};TAIL;".replace(".", ","))
+    run("legs", path, "--marks", table)
+    path.write_text(path.read_text().replace(by_hand, by_hand.replace(f'"{last.to_node}"', '"q"')))
+    assert run("legs", path, "--marks", table) == 1
+    assert load_project(path).leg[-1].to == "TAIL"
+    assert any("node q is in no pair" in problem.text for problem in load_project(path).problem)
     table.write_text("time,node,name\nyesterday,a,X\n")
     with pytest.raises(ConfigError, match="line 2"):
         run("legs", path, "--marks", table)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -21,6 +24,18 @@ if TYPE_CHECKING:
 GAP_S: Final = 1.5
 COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
 NO_POSE_COLOUR: Final = "#d0483f"
+# Letters that matplotlib's own font lacks are taken from the first of these that is installed and has them.
+FALLBACK_FONTS: Final = (
+    "Noto Sans",
+    "Noto Sans CJK SC",
+    "Noto Sans CJK JP",
+    "WenQuanYi Zen Hei",
+    "Noto Sans Arabic",
+    "Noto Sans Hebrew",
+    "Noto Sans Thai",
+    "Noto Sans Devanagari",
+    "Unifont",
+)
 _STYLE: Final[dict[Any, Any]] = {
     # Coordinates of a grid stand in full.
     "axes.formatter.limits": (-5, 9),
@@ -47,6 +62,25 @@ def check() -> None:
     except ImportError:
         raise BuddylineError("drawing needs matplotlib: make install EXTRAS=plots") from None
     mpl.rcParams.update(_STYLE)
+    from matplotlib import font_manager
+
+    installed = set(font_manager.get_font_names())
+    mpl.rcParams["font.family"] = ["DejaVu Sans", *(name for name in FALLBACK_FONTS if name in installed)]
+
+
+@contextmanager
+def _missing_letters_said(*, drawn: bool) -> Iterator[None]:
+    """Say on stderr, in one line, which letters no installed font has. drawn: as shapes, so that they are lost."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.filterwarnings("always", r"Glyph .* missing from font")
+        yield
+    missing = {match[1] for one in caught if (match := re.match(r"Glyph (\d+) ", str(one.message)))}
+    for one in caught:
+        if not str(one.message).startswith("Glyph "):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    if missing and drawn:
+        letters = "".join(sorted(chr(int(code)) for code in missing))
+        print(f"no installed font has {letters}: drawn as boxes; install one, such as fonts-noto-cjk", file=sys.stderr)
 
 
 def new_figure(
@@ -63,7 +97,8 @@ def new_figure(
 def save(figure: Figure, path: Path) -> None:
     """Write a figure in the format that the path's suffix names."""
     try:
-        figure.savefig(path)
+        with _missing_letters_said(drawn=path.suffix != ".svg"):
+            figure.savefig(path)
     except (OSError, ValueError) as error:
         raise BuddylineError(f"{path}: cannot be written: {error}") from error
 
@@ -71,7 +106,9 @@ def save(figure: Figure, path: Path) -> None:
 def svg(figure: Figure) -> str:
     """Return a figure as an SVG file."""
     file = io.StringIO()
-    figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    # Text stays text there: whoever shows it has fonts of its own.
+    with _missing_letters_said(drawn=False):
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return file.getvalue()
 
 
@@ -90,7 +127,7 @@ def pdf(figures: Sequence[Figure]) -> bytes:
     from matplotlib.backends.backend_pdf import PdfPages
 
     file = io.BytesIO()
-    with PdfPages(file, metadata={"CreationDate": None}) as pages:
+    with _missing_letters_said(drawn=True), PdfPages(file, metadata={"CreationDate": None}) as pages:
         for figure in figures:
             figure.savefig(pages, format="pdf")
     return file.getvalue()

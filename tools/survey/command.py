@@ -33,6 +33,9 @@ FORMATS: Final = {
     "pdf": ".pdf",
 }
 
+# Formats that can be written in more than one way.
+STYLES: Final = {"svx": ("auto", "diving", "normal"), "th": ("auto", "diving")}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -71,8 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--style",
         choices=("auto", "diving", "normal"),
         default="auto",
-        help="of svx: diving (tape, compass, depths) or normal (tape, compass, clino); default: diving, but normal for "
-        "legs in loops, because no Survex up to 1.4.22 adjusts loops of diving legs correctly",
+        help="diving (tape, compass, depths; of svx and th) or normal (tape, compass, clino; of svx); default: diving, "
+        "but for legs in loops normal in svx, because no Survex up to 1.4.22 adjusts loops of diving legs correctly, "
+        "and as adjusted in th, because Therion weighs loops without correlations",
     )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
     watch = add("publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch, "watch")
@@ -94,6 +98,7 @@ def _watch(args: argparse.Namespace) -> int:
 
 def _legs(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.derive import Derived
+    from buddyline.tools.survey.gauges import adjust_gauges
     from buddyline.tools.survey.marks import of_project, of_table
     from buddyline.tools.survey.project import load_project, new_project, write_derived
     from buddyline.tools.survey.readings import of_logs
@@ -110,15 +115,22 @@ def _legs(args: argparse.Namespace) -> int:
         pairs = of_logs([str(path.parent / log) for log in one.logs])
         by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
+    for one_place in project.equate:
+        derived.equate(one_place.stations)
     stations = derived.stations()
+    gauges = adjust_gauges(derived.legs, project.alarms)
+    for text in gauges.alarms:
+        derived.say(text)
+    for dive, rate in gauges.tides_m_per_h.items():
+        derived.say(f"water level in dive {dive}: {rate:+.2f} m an hour, by the gauges' own readings; taken off")
     write_derived(
         path, {"problem": derived.problems, "station": stations, "leg": derived.legs, "point": derived.points}
     )
-    alarms = sum(len(leg.alarms) for leg in derived.legs + derived.points)
+    alarms = sum(len(leg.alarms) for leg in derived.legs + derived.points) + len(gauges.alarms)
     print(f"{path}: {len(derived.legs)} legs, {len(stations)} stations, {len(derived.points)} points, {alarms} alarms")
     for problem in derived.problems:
         print(f"  {problem.text}")
-    return 0 if derived.legs or derived.points else 1
+    return 0 if (derived.legs or derived.points) and not derived.faults else 1
 
 
 def _sheet(args: argparse.Namespace) -> Sheet:
@@ -135,7 +147,7 @@ def _sheet(args: argparse.Namespace) -> Sheet:
 
 
 def _adjust(args: argparse.Namespace) -> int:
-    """Print the adjustment; return 1 where it finds a blunder."""
+    """Print the adjustment; return 1 where it finds a blunder or leaves out a leg that nobody has taken out."""
     from buddyline.tools.survey import report
 
     sheet = _sheet(args)
@@ -143,7 +155,9 @@ def _adjust(args: argparse.Namespace) -> int:
         print(json.dumps(as_json(sheet.adjusted), allow_nan=False))
     else:
         print("\n".join(report.summary(sheet)))
-    return 1 if sheet.adjusted.blunders else 0
+    taken_out = {id(leg) for leg in sheet.project.leg + sheet.project.point if sheet.project.taken_out(leg)}
+    lost = [leg for leg, _ in sheet.adjusted.left_out if id(leg) not in taken_out]
+    return 1 if sheet.adjusted.blunders or lost else 0
 
 
 def _report(args: argparse.Namespace) -> int:
@@ -157,8 +171,9 @@ def _report(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace) -> int:
     from buddyline.tools.newfile import write_output
 
-    if args.style != "auto" and args.format != "svx":
-        raise BuddylineError(f"--style is an option of svx; {args.format} has one style")
+    if args.style not in STYLES.get(args.format, ("auto",)):
+        known = "; ".join(f"{name}: {', '.join(styles)}" for name, styles in STYLES.items())
+        raise BuddylineError(f"--style {args.style}: {args.format} has no such style ({known})")
     target = args.output or str(args.project.with_suffix(FORMATS[args.format]))
     write_output(target, exported(_sheet(args), args.format, args.style))
     return 0
@@ -174,7 +189,7 @@ def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
     writers: dict[str, Callable[[], str | bytes]] = {
         "svx": lambda: survex.svx(sheet, style),
         "svx-cartesian": lambda: survex.svx_cartesian(sheet),
-        "th": lambda: survex.th(sheet),
+        "th": lambda: survex.th(sheet, style),
         "dat": lambda: tables.compass_dat(sheet),
         "csv": lambda: tables.legs_csv(sheet),
         "stations": lambda: tables.stations_csv(sheet),
@@ -205,5 +220,6 @@ def as_json(adjusted: Adjusted) -> dict[str, object]:
         "loops": [asdict(loop) for loop in adjusted.loops],
         "residuals": [{"leg": one.leg.name, "moved_m": one.moved_m, "chi2": one.chi2} for one in adjusted.residuals],
         "blunders": [{"legs": one.legs, "chi2": one.chi2} for one in adjusted.blunders],
+        "proposals": [asdict(one) for one in adjusted.proposals],
         "left_out": [{"leg": leg.name, "why": why} for leg, why in adjusted.left_out],
     }

@@ -11,10 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.averages import Mean
 from buddyline.tools.survey.chain import Stop, stand
+from buddyline.tools.survey.gauges import adjust_gauges
 from buddyline.tools.survey.magnetism import usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
 from buddyline.tools.survey.readings import PairReadings
@@ -22,7 +24,6 @@ from buddyline.tools.survey.rests import rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
-from msgspec import UNSET
 from msgspec.structs import replace
 
 # A mark belongs to the nearest rest, but not to one further away than this.
@@ -31,13 +32,18 @@ LEAST_POINT_FIXES: Final = 3
 
 
 class Derived:
-    """What dives give: legs, points, problems; and notes on stations by name."""
+    """What dives give: legs, points, problems; notes on stations by name.
+
+    numbered: stations that no mark has named, and the dive that numbered them. faults: how many marks were of no use.
+    """
 
     def __init__(self) -> None:
         self.legs: list[Leg] = []
         self.points: list[Leg] = []
         self.problems: list[Problem] = []
         self.notes: dict[str, list[str]] = defaultdict(list)
+        self.numbered: dict[str, int] = {}
+        self.faults = 0
 
     def add(
         self,
@@ -47,19 +53,32 @@ class Derived:
         dive: int = 1,
         by_hand: Iterable[Mark] = (),
     ) -> None:
-        """Add one dive's legs and points; each pair of nodes is a chain of its own. by_hand: marks beside the logs'."""
-        marks = sorted([*pairs[0].marks, *by_hand], key=lambda mark: mark.stamp_ns)
+        """Add one dive's legs and points; each pair of nodes is a chain of its own.
+
+        by_hand: marks beside the logs', which count before these: with them a person corrects what was mistyped.
+        """
+        corrections = list(by_hand)
+        marks = sorted([*pairs[0].marks, *corrections], key=lambda mark: mark.stamp_ns)
+        corrected = {id(mark) for mark in corrections}
         chains = []
         for readings in pairs:
-            chain = _Chain(self, readings, marks, settings, limits, dive)
+            chain = _Chain(self, readings, marks, corrected, settings, limits, dive)
             self.legs += chain.legs
             chains.append(chain)
         nodes = {node for chain in chains for node in chain.readings.nodes}
+        marked = {name for chain in chains for stations in chain.named for name in stations.values()}
+        for leg in self.legs:
+            for name in {leg.from_, leg.to} - marked:
+                self.numbered.setdefault(name, leg.dive)
         placed = {id(mark) for chain in chains for mark in chain.placed}
         points = [mark for mark in marks if mark.kind == "point" and mark.node in nodes]
         for mark in marks:
             at = _time_text(mark.stamp_ns)
-            if mark.kind == "note" and mark.note:
+            if mark.node not in nodes and mark.kind != "note":
+                self.faults += 1
+                known = ", ".join(sorted(nodes))
+                self.say(f"mark {mark.name} at {at}: node {mark.node} is in no pair of dive {dive}; known: {known}")
+            elif mark.kind == "note" and mark.note:
                 self.say(f"note at {at}: {mark.note}")
             elif mark.kind == "station" and mark.node in nodes:
                 if not STATION_NAME.match(mark.name):
@@ -68,14 +87,15 @@ class Derived:
                 if mark.note and mark.note not in self.notes[mark.name]:
                     self.notes[mark.name].append(mark.note)
                 if id(mark) not in placed and not points:
+                    self.faults += 1
                     self.say(f"mark {mark.name} at {at}: no rest near it")
         for mark in points:
             name = mark.name or f"p{len(self.points) + 1}"
             # Of several nodes that saw the point, the first with fixes enough.
             found = [chain.point(mark, name) for chain in chains if mark.node in chain.readings.nodes]
-            leg = next((one for one in found if isinstance(one, Leg)), None)
-            if leg is not None:
-                self.points.append(leg)
+            shot = next((one for one in found if isinstance(one, Leg)), None)
+            if shot is not None:
+                self.points.append(shot)
             else:
                 self.say(f"point {name}: {found[0]}")
 
@@ -83,33 +103,37 @@ class Derived:
         """Add a problem."""
         self.problems.append(Problem(text=text))
 
+    def equate(self, stations: list[str]) -> None:
+        """Give stations that are one place the first one's name; raise BuddylineError for one that there is not."""
+        known = {name for leg in self.legs + self.points for name in (leg.from_, leg.to)}
+        for name in stations:
+            if name not in known:
+                raise BuddylineError(f"equate of {name!r}: no leg has this station; known: {', '.join(sorted(known))}")
+        first, *others = stations
+
+        def renamed(name: str) -> str:
+            return first if name in others else name
+
+        self.legs = [replace(leg, from_=renamed(leg.from_), to=renamed(leg.to)) for leg in self.legs]
+        self.points = [replace(leg, from_=renamed(leg.from_)) for leg in self.points]
+        for other in others:
+            self.notes[first] += [note for note in self.notes.pop(other, []) if note not in self.notes[first]]
+
     def stations(self) -> list[Station]:
-        """Return all stations in the order of the legs, each with the weighted mean of its gauges' readings."""
-        seen: dict[str, list[tuple[float, float]]] = {}
-        for leg in self.legs:
-            for name, depth_m, sigma_m in (
-                (leg.from_, leg.depth_from_m, leg.depth_from_sigma_m),
-                (leg.to, leg.depth_to_m, leg.depth_to_sigma_m),
-            ):
-                of_station = seen.setdefault(name, [])
-                if depth_m is not UNSET and sigma_m is not UNSET:
-                    of_station.append((depth_m, sigma_m))
-        return [_station(name, depths, self.notes.get(name, [])) for name, depths in seen.items()]
-
-
-def _station(name: str, depths: list[tuple[float, float]], notes: list[str]) -> Station:
-    if not depths:
-        return Station(name=name, notes=notes)
-    depth_m, sigma_m = np.array(depths).T
-    weight = 1 / sigma_m**2
-    return Station(
-        name=name,
-        depth_m=round(float(weight @ depth_m / weight.sum()), 4),
-        # A gauge has the same error at each of its visits: averaging them gains little, so it is not counted.
-        depth_sigma_m=round(float(sigma_m.min()), 4),
-        readings=len(depths),
-        notes=notes,
-    )
+        """Return all stations in the order of the legs, each with the depth that all gauges' readings give it."""
+        depths = adjust_gauges(self.legs).depths
+        stations = []
+        for name in dict.fromkeys(name for leg in self.legs for name in (leg.from_, leg.to)):
+            known: dict[str, Any] = {}
+            if name in depths:
+                of = depths[name]
+                known = {
+                    "depth_m": round(of.depth_m, 4),
+                    "depth_sigma_m": round(of.sigma_m, 4),
+                    "readings": of.readings,
+                }
+            stations.append(Station(name=name, notes=self.notes.get(name, []), **known))
+        return stations
 
 
 class _Chain:
@@ -120,6 +144,7 @@ class _Chain:
         out: Derived,
         readings: PairReadings,
         marks: list[Mark],
+        corrected: set[int],
         settings: SurveySettings,
         limits: AlarmSettings,
         dive: int,
@@ -142,16 +167,16 @@ class _Chain:
         self.usual = {
             node: usual_field([shot.ends[i].field for shot in shots]) for i, node in enumerate(readings.nodes)
         }
-        named = self._named(out)
+        self.named = self._named(out, corrected)
         stops = [
             Stop(rest.line_m, {end.node: end.depth.value if end.depth else None for end in shot.ends}, stations)
-            for rest, shot, stations in zip(self.found, shots, named, strict=True)
+            for rest, shot, stations in zip(self.found, shots, self.named, strict=True)
         ]
         first = settings.first if settings.first in readings.nodes else readings.nodes[0]
         taken = {name for leg in out.legs for name in (leg.from_, leg.to)}
         self.standings = stand(stops, settings.procedure, first, taken)
         legs = []
-        for rest, shot, standing, stations in zip(self.found, shots, self.standings, named, strict=True):
+        for rest, shot, standing, stations in zip(self.found, shots, self.standings, self.named, strict=True):
             leg = self._leg(shot, standing.station, standing.rear)
             said = [standing.problem] if standing.problem else []
             if id(rest) in doubtful and len(stations) < 2:
@@ -159,10 +184,10 @@ class _Chain:
             legs.append(replace(leg, alarms=[*leg.alarms, *(f"stations: {text}" for text in said)]))
         self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
 
-    def _named(self, out: Derived) -> list[dict[str, str]]:
+    def _named(self, out: Derived, corrected: set[int]) -> list[dict[str, str]]:
         """Return, for each rest, the stations that are known by node: by marks, or by another pair's leg meanwhile.
 
-        A mark belongs to the rest nearest to it; of two marks the later one counts.
+        A mark belongs to the rest nearest to it; of two marks one by hand (corrected) counts, else the later one.
         """
         named: list[dict[str, str]] = [{} for _ in self.found]
         for leg in out.legs:
@@ -170,13 +195,21 @@ class _Chain:
                 if leg.dive == self.dive and leg.start_ns <= rest.end_ns and rest.start_ns <= leg.end_ns:
                     both = {leg.from_node: leg.from_, leg.to_node: leg.to}
                     stations |= {node: name for node, name in both.items() if node in self.readings.nodes}
-        for mark in self.marks:
+        joined: set[str] = set()
+        for mark in sorted(self.marks, key=lambda one: id(one) in corrected):
             if mark.kind != "station" or mark.node not in self.readings.nodes or not STATION_NAME.match(mark.name):
                 continue
             gaps = [max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0) for rest in self.found]
             if gaps and min(gaps) <= MARK_NEAR_NS:
                 named[gaps.index(min(gaps))][mark.node] = mark.name
                 self.placed.append(mark)
+                earlier = out.numbered.get(mark.name, self.dive)
+                if earlier != self.dive and mark.name not in joined:
+                    joined.add(mark.name)
+                    out.say(
+                        f"mark {mark.name} in dive {self.dive}: taken for station {mark.name} of dive {earlier}, which "
+                        f"got that number because no mark named it; is it the same place?"
+                    )
         return named
 
     def point(self, mark: Mark, name: str) -> Leg | str:

@@ -1,75 +1,88 @@
-"""Places: latitude and longitude, the grid of a UTM zone, its convergence, the declination there and then."""
+"""Places: latitude and longitude, the projection of a map grid, its convergence, the declination there and then."""
 
 from __future__ import annotations
 
-import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
-from typing import Final
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.averages import Floats
-from buddyline.tools.survey.project import FixedPoint, Project
+from buddyline.tools.survey.project import FixedPoint, Leg, Project
 from msgspec import UNSET
+
+if TYPE_CHECKING:
+    from pyproj import Proj, Transformer
 
 # WGS 84.
 SEMI_MAJOR_M: Final = 6378137.0
 FLATTENING: Final = 1 / 298.257223563
-UTM_SCALE: Final = 0.9996
-FALSE_EAST_M: Final = 500_000.0
-FALSE_NORTH_SOUTHERN_M: Final = 10_000_000.0
-
-_N: Final = FLATTENING / (2 - FLATTENING)
-_SCALE_M: Final = UTM_SCALE * SEMI_MAJOR_M / (1 + _N) * (1 + _N**2 / 4 + _N**4 / 64)
-# Krueger's series to the third power of n: below a millimetre within a zone (Karney 2011, Eq. 35).
-_ALPHA: Final = (
-    _N / 2 - 2 * _N**2 / 3 + 5 * _N**3 / 16,
-    13 * _N**2 / 48 - 3 * _N**3 / 5,
-    61 * _N**3 / 240,
-)
 _E2: Final = FLATTENING * (2 - FLATTENING)
-_E: Final = math.sqrt(_E2)
-# Each step of the inverse is right to the grid's convergence, a tenth at the very worst.
-_INVERSE_STEPS: Final = 20
+# The World Magnetic Model is worked out for places rounded to this: a kilometre, where it changes by 0.01 degrees.
+MODEL_DIGITS: Final = 2
 
 
-def zone_meridian_rad(zone: str) -> float:
-    """Return the central meridian of a UTM zone such as "32N"."""
-    return math.radians(6 * int(zone[:-1]) - 183)
+@dataclass(frozen=True)
+class Projection:
+    """A projected coordinate system of the EPSG registry, in metres east and north. Needs pyproj."""
+
+    epsg: int
+
+    @cached_property
+    def _transformer(self) -> Transformer:
+        try:
+            from pyproj import CRS, Transformer
+            from pyproj.exceptions import CRSError
+        except ModuleNotFoundError as error:
+            raise BuddylineError("a map grid needs pyproj: make install EXTRAS=survey") from error
+        try:
+            crs = CRS.from_epsg(self.epsg)
+        except CRSError as error:
+            raise ConfigError(f"place.epsg {self.epsg}: the EPSG registry has no such coordinate system") from error
+        units = {axis.unit_name for axis in crs.axis_info}
+        if not crs.is_projected or units != {"metre"}:
+            raise ConfigError(f"place.epsg {self.epsg}: {crs.name} is no map grid in metres")
+        return Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+
+    @cached_property
+    def _proj(self) -> Proj:
+        from pyproj import Proj
+
+        return Proj(self._transformer.target_crs)
+
+    def metres(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Return east and north, metres, of a place of WGS 84; raise BuddylineError outside of the grid."""
+        east_m, north_m = self._transformer.transform(longitude_deg, latitude_deg)
+        if not math.isfinite(east_m + north_m):
+            raise BuddylineError(f"latitude {latitude_deg}, longitude {longitude_deg}: outside of EPSG:{self.epsg}")
+        return east_m, north_m
+
+    def degrees(self, east_m: float, north_m: float) -> tuple[float, float]:
+        """Return latitude and longitude, WGS 84; raise BuddylineError outside of the grid."""
+        longitude_deg, latitude_deg = self._transformer.transform(east_m, north_m, direction="INVERSE")
+        if not math.isfinite(longitude_deg + latitude_deg):
+            raise BuddylineError(f"east {east_m} m, north {north_m} m: outside of EPSG:{self.epsg}")
+        return latitude_deg, longitude_deg
+
+    def convergence_rad(self, latitude_deg: float, longitude_deg: float) -> float:
+        """Return the azimuth of grid north, east of true north positive."""
+        return math.radians(self._proj.get_factors(longitude_deg, latitude_deg).meridian_convergence)
+
+    def scale(self, latitude_deg: float, longitude_deg: float) -> float:
+        """Return metres in the grid per metre on the ground, at the ellipsoid, along the meridian."""
+        return float(self._proj.get_factors(longitude_deg, latitude_deg).meridional_scale)
 
 
-def to_utm(latitude_deg: float, longitude_deg: float, zone: str) -> tuple[float, float]:
-    """Return east and north, metres."""
-    tangent = math.tan(math.radians(latitude_deg))
-    sigma = math.sinh(_E * math.atanh(_E * tangent / math.hypot(1, tangent)))
-    conformal = tangent * math.hypot(1, sigma) - sigma * math.hypot(1, tangent)
-    away = math.radians(longitude_deg) - zone_meridian_rad(zone)
-    eta = math.asinh(math.sin(away) / math.hypot(conformal, math.cos(away)))
-    z = complex(math.atan2(conformal, math.cos(away)), eta)
-    z += sum(alpha * cmath.sin(2 * k * z) for k, alpha in enumerate(_ALPHA, 1))
-    false_north_m = FALSE_NORTH_SOUTHERN_M if zone.endswith("S") else 0.0
-    return FALSE_EAST_M + _SCALE_M * z.imag, false_north_m + _SCALE_M * z.real
-
-
-def from_utm(east_m: float, north_m: float, zone: str) -> tuple[float, float]:
-    """Return latitude and longitude, degrees, by going towards the point until the projection meets it."""
-    latitude_deg, longitude_deg = 0.0, math.degrees(zone_meridian_rad(zone))
-    for _ in range(_INVERSE_STEPS):
-        east_now_m, north_now_m = to_utm(latitude_deg, longitude_deg, zone)
-        per_longitude_m, per_latitude_m = radii_m(latitude_deg)
-        latitude_deg += math.degrees((north_m - north_now_m) / (UTM_SCALE * per_latitude_m))
-        longitude_deg += math.degrees((east_m - east_now_m) / (UTM_SCALE * per_longitude_m))
-    return latitude_deg, longitude_deg
-
-
-def convergence_rad(latitude_deg: float, longitude_deg: float, zone: str) -> float:
-    """Return the azimuth of grid north, east of true north positive, by a step of the projection itself."""
-    step_deg = 1e-5
-    low = to_utm(latitude_deg - step_deg, longitude_deg, zone)
-    high = to_utm(latitude_deg + step_deg, longitude_deg, zone)
-    return math.atan2(-(high[0] - low[0]), high[1] - low[1])
+def utm_epsg(zone: str) -> int:
+    """Return the EPSG code of a UTM zone such as "32N", on WGS 84."""
+    number = int(zone[:-1])
+    if not 1 <= number <= 60:
+        raise ConfigError(f"place.utm_zone {zone!r}: zones are 1 to 60")
+    return (32600 if zone.endswith("N") else 32700) + number
 
 
 def radii_m(latitude_deg: float) -> tuple[float, float]:
@@ -77,14 +90,6 @@ def radii_m(latitude_deg: float) -> tuple[float, float]:
     sine = math.sin(math.radians(latitude_deg))
     prime_m = SEMI_MAJOR_M / math.sqrt(1 - _E2 * sine**2)
     return prime_m * math.cos(math.radians(latitude_deg)), prime_m * (1 - _E2) / (1 - _E2 * sine**2)
-
-
-@dataclass(frozen=True)
-class Declination:
-    """Of magnetic north, east of true north positive; source: where it comes from, for the exports."""
-
-    rad: float
-    source: str
 
 
 def survey_date(project: Project) -> date | None:
@@ -95,52 +100,117 @@ def survey_date(project: Project) -> date | None:
     return min(moments).date() if moments else None
 
 
-def declination(project: Project) -> Declination | None:
-    """Return the declination: stated, or the World Magnetic Model's for place and date. None: not known."""
-    place = project.place
-    if place.declination_deg is not UNSET:
-        return Declination(math.radians(place.declination_deg), place.declination_source or "stated in the project")
-    where, when = _somewhere(project), survey_date(project)
-    if where is None or when is None:
-        return None
+def leg_date(project: Project, leg: Leg) -> date:
+    """Return the date that the leg's dive states, or the leg's own (UTC)."""
+    dive = project.dive[leg.dive - 1] if leg.dive <= len(project.dive) else None
+    return dive.date if dive is not None and dive.date is not UNSET else leg.moment.date()
+
+
+@lru_cache(maxsize=4096)
+def _model_declination_rad(latitude_deg: float, longitude_deg: float, when: date) -> float:
     from buddyline.node.geomagnetism import earth_field
 
     noon_ns = int(datetime(when.year, when.month, when.day, 12, tzinfo=UTC).timestamp()) * S_NS
-    field = earth_field(*where, noon_ns)
-    return Declination(field.declination_rad, f"World Magnetic Model, {where[0]:.4f} {where[1]:.4f}, {when}")
+    return earth_field(latitude_deg, longitude_deg, noon_ns).declination_rad
+
+
+@dataclass(frozen=True)
+class Declination:
+    """Of magnetic north, east of true north positive. source: where it comes from, for the exports.
+
+    stated_rad: the same everywhere, by the project. None: the World Magnetic Model's, for each leg's date and place.
+    """
+
+    source: str
+    stated_rad: float | None
+
+    def rad(self, place: tuple[float, float] | None, when: date) -> float:
+        """Return it at a latitude and longitude, degrees."""
+        if self.stated_rad is not None:
+            return self.stated_rad
+        if place is None:
+            raise ValueError("the magnetic model needs a place")
+        return _model_declination_rad(round(place[0], MODEL_DIGITS), round(place[1], MODEL_DIGITS), when)
+
+
+def declination(project: Project) -> Declination | None:
+    """Return the declination: stated, or the World Magnetic Model's for each leg's place and date. None: not known."""
+    place = project.place
+    if place.declination_deg is not UNSET:
+        source = place.declination_source or "stated in the project"
+        return Declination(source, math.radians(place.declination_deg))
+    where = _somewhere(project)
+    if where is None:
+        return None
+    dates = sorted({leg_date(project, leg) for leg in project.leg + project.point})
+    if not dates:
+        return None
+    when = f"{dates[0]}" if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    return Declination(f"World Magnetic Model, {where[0]:.4f} {where[1]:.4f}, {when}", None)
+
+
+def _projection(project: Project) -> Projection | None:
+    place = project.place
+    if place.utm_zone is not UNSET and place.epsg is not UNSET:
+        raise ConfigError("place: give utm_zone or epsg, not both")
+    if place.utm_zone is not UNSET:
+        return Projection(utm_epsg(place.utm_zone))
+    return None if place.epsg is UNSET else Projection(place.epsg)
 
 
 def _somewhere(project: Project) -> tuple[float, float] | None:
     """Return the latitude and longitude of the place, or of the first fixed point that has one."""
     if project.place.degrees is not None:
         return project.place.degrees
-    zone = project.place.utm_zone
+    projection = _projection(project)
     for fix in project.fix:
         if fix.degrees is not None:
             return fix.degrees
-        if zone is not UNSET and fix.metres is not None:
-            return from_utm(*fix.metres, zone)
+        if projection is not None and fix.metres is not None:
+            return projection.degrees(*fix.metres)
     return None
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The survey's coordinates: a UTM zone, or metres east and north (true, or magnetic) of an origin.
+    """The survey's coordinates: those of a projection, or metres east and north (true, or magnetic) of an origin.
 
-    to_grid_rad: grid azimuth minus magnetic. north: what the grid's north is. origin: latitude and longitude of
-    east 0, north 0 of a local grid; None where no place is known.
+    Legs are as long on the map as on the ground: around `anchor`, the first fixed point, a projection's own scale
+    counts for latitude and longitude alone, as cave programs have it. where: a latitude and longitude of the survey.
+    north: what the grid's north is. origin: latitude and longitude of east 0, north 0 of a local grid; None where no
+    place is known.
     """
 
-    to_grid_rad: float
     north: str
-    zone: str | None
-    origin: tuple[float, float] | None
+    declination: Declination | None = None
+    where: tuple[float, float] | None = None
+    projection: Projection | None = None
+    origin: tuple[float, float] | None = None
+    anchor_m: tuple[float, float] = field(default=(0.0, 0.0))
+
+    def declination_rad(self, when: date, position_m: Floats | None = None) -> float:
+        """Return the declination at a position (east, north, ...), or where the survey is; 0 where it is not known."""
+        return 0.0 if self.declination is None else self.declination.rad(self._place(position_m), when)
+
+    def convergence_rad(self, position_m: Floats | None = None) -> float:
+        """Return the azimuth of grid north at a position (east, north, ...), or where the survey is."""
+        place = self._place(position_m)
+        return 0.0 if self.projection is None or place is None else self.projection.convergence_rad(*place)
+
+    def turn_rad(self, when: date, position_m: Floats | None = None) -> float:
+        """Return grid azimuth minus magnetic azimuth."""
+        return self.declination_rad(when, position_m) - self.convergence_rad(position_m)
+
+    def _place(self, position_m: Floats | None) -> tuple[float, float] | None:
+        return self.where if position_m is None else self.degrees(position_m) or self.where
 
     def degrees(self, position_m: Floats) -> tuple[float, float] | None:
         """Return latitude and longitude of a position (east, north, ...); None where no place is known."""
         east_m, north_m = float(position_m[0]), float(position_m[1])
-        if self.zone is not None:
-            return from_utm(east_m, north_m, self.zone)
+        if self.projection is not None:
+            scale = self._scale
+            away_m = (east_m - self.anchor_m[0]) * scale, (north_m - self.anchor_m[1]) * scale
+            return self.projection.degrees(self.anchor_m[0] + away_m[0], self.anchor_m[1] + away_m[1])
         if self.origin is None:
             return None
         per_longitude_m, per_latitude_m = radii_m(self.origin[0])
@@ -149,14 +219,19 @@ class Grid:
             self.origin[1] + math.degrees(east_m / per_longitude_m),
         )
 
+    @cached_property
+    def _scale(self) -> float:
+        assert self.projection is not None
+        return self.projection.scale(*self.projection.degrees(*self.anchor_m))
+
     def position_m(self, fix: FixedPoint) -> tuple[float, float]:
         """Return east and north of a fixed point."""
         if fix.metres is not None:
             return fix.metres
         if fix.degrees is None:
             raise BuddylineError(f"fix of {fix.station!r}: no coordinates")
-        if self.zone is not None:
-            return to_utm(*fix.degrees, self.zone)
+        if self.projection is not None:
+            return self.projection.metres(*fix.degrees)
         if self.origin is None:
             return 0.0, 0.0
         per_longitude_m, per_latitude_m = radii_m(self.origin[0])
@@ -169,16 +244,18 @@ class Grid:
 def grid_of(project: Project) -> Grid:
     """Return the grid that a project's coordinates are in."""
     known = declination(project)
-    zone = project.place.utm_zone
+    projection = _projection(project)
     where = _somewhere(project)
-    if zone is not UNSET:
+    if projection is not None:
         if known is None or where is None:
-            raise BuddylineError("place.utm_zone: needs a position and a declination as well, to turn to grid north")
-        return Grid(known.rad - convergence_rad(*where, zone), "grid", zone, None)
+            raise BuddylineError("place: a map grid needs a position and a declination as well, to turn to grid north")
+        grid = Grid("grid", known, where, projection)
+        anchor_m = grid.position_m(project.fix[0]) if project.fix else projection.metres(*where)
+        return replace(grid, anchor_m=anchor_m)
     degrees = [fix.degrees for fix in project.fix if fix.degrees is not None]
     if degrees and len(degrees) < len(project.fix):
-        raise BuddylineError("fix: some in metres, some in degrees; name place.utm_zone, or use one of them")
+        raise BuddylineError("fix: some in metres, some in degrees; name place.utm_zone or epsg, or use one of them")
     if known is None:
         # Without a declination the map would be turned by an unknown angle.
-        return Grid(0.0, "magnetic", None, None)
-    return Grid(known.rad, "true", None, degrees[0] if degrees else None if project.fix else where)
+        return Grid("magnetic")
+    return Grid("true", known, where, origin=degrees[0] if degrees else None if project.fix else where)

@@ -100,7 +100,8 @@ def _weighed(
 class Line:
     """A leg to adjust. vector_m: east, north, up of the grid; covariance (3, 3), m^2. turn_m: (3,), per rad of azimuth.
 
-    rise_m: up; its sigma; by_clino: whether it is the clinometers'. distance_sigma_m: as weighed.
+    rise_m: up; its sigma; by_clino: whether it is the clinometers'. distance_sigma_m: as weighed. turn_rad: grid
+    azimuth minus magnetic. read_rise_m, read_rise_sigma_m: of the leg's own two depths, where others are held.
     """
 
     leg: Leg
@@ -111,6 +112,9 @@ class Line:
     rise_sigma_m: float
     distance_sigma_m: float
     by_clino: bool
+    turn_rad: float
+    read_rise_m: float
+    read_rise_sigma_m: float
 
     @property
     def length_m(self) -> float:
@@ -119,12 +123,19 @@ class Line:
 
 
 def line_of(
-    leg: Leg, project: Project, to_grid_rad: float, depths_m: dict[str, float], *, alone: bool = False
+    leg: Leg,
+    project: Project,
+    turn_rad: float,
+    depths_m: dict[str, float],
+    *,
+    alone: bool = False,
+    read_m: tuple[float, float] | None = None,
 ) -> Line | None:
     """Return a leg as a vector; None where it has no bearing or nothing that gives its rise.
 
-    to_grid_rad: grid azimuth minus magnetic. depths_m: stations held at these depths; others by their readings.
-    alone: the leg is not one of many in which the gauges err alike, so its rise has all of their error.
+    turn_rad: grid azimuth minus magnetic. depths_m: stations held at these depths; others by their readings.
+    alone: the leg is not one of many in which the gauges err alike, so its rise has all of their error. read_m: its
+    own two depths, with zeros and levels taken off; by default as read.
     Distance, bearing and rise are independent; the run along follows from distance and rise, except for steep
     legs, where the clinometers give both.
     """
@@ -134,7 +145,7 @@ def line_of(
     fore = wrap(bearing.back + math.pi) if bearing.back is not None else bearing.fore
     if fore is None:
         return None
-    azimuth = to_grid_rad + (fore if bearing.fore is None else fore + 0.5 * wrap(bearing.fore - fore))
+    azimuth = turn_rad + (fore if bearing.fore is None else fore + 0.5 * wrap(bearing.fore - fore))
     distance_m, distance_sigma_m = leg.distance_m, leg.distance_sigma_m
     held = leg.from_ in depths_m and leg.to in depths_m
     own = leg.depth_from_m, leg.depth_to_m
@@ -163,6 +174,11 @@ def line_of(
         other_sigma = rise_sigma_m
     else:
         return None
+    read_rise_m, read_sigma_m = rise_m, rise_sigma_m
+    if read_m is not None and not steep:
+        read_rise_m = read_m[0] - read_m[1]
+        noises = leg.depth_from_noise_m, leg.depth_to_noise_m
+        read_sigma_m = _hypot(*((leg.depth_from_sigma_m, leg.depth_to_sigma_m) if UNSET in noises else noises))
     east, north = math.sin(azimuth), math.cos(azimuth)
     # Columns: by distance, by azimuth, by rise or slope.
     jacobian = np.array(
@@ -181,6 +197,9 @@ def line_of(
         rise_sigma_m=rise_sigma_m,
         distance_sigma_m=distance_sigma_m,
         by_clino=steep,
+        turn_rad=turn_rad,
+        read_rise_m=read_rise_m,
+        read_rise_sigma_m=read_sigma_m,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, get_args
@@ -49,15 +50,19 @@ def of_project(marks: list[HandMark], dive: int, start_ns: int) -> list[Mark]:
 def of_table(path: Path) -> list[HandMark]:
     """Read a CSV of the first dive's marks with the columns time, node, name, and optionally kind and note."""
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            text = file.read()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from error
+    # Spreadsheets write semicolons or tabs where a comma is the decimal point.
+    head = text.partition("\n")[0]
+    delimiter = max(",;\t", key=head.count)
     marks = []
-    for number, row in enumerate(rows, 2):
+    for number, row in enumerate(csv.DictReader(io.StringIO(text), delimiter=delimiter), 2):
         given = {name: row[name].strip() for name in ("node", "kind", "name", "note") if row.get(name)}
         try:
-            time = time_of(row.get("time") or "")
+            text_of_time = (row.get("time") or "").strip()
+            time = time_of(text_of_time.replace(",", ".") if delimiter != "," else text_of_time)
             when = {"seconds": time} if isinstance(time, float) else {"time": time}
             marks.append(msgspec.convert(given | when, HandMark))
         except ValueError as error:

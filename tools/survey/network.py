@@ -10,9 +10,11 @@ from typing import Final, TypeAlias
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.averages import Floats
-from buddyline.tools.survey.geodesy import Grid, grid_of
+from buddyline.tools.survey.gauges import adjust_gauges
+from buddyline.tools.survey.geodesy import Grid, grid_of, leg_date
 from buddyline.tools.survey.lines import Line, line_of
 from buddyline.tools.survey.project import Leg, Project
+from buddyline.tools.survey.proposals import Proposal, proposals
 from msgspec import UNSET
 
 # Chi^2 of three degrees of freedom that one leg in a thousand exceeds.
@@ -22,7 +24,8 @@ MOST_BLUNDERS: Final = 10
 AS_GOOD: Final = 0.8
 EXACT_M: Final = 1e-4
 
-Fixed: TypeAlias = dict[str, tuple[Floats, float]]
+# Position (3,) and its standard deviations (3,): east, north, up, m.
+Fixed: TypeAlias = dict[str, tuple[Floats, Floats]]
 Triple: TypeAlias = tuple[float, float, float]
 
 
@@ -83,7 +86,7 @@ class Blunder:
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """An adjusted survey. left_out: legs without a place in it, each with the reason."""
+    """An adjusted survey. proposals: stations that may be one place. left_out: legs without a place in it, and why."""
 
     grid: Grid
     positions: dict[str, Position]
@@ -92,6 +95,7 @@ class Adjusted:
     loops: list[Loop]
     blunders: list[Blunder]
     points: list[Position]
+    proposals: list[Proposal] = field(default_factory=list)
     left_out: list[tuple[Leg, str]] = field(default_factory=list)
 
     @property
@@ -120,37 +124,51 @@ def water_level_m(project: Project) -> float:
 
 
 def fixed_points(project: Project, grid: Grid) -> Fixed:
-    """Return the fixed stations' positions (3,) and sigmas; without any, the first leg's start at east 0, north 0."""
+    """Return the fixed stations' positions and sigmas; without any, the first leg's start at east 0, north 0."""
     depths, level_m = station_depths(project), water_level_m(project)
     fixed: Fixed = {}
     for fix in project.fix:
-        altitude_m = fix.altitude_m
+        altitude_m, altitude_sigma_m = fix.altitude_m, fix.altitude_sigma_m
         if altitude_m is UNSET or project.adjust.depth == "absolute":
             # Depths are absolute: an altitude of its own would contradict them.
-            altitude_m = level_m - depths.get(fix.station, 0.0)
-        fixed[fix.station] = np.array([*grid.position_m(fix), altitude_m]), fix.sigma_m
+            altitude_m, altitude_sigma_m = level_m - depths.get(fix.station, 0.0), 0.0
+        sigmas_m = np.array([fix.sigma_m, fix.sigma_m, altitude_sigma_m])
+        fixed[fix.station] = np.array([*grid.position_m(fix), altitude_m]), sigmas_m
     if not fixed:
         if not project.leg:
             raise BuddylineError("the project has no legs; run `buddyline survey legs` first")
         start = project.leg[0].from_
-        fixed[start] = np.array([0.0, 0.0, level_m - depths.get(start, 0.0)]), 0.0
+        fixed[start] = np.array([0.0, 0.0, level_m - depths.get(start, 0.0)]), np.zeros(3)
     return fixed
 
 
 def adjust(project: Project) -> Adjusted:
-    """Adjust the whole network; raise BuddylineError where there is nothing to adjust."""
+    """Adjust the whole network; raise BuddylineError where there is nothing to adjust.
+
+    Declination and convergence are each leg's own, so on a map grid a first adjustment tells where the legs are.
+    """
     grid = grid_of(project)
+    first = _adjust(project, grid, {})
+    if grid.declination is None or (grid.projection is None and grid.declination.stated_rad is not None):
+        return first
+    return _adjust(project, grid, {name: one.position_m for name, one in first.positions.items()})
+
+
+def _adjust(project: Project, grid: Grid, at: dict[str, Floats]) -> Adjusted:
+    """Adjust with each leg's north that of its place; at: where stations are, as far as known."""
     depths = held_depths(project)
     fixed = fixed_points(project, grid)
     stations = {name for leg in project.leg for name in (leg.from_, leg.to)}
     for name in fixed:
         if name not in stations:
             raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
+    read_m = adjust_gauges(project.leg).corrected_m
     lines: list[Line] = []
     left_out: list[tuple[Leg, str]] = []
-    for leg in project.leg:
+    for number, leg in enumerate(project.leg):
         edit = project.edit_of(leg)
-        line = line_of(leg, project, grid.to_grid_rad, depths)
+        turn_rad = grid.turn_rad(leg_date(project, leg), at.get(leg.from_))
+        line = line_of(leg, project, turn_rad, depths, read_m=read_m.get(number))
         if edit is not None and not edit.use:
             left_out.append((leg, f"taken out{': ' + edit.note if edit.note else ''}"))
         elif line is None or leg.from_ == leg.to:
@@ -161,14 +179,16 @@ def adjust(project: Project) -> Adjusted:
     left_out += [(line.leg, "not connected to a fixed point") for line in lines if line.leg.from_ not in reached]
     lines = [line for line in lines if line.leg.from_ in reached]
     solution = _Solution(lines, fixed)
-    positions = solution.positions(math.radians(project.settings.compass_common_deg))
+    common_rad = math.radians(project.settings.compass_common_deg)
+    positions = solution.positions(common_rad)
     for held in project.station:
         # An altitude is as good as the gauge: the gauge's slow error is in no leg's noise.
         if held.name in positions and held.depth_sigma_m is not UNSET:
             positions[held.name].covariance[2, 2] += held.depth_sigma_m**2
     points = []
     for leg in project.used(project.point):
-        line = line_of(leg, project, grid.to_grid_rad, {}, alone=True)
+        turn_rad = grid.turn_rad(leg_date(project, leg), at.get(leg.from_))
+        line = line_of(leg, project, turn_rad, {}, alone=True)
         station = positions.get(leg.from_)
         if line is None or station is None:
             left_out.append((leg, "no bearing or no slope" if line is None else f"station {leg.from_} has no position"))
@@ -178,7 +198,18 @@ def adjust(project: Project) -> Adjusted:
         Residual(line.leg, _triple(moved_m), chi2)
         for line, moved_m, chi2 in zip(lines, solution.moved_m, solution.chi2(), strict=True)
     ]
-    return Adjusted(grid, positions, lines, residuals, loops(lines, fixed), _blunders(lines, fixed), points, left_out)
+    gauge_sigma_m = {one.name: one.depth_sigma_m for one in project.station if one.depth_sigma_m is not UNSET}
+    return Adjusted(
+        grid,
+        positions,
+        lines,
+        residuals,
+        loops(lines, fixed),
+        _blunders(lines, fixed),
+        points,
+        solution.proposals(common_rad, gauge_sigma_m),
+        left_out,
+    )
 
 
 class _Solution:
@@ -213,8 +244,8 @@ class _Solution:
         origin = next((position for position, _ in fixed.values()), np.zeros(3))
         for name, (position, sigma_m) in fixed.items():
             if name in self.at:
-                weight = max(sigma_m, EXACT_M) ** -2
-                normal[self.at[name], self.at[name]] += weight * np.eye(3)
+                weight = np.maximum(sigma_m, EXACT_M) ** -2
+                normal[self.at[name], self.at[name]] += np.diag(weight)
                 right[self.at[name]] += weight * (position - origin)
         flat = np.linalg.inv(normal.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n))
         self.covariance = flat.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
@@ -232,11 +263,23 @@ class _Solution:
 
     def positions(self, common_rad: float) -> dict[str, Position]:
         """Return all stations; common_rad: 1 sd of an error that turns every leg alike, in no single leg's sigma."""
-        turn = common_rad * (self._flat @ self._pushed(self._turns).ravel()).reshape(-1, 3)
+        turn = common_rad * self._turned()
         return {
             name: Position(name, self.x[i], self.covariance[i, i] + np.outer(turn[i], turn[i]))
             for name, i in self.at.items()
         }
+
+    def _turned(self) -> Floats:
+        """Return how far each station moves, (n, 3), per radian that turns every leg alike."""
+        return (self._flat @ self._pushed(self._turns).ravel()).reshape(-1, 3)
+
+    def proposals(self, common_rad: float, gauge_sigma_m: dict[str, float]) -> list[Proposal]:
+        """Return stations that may be one place; gauge_sigma_m: by station, of its depth."""
+        turn = common_rad * self._turned()
+        common = turn[:, None, :, None] * turn[None, :, None, :]
+        up_sigma_m = np.array([gauge_sigma_m.get(name, 0.0) for name in self.at])
+        length_m = np.linalg.norm(self.x[self.end] - self.x[self.start], axis=1)
+        return proposals(list(self.at), self.x, self.covariance + common, up_sigma_m, (self.start, self.end), length_m)
 
     def chi2(self) -> list[float | None]:
         """Return each residual's chi^2 by its own covariance (data snooping, Baarda 1968); None: nothing checks it."""
@@ -311,14 +354,18 @@ def loops(lines: list[Line], fixed: Fixed) -> list[Loop]:
         if out[-1] != back[-1]:
             for end, sign in ((out[-1], 1.0), (back[-1], -1.0)):
                 vector = vector + sign * fixed[end][0]
-                covariance = covariance + fixed[end][1] ** 2 * np.eye(3)
+                covariance = covariance + np.diag(fixed[end][1] ** 2)
+        # Held depths close by construction: how well depths repeat is in what each leg read.
+        read_m = sum(sign * (one.read_rise_m - one.rise_m) for one, sign in signed)
+        read_var = sum(one.read_rise_sigma_m**2 - one.rise_sigma_m**2 for one, _ in signed)
+        vector = vector + np.array([0.0, 0.0, read_m])
         found.append(
             Loop(
                 (*reversed(out), *back),
                 sum(one.length_m for one, _ in signed),
                 _triple(vector),
                 math.hypot(vector[0], vector[1]) / math.sqrt(covariance[0, 0] + covariance[1, 1]),
-                abs(float(vector[2])) / math.sqrt(covariance[2, 2]),
+                abs(float(vector[2])) / math.sqrt(max(covariance[2, 2] + read_var, EXACT_M**2)),
             )
         )
     return found

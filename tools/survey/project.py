@@ -39,7 +39,8 @@ class About(Config, frozen=True, kw_only=True):
 
 class Place(Config, frozen=True, kw_only=True):
     """[place]: where the dive is, for the declination; water_level_m: altitude of the surface, where depth
-    is 0; by default from the first fix's altitude and its station's depth, or 0."""
+    is 0; by default from the first fix's altitude and its station's depth, or 0. utm_zone ("32N") or epsg (any
+    projected coordinate system in metres, such as 2154): the map grid of all coordinates."""
 
     latitude_deg: Annotated[float, Meta(ge=-90, le=90)] | UnsetType = UNSET
     longitude_deg: Annotated[float, Meta(ge=-180, le=180)] | UnsetType = UNSET
@@ -47,6 +48,7 @@ class Place(Config, frozen=True, kw_only=True):
     declination_deg: float | UnsetType = UNSET
     declination_source: str = ""
     utm_zone: Annotated[str, Meta(pattern=r"^\d{1,2}[NS]$")] | UnsetType = UNSET
+    epsg: int | UnsetType = UNSET
 
     @property
     def degrees(self) -> tuple[float, float] | None:
@@ -57,7 +59,8 @@ class Place(Config, frozen=True, kw_only=True):
 class FixedPoint(Config, frozen=True, kw_only=True):
     """[[fix]]: a station known from elsewhere, in metres (UTM where the place names a zone) or in degrees.
 
-    altitude_m: by default from the station's depth. sigma_m: 1 sd, 0 for exact.
+    altitude_m: by default from the station's depth. sigma_m: 1 sd of east and of north, altitude_sigma_m: of the
+    altitude; 0 for exact.
     """
 
     station: str
@@ -67,6 +70,7 @@ class FixedPoint(Config, frozen=True, kw_only=True):
     longitude_deg: float | UnsetType = UNSET
     altitude_m: float | UnsetType = UNSET
     sigma_m: NonNegative = 0.0
+    altitude_sigma_m: NonNegative = 0.0
     entrance: bool = False
 
     @property
@@ -85,9 +89,10 @@ def _pair(one: float | UnsetType, other: float | UnsetType) -> tuple[float, floa
 
 
 class DiveFiles(Config, frozen=True, kw_only=True):
-    """[[dive]]: the solved log and the nodes' own, relative to the project file."""
+    """[[dive]]: the solved log and the nodes' own, relative to the project file. date: where the clocks were wrong."""
 
     logs: list[str]
+    date: date | UnsetType = UNSET
     note: str = ""
 
 
@@ -114,6 +119,12 @@ class Edit(Config, frozen=True, kw_only=True):
     use: bool = True
     compass: Literal["both", "fore", "back"] | UnsetType = UNSET
     note: str = ""
+
+
+class Equate(Config, frozen=True, kw_only=True):
+    """[[equate]]: stations that are one place; it has the first one's name."""
+
+    stations: Annotated[list[str], Meta(min_length=2)]
 
 
 class AdjustSettings(Config, frozen=True, kw_only=True):
@@ -202,6 +213,7 @@ class Project(Config, frozen=True, kw_only=True):
     dive: list[DiveFiles] = field(default_factory=list)
     mark: list[HandMark] = field(default_factory=list)
     edit: list[Edit] = field(default_factory=list)
+    equate: list[Equate] = field(default_factory=list)
     settings: SurveySettings = field(default_factory=SurveySettings)
     alarms: AlarmSettings = field(default_factory=AlarmSettings)
     adjust: AdjustSettings = field(default_factory=AdjustSettings)
@@ -215,9 +227,14 @@ class Project(Config, frozen=True, kw_only=True):
         found = [edit for edit in self.edit if edit.leg == leg.name and edit.start_ns in (UNSET, leg.start_ns)]
         return max(found, key=lambda edit: edit.start_ns is not UNSET, default=None)
 
+    def taken_out(self, leg: Leg) -> bool:
+        """Tell whether a person's edit has taken the leg out."""
+        edit = self.edit_of(leg)
+        return edit is not None and not edit.use
+
     def used(self, legs: list[Leg]) -> list[Leg]:
         """Return the legs that no edit has taken out."""
-        return [leg for leg in legs if (edit := self.edit_of(leg)) is None or edit.use]
+        return [leg for leg in legs if not self.taken_out(leg)]
 
 
 def load_project(path: Path | str) -> Project:

@@ -40,6 +40,7 @@ def summary(sheet: Sheet) -> list[str]:
         first, *others = blunder.legs
         also = f" (or {', '.join(others)})" if others else ""
         lines.append(f"BLUNDER: leg {first}{also} is off{off}, chi2 {blunder.chi2:.0f}")
+    lines += [f"QUESTION: {one.text}" for one in adjusted.proposals]
     lines += [f"left out: leg {leg.name}, {why}" for leg, why in adjusted.left_out]
     lines += [f"ALARM: leg {leg.name}: {alarm}" for leg in project.leg + project.point for alarm in leg.alarms]
     lines += [problem.text for problem in project.problem]

@@ -46,7 +46,8 @@ class AlarmSettings(Config, frozen=True, kw_only=True):
 
     sights_deg: foresight against backsight. field_share: strength of the magnetic field against the dive's own;
     dip_deg likewise. heading_deg: the compasses' difference against what the nodes see of each other.
-    depth_sigmas, depth_m: depths against inclination, both exceeded. range_sigmas: of a leg's fixes.
+    depth_sigmas, depth_m: depths against inclination, and gauges at one station, both exceeded. range_sigmas: of a
+    leg's fixes.
     """
 
     sights_deg: Positive = 2.0

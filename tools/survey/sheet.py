@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-from buddyline.tools.survey.averages import Floats
-from buddyline.tools.survey.geodesy import declination, survey_date
+from buddyline.tools.survey.geodesy import leg_date, survey_date
 from buddyline.tools.survey.lines import Line, bearing_of
-from buddyline.tools.survey.network import Adjusted, fixed_points, held_depths
+from buddyline.tools.survey.network import Adjusted, Fixed, fixed_points, held_depths
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET
 
@@ -20,6 +19,7 @@ class Reading:
 
     by_clino: the rise is the clinometers'; then there are no depths. held: its stations are held at their depths.
     looped: the leg is part of a loop. compass_sigma_deg: of each sight, the same for both, for their plain mean.
+    turn_deg: grid azimuth minus magnetic. declination_deg: true azimuth minus magnetic, there and then.
     """
 
     line: Line
@@ -32,20 +32,23 @@ class Reading:
     by_clino: bool
     held: bool
     looped: bool
+    turn_deg: float
+    declination_deg: float
+    distance_m: float
+    remark: str
 
     @property
     def leg(self) -> Leg:
         """The leg that was read."""
         return self.line.leg
 
-    @property
-    def remark(self) -> str:
-        """Who saw whom, how often, how well and when; the gauges as read; alarms."""
-        leg = self.leg
-        words = [f"{leg.from_node}>{leg.to_node} n={leg.fixes} grade {leg.grade} {leg.moment:%H:%M:%S}"]
-        if leg.depth_from_m is not UNSET and leg.depth_to_m is not UNSET:
-            words.append(f"gauges {leg.depth_from_m:.2f} {leg.depth_to_m:.2f}")
-        return " ".join(words + ["ALARM " + "; ".join(leg.alarms)] * bool(leg.alarms))
+
+def remark_on(leg: Leg) -> str:
+    """Say who saw whom, how often, how well and when; the gauges as read; alarms."""
+    words = [f"{leg.from_node}>{leg.to_node} n={leg.fixes} grade {leg.grade} {leg.moment:%H:%M:%S}"]
+    if leg.depth_from_m is not UNSET and leg.depth_to_m is not UNSET:
+        words.append(f"gauges {leg.depth_from_m:.2f} {leg.depth_to_m:.2f}")
+    return " ".join(words + ["ALARM " + "; ".join(leg.alarms)] * bool(leg.alarms))
 
 
 class Sheet:
@@ -61,21 +64,29 @@ class Sheet:
         # The stated date, or the first leg's; empty where there is none.
         self.date = when.strftime("%Y.%m.%d") if when else ""
 
-    @cached_property
-    def angle_deg(self) -> float | None:
-        """Grid azimuth minus magnetic; None where the declination is not known."""
-        known = declination(self.project)
-        return None if known is None else math.degrees(self.adjusted.grid.to_grid_rad)
-
     @property
+    def north_known(self) -> bool:
+        """Whether the declination is known."""
+        return self.adjusted.grid.declination is not None
+
+    @cached_property
     def why(self) -> str:
         """Where the angle to north comes from, in words."""
-        known, angle_deg, zone = declination(self.project), self.angle_deg, self.adjusted.grid.zone
-        if known is None or angle_deg is None:
+        grid = self.adjusted.grid
+        if grid.declination is None:
             return "declination not known: north is magnetic"
-        declination_deg = math.degrees(known.rad)
-        why = f"declination {declination_deg:.2f} deg: {known.source}"
-        return why + (f"; with grid convergence of {declination_deg - angle_deg:.2f} deg, UTM {zone}" if zone else "")
+        readings = self.readings
+        why = f"declination {_span([one.declination_deg for one in readings])} deg: {grid.declination.source}"
+        if grid.projection is None:
+            return why
+        convergences = [one.declination_deg - one.turn_deg for one in readings]
+        return f"{why}; with grid convergence of {_span(convergences)} deg, {self.grid_name}"
+
+    @property
+    def grid_name(self) -> str:
+        """The map grid's name: a UTM zone, or a code of the EPSG registry; empty without one."""
+        zone, projection = self.project.place.utm_zone, self.adjusted.grid.projection
+        return f"UTM {zone}" if zone is not UNSET else f"EPSG:{projection.epsg}" if projection is not None else ""
 
     @property
     def instruments(self) -> dict[str, str]:
@@ -98,8 +109,8 @@ class Sheet:
         return notes
 
     @property
-    def fixed(self) -> dict[str, tuple[Floats, float]]:
-        """Fixed stations: position (3,) and sigma, m."""
+    def fixed(self) -> Fixed:
+        """Fixed stations: positions and sigmas."""
         return fixed_points(self.project, self.adjusted.grid)
 
     @property
@@ -135,4 +146,19 @@ class Sheet:
             by_clino=line.by_clino,
             held=held and not line.by_clino,
             looped=looped,
+            distance_m=leg.distance_m,
+            remark=remark_on(leg),
+            turn_deg=math.degrees(line.turn_rad),
+            declination_deg=math.degrees(self._declination_rad(leg)),
         )
+
+    def _declination_rad(self, leg: Leg) -> float:
+        return self.adjusted.grid.declination_rad(
+            leg_date(self.project, leg), self.adjusted.positions[leg.from_].position_m
+        )
+
+
+def _span(values: list[float]) -> str:
+    """Write one number, or the least and the largest."""
+    ends = list(dict.fromkeys(f"{value + 0.0:.2f}" for value in (min(values), max(values)))) if values else ["0.00"]
+    return " to ".join(ends)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Final
 
+from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.sheet import Reading, Sheet
 
 
@@ -20,6 +21,8 @@ class Language:
     gap: str
     ending: str = ""
     back_sd: bool = False
+    # Whether the program itself turns from true north to the north of a coordinate system.
+    turns: bool = False
 
     @property
     def normal(self) -> str:
@@ -31,12 +34,15 @@ class Language:
         """The columns of legs with two depths."""
         return f"{self.command}data diving from to {self.tape} compass backcompass fromdepth todepth{self.ending}"
 
-    def data(self, sheet: Sheet, by_clino: Callable[[Reading], bool]) -> Iterator[str]:
+    def data(self, sheet: Sheet, readings: Iterable[Reading], by_clino: Callable[[Reading], bool]) -> Iterator[str]:
         """Yield every leg's row, and before it what has changed: standard deviations and the columns' names."""
         state: dict[str, str] = {}
-        for reading in sheet.readings:
+        for reading in readings:
             clino = by_clino(reading)
             now = {f"{self.command}sd {name}": value for name, value in self._sds(reading, clino).items()}
+            if sheet.north_known:
+                north_deg = reading.declination_deg if self.turns else reading.turn_deg
+                now[f"{self.command}declination"] = f"{north_deg + 0.0:.3f} degrees"
             now[self.normal if clino else self.diving] = ""
             for name, value in now.items():
                 if state.get(name) != value:
@@ -47,11 +53,18 @@ class Language:
             numbers = [f"{value:+.3f}" if clino else f"{value:.4f}" for value in rise]
             angles = [self._angle(angle) for angle in (reading.compass_deg, reading.back_deg)]
             leg = reading.leg
-            row = [leg.from_, leg.to, f"{leg.distance_m:.4f}", *angles, *numbers, f"{self.comment} {reading.remark}"]
+            row = [
+                leg.from_,
+                leg.to,
+                f"{reading.distance_m:.4f}",
+                *angles,
+                *numbers,
+                f"{self.comment} {reading.remark}",
+            ]
             yield self.gap.join(row)
 
     def _sds(self, reading: Reading, clino: bool) -> dict[str, str]:
-        line, distance_m = reading.line, reading.leg.distance_m
+        line, distance_m = reading.line, reading.distance_m
         tape_m, level = line.distance_sigma_m, math.cos(math.radians(reading.clino_deg))
         if not clino:
             rise = {"depth": f"{line.rise_sigma_m / math.sqrt(2):.4f} metres"}
@@ -73,13 +86,48 @@ class Language:
 
 
 SURVEX: Final = Language("*", ";", "tape", "\t", " ignoreall", back_sd=True)
-THERION: Final = Language("", "#", "length", " ")
+THERION: Final = Language("", "#", "length", " ", turns=True)
 THERION_INSTRUMENTS: Final = ("tape", "length", "compass", "backcompass", "clino", "depth")
 
 
 def quoted(text: str) -> str:
     """Return text between quotes, which it must not hold itself."""
     return '"' + text.replace('"', "'").replace("\n", " ") + '"'
+
+
+def coordinate_system(sheet: Sheet) -> str:
+    """Return the map grid as both languages name it; empty without one."""
+    projection = sheet.adjusted.grid.projection
+    return "" if projection is None else f"EPSG:{projection.epsg}"
+
+
+def therion_person(name: str) -> str:
+    """Return a name as Therion takes it: first names, a slash, surname; two words at most without the slash."""
+    words = name.replace("/", " ").split()
+    return quoted(" ".join(words) if len(words) < 3 else f"{' '.join(words[:-1])}/{words[-1]}")
+
+
+def _adjusted(sheet: Sheet, reading: Reading) -> Reading:
+    """Return a leg's reading as it would be between the adjusted stations."""
+    leg = reading.leg
+    start, end = (sheet.adjusted.positions[name].position_m for name in (leg.from_, leg.to))
+    east_m, north_m, up_m = (end - start).tolist()
+    fore_deg = math.degrees(math.atan2(east_m, north_m)) - reading.turn_deg
+    distance_m = math.hypot(east_m, north_m, up_m)
+    read = [f"{leg.distance_m:.3f} m"]
+    read += [f"{angle:.2f}" for angle in (reading.compass_deg, reading.back_deg) if angle is not None]
+    return replace(
+        reading,
+        distance_m=distance_m,
+        compass_deg=fore_deg if reading.compass_deg is not None else None,
+        back_deg=fore_deg + 180 if reading.back_deg is not None else None,
+        clino_deg=math.degrees(math.asin(up_m / distance_m)),
+        remark=f"adjusted, read {' '.join(read)}; {reading.remark}",
+    )
+
+
+def _therion_sd(sigmas_m: Floats) -> str:
+    return f" {sigmas_m[0]:.3f} {sigmas_m[1]:.3f} {sigmas_m[2]:.3f}" if sigmas_m.any() else ""
 
 
 def svx(sheet: Sheet, style: str = "auto") -> str:
@@ -102,10 +150,9 @@ def svx(sheet: Sheet, style: str = "auto") -> str:
         "*units tape depth metres",
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
-        *SURVEX.data(sheet, by_clino),
+        *SURVEX.data(sheet, sheet.readings, by_clino),
     ]
-    north = [] if sheet.angle_deg is None else [f"*declination {sheet.angle_deg:.4f} degrees"]
-    return _svx_file(sheet, north, body)
+    return _svx_file(sheet, body)
 
 
 def svx_cartesian(sheet: Sheet) -> str:
@@ -120,16 +167,16 @@ def svx_cartesian(sheet: Sheet) -> str:
             body.append(f"*sd {axis} {math.sqrt(line.covariance[i, i]):.4f} metres")
         values = "\t".join(f"{value:.4f}" for value in line.vector_m)
         body.append(f"{line.leg.from_}\t{line.leg.to}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
-    return _svx_file(sheet, [], body)
+    return _svx_file(sheet, body)
 
 
-def _svx_file(sheet: Sheet, north: list[str], body: list[str]) -> str:
-    zone, fixed = sheet.adjusted.grid.zone, sheet.fixed
+def _svx_file(sheet: Sheet, body: list[str]) -> str:
+    fixed, grid = sheet.fixed, coordinate_system(sheet)
     lines = [
         f"; {sheet.title}",
         f"; {sheet.why}",
         "; Buddyline; from is never swapped with to; sds are 1 sd",
-        *([f"*cs UTM{zone}", f"*cs out UTM{zone}"] if zone else []),
+        *([f"*cs {grid}", f"*cs out {grid}"] if grid else []),
         f"*begin {sheet.name}",
         f"*export {' '.join(fixed)}",
         f"*title {quoted(sheet.title)}",
@@ -139,36 +186,41 @@ def _svx_file(sheet: Sheet, north: list[str], body: list[str]) -> str:
         *(f"; {note}" for note in sheet.notes),
     ]
     for name, (position, sigma_m) in fixed.items():
-        sd = f" {sigma_m:.3f}" if sigma_m else ""
+        # Without correlations Survex takes standard deviations of both axes on the map, and of height.
+        sd = f" {max(sigma_m[0], 0.001):.3f} {max(sigma_m[2], 0.001):.3f}" if sigma_m.any() else ""
         lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
     lines += [f"*entrance {name}" for name in sorted(sheet.entrances)]
     lines += [
-        *north,
         *(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out),
     ]
     return "\n".join([*lines, *body, f"*end {sheet.name}", ""])
 
 
-def th(sheet: Sheet) -> str:
-    """Return .th text: a centreline in diving style; steep legs, and those without depths, with a clino."""
-    zone = sheet.adjusted.grid.zone
+def th(sheet: Sheet, style: str = "auto") -> str:
+    """Return .th text: a centreline in diving style; steep legs, and those without depths, with a clino.
+
+    auto: legs that close a loop are written as adjusted, with what was read in the remark. Therion 6 hands Survex
+    each leg's standard deviations by axis, without their correlations, which bends loops of readings by decimetres.
+    diving: as read.
+    """
+    readings = [_adjusted(sheet, one) if style == "auto" and one.looped else one for one in sheet.readings]
+    grid = coordinate_system(sheet)
     rows = [
         *([f"date {sheet.date}"] if sheet.date else []),
-        *(f"team {quoted(person)}" for person in sheet.team),
+        *(f"team {therion_person(person)}" for person in sheet.team),
         *(
             f"instrument {kind} {quoted(what)}"
             for kind, what in sheet.instruments.items()
             if kind in THERION_INSTRUMENTS
         ),
         *(f"# {note}" for note in sheet.notes),
-        *([f"cs UTM{zone.removesuffix('N')}"] if zone else []),
-        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}" for name, (p, _) in sheet.fixed.items()),
+        *([f"cs {grid}"] if grid else []),
+        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}{_therion_sd(sd)}" for name, (p, sd) in sheet.fixed.items()),
         *(f'station {name} "" entrance' for name in sheet.entrances),
-        *([] if sheet.angle_deg is None else [f"declination {sheet.angle_deg:.4f} degrees"]),
         "units length depth metres",
         "units compass clino degrees",
         "calibrate depth 0 -1",
-        *THERION.data(sheet, lambda reading: reading.by_clino),
+        *THERION.data(sheet, readings, lambda reading: reading.by_clino),
     ]
     head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
     return "\n".join([*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey", ""])

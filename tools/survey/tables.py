@@ -7,13 +7,14 @@ import io
 import json
 import math
 from collections.abc import Iterable
-from datetime import datetime
+from datetime import date
 from typing import Any, Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.geodesy import leg_date
 from buddyline.tools.survey.network import station_depths
 from buddyline.tools.survey.project import Leg
-from buddyline.tools.survey.sheet import Sheet
+from buddyline.tools.survey.sheet import Reading, Sheet
 from msgspec import to_builtins
 
 # A station's columns and their digits after the point; empty where a value is not known.
@@ -84,7 +85,7 @@ def stations_csv(sheet: Sheet) -> str:
 
 def geojson(sheet: Sheet) -> str:
     """Return stations, points and legs as GeoJSON (RFC 7946: WGS 84, longitude first, altitude third)."""
-    if sheet.angle_deg is None:
+    if not sheet.north_known:
         raise BuddylineError("a map needs a declination: give [place] in the project")
     features: list[dict[str, Any]] = []
     at: dict[str, list[float]] = {}
@@ -95,7 +96,9 @@ def geojson(sheet: Sheet) -> str:
 
     for row in _station_rows(sheet):
         if row["latitude_deg"] is None:
-            raise BuddylineError("a map needs a fixed point in degrees, or place.utm_zone: give them in the project")
+            raise BuddylineError(
+                "a map needs a fixed point in degrees, or place.utm_zone or epsg: give them in the project"
+            )
         where = [round(row["longitude_deg"], 8), round(row["latitude_deg"], 8), round(row["up_m"], 3)]
         if row["kind"] == "station":
             at[row["name"]] = where
@@ -111,12 +114,18 @@ def geojson(sheet: Sheet) -> str:
 
 
 def compass_dat(sheet: Sheet) -> str:
-    """Return .dat text: feet and degrees; raise BuddylineError without declination or date, which it must state."""
-    if sheet.angle_deg is None:
+    """Return .dat text: feet and degrees; raise BuddylineError without declination, which it must state."""
+    if not sheet.north_known:
         raise BuddylineError("Compass files must state a declination, and it is not known: give [place] in the project")
-    if not sheet.date:
-        raise BuddylineError("Compass files must state a date: give survey.date in the project")
-    when = datetime.strptime(sheet.date, "%Y.%m.%d")
+    sections: dict[tuple[date, str], list[Reading]] = {}
+    for reading in sheet.readings:
+        key = leg_date(sheet.project, reading.leg), f"{reading.turn_deg + 0.0:7.2f}"
+        sections.setdefault(key, []).append(reading)
+    return "".join(_compass_section(sheet, *key, readings) for key, readings in sections.items())
+
+
+def _compass_section(sheet: Sheet, when: date, turn_deg: str, readings: list[Reading]) -> str:
+    """Return the legs of one date and one declination."""
     comment = f"{sheet.title}; {sheet.why}".replace("\n", " ")[:76]
     rows = [
         sheet.name,
@@ -124,12 +133,12 @@ def compass_dat(sheet: Sheet) -> str:
         f"SURVEY DATE: {when.month} {when.day} {when.year}  COMMENT:{comment}",
         "SURVEY TEAM:",
         ", ".join(sheet.team),
-        f"DECLINATION: {sheet.angle_deg:7.2f}  FORMAT: {COMPASS_FORMAT}  CORRECTIONS:  0.00 0.00 0.00",
+        f"DECLINATION: {turn_deg}  FORMAT: {COMPASS_FORMAT}  CORRECTIONS:  0.00 0.00 0.00",
         "",
         "FROM TO LENGTH BEARING INC LEFT UP DOWN RIGHT AZM2 INC2 FLAGS COMMENTS",
         "",
     ]
-    for reading in sheet.readings:
+    for reading in readings:
         leg, fore_deg, back_deg, remark = reading.leg, reading.compass_deg, reading.back_deg, reading.remark
         if fore_deg is None and back_deg is not None:
             # The format has no leg without a bearing.
