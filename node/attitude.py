@@ -57,7 +57,7 @@ R_NED_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 class AttitudeEstimate:
     """Rotation from body to NED, true north. sigma_rad: of roll, pitch, yaw.
 
-    problem: why the heading is not trusted, "" where it is.
+    problem: why the heading is not trusted; "" if it is trusted.
     """
 
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""A camera that could not be opened at the start: opened again and again while the rest of the node runs."""
+"""A camera that could not be opened at the start: it is tried again while the rest of the node runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RETRY_NS: Final = 2 * S_NS
 
 
 class AwaitedCamera:
-    """Opens a camera every two seconds until that works, then is that camera.
+    """Tries every two seconds to open a camera; once that has worked, passes its frames on.
 
     reason: why it could not be opened at first. on_open: called once it is open, in the thread that takes its frames.
     """
@@ -35,22 +35,22 @@ class AwaitedCamera:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a camera by now."""
+        """Whether the camera is open."""
         return self._camera is not None
 
     @property
     def skipped(self) -> Counter[str]:
-        """Frames that were not given out, by reason."""
+        """Number of frames not passed on, by reason."""
         return self._skipped if self._camera is None else self._camera.skipped
 
     @property
     def row_time_ns(self) -> int:
-        """Time from one row to the next, 0 before it is open."""
+        """Time from one row to the next; 0 before the camera is open."""
         return 0 if self._camera is None else self._camera.row_time_ns
 
     @property
     def problem(self) -> str:
-        """What is wrong with it, "" where nothing is."""
+        """What is wrong with the camera; "" if nothing."""
         return self._health.problem if self._camera is None else self._camera.problem
 
     def info(self) -> NodeInfo | None:

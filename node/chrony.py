@@ -1,4 +1,4 @@
-"""What chrony knows of this machine's clock: `chronyc -c tracking`, read with a time limit."""
+"""chrony's figures for this machine's clock: `chronyc -c tracking`, read with a time limit."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ COMMAND: Final = ("chronyc", "-n", "-c", "tracking")
 # A stopped node must not wait longer than its other threads do.
 TIMEOUT_S: Final = 1.0
 FIELDS: Final = 14
-# chronyd's reference id of a clock that it serves as it stands (the directive `local`).
+# chronyd's reference id where it serves its own, unsynchronised clock (the directive `local`).
 LOCAL_REFERENCE: Final = "7F7F0101"
 
 
 class ChronyError(BuddylineError):
-    """chronyc is there and does not tell; the text says why and what to do."""
+    """chronyc is installed but gives no figures; the text says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tracking:
-    """What `chronyc tracking` says.
+    """The report of `chronyc tracking`.
 
-    offset_s: this clock minus the true time. rms_s: of the last offsets. bound_s: the true time is no farther away.
-    frequency_ppm: by how much the clock gains where chrony does not correct it. skew_ppm: bound of that one's error.
-    source: address or reference clock; "local" for a clock that follows nothing and is served as it stands.
+    offset_s: this clock minus the true time. rms_s: of the last offsets. bound_s: greatest possible error.
+    frequency_ppm: rate at which the uncorrected clock gains. skew_ppm: bound of the error of frequency_ppm.
+    source: address or reference clock; "local" for an unsynchronised clock that chrony serves to others.
     """
 
     source: str
@@ -41,11 +41,11 @@ class Tracking:
 
     @property
     def local(self) -> bool:
-        """Whether it is its own reference: then its offset is from nothing."""
+        """Whether the clock is its own reference: then its offset means nothing."""
         return self.source == "local"
 
     def status_fields(self) -> dict[str, Any]:
-        """Return what NodeStatus carries of it: nothing that is not known."""
+        """Return the known figures under the names of their NodeStatus fields."""
         if not self.synchronised:
             return {"clock_source": ""}
         if self.local:
@@ -60,7 +60,7 @@ class Tracking:
 
 
 def decode_tracking(text: str) -> Tracking:
-    """Decode a line of `chronyc -c tracking`; raise ChronyError where it is none.
+    """Decode a line of `chronyc -c tracking`; raise ChronyError for any other text.
 
     Reference id, address, stratum, reference time, system time (positive: the clock is slow), last offset, RMS offset,
     frequency (positive: fast), residual frequency, skew, root delay, root dispersion, update interval, leap status
@@ -90,7 +90,7 @@ def decode_tracking(text: str) -> Tracking:
 
 
 def read_tracking(timeout_s: float = TIMEOUT_S) -> Tracking | None:
-    """Ask chronyc; None where chrony is not installed. Raises ChronyError where it does not tell."""
+    """Ask chronyc; None if chrony is not installed. Raises ChronyError if it gives no figures."""
     try:
         asked = subprocess.run(
             COMMAND, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False,

@@ -1,4 +1,4 @@
-"""A node's clock beside others: what chrony says of it, and the beacons by which two nodes' clocks are compared."""
+"""Compare a node's clock with others: chrony's figures, and the beacons that nodes exchange."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CHRONY_EVERY_S: Final = 10.0
-# A node that has been silent for longer has left, or its beacons are stuck somewhere: no measure of now.
+# After a longer silence a node has left, or its beacons are delayed: its last beacon is then left out.
 HEARD_FOR_S: Final = 2.0
 
 
 class Beacons:
-    """Which other nodes were heard, and what to say next. Safe to use from several threads.
+    """Keeps the newest beacon of each other node, and makes this node's next one. Safe to use from several threads.
 
-    now_s: monotonic, so that a clock that is set forgets nobody.
+    now_s: monotonic time, so that setting the wall clock does not make any node look silent.
     """
 
     def __init__(self, node: str, boot: str) -> None:
@@ -39,7 +39,7 @@ class Beacons:
         self._heard: dict[str, tuple[float, HeardClock]] = {}
 
     def hear(self, received: Received, now_s: float) -> None:
-        """Take another node's beacon; what is none, or from whom nobody can know, is counted."""
+        """Take another node's beacon; invalid messages are refused and counted."""
         envelope = self.refusals.open(received)
         beacon = envelope.message if envelope else None
         if not isinstance(beacon, ClockBeacon) or beacon.node == self._node:
@@ -52,7 +52,7 @@ class Beacons:
                 self._heard.pop(next(iter(self._heard)))
 
     def beacon(self, clock: Clock, now_s: float) -> ClockBeacon:
-        """Return what to send at once: its stamp is now."""
+        """Return the next beacon, stamped now; send it at once."""
         with self._lock:
             heard = [one for heard_s, one in self._heard.values() if now_s - heard_s <= HEARD_FOR_S]
         return ClockBeacon(node=self._node, stamp_ns=clock.now_ns(), boot=self._boot, heard=heard)
@@ -69,11 +69,11 @@ class ClockSync:
         self._fields: dict[str, Any] = {}
 
     def status_fields(self) -> dict[str, Any]:
-        """Return what the node's status says of its clock."""
+        """Return the fields of the node's status that describe its clock."""
         return self._fields
 
     def follow_chrony(self, stop: threading.Event) -> None:
-        """Ask chrony again and again; for a thread of its own. Where chrony is not installed, nothing is said."""
+        """Ask chrony repeatedly, in a thread of its own. Without chrony the status has no figures."""
         while not stop.is_set():
             try:
                 tracking = self._read()
@@ -88,8 +88,8 @@ class ClockSync:
             stop.wait(CHRONY_EVERY_S)
 
     def exchange(self, bus: Bus, outlet: Outlet, stop: threading.Event) -> None:
-        """Send beacons and hear the others' until stop is set."""
-        # Without history: an old beacon says nothing of how long one takes.
+        """Send beacons and receive the others' until stop is set."""
+        # Without history: the travel time of an old beacon is not known.
         subscription = bus.subscribe(
             CLOCK.key_any(), lambda received: self._beacons.hear(received, time.monotonic()), history=False
         )

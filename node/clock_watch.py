@@ -1,4 +1,4 @@
-"""A wall clock that is set while the node runs: noticed against the one that nobody sets."""
+"""Detects that the wall clock was set while the node runs, by comparing it with CLOCK_BOOTTIME, which is never set."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REMEMBER_NS: Final = 60 * S_NS
 
 
 class ClockWatch:
-    """Looks, a few times a second, whether the wall clock went on as it should. steps: how many times it did not."""
+    """Compares the wall clock with CLOCK_BOOTTIME a few times a second. steps: how often the wall clock was set."""
 
     def __init__(self, wall: Callable[[], int], boottime: Callable[[], int] = boottime_ns) -> None:
         self.steps = 0
@@ -44,7 +44,7 @@ class ClockWatch:
 
     @property
     def problem(self) -> str:
-        """What was wrong within the last minute, "" where nothing was."""
+        """What was wrong within the last minute; "" if nothing."""
         if self._last_step_ns is None or self._boottime() - self._last_step_ns > REMEMBER_NS:
             return ""
         return self._said

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
-# Filters and reading add up to some milliseconds; a tenth of a second is a wrong unit.
+# Filters and reading delay samples by some milliseconds; a tenth of a second is a wrong unit.
 MAX_IMU_DELAY_NS = 100_000_000
 # Largest distance of a principal point from the middle, of the picture's size: real lenses stay within a third of it.
 OFF_CENTRE = 0.15
@@ -134,7 +134,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         return round(1e9 / self.rate_hz)
 
     def earth_field(self, stamp_ns: int) -> EarthField | None:
-        """Return the Earth's field at sensors.position_deg, None where that is not given."""
+        """Return the Earth's field at sensors.position_deg; None if that is not given."""
         position_deg = self.sensors.position_deg
         return None if position_deg is None else earth_field(*position_deg, stamp_ns)
 
@@ -146,7 +146,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         return self.calibration.declination_rad if self.calibration else 0.0
 
     def _check_resolution(self, camera: CameraModel) -> None:
-        """Refuse intrinsics of pictures of another size, detected by their principal point."""
+        """Raise for intrinsics of another picture size, which their principal point shows."""
         for name, found_px, size_px in (
             ("cx_px", camera.cx_px, self.camera.width_px),
             ("cy_px", camera.cy_px, self.camera.height_px),
@@ -158,7 +158,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
                 )
 
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
-        """Return NodeInfo from [calibration]; raise ConfigError where there is none."""
+        """Return NodeInfo from [calibration]; raise ConfigError if there is none."""
         calibration = self.calibration
         if calibration is None:
             raise ConfigError(

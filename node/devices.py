@@ -1,4 +1,4 @@
-"""Cameras and sensors by name: what they give, and which module serves which name."""
+"""The interfaces of cameras and sensors, and the module for each configured name."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Frame:
 class CameraDevice(Protocol):
     """Gives one frame per trigger; used by one thread.
 
-    row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" where all
+    row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" if all
     is well. skipped: frames that were not given out, by reason.
     """
 
@@ -48,11 +48,11 @@ class CameraDevice(Protocol):
     def problem(self) -> str: ...  # noqa: D102
 
     def info(self) -> NodeInfo | None:
-        """Return the calibration that comes with the pictures; None: it stands in the configuration."""
+        """Return the calibration that comes with the pictures; None: it is in the configuration."""
         ...
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
-        """Wait for the next trigger's frame; None where there will be none, or stop is set."""
+        """Wait for the next trigger's frame; None if there will be none, or stop is set."""
         ...
 
     def close(self) -> None:
@@ -63,7 +63,7 @@ class CameraDevice(Protocol):
 class Source(Protocol):
     """One sensor, or several that are read together; used by one thread.
 
-    problem: what is wrong, "" where all is well. retries: transfers on its bus that had to be repeated.
+    problem: what is wrong, "" if all is well. retries: transfers on its bus that had to be repeated.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Source(Protocol):
     def retries(self) -> int: ...  # noqa: D102
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
-        """Wait for the next samples (Imu, Attitude, Depth); None where there will be none, or stop is set."""
+        """Wait for the next samples (Imu, Attitude, Depth); None if there will be none, or stop is set."""
         ...
 
     def close(self) -> None:
@@ -97,7 +97,7 @@ SENSORS: Final[Mapping[str, str]] = {
 
 
 def load(registry: Mapping[str, str], what: str, name: str) -> Callable[..., Any]:
-    """Import what serves a name; raise BuddylineError where there is none, or its package is missing."""
+    """Import the driver of this name; raise BuddylineError if there is none, or its package is missing."""
     target = registry.get(name)
     if target is None:
         raise BuddylineError(f"{what} {name!r}: known are {', '.join(registry)}")

@@ -32,7 +32,7 @@ def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> Ear
     """Return the World Magnetic Model's field at sea level.
 
     After the newest model's five years it is extrapolated: the declination then errs by tenths of a degree a year.
-    Raises BuddylineError where pygeomag is missing, or the position is out of range.
+    Raises BuddylineError if pygeomag is missing, or the position is out of range.
     """
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180):
         raise BuddylineError(f"position {latitude_deg:g}, {longitude_deg:g}: latitude and longitude in degrees")
@@ -56,7 +56,7 @@ def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> Ear
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MagnetometerCalibration:
-    """What the rig adds to the field and distorts of it: field = matrix @ (reading - offset_t), body frame.
+    """Corrects readings for the rig's own magnetism: field = matrix @ (reading - offset_t), body frame.
 
     offset_t: (3,), hard iron. matrix: (3, 3), soft iron, scale and misalignment.
     """
@@ -71,10 +71,10 @@ class MagnetometerCalibration:
 
     @property
     def is_none(self) -> bool:
-        """Whether it changes nothing: the magnetometer is not calibrated."""
+        """Whether this calibration changes nothing: the magnetometer is not calibrated."""
         return not self.offset_t.any() and np.array_equal(self.matrix, np.eye(3))
 
     def apply(self, mag_t: Vector) -> Vector:
-        """Return the Earth's field of readings, (3,) or (n, 3), tesla, body frame."""
+        """Return the Earth's field from readings (3,) or (n, 3), T, body frame."""
         field_t: Vector = (mag_t - self.offset_t) @ self.matrix.T
         return field_t

@@ -28,7 +28,7 @@ GATE_SIGMAS: Final = 3.0
 COMPASS_SIGMA_RAD: Final = math.radians(2.0)
 COMPASS_CORRELATION_S: Final = 3.0  # tilt errors in swell correlate neighbouring readings
 SMOOTHING_S: Final = 0.5
-# On a rig that turns, a disturbance lines up with the Earth's field now and then; that does not end it.
+# On a turning rig a disturbance sometimes points along the Earth's field; that does not end it.
 PROBATION_S: Final = 8.0
 GYRO_WALK_RAD: Final = math.radians(0.02)  # after one second
 DRIFT_CORRELATION_S: Final = 60.0
@@ -88,7 +88,7 @@ class _Steady:
 class HeadingFilter:
     """Estimates delta: the angle, about up, from the gyroscope's level frame to the magnetic one (y north).
 
-    reference: the expected field; None learns its strength and dip. problem: why the compass is not used, "" where it
+    reference: the expected field; None learns its strength and dip. problem: why the compass is not used; "" if it
     is used.
     """
 
@@ -109,7 +109,7 @@ class HeadingFilter:
         self._steady = _Steady()
 
     def predict(self, dt_s: float, bias_sigma_radps: float) -> None:
-        """Move on by dt_s. bias_sigma_radps: how well the gyroscope's bias is known just now."""
+        """Predict over dt_s. bias_sigma_radps: present 1 sd of the gyroscope's bias."""
         p00, p01, p11 = self._p
         if not self._started:
             p11 = bias_sigma_radps**2
@@ -120,7 +120,7 @@ class HeadingFilter:
         self.delta_rad = wrap(self.delta_rad + self._drift_radps * dt_s)
 
     def update(self, dt_s: float, mag_level_t: Vector, turn_rad: float) -> None:
-        """Weigh one reading of the compass.
+        """Update with one reading of the compass.
 
         mag_level_t: (3,), calibrated field in the gyroscope's level frame (z up). turn_rad: turned about up
         since the last reading.
@@ -185,7 +185,7 @@ class HeadingFilter:
         self._started = True
 
     def _off(self, delta_rad: float) -> str:
-        """Return a text where the compass is further from its prediction than the gate allows, else ""."""
+        """Return a text if the compass is further from its prediction than the gate allows, else ""."""
         if not self._started:
             return ""
         off_rad = abs(wrap(delta_rad - self.delta_rad))

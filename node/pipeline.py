@@ -41,7 +41,7 @@ class Pipeline:
         self._last_trigger = -1
 
     def candidates(self, frame: Frame) -> Candidates | None:
-        """Return the frame's candidates; None where the previous frame had the same trigger."""
+        """Return the frame's candidates; None if the previous frame had the same trigger."""
         trigger = trigger_index(frame.stamp_ns, self.trigger_period_ns)
         if trigger == self._last_trigger:
             self.repeated += 1

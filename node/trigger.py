@@ -52,7 +52,7 @@ class FrameChooser:
 class FollowerWatch:
     """Checks that the frames of a camera whose phase something else locks are on the instants.
 
-    problem: what is wrong, "" during the first FOLLOWED_WITHIN_NS and where nothing is.
+    problem: what is wrong; "" if nothing, and during the first FOLLOWED_WITHIN_NS.
     """
 
     def __init__(self, trigger_period_ns: int) -> None:
@@ -117,7 +117,7 @@ class PhaseLock:
         return self.residual_ns is not None and abs(self.residual_ns) <= LOCKED_NS
 
     def update(self, stamp_ns: int) -> int | None:
-        """Take a frame's stamp; return the duration in ns to ask for from the next request on, None: no change."""
+        """Take a frame's stamp; return the duration, ns, to set from the next request on; None: no change."""
         if self._stretched:
             self._stretched = False
             return self.duration_ns
@@ -138,7 +138,7 @@ class PhaseLock:
     def _phase_ns(self, time_ns: int) -> int:
         """Return how far after the nearest point of the grid a time is: from -period/2 to +period/2.
 
-        The grid starts anew at each instant: a period that is no whole number of ns must not add up since 1970.
+        The grid begins at each instant: otherwise the rounding of the period to whole ns would add up since 1970.
         """
         since_ns = time_ns % self._trigger_period_ns
         return since_ns - round(round(since_ns / self._period_ns) * self._period_ns)
@@ -157,12 +157,12 @@ class PhaseLock:
         return median(slopes) if slopes else 0.0
 
     def _carried_ns(self, stamp_ns: int, newest_ns: int, drift_ns: float) -> float:
-        """Return how much later than it did the newest frame would have come, going by this one."""
+        """Return when the newest frame would have come by this frame's time and the drift, minus when it came, ns."""
         return stamp_ns + self._frames(newest_ns - stamp_ns) * (self._period_ns + drift_ns) - newest_ns
 
     def _correct(self, phase_ns: int, drift_ns: float) -> int | None:
-        """Return the duration of the one frame that makes up for phase and drift."""
-        # Half a line too long and half a line too short are alike: no going to and fro between them.
+        """Return the duration of the one frame that corrects phase and drift."""
+        # Half a line too long and half a line too short are equally good: do not alternate between them.
         more = round(-drift_ns / self._line_ns) if abs(drift_ns) > 0.65 * self._line_ns else 0
         if abs((self._lines + more) * self._line_ns - self._period_ns) > self._period_ns * MAX_DRIFT:
             more = 0

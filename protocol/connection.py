@@ -12,7 +12,7 @@ _DESCRIPTORS: Final = "/proc/self/fd"
 def cut_connection(host: str, port: int) -> bool:
     """Shut down this process's connection with the local address host:port.
 
-    The library finds it broken at its next read or write. Returns False where there is no such connection or no /proc.
+    The library finds it broken at its next read or write. Returns False if there is no such connection or no /proc.
     """
     try:
         descriptors = os.listdir(_DESCRIPTORS)

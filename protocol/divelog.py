@@ -98,7 +98,7 @@ class DiveLogWriter:
     ) -> None:
         """Add one payload. publish_time_ns: its stamp, by default read from it. schema: for keys of other programs.
 
-        Raises OSError where the disk refuses to write; then this payload is not in the log, and earlier ones stay
+        Raises OSError if the disk refuses to write; then this payload is not in the log, and earlier ones stay
         queued.
         """
         if self._file.stuck:

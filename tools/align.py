@@ -18,13 +18,13 @@ from buddyline.tools.solve import messages_of, pair_of
 
 log = logging.getLogger(__name__)
 
-# While the clocks may disagree by this much (1 sd), the gaps are judged with that in mind.
+# Assumed 1 sd of the clocks' offset: it widens the gates on range and twist gaps.
 SKEW_SIGMA_S: Final = 0.05
 PASSES: Final = 4
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate the offset; return 1 where the dive does not tell it."""
+    """Estimate the offset; return 1 if the dive does not determine it."""
     with Dive(args.dives) as dive:
         node_a, node_b = pair_of(dive, args.nodes)
         offset: ClockOffset | None = None
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
             if found is None or abs(found.offset_s) < 0.1 * found.sigma_s:
                 break
     if offset is None:
-        log.error("align: the fixes do not tell the offset: they are too few, or the pair did not move")
+        log.error("align: the fixes do not determine the offset: they are too few, or the pair did not move")
         return 1
     if args.json:
         print(json.dumps({"node_a": node_a, "node_b": node_b, **asdict(offset)}))
@@ -59,6 +59,6 @@ def _pass(
         core.handle(envelope.message)
     core.flush()
     if not core.counts["solved"]:
-        raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
+        raise BuddylineError(f"{dive.name}: no trigger was solved, so the clocks' offset cannot be estimated")
     alignment = core.pairs[pair].alignment
     return None if alignment is None else alignment.estimate()

@@ -57,10 +57,10 @@ def _detector(parser: argparse.ArgumentParser) -> None:
 def play(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `play`."""
     _dives(parser)
-    parser.add_argument("--speed", type=float, default=1.0, help="1: as it was (default); 0: as fast as possible")
+    parser.add_argument("--speed", type=float, default=1.0, help="1: real time (default); 0: as fast as possible")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
     parser.add_argument("--end", type=float, metavar="S", help="seconds from the dive's start")
-    parser.add_argument("--loop", action="store_true", help="again and again; the times go on")
+    parser.add_argument("--loop", action="store_true", help="repeat the dive; the times continue")
     add_client_arguments(parser, PLAYER)
 
 
@@ -100,7 +100,7 @@ def tune(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `tune`."""
     parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")
     parser.add_argument(
-        "--truth", metavar="T.mcap", help="where the lights truly are; default: in the dive, if it says"
+        "--truth", metavar="T.mcap", help="the true places of the lights; default: the dive's own, if it has them"
     )
     parser.add_argument("--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}")
     parser.add_argument("--environment", default=PRESETS[1], choices=PRESETS[1:], help="the preset to start from")
@@ -197,7 +197,7 @@ def artag(parser: argparse.ArgumentParser) -> None:
 def experiments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `experiments`."""
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="a new folder for the report")
-    parser.add_argument("--quick", action="store_true", help="short dives: for a look, not figures to quote")
+    parser.add_argument("--quick", action="store_true", help="short dives: a first look, not figures to quote")
     parser.add_argument(
         "--readme", type=Path, metavar="README.md", help="write the summary table into this file, between its markers"
     )

@@ -44,7 +44,7 @@ class TagSolver:
     _finders: dict[str, TagFinder] = field(default_factory=dict)
 
     def look(self, node: str, image: CompressedImage) -> None:
-        """Take one picture; raise PictureError where it cannot be used."""
+        """Take one picture; raise PictureError if it cannot be used."""
         info = self.infos[node]
         picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
         if picture.shape[:2] != (info.height_px, info.width_px):
@@ -62,7 +62,7 @@ class TagSolver:
         self._seen.setdefault(trigger, {})[node] = (image.stamp_ns, found)
 
     def poses(self, attitudes_a: PoseHistory) -> list[RelativePose]:
-        """Return the poses of all triggers with tags that tell one, in order of time."""
+        """Return the poses of all triggers whose tags determine one, in order of time."""
         poses = []
         for trigger, views in sorted(self._seen.items()):
             readings = [

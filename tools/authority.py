@@ -39,7 +39,7 @@ class Authority:
 
     @classmethod
     def create(cls, directory: Path, days: int) -> Self:
-        """Make a new authority; raise BuddylineError where there is one."""
+        """Make a new authority; raise BuddylineError if there is one."""
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
@@ -142,7 +142,7 @@ def _write_pair(
             raise BuddylineError(f"{path}: exists; no key is ever overwritten, move it away first")
     pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     try:
-        # The mode is there before the first byte is: nobody else can open it in between.
+        # The file has its mode before it has content, so no other user can open it in between.
         with open(os.open(key_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.write(pem)
         certificate_path.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))

@@ -49,7 +49,7 @@ class Union:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the union of the logs; tell what the topside recording had missed."""
+    """Write the union of the logs; report what the topside recording had missed."""
     with Dive([args.topside, *args.nodes]) as dive:
         union = Union()
         # Nodes' own logs come first: their log times are the node's, and their pictures are not previews.

@@ -1,4 +1,4 @@
-"""`buddyline calibrate`: camera, lights and magnetometer of a node, each with a picture, or a refusal; two clocks."""
+"""`buddyline calibrate`: camera, lights and magnetometer of a node, and two nodes' clocks. Poor data is refused."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     camera.add_argument("--node", help="whose pictures, of a log of several nodes")
     camera.add_argument("--info", metavar="FILE", help="the node's description: its log, or JSON")
-    camera.add_argument("--new-info", metavar="OUT.json", help="write it anew with this result, for solve --info")
+    camera.add_argument("--new-info", metavar="OUT.json", help="write a description with this result, for solve --info")
 
     lights = add(
         "find the positions of two nodes' lights from a solved dive at taped distances",
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--new-info",
         nargs=2,
         metavar=("A.json", "B.json"),
-        help="write both nodes' descriptions anew, for solve --info",
+        help="write descriptions of both nodes with this result, for solve --info",
     )
 
     magnetometer = add(
@@ -240,7 +240,7 @@ def _clock(args: argparse.Namespace) -> int:
     heard = read(args.dives) if args.dives else listen(client_config(args), args.seconds)
     found = reports(heard, args.nodes)
     print(as_json(found, heard) if args.json else as_text(found, heard))
-    # A dive that is over is what it is: its clocks need not agree, they need to be known.
+    # After a dive the clocks need not agree: their offset only has to be known.
     return 0 if args.dives else int(any(one.problem() for one in found))
 
 

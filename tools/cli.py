@@ -77,7 +77,7 @@ COMMANDS: Final = (
     ),
     Command(
         "doctor",
-        "check what a diver may have forgotten, and say what to do about it",
+        "check what is forgotten before a dive, and say what to do about it",
         ("doctor --config a.toml", "doctor", "doctor --config a.toml --json"),
         "tools.doctor.command",
     ),
@@ -201,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
     0 done, 1 a check failed or input was damaged, 2 a known error, 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else argv
-    # A terminal or a pipe that takes no more than ASCII gets "?" for the rest, not a traceback.
+    # On a terminal or pipe limited to ASCII, other characters become "?"; there is no traceback.
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
@@ -234,7 +234,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # Whoever read our output has gone: nothing is left to say, and nothing to flush at exit.
+        # The reader of our output has gone (as `head` does): say nothing, and flush nothing at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
 

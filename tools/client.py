@@ -1,4 +1,4 @@
-"""Where a command finds the hub, and by what right: `--connect`, or a configuration with a [tls] table."""
+"""How a command reaches the hub: `--connect`, or a configuration with a [tls] table."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class ClientConfig(Config, frozen=True, kw_only=True):
 
 
 def add_client_arguments(parser: argparse.ArgumentParser, role: str = VIEWER) -> None:
-    """Declare what says where the hub is; role: whose certificate the command needs."""
+    """Declare the arguments for the hub's address; role: the certificate that the command needs."""
     parser.add_argument("--config", metavar="FILE.toml", help=f"where the hub is, with [tls] (`buddyline keys {role}`)")
     parser.add_argument("--connect", metavar="ENDPOINT", help=f"the hub; default: {DEFAULT_ENDPOINT}")
 
 
 def client_config(args: argparse.Namespace, role: str = VIEWER) -> ClientConfig:
-    """Return what the arguments say; raise BuddylineError naming the file and what is wrong with it."""
+    """Return the configuration that the arguments give; raise BuddylineError naming the file and its fault."""
     return client_config_of(args.config, args.connect, role)
 
 
 def client_config_of(path: Path | str | None, connect: str | None = None, role: str = VIEWER) -> ClientConfig:
-    """Return what a TOML file says, or the defaults; connect: an endpoint that takes precedence."""
+    """Return the configuration of a TOML file, or the defaults; connect: an endpoint that takes precedence."""
     config = load_config(path, ClientConfig) if path else ClientConfig()
     if config.tls is not None and path:
         config = replace(config, tls=config.tls.beside(path))

@@ -1,7 +1,7 @@
 """A dive's messages as numpy columns, for notebooks and other programs.
 
 Rows are in the order of their stamps; of two samples of a node with one stamp (its own log and a recording of the bus,
-say) the first counts, as does the first of two outcomes of a trigger. What a log does not say is NaN; a trigger, -1.
+say) the first counts, as does the first of two outcomes of a trigger. Unknown numbers are NaN, unknown triggers -1.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ class TrackColumns(Columns):
     """The fused estimate of T_a_b, also between poses. Columns as in PoseColumns, and:
 
     v_a_b_mps (n, 3): velocity of B's camera relative to A's, in A's camera frame, A's turning not counted;
-    v_covariance (n, 3, 3). lights (n,): how many different lights the last trigger told of. age_s (n,): since a light
-    was last used. mode: "smooth" (whole dive), "lag" (a second later), "filter" (live); empty where there is no track.
+    v_covariance (n, 3, 3). lights (n,): number of different lights used at the last trigger. age_s (n,): since a light
+    was last used. mode: "smooth" (whole dive), "lag" (a second later), "filter" (live); empty if there is no track.
     """
 
     t_a_b_m: Floats
@@ -202,14 +202,14 @@ class CandidateColumns(Columns):
 class DiveColumns:
     """A stored dive, out of one or more logs. Each method reads what it returns; no file stays open.
 
-    nodes, pairs: which the logs speak of. infos: each node's calibration. losses: what could not be read of damaged
+    nodes, pairs: those in the logs. infos: each node's calibration. losses: what could not be read of damaged
     logs so far, a line each with file and byte; everything else was used.
     Raises BuddylineError naming the file where one is missing or is no dive log.
     """
 
     def __init__(self, *logs: str | Path) -> None:
         if not logs:
-            raise BuddylineError("no dive log is named")
+            raise BuddylineError("give at least one dive log")
         self._logs = [Path(log) for log in logs]
         self.losses: list[str] = []
         with Dive(self._logs) as dive:

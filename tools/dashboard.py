@@ -1,4 +1,4 @@
-"""What a person wants to see of a running pair, as text; with the truth beside it, as the dive is simulated."""
+"""The state of a running simulated pair as text, with its errors against the truth."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
 
 RECENT_S: Final = 5.0
-# For the figures of the whole run the track is kept so often: its errors last longer.
+# Interval at which the track is kept for the figures of the whole run; its errors change more slowly.
 TRACK_SPACING_NS: Final = S_NS // 5
 SHARE_SAMPLES: Final = 500
 
 
 class Dashboard:
-    """Keeps the newest of everything; safe to feed from the bus's threads."""
+    """Keeps the newest messages; `take` may be called from the bus's threads."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Dashboard:
         self._solver: SolverStatus | None = None
 
     def subscribe(self, bus: Bus) -> None:
-        """Follow poses, tracks, rejections and everyone's health."""
+        """Subscribe to poses, tracks, rejections and status messages."""
         refusals = Refusals("demo")
         for topic in (POSE, TRACK, TRACK_LAG, REJECTED, SOLVER_STATUS, NODE_STATUS):
             follow(bus, topic.key_any(), refusals, self.take)
@@ -107,7 +107,7 @@ class Dashboard:
             )
 
     def screen(self) -> str:
-        """Return the present state as a screenful, which overwrites the last."""
+        """Return the present state as a screen of text that overwrites the last one."""
         with self._lock:
             lines = [self._title, "", *self._pose_lines(), "", *self._health_lines(), "", "Ctrl-C ends."]
         return "\x1b[H\x1b[2J" + "\n".join(lines)
@@ -135,7 +135,7 @@ class Dashboard:
         return self._poses[-1] if self._poses else self._track
 
     def _age(self, shown: Estimate) -> str:
-        """Return what is to be said of the age of what is shown, "" where it goes without saying."""
+        """Return the age of what is shown, in words; "" if it is fresh."""
         if isinstance(shown, Track):
             dark_s = shown.age_s + self._now_s() - self._track_came_s
             return f"no light for {dark_s:.1f} s  " if dark_s > NO_LIGHT_S else ""
@@ -146,7 +146,7 @@ class Dashboard:
     def _shares(self) -> str:
         """Return the shares of time with a track and of triggers with a pose."""
         tracks = self._tracks.get("filter", [])
-        # Of a long run a part is enough to tell a share by.
+        # A long run keeps only a part of its samples, which is enough for a share.
         covered = covered_share(tracks[:: 1 + len(tracks) // SHARE_SAMPLES], self._poses)
         solved = self._solved_share()
         return f"track {covered or 0.0:.0%} of the time, poses {solved or 0.0:.0%} of triggers"

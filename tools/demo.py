@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="default: cavern")
-    parser.add_argument("--seed", type=int, default=1, help="another dive for each; default: 1")
+    parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="triggers a second; default: 10")
     parser.add_argument("--record", metavar="DIR", help="keep the nodes' dive logs here; default: they are removed")
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -119,7 +119,7 @@ def _start(children: list[Child], args: argparse.Namespace, work: Path, endpoint
 
 
 def _watch(service: Service, children: list[Child]) -> None:
-    """End the demo as soon as one of its processes has died, and say which and why; runs beside all else."""
+    """End the demo as soon as one of its processes has died, and say which and why; runs in a thread of its own."""
     while not service.stop.wait(LOOK_S):
         deaths = [death for child in reversed(children) if (death := child.death()) is not None]
         if deaths:
@@ -139,7 +139,7 @@ def _cpu_seconds(children: list[Child]) -> dict[str, float]:
 
 
 def _show(service: Service, dashboard: Dashboard, seconds: float | None) -> bool:
-    """Show what goes on; return whether the time was over, and not stopped from outside."""
+    """Show the state until the end; return True if the time was over, False if the demo was stopped."""
     ends_s = None if seconds is None else time.monotonic() + seconds
     interactive = sys.stderr.isatty()
     while not service.stop.wait(0.25 if interactive else 1.0):

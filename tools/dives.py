@@ -1,7 +1,7 @@
-"""Stored dives as the tools read them: several logs as one, and one policy for damage.
+"""Read stored dives: several logs as one dive, and one policy for damage.
 
-What can be read is used. What cannot is in `Dive.losses`, by file and byte, and reaches the command line by itself:
-`buddyline` prints it on stderr and exits with 1.
+What can be read is used. What cannot be read is listed in `Dive.losses`, by file and byte. `buddyline` prints these
+losses on stderr and exits with 1; no command has to do that itself.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _OUTCOMES: Final = (RelativePose, Rejected)
 
 @dataclass
 class _Pass:
-    """What one reading of a dive left out: bad messages, by log, and second outcomes of triggers, by pair."""
+    """Counts what one reading of a dive left out: bad messages, by log, and second outcomes of triggers, by pair."""
 
     refusals: dict[Path, Refusals] = field(default_factory=dict)
     repeated: Counter[str] = field(default_factory=Counter)
@@ -92,7 +92,7 @@ class Dive:
 
     @property
     def seconds(self) -> float:
-        """From the first message to the last; 0 where there is none."""
+        """From the first message to the last; 0 if there is none."""
         starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
         return (self.end_ns - min(starts)) / S_NS if starts else 0.0
 
@@ -113,7 +113,7 @@ class Dive:
         return {key: max(one.repeated[key] for one in self._passes) for one in self._passes for key in one.repeated}
 
     def _refusals(self) -> dict[Path, Refusals]:
-        # Each reading of a dive meets the same bad messages: the longest reading counts.
+        # Every reading of a dive meets the same bad messages, so the longest reading has the right count.
         found: dict[Path, Refusals] = {}
         for reading in self._passes:
             for path, refusals in reading.refusals.items():
@@ -122,7 +122,7 @@ class Dive:
         return found
 
     def nodes(self, *topic_names: str) -> list[str]:
-        """Return the ids of the nodes that any of these topics is of, sorted."""
+        """Return the ids of the nodes that have one of these topics, sorted."""
         found = [parsed for key in filter(_wanted(topic_names), self.keys) if (parsed := parse_key(key))]
         return sorted(
             {one for topic, ids in found for field, one in zip(topic.id_fields, ids, strict=True) if field != "net"}
@@ -171,7 +171,7 @@ class Dive:
                 reading.refusals.setdefault(reader.path, Refusals()).note(record.key, error)
 
     def metadata(self) -> dict[str, str]:
-        """Return what the writers noted about the logs; the first named log takes precedence."""
+        """Return the metadata of the logs; the first named log takes precedence."""
         noted: dict[str, str] = {}
         for reader in reversed(self.readers):
             noted |= reader.metadata()
@@ -200,7 +200,7 @@ class Dive:
         return {node: info for node, (_, info) in first.items()}
 
     def close(self) -> None:
-        """Close all logs, and let the command line say what was lost."""
+        """Close all logs, and report the losses to the command line."""
         self._stack.close()
         if self._closed:
             return
@@ -224,7 +224,7 @@ def open_each(paths: Sequence[str], stack: ExitStack) -> list[Dive]:
 
 
 def _distinct(paths: Sequence[str] | Sequence[Path]) -> list[Path]:
-    """Return the paths; raise BuddylineError where one is named twice."""
+    """Return the paths; raise BuddylineError if one is named twice."""
     seen: set[Path] = set()
     for path in map(Path, paths):
         if path.resolve() in seen:

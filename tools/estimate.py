@@ -1,4 +1,4 @@
-"""Where B is as A sees it, by one trigger or by the track, and how sure that is."""
+"""Uncertainties of an estimate of T_a_b: of one trigger's pose or of the track."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from buddyline.protocol.messages import RelativePose, Track
 from msgspec import UNSET
 
-# A measurement of one trigger, or the fused estimate at any time: fields of one name mean the same.
+# The pose of one trigger, or the fused estimate at any time. Fields with the same name have the same meaning.
 Estimate: TypeAlias = RelativePose | Track
 
 
@@ -26,6 +26,6 @@ def range_sigma_m(estimate: Estimate) -> float:
 
 
 def known(estimate: Estimate, field: str) -> float | None:
-    """Return a number that an estimate may lack, such as sigma_azimuth_rad, None where it does."""
+    """Return an optional field of an estimate, such as sigma_azimuth_rad; None if it is absent."""
     value = getattr(estimate, field)
     return None if value is UNSET else float(value)

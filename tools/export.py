@@ -1,4 +1,4 @@
-"""`buddyline export`: the track, or the poses, for other programs."""
+"""`buddyline export`: write the track, or the poses, for other programs."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def track_csv_lines(track: Iterable[Track]) -> Iterator[str]:
 
 
 def _place(result: RelativePose | Track) -> dict[str, object]:
-    """Return what poses and tracks have alike: where B is, and how sure that is; unknown is left out."""
+    """Return the columns that poses and tracks share: B's place and its sigmas; unknown values are left out."""
     row: dict[str, object] = dict(zip(_PLACE_FIELDS[:7], (*result.t_a_b_m, *result.q_a_b_xyzw), strict=True))
     variances = result.covariance[::7]
     row |= {name: math.sqrt(v) if v >= 0.0 else "" for name, v in zip(_SD_FIELDS, variances, strict=True)}

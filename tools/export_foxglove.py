@@ -35,14 +35,14 @@ from msgspec import UNSET
 
 WORLD: Final = "world"
 TRANSFORMS: Final = "/tf"
-# Between poses A's own transform need not come faster than eyes follow.
+# Greatest rate of A's own transform between poses: a viewer needs no more.
 ATTITUDE_SPACING_NS: Final = S_NS // 20
 KEPT_FRAMES: Final = 256
 DISTORTION_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "kannala_brandt"}
 R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Level, looking north: what A is drawn as until its attitude is known.
+# A's attitude until it is known: level, looking north.
 R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-# Pieces of the path, each of so much time, so that it can be watched as it grows.
+# The path is written in pieces of this length, so that it can be watched as it grows.
 PATH_NS: Final = S_NS
 LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
 
@@ -61,7 +61,7 @@ class FoxgloveTranslation:
         self._base: str | None = None
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
-        """Yield what stands before the first message: A level at the origin. base: A's id."""
+        """Yield the messages before the dive's first: A level at the origin. base: A's id."""
         self._infos.update(infos)
         self._base = base
         if base is not None:
@@ -282,7 +282,7 @@ def export_foxglove(dive: Dive, output: Path, what: str | None = None) -> int:
 
 
 def _track_topic(dive: Dive) -> str | None:
-    """Return the topic of the best track in a dive: of a live one, that which is a second late."""
+    """Return the topic of the best track in a dive: for a live dive, the one that is a second late."""
     return next((topic.name for topic in (TRACK_LAG, TRACK) if dive.ids(topic.name)), None)
 
 

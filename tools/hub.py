@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 class HubConfig(Config, frozen=True, kw_only=True):
     """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it.
 
-    status_file: where it says how it is; "": in the runtime directory (protocol/statusfile.py).
+    status_file: its health report; "": in the runtime directory (protocol/statusfile.py).
     """
 
     listen: str = DEFAULT_ENDPOINT
@@ -48,20 +48,22 @@ def load_hub_config(path: str | None) -> HubConfig:
 
 
 def check_exposure(config: HubConfig, *, insecure: bool) -> str | None:
-    """Return what to warn of; raise BuddylineError where the hub would let anyone in without being told to."""
+    """Return a warning or None; raise BuddylineError if the hub would be open to anyone without --insecure."""
     if config.tls is not None:
         check_identity(config.tls, HUB)
         return None if config.nodes else "no node may publish: `nodes` is empty"
     if config.nodes:
-        raise BuddylineError("hub: `nodes` says who may publish, and without a [tls] table nobody is known")
+        raise BuddylineError(
+            "hub: `nodes` restricts who may publish, which needs a [tls] table to identify the clients"
+        )
     if is_loopback(config.listen):
         return None
     if not insecure:
         raise BuddylineError(
-            f"hub: {config.listen} is open to the network: use TLS (`buddyline keys init`), or say --insecure "
+            f"hub: {config.listen} is open to the network: use TLS (`buddyline keys init`), or add --insecure "
             "where the network is yours alone"
         )
-    return f"INSECURE: whoever reaches {config.listen} can read and send everything"
+    return f"INSECURE: everyone who reaches {config.listen} can read and send everything"
 
 
 def run(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from typing import Final
 from buddyline.protocol.errors import BuddylineError
 
 STATE: Final = Path("/var/lib/buddyline")
-# Chrony first, where it is installed: the triggers are instants of its clock.
+# After chrony, if it is installed: the triggers are instants of the clock that it sets.
 AFTER: Final = {
     "node": "chrony.service",
     "hub": "network-online.target",
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("service", choices=tuple(AFTER), help="which unit to write: buddyline-<service>.service")
     parser.add_argument("--config", metavar="FILE.toml", help="its configuration; a node must have one")
     parser.add_argument(
-        "--run-as", metavar="USER", help="default: whoever called sudo; needs access to camera and I2C bus, no more"
+        "--run-as", metavar="USER", help="default: the user who called sudo; needs access to camera and I2C bus only"
     )
     parser.add_argument("--print", action="store_true", help="show the unit, write nothing")
     parser.add_argument("--user", action="store_true", help="a unit of your own (systemctl --user), not hardened")
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class UnitSource:
-    """What a unit is made from. groups: those whose devices it opens; writable: where it writes besides its state."""
+    """The input of a unit. groups: of the devices it opens; writable: directories it writes besides its state."""
 
     service: str
     config: Path | None = None
@@ -98,7 +98,7 @@ def system_unit(source: UnitSource) -> str:
 
 
 def user_unit(source: UnitSource) -> str:
-    """Return the unit of one user's own manager, which lacks the rights to harden anything."""
+    """Return the unit for a user's own service manager, which has no right to harden a service."""
     directory = source.config.parent if source.config else Path.home()
     return _unit(source, [f"WorkingDirectory={str(directory).replace('%', '%%')}"], "default.target")
 
@@ -113,7 +113,7 @@ def _unit(source: UnitSource, lines: list[str], target: str) -> str:
 Description=Buddyline {source.service}
 After={after}
 {f"Wants={after}" if source.service == "hub" else ""}
-# However often it fails: under water nobody is there to start it.
+# Restart without a limit: under water nobody is there to start it.
 StartLimitIntervalSec=0
 
 [Service]
@@ -125,7 +125,7 @@ Restart=on-failure
 RestartSec=2
 TimeoutStopSec=10
 RuntimeDirectory=buddyline
-# The three services share it: the one that ends first must not take it from the others.
+# The three services share it: the first that ends must not remove it.
 RuntimeDirectoryPreserve=yes
 {own}
 
@@ -135,7 +135,7 @@ WantedBy={target}
 
 
 def _source(args: argparse.Namespace) -> UnitSource:
-    """Check the service's configuration, and take from it what the unit needs."""
+    """Check the service's configuration; return what the unit needs of it."""
     config = Path(args.config).resolve() if args.config else None
     user: str = args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
     if not all(letter.isalnum() or letter in "_-." for letter in user):
@@ -163,7 +163,7 @@ def _source(args: argparse.Namespace) -> UnitSource:
 
 
 def _program() -> Path:
-    """Return this program as it is installed; raise BuddylineError where it runs out of a source tree alone."""
+    """Return this program as it is installed; raise BuddylineError if it is not installed."""
     program = Path(sys.executable).parent / "buddyline"
     if not program.is_file():
         raise BuddylineError(f"{program}: not there; install the program first: make install")
@@ -177,7 +177,7 @@ def _directory(args: argparse.Namespace) -> Path:
 
 
 def _write(path: Path, text: str, *, force: bool) -> str:
-    """Write a unit; return what was done. One that differs is shown, and replaced only by force."""
+    """Write a unit; return what was done. A different existing one is shown, and replaced only with force."""
     try:
         before = path.read_text() if path.exists() else None
         if before == text:
@@ -214,6 +214,6 @@ next:
 
 
 def _quoted(text: str) -> str:
-    """Return a word as a unit's setting takes it."""
+    """Return a word quoted for a unit's ExecStart."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
     return f'"{escaped}"' if any(letter in escaped for letter in " \t\"'\\;") else escaped

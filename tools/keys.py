@@ -25,9 +25,9 @@ AUTHORITY_DAYS: Final = 3650
 # The role of each certificate, and what it is for.
 ROLES: Final = {
     "solver": "make the solver's certificate, which may publish poses",
-    "viewer": "make the certificate of everything that only reads: record, monitor",
-    "surveyor": "make the certificate of whoever marks stations: mark, survey watch; it reads as well",
-    "ros2": "make the certificate of `ros2`, which may publish what it makes for ROS; it reads as well",
+    "viewer": "make the certificate for commands that only read: record, monitor",
+    "surveyor": "make the certificate for marking stations: mark, survey watch; it reads as well",
+    "ros2": "make the certificate of `ros2`, which may publish its messages for ROS; it reads as well",
     "player": "make the certificate of `play`, which may publish what any node publishes",
 }
 

@@ -23,9 +23,9 @@ class NoHubError(BuddylineError):
 
 
 class LiveClient(Service):
-    """A command on the bus. Ends at Ctrl-C, after `seconds`, or where one of its threads fails.
+    """A command on the bus. Ends at Ctrl-C, after `seconds`, or when one of its threads fails.
 
-    seconds count from the start, whether a hub answers or not; None: no limit. refusals: messages that are not sound.
+    seconds count from the start, whether a hub answers or not; None: no limit. refusals: counts invalid messages.
     """
 
     def __init__(self, name: str, config: ClientConfig, seconds: float | None = None) -> None:
@@ -38,7 +38,7 @@ class LiveClient(Service):
     def run(self, work: Callable[[Bus], None]) -> int:
         """Connect, hand the bus to work, leave the bus when work returns; return the exit status.
 
-        0: work is done or the time is over; 2: no hub answered within the time, or another known error; 130: Ctrl-C.
+        0: the work is done or the time is over; 2: no hub answered in time, or another known error; 130: Ctrl-C.
         For the main thread of a process.
         """
         self.handle_signals()
@@ -65,9 +65,9 @@ class LiveClient(Service):
 
 
 def open_bus(config: ClientConfig, stop: threading.Event, on_wait: Callable[[str], None]) -> Bus | None:
-    """Connect to the configured hub, waiting for it; None where stop was set before it answered.
+    """Connect to the configured hub, waiting for it; None if stop was set before it answered.
 
-    on_wait is called once, with what is waited for. Raises RefusedError where the hub refuses this client.
+    on_wait is called once, with what is waited for. Raises RefusedError if the hub refuses this client.
     """
     from buddyline.protocol.zenoh_bus import connect
 
@@ -76,7 +76,7 @@ def open_bus(config: ClientConfig, stop: threading.Event, on_wait: Callable[[str
 
 
 def open_bus_within(config: ClientConfig, seconds: float) -> Bus:
-    """Connect to the configured hub; raise NoHubError where none answers within this time."""
+    """Connect to the configured hub; raise NoHubError if none answers within this time."""
     stop = threading.Event()
     timer = threading.Timer(seconds, stop.set)
     timer.start()
@@ -103,7 +103,7 @@ def follow(
     capacity: int = 1024,
     history: bool = True,
 ) -> Subscription:
-    """Hand the sound messages on these keys to take, as Bus.subscribe does; refusals counts the others."""
+    """Pass the valid messages on these keys to take, as Bus.subscribe does; refusals counts the others."""
 
     def receive(received: Received) -> None:
         envelope = refusals.open(received)

@@ -1,4 +1,4 @@
-"""Live messages for a program of one's own: a loop over what the solver says, until it is stopped."""
+"""Live messages for other programs: a loop over the messages of a topic, until it is stopped."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ LOOK_S: Final = 1.0
 
 
 class LiveStream(Generic[M]):
-    """Iterates over the messages of a topic as they come; a context manager that leaves the bus.
+    """Iterates over the messages of a topic as they arrive; a context manager that leaves the bus.
 
-    ids: of a node or pair, None for all. Ends after `seconds`, where they are given. Past a thousand waiting messages
-    the oldest is dropped. Raises NoHubError where no hub answers within connect_s.
+    ids: of a node or pair; None: all. Ends after `seconds`, if given. Beyond a thousand waiting messages the oldest
+    is dropped. Raises NoHubError if no hub answers within connect_s.
     """
 
     def __init__(
@@ -60,17 +60,17 @@ class LiveStream(Generic[M]):
 
     @property
     def refused(self) -> int:
-        """How many messages were not sound."""
+        """How many invalid messages were refused."""
         return self._refusals.count
 
     def stop(self) -> None:
-        """Let the loop end with the message that it has in hand; from any thread."""
+        """End the loop after its present message; may be called from any thread."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Stop, and leave the bus; twice does no harm."""
+        """Stop, and leave the bus; a second call does nothing."""
         self.stop()
         self._bus.close()
 
@@ -83,7 +83,7 @@ class LiveStream(Generic[M]):
         """Wait for the next message; None at the end."""
         with self._changed:
             left_s = self._end_s - time.monotonic()
-            # A wait without end is one that Ctrl-C does not end on every platform.
+            # With a time limit, because on some platforms Ctrl-C does not interrupt a wait without one.
             while not (self._waiting or self._stopped or self._failure or left_s <= 0):
                 self._changed.wait(min(left_s, LOOK_S))
                 left_s = self._end_s - time.monotonic()

@@ -1,4 +1,4 @@
-"""What a command could not read of its input: said on stderr when the command ends, which then exits with 1."""
+"""Collect what a command could not read of its input. It goes to stderr at the end, and the exit status is 1."""
 
 from __future__ import annotations
 
@@ -44,6 +44,6 @@ def collected() -> Iterator[Losses]:
 
 
 def report(lines: Iterable[str]) -> None:
-    """Say what could not be read, a line each. Where no command runs this does nothing: `Dive.losses` has it."""
+    """Report what could not be read, a line each. Outside a command this does nothing: `Dive.losses` has it."""
     if _of_commands:
         _of_commands[-1].add(lines)

@@ -1,7 +1,7 @@
-"""New files: what a command writes never takes the place of a file that is there, and is never found half written.
+"""Write new files: an existing file is never replaced, and no file is ever incomplete under its final name.
 
-A file is written beside its place, as NAME.part, and gets its name when it is whole. Where the command fails or is
-interrupted, the part is removed.
+A file is written as NAME.part and renamed when it is complete. If the command fails or is interrupted, the part is
+removed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ REMOVE_IT: Final = "name another or remove it first"
 
 
 def check_new(path: Path | str, hint: str = REMOVE_IT) -> Path:
-    """Return the path; raise BuddylineError where a file is there, so that no work is done for nothing."""
+    """Return the path; raise BuddylineError if a file is there. Call it before the work whose result goes there."""
     if os.path.lexists(path):
         raise BuddylineError(f"{path}: exists; {hint}")
     return Path(path)
@@ -32,9 +32,9 @@ def check_new(path: Path | str, hint: str = REMOVE_IT) -> Path:
 
 @contextmanager
 def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
-    """Give the place beside a new file to write to, and name it when it is whole.
+    """Yield NAME.part to write to, and rename it to NAME at the end.
 
-    Raises BuddylineError where a file is there (hint: what to do about it), or where the place cannot be written.
+    Raises BuddylineError if NAME exists (hint: what to do about it), or cannot be written.
     """
     target = check_new(path, hint)
     if not target.parent.is_dir():
@@ -48,7 +48,7 @@ def new_file(path: Path | str, hint: str = REMOVE_IT) -> Iterator[Path]:
         except FileExistsError:
             check_new(target, hint)
         except OSError:
-            # A file system without hard links (a memory stick's).
+            # A file system without hard links, such as a memory stick's.
             check_new(target, hint)
             part.rename(target)
     except OSError as error:
@@ -64,7 +64,7 @@ def write_new(path: Path | str, content: str | bytes, hint: str = REMOVE_IT) -> 
 
 
 def write_output(target: str, content: str | bytes) -> None:
-    """Write what a command was asked for: to a new file, which is named on stderr, or to stdout for `-`."""
+    """Write a command's output to a new file, and name it on stderr; `-`: to stdout."""
     if target != "-":
         write_new(target, content)
         print(f"wrote {target}", file=sys.stderr)
@@ -74,7 +74,7 @@ def write_output(target: str, content: str | bytes) -> None:
 
 
 def new_folder(path: Path | str) -> Path:
-    """Make a folder for what a command writes; raise BuddylineError where there is one with something in it."""
+    """Make a folder for a command's output; raise BuddylineError if it exists and is not empty."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,7 +86,7 @@ def new_folder(path: Path | str) -> Path:
 
 
 def write_picture(folder: Path, name: str, picture: NDArray[np.uint8]) -> None:
-    """Write a new picture as NAME.png, or NAME_2.png and so on where that is taken."""
+    """Write a new picture as NAME.png, or as NAME_2.png and so on if that exists."""
     import cv2
 
     path, number = folder / f"{name}.png", 2

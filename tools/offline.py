@@ -37,7 +37,7 @@ from buddyline.tools.solve import TOGETHER
 
 @dataclass(frozen=True, eq=False)
 class SolvedDive:
-    """What became of a dive's triggers, and the track, as columns by time. pair: a and b of T_a_b."""
+    """The poses, rejections and track of a dive, as columns by time. pair: a and b of T_a_b."""
 
     pair: Pair
     poses: PoseColumns
@@ -58,8 +58,8 @@ def solve_messages(
     """Solve a pair's messages (NodeInfo, Candidates, Imu, Attitude, Depth), in the order in which they were received.
 
     pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. track:
-    "smooth", "lag", "filter" or "none". The results are those of `buddyline solve`. Raises BuddylineError where the
-    pair or its calibration is not there.
+    "smooth", "lag", "filter" or "none". The results are those of `buddyline solve`. Raises BuddylineError if the
+    pair or its calibration is missing.
     """
     taken = list(messages)
     chosen = _pair(sorted({message.node for message in taken if isinstance(message, Candidates)}), pair)
@@ -72,7 +72,7 @@ def solve_messages(
         settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)}, track=track_settings(track, track_hz)
     )
     rest, outcomes = iter(taken), list[Message]()
-    # A node's streams keep a minute: what is handed over at once has to be less.
+    # A node's streams keep a minute of messages, so each batch spans less than that.
     while together := list(islice(rest, TOGETHER)):
         outcomes += core.handle_many(together)
     outcomes += core.flush()

@@ -1,4 +1,4 @@
-"""Pairs of nodes on the command line, and which of those that a dive holds is meant."""
+"""Pairs of nodes on the command line, and the choice among the pairs of a dive."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def pair_words(pairs: Sequence[Pair]) -> str:
 
 
 def wanted_pair(wanted: Pair, pairs: Sequence[Pair], name: str) -> Pair:
-    """Return the wanted pair in the order in which it is among pairs; raise BuddylineError, naming the dive."""
+    """Return the wanted pair in the node order that pairs has; raise BuddylineError, naming the dive."""
     for pair in (wanted, wanted[::-1]):
         if pair in pairs:
             return pair
@@ -47,7 +47,7 @@ def wanted_pair(wanted: Pair, pairs: Sequence[Pair], name: str) -> Pair:
 
 
 def solved_pair(dive: Dive, wanted: Pair | None) -> Pair | None:
-    """Return the wanted pair, or the first of which the dive has poses or rejections; None where it has none."""
+    """Return the wanted pair, or the first of which the dive has poses or rejections; None if it has none."""
     pairs = [(ids[0], ids[1]) for ids in dive.ids("pose", "rejected")]
     if wanted is not None:
         return wanted_pair(wanted, pairs, dive.name)

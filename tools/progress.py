@@ -11,7 +11,7 @@ WIDTH: Final = 30
 
 
 class Progress:
-    """Shows how far a task is; shows nothing where stderr is no terminal or the task is short."""
+    """Shows the progress of a task; shows nothing if stderr is no terminal or the task is short."""
 
     def __init__(self, what: str, total: float, stream: TextIO | None = None) -> None:
         self.what = what

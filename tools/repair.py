@@ -1,4 +1,4 @@
-"""`buddyline repair`: make a whole, indexed log out of a damaged one, and tell what was lost."""
+"""`buddyline repair`: make a complete, indexed log from a damaged one, and report what was lost."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
 def missing(numbers: np.ndarray, times_ns: np.ndarray) -> list[str]:
     """Return a line for each gap in the messages' sequence numbers.
 
-    numbers, times_ns: (n,) int, in any order. Where the writer did not number its messages there is nothing to tell;
+    numbers, times_ns: (n,) int, in any order. If the writer did not number its messages, no loss can be found;
     messages lost after the last one are not seen.
     """
     order = np.argsort(numbers, kind="stable")

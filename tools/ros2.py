@@ -1,8 +1,8 @@
-"""`buddyline ros2`: attitudes, depths, poses and tracks for ROS 2, as its middleware rmw_zenoh lays them.
+"""`buddyline ros2`: publish attitudes, depths, poses and tracks for ROS 2, in the form of its middleware rmw_zenoh.
 
-ROS 2 machines with RMW_IMPLEMENTATION=rmw_zenoh_cpp whose router is our hub see them as any other topic. Frames
+ROS 2 machines with RMW_IMPLEMENTATION=rmw_zenoh_cpp and our hub as their router see them as any other topic. Frames
 follow REP 103: the world `map` is east, north, up, with the surface at zero; bodies are forward, left, up; cameras
-are right, down, forward, as ours are.
+are right, down, forward, as in this project.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ log = logging.getLogger(__name__)
 
 MAP: Final = "map"
 NODE_NAME: Final = "buddyline"
-# Reliable, volatile, the last 10 kept; the rest as it is by default (rmw_zenoh's liveliness tokens).
+# Quality of service in rmw_zenoh's liveliness tokens: reliable, volatile, the last 10 kept, the rest default.
 QOS: Final = "::,10:,:,:,,"
 TRANSFORM_SPACING_NS: Final = S_NS // 20
-# Poses say again where B is once a track has been silent for so long.
+# After a track has been silent for this time, poses give B's transform again.
 TRACK_SILENT_NS: Final = S_NS
 R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-# Forward, left, up seen from forward, right, down: its own inverse.
+# Between forward, left, up and forward, right, down: the matrix is its own inverse.
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
-# A quantity that a message has room for and nobody measured: so uncertain that filters leave it alone.
+# Variance of a field that was not measured: large, so that filters ignore the field.
 UNKNOWN_VARIANCE: Final = 1e6
 
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -53,7 +53,7 @@ TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 
 @dataclass(frozen=True)
 class RosMessage:
-    """One message for ROS: its topic, its type as ROS names it, and the value as rosbags' type of that name."""
+    """One ROS message: its topic, its ROS type name, and the value as rosbags' class of that type."""
 
     topic: str
     type_name: str
@@ -61,12 +61,12 @@ class RosMessage:
 
 
 def name_of(node: str) -> str:
-    """Return a node's id as a part of ROS names, which begin with a letter."""
+    """Return a node's id as part of a ROS name, which must begin with a letter."""
     return node if node[0].isalpha() else f"node_{node}"
 
 
 class Translation:
-    """Turns our messages into ROS's; pure but for what it has heard before. types: of a rosbags type store."""
+    """Translates our messages into ROS's. Its state is what earlier messages said. types: of a rosbags type store."""
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types
@@ -77,7 +77,7 @@ class Translation:
         self._base: str | None = None
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
-        """Yield what one of our messages is in ROS."""
+        """Yield the ROS messages for one of our messages."""
         if isinstance(message, NodeInfo):
             self._infos[message.node] = message
         elif isinstance(message, Attitude):
@@ -102,7 +102,7 @@ class Translation:
             header=self._header(attitude.stamp_ns, f"{name_of(attitude.node)}_body"),
             orientation=self._quaternion(R_enu_flu),
             orientation_covariance=np.diag(np.array(attitude.sigma_rad) ** 2).ravel(),
-            # sensor_msgs/Imu: -1 says that a quantity is not given.
+            # sensor_msgs/Imu: -1 means that a quantity is not given.
             angular_velocity=nothing,
             angular_velocity_covariance=unknown,
             linear_acceleration=nothing,
@@ -111,7 +111,7 @@ class Translation:
         return RosMessage(f"/buddyline/{name_of(attitude.node)}/attitude", IMU_TYPE, value)
 
     def _camera_in_map(self, attitude: Attitude) -> Iterator[RosMessage]:
-        """Yield where A's camera stands; B's follows from the pose, and a frame has one parent."""
+        """Yield the transform of A's camera. B's follows from the pose, because a frame has only one parent."""
         node, stamp_ns = attitude.node, attitude.stamp_ns
         info, before_ns = self._infos.get(node), self._transform_ns.get(node)
         if node != self._base or info is None:
@@ -133,7 +133,7 @@ class Translation:
     def _pose(self, pose: RelativePose) -> Iterator[RosMessage]:
         a, b = name_of(pose.node_a), name_of(pose.node_b)
         R_a_b = quat_to_matrix(np.array(pose.q_a_b_xyzw))
-        # Position, then rotation about A's fixed axes: ROS's order and meaning are ours.
+        # Position, then rotation about A's fixed axes: the same order and meaning as in ROS.
         value = self._posed(pose.stamp_ns, f"{a}_camera", pose.t_a_b_m, R_a_b, np.array(pose.covariance))
         yield RosMessage(f"/buddyline/{a}/{b}/pose", POSE_TYPE, value)
         tracked_ns = self._tracked_ns.get((a, b))
@@ -141,11 +141,11 @@ class Translation:
             yield self._transform(pose.stamp_ns, f"{a}_camera", f"{b}_camera", pose.t_a_b_m, R_a_b)
 
     def _track(self, track: Track) -> Iterator[RosMessage]:
-        """Yield a track's sample as an odometry of B's camera; where B is on /tf follows the one that is not late.
+        """Yield a track's sample as an odometry of B's camera, and on /tf the sample of the track that is not late.
 
-        nav_msgs/Odometry: the pose in the header's frame, A's camera; the twist in the child's, B's camera. So the
-        velocity and its covariance are turned by R_b_a. It is relative to A, but not to A's turning. The track says
-        nothing of B's rate of turn.
+        nav_msgs/Odometry: the pose is in the header's frame, A's camera; the twist in the child's, B's camera. So the
+        velocity and its covariance are rotated by R_b_a. The velocity has no part from A's rotation. The track does
+        not contain B's angular rate.
         """
         a, b = name_of(track.node_a), name_of(track.node_b)
         R_a_b = quat_to_matrix(np.array(track.q_a_b_xyzw))
@@ -211,7 +211,7 @@ class Translation:
 
 
 class RosGraph:
-    """One ROS node with its publishers, as rmw_zenoh shows them to others: keys, liveliness tokens, attachments."""
+    """One ROS node and its publishers in the form of rmw_zenoh: keys, liveliness tokens, attachments."""
 
     def __init__(self, session: Any, store: Any, clock: Clock, domain: int) -> None:
         self._session = session
@@ -223,11 +223,11 @@ class RosGraph:
         self._tokens = [session.liveliness().declare_token(self._token(0, "NN"))]
 
     def _token(self, entity: int, kind: str) -> str:
-        # Empty enclave and the root namespace are both written %.
+        # An empty enclave and the root namespace are both written as %.
         return f"@ros2_lv/{self._domain}/{self._zid}/0/{entity}/{kind}/%/%/{NODE_NAME}"
 
     def publish(self, message: RosMessage) -> None:
-        """Send one message; its topic is declared when it first comes."""
+        """Send one message; its topic is declared at the first message."""
         self.declare(message)
         endpoint = self._endpoints[message.topic]
         payload = bytes(self._store.serialize_cdr(message.value, message.type_name))
@@ -235,7 +235,7 @@ class RosGraph:
         endpoint.publisher.put(payload, attachment=attachment(endpoint.sequence, self._clock.now_ns(), endpoint.gid))
 
     def declare(self, message: RosMessage) -> None:
-        """Let others see the topic of a message, where they do not yet."""
+        """Declare the topic of a message, if it is not declared yet."""
         if message.topic in self._endpoints:
             return
         entity = len(self._endpoints) + 1
@@ -258,18 +258,18 @@ class RosEndpoint:
 
 
 def dds_type(type_name: str) -> str:
-    """Return `package/msg/Type` as DDS writes it: `package::msg::dds_::Type_`."""
+    """Return DDS's form of `package/msg/Type`: `package::msg::dds_::Type_`."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """Return what rmw_zenoh sends beside each sample: two int64, then the gid with its length before it."""
+    """Return rmw_zenoh's attachment of a sample: two int64, then the gid with its length before it."""
     return struct.pack("<qqB", sequence, stamp_ns, len(gid)) + gid
 
 
 def type_store() -> Any:
-    """Return ROS 2 Jazzy's types; raise BuddylineError where rosbags is not installed."""
+    """Return ROS 2 Jazzy's types; raise BuddylineError if rosbags is not installed."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
@@ -285,7 +285,7 @@ def run(args: argparse.Namespace) -> int:
     def translate(bus: Bus) -> None:
         from buddyline.protocol.zenoh_bus import open_session
 
-        # ROS's keys and payloads are not ours: they go by a session of their own.
+        # ROS's keys and payloads do not go over our bus, but over a session of their own.
         tls = client.config.tls
         session: Any = open_session(client.config.connect, stop=client.stop, on_wait=log.info, tls=tls)
         if session is None:

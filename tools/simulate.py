@@ -22,9 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--environment", choices=ENVIRONMENTS, default=scenario.environment, help="default: cavern")
     parser.add_argument("--seconds", type=float, default=plan.seconds, help="default: %(default)s")
     parser.add_argument("--rate", type=float, default=plan.rate_hz, metavar="HZ", help="triggers; default: %(default)s")
-    parser.add_argument("--seed", type=int, default=1, help="another seed is another dive; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: %(default)s")
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
-    parser.add_argument("--imu", action="store_true", help="raw inertial samples, too")
+    parser.add_argument("--imu", action="store_true", help="with raw inertial samples")
     parser.add_argument(
         "--inertial",
         choices=INERTIAL_GRADES,
@@ -37,13 +37,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     world.add_argument(
         "--range-min", type=float, default=scenario.range_min_m, metavar="M", help="default: %(default)s"
     )
-    world.add_argument("--range-max", type=float, default=0.0, metavar="M", help="default: what the water lets be seen")
+    world.add_argument("--range-max", type=float, default=0.0, metavar="M", help="default: as far as the water allows")
     world.add_argument(
         "--baseline", type=float, default=scenario.baseline_a_m, metavar="M", help="default: %(default)s"
     )
     world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
-    world.add_argument("--tags", action="store_true", help="two AR tags on each node, to compare with")
-    world.add_argument("--undisturbed", action="store_true", help="nobody looks away, nothing passes before a light")
+    world.add_argument("--tags", action="store_true", help="two AR tags on each node, for comparison")
+    world.add_argument("--undisturbed", action="store_true", help="no diver looks away, nothing passes before a light")
     faults = parser.add_argument_group("noise and faults")
     faults.add_argument("--sigma-px", type=float, default=scenario.sigma_px, metavar="PX", help="noise of candidates")
     faults.add_argument("--gross", type=float, default=scenario.gross_share, metavar="SHARE", help="off by pixels")
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _differing(scenario: Scenario) -> dict[str, object]:
-    """Return the fields of a scenario that are not at their default, and what always tells."""
+    """Return the fields of a scenario that differ from their defaults, and those that are always recorded."""
     return {
         field.name: getattr(scenario, field.name)
         for field in fields(scenario)

@@ -25,14 +25,14 @@ from buddyline.tools.newfile import new_dive_log
 
 log = logging.getLogger(__name__)
 
-# How many messages are matched before what they match is solved, all at once.
+# This many messages are matched before the matched triggers are solved, all at once.
 TOGETHER: Final = 2048
-# What the output carries beside the poses, so that it can be evaluated and solved again on its own.
+# The inputs that the output has beside the poses, so that it can be evaluated and solved again without other logs.
 COPIED = ("info", "candidates", "imu", "attitude", "depth", "mark", "truth", "light_truth", "net_truth")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve a dive; return 0, or 1 where not one trigger was resolved."""
+    """Solve a dive; return 0, or 1 if no trigger was resolved."""
     settings = SolveConfig(method=args.method, checks=[check for check in args.checks.split(",") if check]).settings(
         "--checks"
     )
@@ -89,7 +89,7 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:
-    """Return the nodes to solve: the given ones, or all of the dive; raise where there are not two."""
+    """Return the nodes to solve: the given ones, or all of the dive; raise if there are fewer than two."""
     present = dive.nodes("candidates", "image")
     if given:
         nodes = node_ids(given)
@@ -106,7 +106,7 @@ def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:
 
 
 def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
-    """Return the one pair that a command takes: the given one, or the dive's two nodes; raise where there is none."""
+    """Return a command's one pair: the given one, or the dive's two nodes; raise if it is not clear."""
     nodes = nodes_of(dive, given)
     if len(nodes) > 2:
         raise BuddylineError(f"{dive.name}: nodes {', '.join(nodes)}; choose a pair with --nodes A B")
@@ -114,7 +114,7 @@ def pair_of(dive: Dive, given: list[str] | None) -> tuple[str, str]:
 
 
 def _with_info(dive: Dive, nodes: list[str], infos: Mapping[str, NodeInfo], *, given: bool) -> list[str]:
-    """Leave out the nodes without a calibration; raise where they were asked for, or fewer than two are left."""
+    """Leave out the nodes without a calibration; raise if such a node was asked for, or fewer than two are left."""
     known = [node for node in nodes if node in infos]
     unknown = [node for node in nodes if node not in infos]
     if unknown and (given or len(known) < 2):
@@ -127,7 +127,7 @@ def _with_info(dive: Dive, nodes: list[str], infos: Mapping[str, NodeInfo], *, g
 def messages_of(
     dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *nodes: str, doing: str
 ) -> Iterator[Envelope]:
-    """Yield what the solver and the output need; the pictures of a node without candidates are detected."""
+    """Yield the messages for solver and output; pictures of a node without candidates are detected."""
     raw = [node for node in nodes if node not in dive.nodes("candidates")]
     detector = None
     if raw:
@@ -147,7 +147,7 @@ def messages_of(
 
 
 def _write(writer: DiveLogWriter, results: Iterable[Message]) -> None:
-    """Write outcomes and track; of a track, the one that was asked for is the dive's."""
+    """Write outcomes and track; a track of any mode goes to the topic `track`."""
     for result in results:
         key = TRACK.key(result.node_a, result.node_b) if isinstance(result, Track) else None
         writer.write_message(result, key=key)

@@ -1,7 +1,7 @@
 """`buddyline tune`: propose a detector's values from a site's own pictures, and write those pictures with marks.
 
 The values are judged by the dive's light truth, if it has any. Otherwise the likely candidates of the default detector
-take its place, and the proposed values are the strictest ones that keep these candidates.
+replace it, and the proposed values are the strictest ones that keep these candidates.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Judged:
 
     @property
     def worth(self) -> float:
-        """Recall, reduced for false candidates."""
+        """Recall, reduced for false candidates: the figure of merit."""
         return self.recall - COST_OF_FALSE * self.false
 
 

@@ -92,7 +92,7 @@ class SurfaceZero:
 
 
 def save_zero(path: Path, stamp_ns: int, surface_pa: float) -> None:
-    """Keep a zero for the rest of the day; raise OSError where it cannot be written."""
+    """Store a zero for the rest of the day; raise OSError if it cannot be written."""
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_suffix(".new")
     fresh.write_text(json.dumps({"stamp_ns": stamp_ns, "surface_pa": surface_pa}))
@@ -100,7 +100,7 @@ def save_zero(path: Path, stamp_ns: int, surface_pa: float) -> None:
 
 
 def load_zero(path: Path, now_ns: int) -> float | None:
-    """Return the zero that was kept less than half a day ago, or None."""
+    """Return the zero that was stored less than half a day ago, or None."""
     try:
         kept = json.loads(path.read_text())
         stamp_ns, surface_pa = int(kept["stamp_ns"]), float(kept["surface_pa"])

@@ -29,7 +29,7 @@ REOPEN_NS: Final = 2 * S_NS
 
 
 class Metronome:
-    """Keeps a loop to a period on a clock that may be set while it runs."""
+    """Keeps a loop at a fixed period, also if its clock is set meanwhile."""
 
     def __init__(self, period_ns: int, clock: Clock) -> None:
         self._period_ns = period_ns
@@ -37,7 +37,7 @@ class Metronome:
         self._next_ns = clock.now_ns()
 
     def wait(self, stop: threading.Event) -> bool:
-        """Wait for the next turn, at most a period; return True where stop is set."""
+        """Wait for the next turn, at most a period; return True if stop is set."""
         now_ns = self._clock.now_ns()
         self._next_ns += self._period_ns
         if not now_ns <= self._next_ns <= now_ns + self._period_ns:
@@ -70,7 +70,7 @@ class ImuSource:
 
     @property
     def problem(self) -> str:
-        """What is wrong with it, "" where nothing is."""
+        """What is wrong with it, "" if nothing is."""
         return "; ".join(filter(None, (self._health.problem, self._compass.problem)))
 
     @property
@@ -141,7 +141,7 @@ class DepthSource:
 
     @property
     def problem(self) -> str:
-        """What is wrong with it, "" where nothing is."""
+        """What is wrong with it, "" if nothing is."""
         return "; ".join(filter(None, (self._health.problem, self._zero.problem)))
 
     @property
@@ -219,8 +219,8 @@ def _triple(vector: Vector) -> Vector3:
 def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSource]:
     """Return the sensors on the bus; "none" leaves one out.
 
-    A bus that cannot be opened, or a chip that does not answer, is named and tried again every two seconds. An unknown
-    name is an error.
+    A bus that cannot be opened, or a chip that does not answer, is reported and tried again every two seconds. An
+    unknown name is an error.
     """
     sensors = config.sensors
     check_names(sensors.imu, sensors.depth)

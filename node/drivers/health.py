@@ -1,4 +1,4 @@
-"""How a device is: said once when it changes, and asked for at any time."""
+"""A device's health: each change is logged once, and the present state can be read at any time."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ log = logging.getLogger(__name__)
 
 
 class DeviceHealth:
-    """What is wrong with one device. problem: "" where all is well."""
+    """The health of one device. problem: what is wrong; "" if nothing."""
 
     def __init__(self, name: str) -> None:
         self.problem = ""
         self._name = name
 
     def update(self, problem: str) -> None:
-        """Take note of how it is now."""
+        """Take the present problem ("" for none); log it if it has changed."""
         if problem and not self.problem:
             log.warning("%s: %s", self._name, problem)
         elif self.problem and not problem:

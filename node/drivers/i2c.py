@@ -28,7 +28,7 @@ _MEANING: Final = {
 class I2cBus:
     """Bus number /dev/i2c-<number>, shared by all its chips and by all threads.
 
-    It is opened by `open` or the first transfer, so that a bus that is absent at the start can come later.
+    It is opened by `open` or the first transfer, so that a bus that is absent at the start can appear later.
     retries: transfers that were repeated; a growing count means a failing wire.
     """
 
@@ -45,7 +45,7 @@ class I2cBus:
         self._bus: Any = None
 
     def open(self) -> None:
-        """Open the adapter if it is not open; raise DeviceError where it cannot be. The next call tries again."""
+        """Open the adapter if it is not open; raise DeviceError if it cannot be. The next call tries again."""
         with self._lock:
             if self._bus is None:
                 self._bus = self._open()

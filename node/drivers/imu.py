@@ -85,7 +85,7 @@ class SoughtLis3mdl:
         self._chip: Lis3mdl | None = None
 
     def start(self) -> None:
-        """Find the chip and write its settings; raise DeviceError where it does not answer."""
+        """Find the chip and write its settings; raise DeviceError if it does not answer."""
         self._chip = self._chip or Lis3mdl.find(self._bus)
         if self._chip is None:
             raise self._bus.error(
@@ -108,7 +108,7 @@ class ChipImu:
     R_body_chip: (3, 3), maps the board's axes to the body's (x forward, y right, z down). After any failure
     the chips are identified and set up again before the next reading counts, because a chip sleeps after a
     brown-out. Control registers are read back once a second, and at once where a sensor reads zero. A magnetometer
-    that fails, or is absent at the start, is named in `problem` and tried again once a second; motion goes on without.
+    that fails, or is absent at the start, is named in `problem` and tried again once a second; samples continue.
     """
 
     def __init__(
@@ -135,11 +135,11 @@ class ChipImu:
 
     @property
     def problem(self) -> str:
-        """What is wrong although samples come, "" where nothing is."""
+        """What is wrong although samples come; "" if nothing."""
         return "; ".join(filter(None, (self._mag_problem, self._saturated)))
 
     def start(self) -> None:
-        """Check and set up the chips; raise DeviceError where motion is absent, name an absent magnetometer."""
+        """Check and set up the chips; raise DeviceError without a motion chip, report a missing magnetometer."""
         self._start_motion()
         if self._magnetometer is not None:
             try:
@@ -156,7 +156,7 @@ class ChipImu:
         self._gyro_watch.restart(now_ns)
 
     def read(self) -> ImuSample:
-        """Return the newest sample; raise DeviceError where there is none. The next call tries again."""
+        """Return the newest sample; raise DeviceError if there is none. The next call tries again."""
         try:
             if not self._motion_ready:
                 self._start_motion()
@@ -260,7 +260,7 @@ class Lsm6dsAlone(Lsm6dsImu):
 
 
 def check_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return R, (3, 3); raise BuddylineError where it is not a right-handed rotation."""
+    """Return R, (3, 3); raise BuddylineError if it is not a right-handed rotation."""
     matrix = np.asarray(R, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
         raise BuddylineError("mount of the IMU: not a rotation (orthonormal, right-handed)")

@@ -28,7 +28,7 @@ RETRY_NS: Final = 200 * MS_NS
 PERIOD_NS: Final = 50 * MS_NS
 OVERSAMPLING: Final = 5  # of 0..5: 8192 samples, 0.2 mbar of noise on the 30BA
 CONVERSION_NS: Final = (600_000, 1_170_000, 2_280_000, 4_540_000, 9_040_000, 18_080_000)
-# A conversion begins once its command is on the wire: after a read and, at 100 kHz, what the inertial unit has there.
+# A conversion begins once its command is on the wire, possibly behind a read and a transfer of the inertial unit.
 TRANSFERS_NS: Final = 1_500_000
 
 Model = Literal["30ba", "02ba"]
@@ -38,13 +38,13 @@ Model = Literal["30ba", "02ba"]
 TYPES: Final[dict[int, Model]] = {0x1A: "30ba", 0x15: "02ba"}
 SENSITIVITY: Final[dict[Model, range]] = {"30ba": range(26_000, 37_001), "02ba": range(37_001, 49_001)}
 
-# What the chips can measure, in Pa and degC; anything else is a transfer gone wrong.
+# What the chips can measure, in Pa and degC; anything else is a failed transfer.
 PRESSURE_PA: Final[dict[Model, tuple[float, float]]] = {"30ba": (0.0, 3.1e6), "02ba": (1e4, 2.1e5)}
 TEMPERATURE_DEGC: Final = (-20.0, 85.0)
 
 
 def crc4(words: Sequence[int]) -> int:
-    """Return the four-bit checksum of the seven PROM words, as word 0 carries it in bits 15:12."""
+    """Return the four-bit checksum of the seven PROM words, which word 0 has in bits 15:12."""
     remainder = 0
     for word in (words[0] & 0x0FFF, *words[1:7], 0):
         for byte in word.to_bytes(2, "big"):
@@ -56,7 +56,7 @@ def crc4(words: Sequence[int]) -> int:
 
 
 def decode_prom(words: Sequence[int]) -> tuple[int, ...]:
-    """Return C1..C6 of seven PROM words; raise BuddylineError where the checksum fails."""
+    """Return C1..C6 of seven PROM words; raise BuddylineError if the checksum fails."""
     stored, computed = words[0] >> 12, crc4(words)
     if not any(words) or stored != computed:
         raise BuddylineError(f"PROM checksum {computed}, stored {stored}: bad contact or a damaged chip")
@@ -64,7 +64,7 @@ def decode_prom(words: Sequence[int]) -> tuple[int, ...]:
 
 
 def decode_model(words: Sequence[int]) -> Model:
-    """Return which chip it is; raise BuddylineError where type and sensitivity disagree or are unknown."""
+    """Return which chip it is; raise BuddylineError if type and sensitivity disagree or are unknown."""
     kind, sensitivity = words[0] >> 5 & 0x7F, words[1]
     model = next((model for model, known in SENSITIVITY.items() if sensitivity in known), None)
     if model is None or TYPES.get(kind, model) != model:
@@ -143,7 +143,7 @@ class _Phase(Enum):
 class Ms5837:
     """The sensor as a state machine: each step is at most one command and one short read.
 
-    model: None finds out by the PROM. After any failure the chip is reset and its PROM read again.
+    model: None reads it from the PROM. After any failure the chip is reset and its PROM read again.
     """
 
     def __init__(self, bus: I2cBus, model: Model | None = None) -> None:
@@ -159,7 +159,7 @@ class Ms5837:
 
     @classmethod
     def open(cls, bus: I2cBus, model: Model | None, clock: Clock) -> Self:
-        """Return the sensor once its PROM has been read; raise DeviceError where it cannot be."""
+        """Return the sensor once its PROM has been read; raise DeviceError if it cannot be."""
         device, never = cls(bus, model), threading.Event()
         while not device.ready:
             clock.wait_until_ns(device.next_due_ns, never)
@@ -173,14 +173,14 @@ class Ms5837:
 
     @property
     def ready(self) -> bool:
-        """Whether the PROM has been read and the chip converts."""
+        """Whether the PROM has been read and conversions run."""
         return self._phase not in (_Phase.LOST, _Phase.RESETTING)
 
     def step(self, now_ns: int) -> DepthSample | None:
-        """Do what is due at now_ns; return a sample where one is complete.
+        """Take the step that is due at now_ns; return a sample if one is complete.
 
-        A clock set back starts the conversion in hand anew; one set forward is met by the chip's own 0.
-        Raises DeviceError; the chip is tried again RETRY_NS later.
+        If the clock is set back, the conversion is repeated. If it is set forward, the chip is read too early and
+        returns 0, which is an error. Raises DeviceError; the chip is tried again RETRY_NS later.
         """
         if self._since_ns <= now_ns < self.next_due_ns:
             return None

@@ -36,9 +36,9 @@ def boottime_ns() -> int:
 
 
 def wall_offset_ns(boottime: Callable[[], int], wall: Callable[[], int]) -> int:
-    """Return what to add to a time of CLOCK_BOOTTIME to have it on the wall clock.
+    """Return the wall clock minus CLOCK_BOOTTIME.
 
-    The wall clock is read between two readings of the other; of a few tries the tightest counts, since a thread
+    The wall clock is read between two readings of the other; of a few tries the quickest counts, because a thread
     can be interrupted in between.
     """
     best_ns, offset_ns = None, 0
@@ -67,9 +67,9 @@ def first_line_ns(model: str, shortest_frame_us: int, mode_height: int) -> float
 class LineTimer:
     """Measures the time of one sensor line, from durations that are a whole number of lines.
 
-    libcamera reports ExposureTime, FrameDuration and the shortest frame in whole microseconds. Each leaves only
-    lines that divide it; two or three of them leave one within FIRST_ERROR of the first estimate.
-    line_ns: of the lines that are left, the one nearest to the first estimate. measured: whether only one is left.
+    libcamera reports ExposureTime, FrameDuration and the shortest frame in whole microseconds. A line time is possible
+    if it divides all reported durations. Within FIRST_ERROR of the first estimate, two or three durations leave one.
+    line_ns: of the possible line times, the one nearest to the first estimate. measured: only one is possible.
     """
 
     def __init__(self, first_ns: float) -> None:
@@ -80,11 +80,11 @@ class LineTimer:
 
     @property
     def measured(self) -> bool:
-        """Whether only one line time is left."""
+        """Whether only one line time is possible."""
         return len(self._ranges_ns) == 1 and bool(self._seen_us)
 
     def update(self, duration_us: int) -> None:
-        """Take a duration; one that no line time left fits is not used, since it is no whole number of lines."""
+        """Take a duration; it is ignored if no possible line time divides it."""
         if self.measured or duration_us in self._seen_us or len(self._seen_us) >= MAX_DURATIONS:
             return
         self._seen_us.add(duration_us)

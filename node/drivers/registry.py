@@ -23,7 +23,7 @@ IMUS: Final[Mapping[str, str]] = {
     "lsm6ds": "buddyline.node.drivers.imu:Lsm6dsAlone",
 }
 
-# A board without a magnetometer is used only where it is named: `auto` would take a silent magnetometer for none.
+# `auto` never chooses a board without a magnetometer: one that does not answer would be taken for a missing one.
 SEARCHED_IMUS: Final = ("minimu9_v3", "minimu9_v5", "minimu9_v6")
 
 DEPTHS: Final[Mapping[str, tuple[str, str | None]]] = {
@@ -42,7 +42,7 @@ def open_imu(
     """Open the IMU of that name, or the first of SEARCHED_IMUS that `auto` finds by identity.
 
     R_body_chip: (3, 3), maps the board's axes to the body's; default: identity.
-    Raises DeviceError where no motion chip answers. A magnetometer may be absent (ImuDevice.problem names it).
+    Raises DeviceError if no motion chip answers. A magnetometer may be absent (ImuDevice.problem names it).
     """
     _check_name("sensors.imu", name, (AUTO, *IMUS))
     bus.open()
@@ -63,7 +63,7 @@ def open_imu(
 def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> DepthDevice:
     """Open the depth sensor of that name; `auto` reads the model from its PROM.
 
-    Returns once the PROM has been read, after 10 ms. Raises DeviceError where it cannot be.
+    Returns once the PROM has been read, after 10 ms. Raises DeviceError if it cannot be.
     """
     _check_name("sensors.depth", name, tuple(DEPTHS))
     target, model = DEPTHS[name]

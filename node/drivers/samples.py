@@ -19,7 +19,7 @@ class DeviceError(BuddylineError):
 
 
 class AbsentError(DeviceError):
-    """A device that is not there, or in use elsewhere; it may come later."""
+    """A device that is absent, or in use elsewhere; it may become available later."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class DepthSample:
 class ImuDevice(Protocol):
     """Accelerometer, gyroscope and, on most boards, magnetometer.
 
-    problem: what is wrong although samples come, "" where nothing is.
+    problem: what is wrong although samples come; "" if nothing.
     """
 
     name: str
@@ -58,12 +58,12 @@ class ImuDevice(Protocol):
     def problem(self) -> str: ...  # noqa: D102
 
     def read(self) -> ImuSample:
-        """Return the newest sample; raise DeviceError where there is none. The next call tries again."""
+        """Return the newest sample; raise DeviceError if there is none. The next call tries again."""
         ...
 
 
 class DepthDevice(Protocol):
-    """A pressure sensor whose conversions run beside everything else: nothing here waits."""
+    """A pressure sensor that converts while the caller does other work: no method waits."""
 
     next_due_ns: int
 
@@ -73,7 +73,7 @@ class DepthDevice(Protocol):
         ...
 
     def step(self, now_ns: int) -> DepthSample | None:
-        """Do what is due, if anything is; return a sample where one is complete.
+        """Take the next step if one is due; return a sample if one is complete.
 
         Call it at every turn of the loop that owns the bus. Raises DeviceError; later calls try again.
         """

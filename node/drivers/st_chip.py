@@ -61,13 +61,13 @@ class StChip:
                 raise self.bus.error(self.address, register, f"{self.NAME} kept 0x{kept:02x} in place of 0x{value:02x}")
 
     def check_setting(self, register: int, value: int) -> None:
-        """Read one control register back; raise DeviceError where it is not value."""
+        """Read one control register back; raise DeviceError if it differs from value."""
         found = self.bus.read(self.address, register, 1)[0]
         if found != value:
             what = f"{self.NAME} has reset: 0x{found:02x} in place of 0x{value:02x}"
             raise self.bus.error(self.address, register, what)
 
     def check_settings(self) -> None:
-        """Read all control registers back; raise DeviceError where one has lost its value."""
+        """Read all control registers back; raise DeviceError if one has lost its value."""
         for register, value in self.SETTINGS:
             self.check_setting(register, value)

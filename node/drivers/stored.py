@@ -1,6 +1,6 @@
-"""Stored pictures as a camera: a folder of them, or a dive log with what its sensors said.
+"""Stored pictures as a camera: a folder of pictures, or a dive log with its sensors' samples.
 
-A dive log keeps its own times; it is given out at the pace it was recorded at. Pictures of a folder come one
+A dive log keeps its own times, and is played at the pace of its recording. Pictures of a folder come one
 a trigger.
 """
 
@@ -76,7 +76,7 @@ def picture_files(path: Path) -> list[Path]:
 
 
 class FolderCamera:
-    """One picture of a folder a trigger; broken ones are counted and skipped."""
+    """Gives one picture of a folder at each trigger; damaged ones are counted and skipped."""
 
     row_time_ns = 0
     problem = ""
@@ -89,11 +89,11 @@ class FolderCamera:
         self._next_ns = 0
 
     def info(self) -> NodeInfo | None:
-        """Return None: pictures alone carry no calibration."""
+        """Return None: a folder of pictures has no calibration."""
         return None
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
-        """Wait for the next trigger instant and return the next sound picture."""
+        """Wait for the next trigger instant and return the next undamaged picture."""
         for file in self._files:
             try:
                 picture = decode_picture(file.read_bytes(), str(file))
@@ -113,7 +113,7 @@ class FolderCamera:
 
 
 class _Paced:
-    """Messages of some keys of a log, each when its time has come."""
+    """Gives some messages of a log, each at its time."""
 
     def __init__(self, path: Path, kinds: frozenset[str], clock: Clock) -> None:
         self._logs = ExitStack()

@@ -13,7 +13,7 @@ from buddyline.protocol.clock import MS_NS, S_NS
 # Noise always moves the last bits. A few readings may repeat while the chip is slower than the loop;
 # ten in a row mean that the chip has stopped.
 FROZEN_READINGS: Final = 10
-# A gyroscope at rest reads zero on all axes now and then (about one reading in a hundred without a bias), not thrice.
+# A gyroscope at rest may read zero on all axes once (about one reading in a hundred without a bias), not three times.
 ZERO_READINGS: Final = 3
 # A chip gives zeros until its first conversion is done; the L3GD20H takes 250 ms.
 SETTLING_NS: Final = 500 * MS_NS
@@ -22,13 +22,13 @@ FULL_SCALE_COUNTS: Final = 32_700  # of 32,768
 
 
 class SettlingError(DeviceError):
-    """A chip that was just started and has no reading yet; it needs time, not another start."""
+    """A chip that was just started and has no reading yet; it needs no restart."""
 
 
 class SensorWatch:
-    """Judges the readings of one sensor.
+    """Checks the readings of one sensor.
 
-    chip: where its settings are. limit: its full scale, in the unit of the readings.
+    chip: holds its settings. limit: its full scale, in the unit of the readings.
     """
 
     def __init__(self, name: str, chip: StChip, limit: float) -> None:
@@ -45,7 +45,7 @@ class SensorWatch:
         self._last: Vector = np.full(3, np.nan)
 
     def is_saturated(self, reading: Vector, now_ns: int) -> bool:
-        """Return whether a reading, (3,), is at full scale; raise DeviceError where the chip did not measure it."""
+        """Return whether a reading, (3,), is at full scale; raise DeviceError if the chip did not measure it."""
         if not reading.any():
             self._judge_zero(now_ns)
         else:
@@ -75,7 +75,7 @@ class SettingsWatch:
         self._checked_ns = 0
 
     def look(self, now_ns: int) -> None:
-        """Read the next register back where one is due; raise DeviceError where the chip has lost its setting."""
+        """Read the next register back if one is due; raise DeviceError if the chip has lost its setting."""
         if 0 <= now_ns - self._checked_ns < CHECK_NS // len(self._checks):
             return
         self._checked_ns = now_ns

@@ -65,7 +65,7 @@ def test_temperature(degc, level):
 @pytest.mark.parametrize(
     ("bits", "level", "word"),
     [
-        (None, "skipped", "not tell"),
+        (None, "skipped", "not report"),
         (0, "ok", "no undervoltage"),
         (0x50005, "problem", "undervoltage now"),
         (0x40004, "problem", "slowed down now"),

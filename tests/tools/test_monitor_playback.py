@@ -197,9 +197,9 @@ class TestReport:
             with pytest.raises(BuddylineError, match="nothing of pair b/c; pairs: a/b, a/c"):
                 solved_pair(opened, ("b", "c"))
         assert "3.00 to 3.00 m" in first
-        assert "poses of other pairs are not told: a and c" in first
+        assert "poses of other pairs are not reported: a and c" in first
         assert "7.00 to 7.00 m" in chosen
-        assert "poses of other pairs are not told: a and b" in chosen
+        assert "poses of other pairs are not reported: a and b" in chosen
 
     def test_a_log_without_poses_is_reported_and_says_so(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "raw.mcap", *INFOS.values(), *(frame("a", k) for k in range(20)))

@@ -70,7 +70,7 @@ def watch(bus: Bus, seconds: float) -> Seen:
 def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
     """Judge hub and nodes. own: this machine's node; None for a laptop."""
     if seen.error:
-        nodes = Finding("nodes", "skipped", "nobody is seen without a hub")
+        nodes = Finding("nodes", "skipped", "no node can be seen without a hub")
         if seen.no_hub:
             advice = "start it: buddyline hub; a node records without it"
             return [Finding("hub", "warning", seen.error, advice), nodes]
@@ -90,8 +90,8 @@ def check_bus(seen: Seen, endpoint: str, own: str | None) -> list[Finding]:
 def _node(node: str, seen: Seen) -> list[Finding]:
     name, info, status = f"node {node}", seen.infos.get(node), seen.statuses.get(node)
     if info is None:
-        return [Finding(name, "problem", "is on the bus, and its calibration is not known", "restart it")]
+        return [Finding(name, "problem", "is on the bus, but its calibration is not known", "restart it")]
     if status is None:
-        return [Finding(name, "warning", "is on the bus, and does not say how it is", "look at its log")]
+        return [Finding(name, "warning", "is on the bus, but sends no status", "look at its log")]
     well = f"runs for {status.uptime_s:.0f} s, {info.width_px}x{info.height_px}, no complaints"
     return reported(name, status) or [Finding(name, "ok", well)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Depths = Sequence[tuple[int, float]]
-# About so many of a track's points get an ellipse on a map.
+# About this many of a track's points get an ellipse on a map.
 ELLIPSES: Final = 25
 
 
@@ -149,6 +149,6 @@ def _ellipse(axis: Axes, at_m: tuple[float, float], x_m: float, y_m: float, at_d
 
 
 def _gap_s(points: Sequence[Point]) -> float:
-    """Return the time past which two points are not joined: of a long dive only some points are kept."""
+    """Return the time, s, beyond which two points are not joined; longer dives keep fewer points."""
     steps_ns = np.diff([point.at_ns for point in points])
     return max(GAP_S, 3 * float(np.median(steps_ns)) / S_NS) if len(steps_ns) else GAP_S

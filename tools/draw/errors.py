@@ -46,7 +46,7 @@ def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Fi
     """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m."""
     figure, axes = new_figure(max(3.1 * len(dives), 5.0), 6.4, 2, len(dives))
     for column, (title, (true_m, curves)) in enumerate(dives.items()):
-        # Equal steps in both directions, of a metre or of what leaves twenty of them.
+        # Equal steps in both directions: a metre, or more where that would give over twenty steps.
         step_m = max(1.0, float(np.ceil(np.abs(true_m).max() / 20)))
         for row, across, name in ((0, 0, "right"), (1, 1, "down")):
             axis = axes[row * len(dives) + column]

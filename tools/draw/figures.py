@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Nothing is known between poses that are further apart in time: lines break there.
+# Lines break between poses that are further apart in time than this.
 GAP_S: Final = 1.5
 COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
 NO_POSE_COLOUR: Final = "#d0483f"
@@ -37,7 +37,7 @@ FALLBACK_FONTS: Final = (
     "Unifont",
 )
 _STYLE: Final[dict[Any, Any]] = {
-    # Coordinates of a grid stand in full.
+    # Coordinates of a grid are written in full, without an offset at the axis.
     "axes.formatter.limits": (-5, 9),
     "axes.formatter.useoffset": False,
     "axes.grid": True,
@@ -48,15 +48,15 @@ _STYLE: Final[dict[Any, Any]] = {
     "legend.fontsize": 8.0,
     "lines.markersize": 4.0,
     "savefig.dpi": 90,
-    # Text stays text, which can be searched.
+    # Text stays text in SVG, so that it can be searched.
     "svg.fonttype": "none",
-    # The same data give the same file.
+    # Fixed, so that the same data give the same file.
     "svg.hashsalt": "buddyline",
 }
 
 
 def check() -> None:
-    """Raise BuddylineError where matplotlib is missing: known before the work is done."""
+    """Raise BuddylineError if matplotlib is missing. Call it before the work, not after."""
     try:
         import matplotlib as mpl
     except ImportError:
@@ -113,10 +113,10 @@ def svg(figure: Figure) -> str:
 
 
 def inline_svg(figure: Figure, words: str) -> str:
-    """Return a figure as an <svg> element of a page; words: for those who do not see it."""
+    """Return a figure as an <svg> element of a page; words: its description for screen readers."""
     element = svg(figure)
     element = element[element.index("<svg") :]
-    # A page needs no namespaces, names no element twice, and sets the width itself.
+    # In a page: no namespaces, ids unique among all figures, and the width set by the page.
     element = re.sub(r' xmlns(:\w+)?="[^"]*"| id="[^"]*_\d+"|\s*<metadata>.*?</metadata>', "", element, flags=re.DOTALL)
     return re.sub(r' width="[^"]*" height="[^"]*"', f' role="img" aria-label="{escape(words)}"', element, count=1)
 

@@ -1,4 +1,4 @@
-"""HTML pages that stand alone: no file beside them, no request to any network, no markup out of data."""
+"""HTML pages that are complete in one file: no request to any network, and no markup out of data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CSS: Final = (
     ".dim,figcaption{color:#5b6670;font-size:.87em}.warn{background:#fff3d6;border-left:4px solid #d9a520;"
     "padding:4px 10px}svg,img{max-width:100%;height:auto}"
 )
-# A browser asks nobody for anything, whatever a log holds.
+# The browser makes no request, whatever text a log contains.
 _POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
@@ -32,7 +32,7 @@ def page(title: str, *parts: str, css: str = "") -> str:
 
 
 def section(heading: str, *parts: str) -> str:
-    """Return parts of HTML under a heading, nothing where all are empty."""
+    """Return parts of HTML under a heading, nothing if all are empty."""
     content = "".join(parts)
     return f"<h2>{escape(heading)}</h2>{content}" if content else ""
 

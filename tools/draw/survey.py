@@ -68,7 +68,7 @@ def profile(adjusted: Adjusted, title: str) -> Figure:
 
 
 def _name(axis: Axes, name: str, at: tuple[float, float]) -> None:
-    # A name with two dollar signs is no formula.
+    # Otherwise a name with two dollar signs would be drawn as a formula.
     axis.annotate(name, at, xytext=(4, 3), textcoords="offset points", parse_math=False)
 
 

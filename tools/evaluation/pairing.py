@@ -18,7 +18,7 @@ class Pairing:
     marked: visible by LightTruth; if false, the projected lights are inside both pictures, without regard to obstacles.
     Numbers of these triggers: right: a pose from the right pair. other_pair: a pose from another pair. partial: a pose
     from fewer than four lights. wrong: a wrong pose, from any pair. ended: the others, by reason (also "no result").
-    detected: with a candidate near all four lights. right_detected: right ones among these. None where candidates or
+    detected: with a candidate near all four lights. right_detected: right ones among these. None if candidates or
     results are not known.
     """
 

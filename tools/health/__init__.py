@@ -1,1 +1,1 @@
-"""The one judge: what is said of machine, rig, nodes, solver and pair. Its limits are in protocol/health.py."""
+"""Judge the health of machine, rig, nodes, solver and pair, for all commands. The limits: protocol/health.py."""

@@ -1,4 +1,4 @@
-"""What a judgement is made of."""
+"""A finding: one result of a check."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ WORST_FIRST: Final[tuple[Level, ...]] = ("problem", "warning", "ok", "skipped")
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing to say.
+    """One result of a check.
 
-    name: what it is about, such as `clock`, `node a`, `solver`, `bus`, `pair`. skipped: it cannot be told.
-    advice: what to do, "" where nothing is to be done. since_ns: None where it is not known.
+    name: what it is about, such as `clock`, `node a`, `solver`, `bus`, `pair`. skipped: it cannot be checked.
+    advice: what to do, "" if nothing is to be done. since_ns: None if it is not known.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What is said of this machine: clock, temperature, power, disk. Facts go in, findings come out."""
+"""Judge this machine: clock, temperature, power, disk. Input: facts; output: findings."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from buddyline.node.chrony import Tracking
 from buddyline.protocol.health import CLOCK_OFF_S, DIVE_H, HOT_DEGC, TOO_HOT_DEGC
 from buddyline.tools.health.finding import Finding, Level
 
-# Of JPEGs of quality 90 of dark water with lamps, and of all else that a node records.
+# Bytes per pixel of JPEGs of quality 90 of dark water with lamps; bytes per second of all else that a node records.
 BYTES_A_PIXEL: Final = 0.25
 BYTES_A_SECOND: Final = 50_000
 
-# vcgencmd get_throttled, the worst first: bits of now, and of since the start.
+# Bits of vcgencmd get_throttled, the worst first: the present ones, then those since the start.
 _POWER: Final[tuple[tuple[int, Level, str, str], ...]] = (
     (1 << 0, "problem", "undervoltage now", "charge or change the battery; thicker, shorter cables"),
     (1 << 2, "problem", "the processor is slowed down now", "cool it, and check the supply"),
@@ -22,9 +22,9 @@ _POWER: Final[tuple[tuple[int, Level, str, str], ...]] = (
 
 
 def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: bool = True) -> Finding:
-    """Judge whether this machine's clock is that of the others.
+    """Judge whether this machine's clock agrees with the others.
 
-    timesyncd: systemd says it is synchronised. stamps: frames are stamped by it; else nothing is worse than a warning.
+    timesyncd: systemd says it is synchronised. stamps: this clock stamps frames; if not, warnings are the worst.
     """
     worst: Level = "problem" if stamps else "warning"
     if error:
@@ -33,7 +33,10 @@ def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: boo
         if timesyncd:
             return Finding("clock", "warning", "set by systemd-timesyncd, to milliseconds", "apt install chrony")
         return Finding(
-            "clock", "warning", "chrony is not installed: nothing keeps it with the others'", "apt install chrony"
+            "clock",
+            "warning",
+            "chrony is not installed: nothing synchronises this clock with the others",
+            "apt install chrony",
         )
     if not tracking.synchronised:
         return Finding(
@@ -50,7 +53,7 @@ def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: boo
 def temperature(degc: float | None) -> Finding:
     """Judge the processor's temperature."""
     if degc is None:
-        return Finding("temperature", "skipped", "this machine does not tell")
+        return Finding("temperature", "skipped", "this machine does not report it")
     level: Level = "problem" if degc >= TOO_HOT_DEGC else "warning" if degc >= HOT_DEGC else "ok"
     advice = "" if level == "ok" else "get it into the shade or the water; a Pi slows down at 80 degrees"
     return Finding("temperature", level, f"{degc:.0f} degrees C", advice)
@@ -59,7 +62,7 @@ def temperature(degc: float | None) -> Finding:
 def power(throttled: int | None) -> Finding:
     """Judge the supply by the firmware's bits (vcgencmd get_throttled)."""
     if throttled is None:
-        return Finding("power", "skipped", "this machine does not tell of undervoltage")
+        return Finding("power", "skipped", "this machine does not report undervoltage")
     for bit, level, text, advice in _POWER:
         if throttled & bit:
             return Finding("power", level, text, advice)
@@ -67,7 +70,7 @@ def power(throttled: int | None) -> Finding:
 
 
 def disk(place: str, free_bytes: int, min_free_bytes: int, picture_px_a_second: float, error: str) -> Finding:
-    """Judge whether a dive fits. error: why nothing can be written there, "" where it can."""
+    """Judge whether a dive fits. error: why nothing can be written there, "" if it can."""
     if error:
         return Finding("disk", "problem", f"{place}: {error}", "set record.directory to a place this user can write")
     hours = max(free_bytes - min_free_bytes, 0) / (picture_px_a_second * BYTES_A_PIXEL + BYTES_A_SECOND) / 3600

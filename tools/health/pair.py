@@ -1,4 +1,4 @@
-"""What is wrong with a pair and its nodes, since when, and what to do: of what is known at an instant."""
+"""Judge a pair and its nodes at an instant: what is wrong, since when, and what to do."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ START_SOLVER: Final = "start it: buddyline solver"
 
 
 def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Finding]:
-    """Return what there is to say of a pair, the worst first. live: of now, not of a stored dive."""
+    """Return the findings on a pair, the worst first. live: a running pair, not a stored dive."""
     if live:
         bus = _bus(picture, now_ns)
         if bus is not None:
@@ -50,7 +50,7 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
 
 
 def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
-    """Return what a node says of itself, and what its figures say. since_ns: since when it has its problem."""
+    """Return the findings from a node's status: its problem (since since_ns), temperature and clock."""
     said = []
     if status.problem:
         said.append(Finding(name, "problem", f"{_named(name)} reports: {status.problem}", "", since_ns))
@@ -64,14 +64,14 @@ def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list
 
 
 def _named(name: str) -> str:
-    """Return a name as a sentence begins with it."""
+    """Return a name as the beginning of a sentence."""
     return f"{name[0].upper()}{name[1:]}"
 
 
 def _bus(picture: PairPicture, now_ns: int) -> Finding | None:
     if picture.last_ns is None:
         return Finding("bus", "warning", "Nothing has come over the bus yet.", "start hub, nodes and solver")
-    # Every node and the solver say something each second: without any of it, it is the link.
+    # Every node and the solver send a status each second. If none comes, the link is down.
     if now_ns - picture.last_ns > SILENT_S * S_NS:
         advice = "check that the hub runs and the cable to it; the nodes go on recording by themselves"
         return Finding("bus", "problem", "Nothing comes over the bus any more.", advice, picture.last_ns)
@@ -80,7 +80,7 @@ def _bus(picture: PairPicture, now_ns: int) -> Finding | None:
 
 def _node(node: NodePicture, now_ns: int, live: bool) -> list[Finding]:
     name, alive_ns = f"node {node.node}", node.alive_ns()
-    # What comes after it left says that it is back; what was on its way does not.
+    # A message sent after it left shows that it is back; one that was on its way does not.
     if live and node.left_ns is not None and alive_ns <= node.left_ns + node.stale_after_ns(CANDIDATES):
         advice = f"{_POWER}; if it still runs, it goes on recording by itself"
         return [Finding(name, "problem", f"{_named(name)} has left the bus.", advice, node.left_ns)]
@@ -128,7 +128,7 @@ def _solver(picture: PairPicture, now_ns: int) -> list[Finding]:
 
 
 def _reported_by_solver(picture: PairPicture) -> list[Finding]:
-    """Say what the solver names as wrong: with the nodes, their clocks, their inertial units, the track."""
+    """Return the problem that the solver reports: of nodes, clocks, inertial units or the track."""
     if picture.solver is None or not picture.solver.problem:
         return []
     text = f"The solver reports: {picture.solver.problem}"
@@ -136,7 +136,7 @@ def _reported_by_solver(picture: PairPicture) -> list[Finding]:
 
 
 def _track(picture: PairPicture, now_ns: int) -> list[Finding]:
-    """Say that the track has ended, or is uncertain."""
+    """Return a finding if the track has ended or is uncertain."""
     track = picture.track
     if track is None:
         return []
@@ -151,7 +151,7 @@ def _track(picture: PairPicture, now_ns: int) -> list[Finding]:
 
 
 def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
-    """Say that there is no pose, and why, where the nodes themselves are well."""
+    """Return why there is no pose, if the nodes themselves are well."""
     age_ns = picture.pose_age_ns(now_ns)
     if age_ns is not None and age_ns <= NO_POSE_S * S_NS:
         return []

@@ -1,4 +1,4 @@
-"""Judges a node's rig: calibration, camera, lights, sensors. Input: what they gave; output: findings."""
+"""Judge a node's rig: calibration, camera, lights, sensors. Input: their data; output: findings."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ LIKELY: Final = 0.5
 
 
 def calibration(entered: CalibrationConfig | None, info: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:
-    """Judge whether there is a calibration, and of this camera.
+    """Judge whether there is a calibration, and whether it is of this camera.
 
-    entered: what stands in the configuration; info: what the node sends; shape: of a frame, (H, W, ...).
+    entered: the configuration's own; info: what the node sends; shape: of a frame, (H, W, ...).
     """
     if info is None:
         return Finding(
@@ -48,7 +48,7 @@ def calibration(entered: CalibrationConfig | None, info: NodeInfo | None, shape:
 
 
 def _odd(camera: CameraModel, size: tuple[int, int]) -> str:
-    """Say what no camera with pictures of this size has, "" where nothing."""
+    """Return what is implausible for a camera with pictures of this size; "" if nothing."""
     if abs(camera.cx_px / size[0] - 0.5) > 0.2 or abs(camera.cy_px / size[1] - 0.5) > 0.2:
         return f"has its centre at {camera.cx_px:.0f}, {camera.cy_px:.0f} in pictures of {size[0]}x{size[1]} pixels"
     if not 0.2 < camera.fx_px / size[0] < 5 or abs(camera.fx_px / camera.fy_px - 1) > 0.1:
@@ -57,7 +57,7 @@ def _odd(camera: CameraModel, size: tuple[int, int]) -> str:
 
 
 def picture(image: NDArray[np.uint8]) -> Finding:
-    """Judge a test frame's light, without the lamps in it."""
+    """Judge the exposure of a test frame; lamps in it do not count."""
     height, width = image.shape[:2]
     brightest, clipped = int(image.max()), float((image >= 250).mean())
     text = f"gives {width}x{height} pixels, median {np.median(image):.0f} of 255"
@@ -69,7 +69,7 @@ def picture(image: NDArray[np.uint8]) -> Finding:
 
 
 def lights(frames: list[list[Detection]]) -> Finding:
-    """Judge whether lights are seen in the test frames: of each, what was detected."""
+    """Judge whether lights are seen. frames: the detections of each test frame."""
     counts = [sum(1 for d in found if d.blob.score is UNSET or d.blob.score >= LIKELY) for found in frames]
     best = max(counts, default=0)
     text = f"{best} likely in a test frame" if best else "none likely in a test frame"
@@ -79,7 +79,7 @@ def lights(frames: list[list[Detection]]) -> Finding:
 
 
 def sensor(name: str, messages: list[Message], problem: str) -> Finding:
-    """Judge one sensor by what it gave within a few seconds."""
+    """Judge one sensor by its messages of a few seconds."""
     if problem:
         return Finding(name, "problem", problem, "check its wiring; see node/README.md")
     if not messages:
@@ -97,7 +97,7 @@ def sensor(name: str, messages: list[Message], problem: str) -> Finding:
 
 
 def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
-    """Return a reading in words, and what is odd about it."""
+    """Return a reading in words, and what is implausible about it."""
     if isinstance(message, Imu):
         pull_mps2 = float(np.linalg.norm(message.accel_mps2))
         text = f"{pull_mps2:.2f} m/s2"
@@ -105,7 +105,7 @@ def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
         if message.mag_t is not UNSET:
             field_ut = 1e6 * float(np.linalg.norm(message.mag_t))
             text += f", {field_ut:.0f} uT"
-            # The Earth's is 22 to 67 uT; hard iron that calibration takes off may be as much again.
+            # The Earth's field is 22 to 67 uT; hard iron, which calibration removes, may add as much again.
             wrong = wrong or not 5 < field_ut < 200
         return text, f"{text}: not the Earth's" if wrong else ""
     if isinstance(message, Depth):
@@ -116,7 +116,7 @@ def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
 
 
 def imu_place(entered: CalibrationConfig | None, chips: bool) -> Finding:
-    """Judge whether the inertial unit's place is known; chips: real ones, whose place no simulation tells."""
+    """Judge whether the inertial unit's place is known; chips: real ones, not simulated."""
     if not chips:
         return Finding("imu place", "skipped", "not a real one")
     if entered is None or entered.imu_m is None:

@@ -1,4 +1,4 @@
-"""Plain words for rejections and durations."""
+"""Rejection reasons and durations in words."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.health.finding import Finding
 
-# Each reason of the contract: what it means, and what may help.
+# Each rejection reason of the protocol: what it means, and what may help.
 REASONS: Final[dict[str, tuple[str, str]]] = {
     "unmatched": (
         "the other node has no picture of that instant",
@@ -41,19 +41,19 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
 
 
 def reason_words(reason: str) -> str:
-    """Return what a rejection's reason means, for a person."""
+    """Return a rejection's reason in words."""
     return REASONS.get(reason, (reason.replace("_", " "), ""))[0]
 
 
 def sentence(finding: Finding, now_ns: int) -> str:
-    """Return what a finding says, and since when."""
+    """Return a finding as a sentence, with its duration."""
     if finding.since_ns is None:
         return finding.text
     return f"{finding.text.rstrip('.')}, for {duration_words((now_ns - finding.since_ns) / S_NS)}."
 
 
 def duration_words(seconds: float) -> str:
-    """Return a duration as a person says it."""
+    """Return a duration in s, min or h."""
     seconds = max(seconds, 0.0)
     if seconds < 10:
         return f"{seconds:.1f} s"

@@ -1,1 +1,1 @@
-"""How things are measured: child processes and what they take, turns on a busy machine, tables."""
+"""Measure: child processes and their load, times on a busy machine, tables of figures."""

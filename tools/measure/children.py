@@ -22,13 +22,13 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 def _end_with_parent() -> None:
-    """In a child, before it becomes the command: have the kernel end it if this process dies without a word."""
+    """In a child, before it becomes the command: have the kernel end it if its parent is killed."""
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Child:
-    """`buddyline words...` as a child process, from now on; its output goes to a file without a name.
+    """`buddyline words...` as a running child process; its output goes to an unnamed temporary file.
 
     A context manager that ends it. Nothing in the current folder can take the place of one of its modules. The kernel
     ends it with the thread that started it: start it from one that lives as long.
@@ -53,7 +53,7 @@ class Child:
         return self._process.pid
 
     def death(self) -> str | None:
-        """Return that it ended, and its last words; None while it runs."""
+        """Return its exit status and its last line of output, in words; None while it runs."""
         status = self._process.poll()
         if status is None:
             return None
@@ -63,7 +63,7 @@ class Child:
         return f"{self.name} ended with status {status}: {last}"
 
     def load(self) -> Load:
-        """Return what it takes of the machine; raise BuddylineError where it has ended."""
+        """Return its load on the machine; raise BuddylineError if it has ended."""
         return load_of(self.pid)
 
     def __enter__(self) -> Child:
@@ -74,7 +74,7 @@ class Child:
 
 
 def end_all(children: Iterable[Child], within_s: float = END_WITHIN_S) -> list[str]:
-    """Ask all to end, and kill what does not within this time; return the names of the killed."""
+    """Ask all to end, and kill those that do not within this time; return the names of the killed."""
     children, killed = list(children), []
     for child in children:
         if child._process.poll() is None:
@@ -92,12 +92,12 @@ def end_all(children: Iterable[Child], within_s: float = END_WITHIN_S) -> list[s
 
 
 def free_port() -> int:
-    """Return a port of loopback that nobody listens on."""
+    """Return a free port of loopback."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def free_endpoint() -> str:
-    """Return an endpoint on loopback that nobody listens on."""
+    """Return an endpoint on loopback with a free port."""
     return f"tcp/127.0.0.1:{free_port()}"

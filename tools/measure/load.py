@@ -1,4 +1,4 @@
-"""What a process takes of the machine: memory, open files, processor time (Linux)."""
+"""The load of a process: memory, open files, processor time (Linux)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Load:
 
 
 def load_of(pid: int | None = None) -> Load:
-    """Return what a process takes (None: this one); raise BuddylineError where it has ended, or on another system."""
+    """Return the load of a process (None: this one); raise BuddylineError if it has ended, or without /proc."""
     process = Path(f"/proc/{os.getpid() if pid is None else pid}")
     try:
         fields = (process / "stat").read_text().rpartition(")")[2].split()

@@ -1,6 +1,6 @@
-"""How fast the machine is just now: the same piece of work ten times a second, the ms it took in a line each.
+"""Show the machine's present speed: do the same work ten times a second, and print the ms it took, a line each.
 
-A process of its own, `python -m buddyline.tools.measure.pace`, beside what is measured; its lines go to stderr.
+Runs as `python -m buddyline.tools.measure.pace` beside the measured processes; its lines go to stderr.
 """
 
 import sys
@@ -12,7 +12,7 @@ TERMS: Final = 10_000
 
 
 def main() -> None:
-    """Work and say how long it took, until nobody reads the lines any more."""
+    """Work and print the times until the reader of the lines has gone."""
     while True:
         began_s = time.perf_counter()
         sum(i * i for i in range(TERMS))

@@ -39,14 +39,14 @@ def simulated_world(environment: str, seed: int, width_px: int = 0, height_px: i
 
 
 def views(world: World, count: int, step_s: float) -> Iterator[tuple[str, int]]:
-    """Yield node and instant (ns) of so many pictures, of both nodes by turns, from the first second on."""
+    """Yield node and instant (ns) of `count` pictures, of both nodes by turns, from the first second on."""
     nodes = world.scenario.node_a, world.scenario.node_b
     for i in range(count):
         yield nodes[i % 2], world.scenario.start_ns + round((1.0 + step_s * i) * S_NS)
 
 
 def spread(pictures: Iterator[NDArray[np.uint8]], count: int, source: str) -> list[NDArray[np.uint8]]:
-    """Return at most count pictures, evenly spread; raise BuddylineError where there are none."""
+    """Return at most count pictures, evenly spread; raise BuddylineError if there are none."""
     found = list(pictures)
     if not found:
         raise BuddylineError(f"{source}: holds no pictures")

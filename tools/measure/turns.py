@@ -1,4 +1,4 @@
-"""Times on a machine whose speed changes: by turns, so that ratios hold, or the fastest of several."""
+"""Measure times on a machine whose speed changes: by turns, for ratios, or the fastest of several."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def by_turns(
 ) -> dict[str, NDArray[np.float64]]:
     """Do each work once a round; return its seconds by round, (rounds,), after a first round to warm up.
 
-    Within a round the machine is as fast for one as for the next: compare works by the ratios of their rounds.
+    Within a round the machine's speed hardly changes: compare works by their ratios in each round.
     """
     times_s = {name: np.empty(rounds + 1) for name in works}
     for i in range(rounds + 1):
@@ -27,7 +27,7 @@ def by_turns(
 
 
 def fastest_s(work: Work, repeats: int, clock_s: Callable[[], float] = time.perf_counter) -> float:
-    """Return the least time of several, which other work on the machine disturbed least."""
+    """Return the shortest of several times: the one that other processes disturbed least."""
     return min(seconds_of(work, clock_s) for _ in range(repeats))
 
 

@@ -1,4 +1,4 @@
-"""Where a dive has poses and where it has none, in bins of time."""
+"""Show in bins of time when a dive has poses or a track, and when not."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Coverage:
         return f'<div class="strip">{image}{cursor}</div>'
 
     def words(self, begin_ns: int, end_ns: int, reasons: Counter[str]) -> str:
-        """Say where a stretch without poses is, how long, and why."""
+        """Return begin, length and reasons of a stretch without poses, in words."""
         why = ", ".join(f"{reason_words(reason)} ({count})" for reason, count in reasons.most_common(3))
         at_s = (begin_ns - self.begin_ns) / S_NS
         return f"from {clock_words(at_s)} for {duration_words((end_ns - begin_ns) / S_NS)}: {why}"

@@ -1,4 +1,4 @@
-"""`buddyline monitor`: watch a running pair in the browser, without weighing on it."""
+"""`buddyline monitor`: watch a running pair in the browser, without a load on the pair."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ STREAMS: Final = (topics.POSE, topics.TRACK, topics.REJECTED, topics.CANDIDATES,
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add_client_arguments(parser)
-    add_pair_argument(parser, "the first that the solver speaks of")
+    add_pair_argument(parser, "the first that the solver reports")
     add_page_arguments(parser)
 
 
@@ -47,7 +47,7 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
-    """Serve the page, and say where."""
+    """Serve the page, and print its address."""
     from buddyline.tools.monitor.page import Page, open_server
 
     server = open_server(args.host, args.port, title)
@@ -81,10 +81,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def subscribe(bus: Bus, refusals: Refusals, picture: PairPicture, lock: threading.Lock) -> None:
-    """Let everything that is shown come into the picture, under the lock.
+    """Subscribe to everything that is shown; messages go into the picture, under the lock.
 
-    Only what describes a state is asked for from before: a history of the rest would load the link that the solver
-    needs. Each subscription's queue drops its oldest, so a slow page slows nobody who publishes.
+    Only the last message of each latest-only topic is fetched: a history of the rest would load the link that the
+    solver needs. Each subscription's queue drops its oldest message, so a slow page does not slow the publishers.
     """
 
     def take(envelope: Envelope) -> None:

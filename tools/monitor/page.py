@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# As often as the track comes.
+# The rate of the track.
 TICK_S: Final = 1.0 / TRACK.rate_hz
 TEXTS_EVERY: Final = 6
 PLOTS_EVERY: Final = 20
@@ -37,7 +37,7 @@ NO_POSE_COLOUR: Final = "#e0574f"
 
 
 def open_server(host: str, port: int, title: str) -> viser.ViserServer:
-    """Serve the page on host and port; raise BuddylineError where viser or the port cannot be had."""
+    """Serve the page on host and port; raise BuddylineError if viser is missing or the port cannot be used."""
     try:
         import viser
     except ImportError as error:
@@ -46,7 +46,7 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
         ) from error
     logging.getLogger("websockets").setLevel(logging.WARNING)
     try:
-        # Its banner would go to standard output, which is for data.
+        # viser prints a banner to standard output, which is for data.
         with redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     except (OSError, RuntimeError, OverflowError) as error:
@@ -63,7 +63,7 @@ def open_server(host: str, port: int, title: str) -> viser.ViserServer:
 
 
 class TimePlots:
-    """The last two minutes of poses and track, and how many triggers of each second ended without a pose."""
+    """Plots of the last two minutes: poses and track, and the number of triggers without a pose in each second."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
@@ -71,7 +71,7 @@ class TimePlots:
         self._plots: dict[str, viser.GuiUplotHandle] = {}
 
     def draw(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw each quantity that is known; a plot is there while it has values."""
+        """Draw each quantity; a plot without values is removed."""
         points = [point for point in picture.points if 0 <= now_ns - point.at_ns <= PLOTTED_S * S_NS]
         plots: dict[str, tuple[Floats, ...]] = {
             title: (t_s, np.where(tracked, np.nan, values), np.where(tracked, values, np.nan))
@@ -87,7 +87,7 @@ class TimePlots:
             if plot is None:
                 self._plots[title] = self._add(title, data, scales)
                 continue
-            # Other scales make the browser draw the whole plot anew, where other data do not.
+            # New scales make the browser rebuild the whole plot; new data do not.
             if plot.scales != scales:
                 plot.scales = scales
             plot.data = data
@@ -114,9 +114,9 @@ class TimePlots:
 
 
 def _scales(columns: Sequence[Floats]) -> Any:
-    """Return the scales of a plot: the browser finds no range among values of which some are NaN.
+    """Return the scales of a plot: the browser cannot find them itself if some values are NaN.
 
-    The range is of round numbers, so that it seldom changes.
+    The limits are round numbers, so that they seldom change.
     """
     values = np.concatenate(columns)
     least, most = float(np.nanmin(values)), float(np.nanmax(values))
@@ -126,17 +126,17 @@ def _scales(columns: Sequence[Floats]) -> Any:
 
 
 def _series(label: str, colour: str, dot_px: int, line_px: int) -> dict[str, Any]:
-    """Return how a series is drawn.
+    """Return the style of a series.
 
-    Poses and track are dots, those of the track small and close together: a line would cross the gaps, since the page
-    knows no missing value but NaN, which it leaves out.
+    Poses and track are dots, those of the track small and close together. A line would cross the gaps: the page can
+    mark a missing value only as NaN, and leaves NaN out.
     """
     points = {"show": dot_px > 0, "size": dot_px, "fill": colour, "stroke": colour}
     return {"label": label, "stroke": colour, "width": line_px, "points": points}
 
 
 class Page:
-    """Scene and panel of one server; `live` tells a running pair from a stored dive."""
+    """Scene and panel of one server; live: a running pair, not a stored dive."""
 
     def __init__(self, server: viser.ViserServer, *, live: bool) -> None:
         self.server = server
@@ -153,7 +153,7 @@ class Page:
         self._content: dict[int, str] = {}
 
     def close(self) -> None:
-        """Serve no longer."""
+        """Stop serving."""
         with redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -174,7 +174,7 @@ class Page:
             viewers = frozenset(self.server.get_clients())
             with lock:
                 picture, now_ns, jumped = step(bool(viewers))
-                # Who has just come sees all of it at once.
+                # A new viewer gets everything at once.
                 tick = 0 if jumped or viewers - seen else tick + 1
                 seen = viewers
                 if viewers:
@@ -194,7 +194,7 @@ class Page:
             self._plots.draw(picture, now_ns)
 
     def set_html(self, handle: viser.GuiHtmlHandle, content: str) -> None:
-        """Show HTML where it differs from what is shown: what is sent goes to every viewer."""
+        """Show HTML if it has changed, because each update is sent to every viewer."""
         if self._content.get(id(handle)) != content:
             self._content[id(handle)] = content
             handle.content = content

@@ -1,4 +1,4 @@
-"""The texts and pictures beside the scene, as HTML; everything that came over the bus is escaped."""
+"""The texts and pictures beside the scene, as HTML; all text from the bus is escaped."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def block(*parts: str) -> str:
 
 
 def headline(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
-    """Return the worst thing to say, and where B is, in large figures that are struck through once they are stale."""
+    """Return the worst finding, and B's place in large figures, which are struck through if they are stale."""
     worst = findings(picture, now_ns, live=live)[0]
     banner = f'<div class="banner {worst.level}">{escape(sentence(worst, now_ns))}</div>'
     return block(banner, _figures(picture, now_ns))
@@ -76,17 +76,17 @@ def _figures(picture: PairPicture, now_ns: int) -> str:
 
 
 def _angle(estimate: Estimate, field: str, digits: str) -> tuple[str, str]:
-    """Return an angle and its uncertainty, "" where that is not known."""
+    """Return an angle and its uncertainty, "" if that is not known."""
     angle_rad, sigma_rad = known(estimate, field), known(estimate, f"sigma_{field}")
     if angle_rad is None:
-        # Smaller than a figure, which it is not.
+        # In smaller letters, because it is no figure.
         return "<span class='dim'>unknown</span>", ""
     sigma = "" if sigma_rad is None else f"± {math.degrees(sigma_rad):.1f}°"
     return f"{math.degrees(angle_rad):{digits}}°", sigma
 
 
 def _ned_words(estimate: Estimate) -> str:
-    """Return B from A north, east and down, with the compass's error where it is known; else how sure it is."""
+    """Return B from A north, east and down with its sigmas, compass included; else the position's sigma alone."""
     if estimate.t_ned_m is UNSET:
         return f", position ± {length_words(sigma_m(estimate))}"
     named = list(zip(("north", "east", "down"), estimate.t_ned_m, strict=True))
@@ -97,7 +97,7 @@ def _ned_words(estimate: Estimate) -> str:
 
 
 def _origin(estimate: Estimate) -> str:
-    """Return what an estimate is from."""
+    """Return the origin of an estimate in words."""
     if isinstance(estimate, Track):
         return f"Track ({TRACK_WORDS[estimate.mode]}), {estimate.lights} of 4 lights in the last pictures."
     upright = " Upright assumed." if "upright_assumed" in estimate.checks else ""
@@ -106,12 +106,12 @@ def _origin(estimate: Estimate) -> str:
 
 
 def length_words(metres: float) -> str:
-    """Return a length in the unit that suits it."""
+    """Return a length in mm or m."""
     return f"{metres * 1e3:.1f} mm" if metres < 0.1 else f"{metres:.2f} m"
 
 
 def health(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
-    """Return all there is to say, then each node's and the solver's figures and the rejections by reason."""
+    """Return all findings, then each node's and the solver's figures and the rejections by reason."""
     said = "".join(_finding(finding, now_ns) for finding in findings(picture, now_ns, live=live))
     rows = [(f"Node {name}", _node_facts(picture.nodes[name], now_ns)) for name in sorted(picture.nodes)]
     rows += [("Solver", facts)] if (facts := _solver_facts(picture, now_ns)) else []
@@ -171,7 +171,7 @@ def _rejections(picture: PairPicture) -> str:
 
 
 def camera(picture: PairPicture, node: NodePicture, now_ns: int) -> str:
-    """Return a node's newest picture with what was found in it and what became of it, or its candidates alone."""
+    """Return a node's newest picture with its candidates and the trigger's outcome, or the candidates alone."""
     image, frame = node.image, node.shown()
     topic = CANDIDATES if image is None else IMAGE
     age_ns, old = node.age_ns(topic.name, now_ns), node.is_stale(topic, now_ns)
@@ -189,13 +189,13 @@ def camera(picture: PairPicture, node: NodePicture, now_ns: int) -> str:
 
 
 def judged_picture(picture: PairPicture, node: NodePicture) -> tuple[str, str]:
-    """Return a node's newest picture as <svg>, marked, and in words what became of it ("" where not known)."""
+    """Return a node's newest picture as <svg>, marked, and its trigger's outcome in words ("" if not known)."""
     frame = node.shown()
     if frame is None:
         return marked_svg(node.image, None), ""
     result = picture.results.get(frame.trigger)
     if result is None:
-        return marked_svg(node.image, frame), "The solver has said nothing of this picture."
+        return marked_svg(node.image, frame), "The solver has not reported on this picture."
     if isinstance(result, Rejected):
         detail = f" ({result.detail})" if result.detail else ""
         return marked_svg(node.image, frame), f"No pose: {reason_words(result.reason)}{detail}."

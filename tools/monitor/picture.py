@@ -1,8 +1,8 @@
-"""What is known of a pair at an instant: the state that page, playback and report draw from.
+"""The state of a pair at an instant, from which page, playback and report are drawn.
 
-Pure: messages go in with the time at which they came, questions are asked with the present time, and nothing here
-asks a clock. Live, the times are receive times, so that no other machine's clock makes a thing look fresh; of a stored
-dive they are log times.
+Pure: each message is given with its time, and each question with the present time; no clock is read. Live, the times
+are receive times, so that another machine's clock cannot make old data look fresh; for a stored dive they are log
+times.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 KEPT_NS: Final = 150 * S_NS
-# Of poses, and of the track, closer together than this there is one point on trail and plots.
+# Trail and plots have at most one pose, and one point of the track, in this time.
 POINT_SPACING_NS: Final = S_NS // 5
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
@@ -49,7 +49,7 @@ LIVE_WITHIN_NS: Final = 60 * S_NS
 class Point:
     """A pose, or the track at one time, on trail and plots.
 
-    at_ns: when it came; t_m: B in the scene, (north, east, down) from A.
+    at_ns: receive or log time; t_m: B in the scene, (north, east, down) from A.
     """
 
     at_ns: int
@@ -59,26 +59,24 @@ class Point:
 
     @property
     def tracked(self) -> bool:
-        """Whether it is of the track."""
+        """Whether the point is of the track."""
         return isinstance(self.estimate, Track)
 
     @property
     def latency_s(self) -> float:
-        """From a pose's exposure to here; NaN for a log solved offline, where it came at its stamp, and for a track."""
+        """Time from a pose's exposure to at_ns; NaN for a track, and for a log that was solved offline."""
         latency_ns = self.at_ns - self.estimate.stamp_ns
         return latency_ns / S_NS if 0 < latency_ns < LIVE_WITHIN_NS and not self.tracked else math.nan
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What stands for B at an instant: the track, else the newest of pose and track.
+    """The estimate that is shown at an instant: the track, else the newest of pose and track.
 
-    estimate: came at came_ns. stale: older than its topic allows. note: how old it is, "" where that goes without
-    saying, and that there is no track where that is so.
+    stale: older than its topic allows. note: its age, and that there is no track, in words; "" for a fresh track.
     """
 
     estimate: Estimate
-    came_ns: int
     stale: bool
     note: str
 
@@ -141,9 +139,9 @@ class Miss:
 
 @dataclass
 class NodePicture:
-    """What is known of one node: the newest message of each topic, under the topic's name.
+    """The state of one node: the newest message of each topic, under the topic's name.
 
-    heard_ns: when it came, by topic's name.
+    heard_ns: its receive or log time, by the topic's name.
     """
 
     node: str
@@ -158,25 +156,25 @@ class NodePicture:
     left_ns: int | None = None
 
     def stale_after_ns(self, topic: Topic) -> int:
-        """Return the age from which what it sends on a topic is stale."""
+        """Return the age from which this node's messages on a topic are stale."""
         return round(stale_after_s(topic, 0.0 if self.info is None else self.info.trigger_period_ns / S_NS) * S_NS)
 
     def is_stale(self, topic: Topic, now_ns: int) -> bool:
-        """Return whether the newest message of a topic is stale; False where none ever came."""
+        """Return whether the newest message of a topic is stale; False if none has come."""
         heard_ns = self.heard_ns.get(topic.name)
         return heard_ns is not None and now_ns - heard_ns >= self.stale_after_ns(topic)
 
     def age_ns(self, what: str, now_ns: int) -> int | None:
-        """Return how long ago a message of this kind came, None where none ever did."""
+        """Return the age of the newest message of this kind; None if none has come."""
         heard_ns = self.heard_ns.get(what)
         return None if heard_ns is None else max(now_ns - heard_ns, 0)
 
     def alive_ns(self) -> int:
-        """Return when the last sign of life came (0: never)."""
+        """Return the time of the newest message of any topic except NodeInfo; 0: none."""
         return max((ns for what, ns in self.heard_ns.items() if what != INFO.name), default=0)
 
     def shown(self) -> Candidates | None:
-        """Return the candidates of the newest picture, where they are still kept; without pictures the newest."""
+        """Return the candidates of the newest picture if they are still kept; without pictures the newest ones."""
         if self.image is None:
             return self.candidates[-1] if self.candidates else None
         stamp_ns = self.image.stamp_ns
@@ -199,7 +197,7 @@ class NodePicture:
 class PairPicture:
     """The state of one pair, and of all nodes.
 
-    pair: the one to follow; without, the first that a solver speaks of, and until then the first two nodes by name.
+    pair: the one to follow; None: the first that a solver reports, and until then the first two nodes by name.
     """
 
     def __init__(self, pair: Pair | None = None) -> None:
@@ -224,7 +222,7 @@ class PairPicture:
         self.other_pairs: set[Pair] = set()
 
     def take(self, envelope: Envelope) -> None:
-        """Take one message, which came at its time_ns."""
+        """Take one message, received at its time_ns."""
         message, at_ns = envelope.message, envelope.time_ns
         self.first_ns = at_ns if self.first_ns is None else self.first_ns
         self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
@@ -246,7 +244,7 @@ class PairPicture:
             self._take_result(message, at_ns)
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
-        """Take what the bus says of who is there: `node/<id>` or `solver/...`."""
+        """Take a change of the names that are alive: `node/<id>` or `solver/...`."""
         kind, _, node = name.partition("/")
         left_ns = None if alive else at_ns
         if kind == "solver":
@@ -262,16 +260,16 @@ class PairPicture:
         return names[0], names[1]
 
     def end_nodes(self) -> tuple[NodePicture | None, NodePicture | None]:
-        """Return what is known of A and of B."""
+        """Return the states of A and B."""
         a, b = (self.nodes.get(name) if name is not None else None for name in self.ends())
         return a, b
 
     def pose_age_ns(self, now_ns: int) -> int | None:
-        """Return how old the newest pose is, None where there is none."""
+        """Return the age of the newest pose; None if there is none."""
         return None if self.pose_ns is None else max(now_ns - self.pose_ns, 0)
 
     def shown(self, now_ns: int) -> Shown | None:
-        """Return what stands for B now: the track unless it is stale, else the newest of pose and track."""
+        """Return the estimate to show now: the track unless it is stale, else the newest of pose and track."""
         came = [
             (at_ns, topic, estimate)
             for at_ns, topic, estimate in ((self.track_ns, TRACK, self.track), (self.pose_ns, POSE, self.pose))
@@ -290,15 +288,15 @@ class PairPicture:
             notes.append("no track, the last pose")
         else:
             notes.append(f"no track for {duration_words((now_ns - self.track_ns) / S_NS)}, the last pose")
-        return Shown(estimate, at_ns, not fresh, ", ".join(notes))
+        return Shown(estimate, not fresh, ", ".join(notes))
 
     def is_stale(self, now_ns: int) -> bool:
-        """Return whether what the scene shows of B is no longer so."""
+        """Return whether the shown estimate is missing or stale."""
         shown = self.shown(now_ns)
         return shown is None or shown.stale
 
     def track_is_fresh(self, now_ns: int) -> bool:
-        """Return whether there is a track, not stale."""
+        """Return whether there is a track that is not stale."""
         return self.track_ns is not None and now_ns - self.track_ns < self._stale_after_ns(TRACK)
 
     def _stale_after_ns(self, topic: Topic) -> int:
@@ -306,7 +304,7 @@ class PairPicture:
         return round(stale_after_s(topic) * S_NS) if a is None else a.stale_after_ns(topic)
 
     def frame(self) -> SceneFrame:
-        """Return how A's camera stands in the scene, by A's newest attitude."""
+        """Return the orientation of A's camera in the scene, by A's newest attitude."""
         node = self.end_nodes()[0]
         return SceneFrame.unknown() if node is None else frame_of(node.info, node.attitude)
 
@@ -335,7 +333,7 @@ class PairPicture:
 
 
 def _is_new_problem(before: NodeStatus | SolverStatus | None, status: NodeStatus | SolverStatus) -> bool:
-    """Return whether a status speaks of another problem; figures in it change from one report to the next."""
+    """Return whether a status has another problem than the one before; different figures in its text do not count."""
     one, other = (
         "".join(letter for letter in text if not letter.isdigit())
         for text in ((before.problem if before else ""), status.problem)

@@ -1,4 +1,4 @@
-"""A stored dive as a picture of the pair at any instant, read as it is played and never held as a whole."""
+"""A stored dive as the pair's state at any instant; it is read as it is played, and never held as a whole."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ SHOWN: Final = (
     *("info", "candidates", "attitude", "depth", "image", "node_status"),
     *("pose", "track", "rejected", "solver_status"),
 )
-# Before an instant that was jumped to, this much of the dive is read for trail and plots.
+# After a jump, this much of the dive before the new instant is read for trail and plots.
 LEAD_NS: Final = 30 * S_NS
-# After so many outcomes, reading the whole dive lets playback and page go first.
+# While the whole dive is read, other threads get a turn after this many outcomes.
 PACE: Final = 256
 
 
@@ -59,7 +59,7 @@ class Playback:
 def cover(coverage: Coverage, paths: list[str], pair: Pair | None, stop: threading.Event) -> None:
     """Count a whole dive's outcomes of one pair (None: of all) into coverage, until stop is set.
 
-    Opens the logs anew: it runs beside the playback, which reads elsewhere in the files.
+    Opens the logs itself, because the playback reads other parts of the same files meanwhile.
     """
     with Dive(paths, one_rig=False) as dive:
         for count, envelope in enumerate(dive.messages("pose", "rejected")):

@@ -1,4 +1,4 @@
-"""The report's 3-D replay: one canvas and a hundred lines of script, which ask nothing of any network."""
+"""The report's 3-D replay: one canvas and a hundred lines of script, without any network access."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def keyframes(points: Sequence[Point], begin_ns: int, joined_ns: int) -> list[Ke
 
 
 def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
-    """Return what the replay draws of a node: both lights and the corners of its view, in its camera frame (m)."""
+    """Return a node's outline for the replay: both lights and the corners of its view, in its camera frame (m)."""
     if info is None:
         return {"lights": [[-0.5, 0, 0], [0.5, 0, 0]], "corners": [0.25, 0.2, 0.35]}
     fov_rad, aspect = fields_of_view(info)
@@ -51,7 +51,7 @@ def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
 
 
 def replay_html(frames: Sequence[Keyframe], picture: PairPicture, *, levelled: bool, what: str, stale_s: float) -> str:
-    """Return the replay as an HTML fragment; what: "track" or "pose", without which for stale_s B is grey."""
+    """Return the replay as an HTML fragment; what: "track" or "pose"; B is grey if it has had none for stale_s."""
     names = [name or default for name, default in zip(picture.ends(), "AB", strict=True)]
     rigs = [rig_outline(node.info if node else None) for node in picture.end_nodes()]
     # Inside a script only `</` could end it early.

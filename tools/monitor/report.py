@@ -1,4 +1,4 @@
-"""`buddyline report`: a dive on one page that needs nothing else, to keep, to send and to print."""
+"""`buddyline report`: a dive on one HTML page, to keep, to send and to print."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def report_html(dive: Dive, pair: Pair | None) -> str:
-    """Return the report of a dive as one HTML page; pair: whose poses are told."""
+    """Return the report of a dive as one HTML page; pair: whose poses are reported."""
     summary = summarize(dive, pair)
     begun = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(dive.start_ns / S_NS))
     nodes = " and ".join(sorted(summary.picture.nodes)) or "none"
@@ -71,7 +71,7 @@ def report_html(dive: Dive, pair: Pair | None) -> str:
         warnings.append("this log holds no pose; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     if summary.picture.other_pairs:
         others = ", ".join(f"{a} and {b}" for a, b in sorted(summary.picture.other_pairs))
-        warnings.append(f"poses of other pairs are not told: {others}; choose with --pair A/B")
+        warnings.append(f"poses of other pairs are not reported: {others}; choose with --pair A/B")
     return page(
         f"Dive report: {', '.join(reader.path.name for reader in dive.readers)}",
         f'<p class="dim">Begun {begun}, {duration_words(dive.seconds)} long, nodes {escape(nodes)}.</p>',

@@ -1,6 +1,6 @@
-"""The pair in space: where what is drawn stands, in a frame of north, east and down with A's camera at its origin.
+"""The pair in space: places in the scene's frame, which is north, east and down with A's camera at its origin.
 
-Where A's attitude is unknown A is drawn level, looking north, and the scene says that it is.
+If A's attitude is unknown, A is drawn level, looking north, and the scene says so.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Floats: TypeAlias = NDArray[np.float64]
 
 # A camera that is level and looks north: x right is east, y down is down, z forward is north.
 R_LEVEL: Final[Floats] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-# Half axes of the ellipsoid that holds a position with 95 %, in standard deviations (chi-squared, 3 degrees).
+# Half axes of the 95 % ellipsoid of a position, in standard deviations (chi-squared, 3 degrees of freedom).
 ELLIPSOID_SD: Final = 2.795
-# Below this the shape could not be told from a point, and its axes are those of rounding.
+# A smaller ellipsoid looks like a point, and its axes are rounding errors.
 MIN_HALF_AXIS_M: Final = 1e-4
 MAX_HALF_AXIS_M: Final = 50.0
 # Share of a view's height, from its middle, that is well inside it; the panel covers one side.
@@ -30,14 +30,14 @@ INSIDE: Final = 0.4
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """How A's camera stands: R_s_a maps its frame into the scene's; levelled: by a measured attitude."""
+    """The orientation of A's camera: R_s_a maps its frame into the scene's; levelled: by a measured attitude."""
 
     R_s_a: Floats
     levelled: bool
 
     @staticmethod
     def unknown() -> SceneFrame:
-        """Return A level and looking north, for want of an attitude."""
+        """Return A level and looking north: its attitude is unknown."""
         return SceneFrame(R_LEVEL, False)
 
     def place(self, estimate: Estimate) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ class SceneFrame:
 
 
 def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> SceneFrame:
-    """Return how a camera stands by its mount and its node's attitude."""
+    """Return a camera's orientation by its mount and its node's attitude."""
     if info is None or attitude is None:
         return SceneFrame.unknown()
     R_s_body = quat_to_matrix(np.array(attitude.q_ned_body_xyzw))
@@ -62,7 +62,7 @@ def frame_of(info: NodeInfo | None, attitude: Attitude | None) -> SceneFrame:
 
 
 def ellipsoid(estimate: Estimate, frame: SceneFrame) -> tuple[Floats, Floats]:
-    """Return the half axes (3,) in m and R_s_axes (3, 3) of the ellipsoid that holds B with 95 %."""
+    """Return the half axes (3,), m, and R_s_axes (3, 3) of B's 95 % ellipsoid."""
     covariance = np.array(estimate.covariance).reshape(6, 6)[:3, :3]
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if np.linalg.det(axes) < 0:
@@ -84,7 +84,7 @@ def fields_of_view(info: NodeInfo) -> tuple[float, float]:
 
 
 def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
-    """Return eye and target (3,) from which A at the origin and B at t_m are seen side by side, from above.
+    """Return eye and target (3,) of a view from above with A, at the origin, and B, at t_m, side by side.
 
     aspect: width by height of the view.
     """
@@ -108,9 +108,9 @@ def holds(eye: Floats, target: Floats, fov_rad: float, points: Floats) -> bool:
 
 
 def age_colours(ages_s: Floats, whole_s: float) -> NDArray[np.uint8]:
-    """Return a colour (n, 3) for each age: bright amber for now, fading into blue at whole_s.
+    """Return a colour (n, 3) for each age: bright amber at 0, fading into blue at whole_s.
 
-    Linear light, as colours of single points are taken, not sRGB.
+    Linear values, not sRGB: viser takes the colours of single points so.
     """
     share = np.clip(ages_s / whole_s, 0.0, 1.0)[:, None]
     fresh, old = np.array([1.0, 0.45, 0.04]), np.array([0.03, 0.09, 0.26])

@@ -25,11 +25,11 @@ DOWN_COLOUR: Final = (90, 160, 255)
 SURFACE_COLOUR: Final = (70, 150, 190)
 FRUSTUM_M: Final = 0.35
 LIGHT_RADIUS_M: Final = 0.035
-# A viewer has chosen the view where the eye is further from where the page put it than this share of its distance.
+# If the eye is further from the page's own view than this share of its distance, the viewer has moved it.
 CHOSEN: Final = 0.02
-# The view follows the pair only where a better eye is further away than this share of its distance.
+# The view follows the pair only if the better eye is further away than this share of its distance.
 WORTH_A_TURN: Final = 0.2
-# Trail segments longer than this in time are not drawn: where the track has a gap nothing is known.
+# Trail segments longer than this in time are not drawn: they would hide a gap of the track.
 TRAIL_BREAK_NS: Final = 3 * S_NS // 2
 
 
@@ -50,7 +50,7 @@ class NodeDrawing:
         self._stale = False
 
     def show(self, node: NodePicture | None, R_s_c: Floats, t_m: Floats, text: str, stale: bool) -> None:
-        """Draw it at t_m, turned by R_s_c."""
+        """Draw the node at t_m, turned by R_s_c."""
         if node is not None and node.info is not None:
             self._build(node.info)
         self._frame.position = t_m
@@ -63,7 +63,7 @@ class NodeDrawing:
             self._tint()
 
     def hide(self) -> None:
-        """Draw it not at all."""
+        """Hide the node."""
         self._frame.visible = self._label.visible = False
 
     def _build(self, info: NodeInfo) -> None:
@@ -100,7 +100,7 @@ def _segments(*points: Any) -> Any:
 
 
 class SceneDrawing:
-    """Both nodes, the line of sight, the trail, the poses, the uncertainty, and what tells where up and north are."""
+    """Both nodes, the line of sight, the trail, the poses, the uncertainty, and the marks of up and north."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -132,12 +132,12 @@ class SceneDrawing:
         self._trail_key: tuple[int, int] | None = None
         self._fitted = False
         self._t_m = np.array([3.0, 0.0, 0.0])
-        self._eyes: dict[int, tuple[Floats, Floats, bool]] = {}  # eye, target, upright, as the page put them
+        self._eyes: dict[int, tuple[Floats, Floats, bool]] = {}  # eye, target and upright, as the page has set them
         server.on_client_connect(self.fit)
         server.on_client_disconnect(lambda client: self._eyes.pop(client.client_id, None) and None)
 
     def fit(self, client: viser.ClientHandle) -> None:
-        """Turn one viewer's eye so that it sees the pair."""
+        """Turn one viewer's view to the pair."""
         eye, target = fit(self._t_m, client.camera.aspect)
         self._eyes[client.client_id] = eye, target, client.camera.aspect < 1.0
         with client.atomic():
@@ -146,12 +146,12 @@ class SceneDrawing:
             client.camera.look_at = target
 
     def fit_all(self) -> None:
-        """Turn every viewer's eye."""
+        """Turn every viewer's view to the pair."""
         for client in list(self._server.get_clients().values()):
             self.fit(client)
 
     def _follow(self) -> None:
-        """Turn the eyes of viewers out of whose view the pair has moved, unless they have chosen their own view."""
+        """Turn the views that the pair has left, unless the viewer has chosen the view."""
         for client in list(self._server.get_clients().values()):
             put = self._eyes.get(client.client_id)
             if put is None:
@@ -167,7 +167,7 @@ class SceneDrawing:
                     self.fit(client)
 
     def draw(self, picture: PairPicture, now_ns: int) -> None:
-        """Move everything to where it is now."""
+        """Draw everything at its present place."""
         (name_a, name_b), (node_a, node_b) = picture.ends(), picture.end_nodes()
         frame, shown = picture.frame(), picture.shown(now_ns)
         with self._server.atomic():
@@ -204,9 +204,9 @@ class SceneDrawing:
             self.fit_all()
 
     def draw_trail(self, picture: PairPicture, now_ns: int) -> None:
-        """Draw where B was, by age: the track as a line, poses as dots, joined where there is no track at all.
+        """Draw B's past places, coloured by age: the track as a line, poses as dots, joined if there is no track.
 
-        At most once a second, since all of it is sent anew.
+        At most once a second, because the whole trail is sent each time.
         """
         key = (len(picture.points), now_ns // S_NS)
         if key == self._trail_key:
@@ -220,7 +220,7 @@ class SceneDrawing:
             if other.at_ns - one.at_ns <= TRAIL_BREAK_NS and one.frame.levelled == other.frame.levelled
         ]
         scene = self._server.scene
-        # The same name replaces the one before: colours of points that change in number cannot be set alone.
+        # Drawn again under the same name: colours cannot be updated alone while the number of points changes.
         if poses:
             spots_m = np.array([point.t_m for point in poses], np.float32)
             colours = age_colours(np.array([now_ns - point.at_ns for point in poses]) / S_NS, KEPT_NS / S_NS)

@@ -1,4 +1,4 @@
-"""A whole dive in one pass: what the report tells of it."""
+"""Summarize a whole dive in one pass, for the report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SHOTS_NS: Final = 20 * S_NS
 
 @dataclass
 class JudgedPicture:
-    """A picture of one node, marked, and what became of it."""
+    """A marked picture of one node, and its trigger's outcome."""
 
     at_ns: int
     drawing: str
@@ -41,7 +41,7 @@ class JudgedPicture:
 
 @dataclass
 class Summary:
-    """What the report shows of one pair.
+    """The report's content about one pair.
 
     points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
     which the track used no light. track_coverage: where the track covers the dive, None without a track.
@@ -64,7 +64,7 @@ class Summary:
     infos: dict[str, list[NodeInfo]] = field(default_factory=dict)
 
     def errors(self) -> PoseErrors:
-        """Compare the poses with the truth, where the logs hold it."""
+        """Compare the poses with the truth, if the logs have it."""
         return pose_errors(self.poses, TruthTrack(self.truths), lambda _: None, None)
 
     def track_figures(self) -> list[TrackFigures]:
@@ -76,7 +76,7 @@ class Summary:
         return covered_share(self._samples(), self.poses)
 
     def drawn(self) -> list[Point]:
-        """Return where B swam: the track, without one the poses."""
+        """Return B's path: the track, or the poses if there is no track."""
         return self.tracks or self.points
 
     def _samples(self) -> list[Track]:

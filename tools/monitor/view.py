@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SPEEDS: Final = ("0.25", "1", "4", "16", "64")
-# A slow machine plays a dive slower, rather than in jumps longer than this.
+# A slow machine plays a dive more slowly, instead of in jumps longer than this.
 MAX_STEP_NS: Final = 3 * S_NS // 10
 
 
@@ -28,13 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="one dive: a solved log, or each node's own")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds from the dive's start")
-    parser.add_argument("--paused", action="store_true", help="do not begin to play at once")
+    parser.add_argument("--paused", action="store_true", help="do not start to play at once")
     add_pair_argument(parser, "the first in the logs")
     add_page_arguments(parser)
 
 
 class Controls:
-    """What a viewer can press, and where the playback stands; its state is read by the playing thread."""
+    """The page's controls and the playback's position; the playing thread reads their state."""
 
     def __init__(self, page: Page, duration_s: float, playing: bool) -> None:
         gui = page.server.gui
@@ -46,7 +46,7 @@ class Controls:
         with gui.add_folder("Playback", order=-1):
             self._button = gui.add_button(self._button_text())
             speeds = gui.add_button_group("Speed", SPEEDS)
-            # viser's types say that the value cannot be set; it can.
+            # viser's types wrongly say that the value cannot be set.
             self._slider: Any = gui.add_slider("Seconds", 0.0, max(round(duration_s, 1), 0.1), 0.1, 0.0)
             self._strip = gui.add_html("")
         self._button.on_click(self._toggle)
@@ -70,18 +70,18 @@ class Controls:
                 self._wanted_s = float(event.target.value)
 
     def wanted_s(self) -> float | None:
-        """Return where a viewer has asked to go since the last call, in seconds from the start."""
+        """Return where a viewer has moved the slider since the last call, s from the start; None: nowhere."""
         with self._lock:
             wanted_s, self._wanted_s = self._wanted_s, None
             return wanted_s
 
     def pause(self) -> None:
-        """Stop at the dive's end."""
+        """Pause the playback, at the dive's end."""
         if self.playing:
             self._toggle(None)
 
     def show(self, coverage: Coverage, position_ns: int) -> None:
-        """Show where the playback stands, in slider and strip."""
+        """Show the playback's position in slider and strip."""
         from buddyline.tools.monitor import panel
         from buddyline.tools.monitor.coverage import CSS, LEGEND, clock_words
 
@@ -127,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
             if wanted_s is not None:
                 playback.seek(playback.start_ns + round(wanted_s * S_NS))
             elif controls.playing and watched:
-                # A dive waits for its viewers.
+                # Without viewers the playback waits.
                 playback.advance(playback.position_ns + round(min(passed_ns, MAX_STEP_NS) * controls.speed))
                 if playback.position_ns >= playback.end_ns:
                     controls.pause()

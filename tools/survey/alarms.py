@@ -13,25 +13,25 @@ from buddyline.tools.survey.shots import Shot
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# Sights further apart than this many of their sigmas, and a field this share of its limit off, are suspect together.
+# Sights further apart than this many sigmas, with a field this share of its limit off, are suspect together.
 SUSPECT_SIGMAS: Final = 2.0
 SUSPECT_SHARE: Final = 0.25
 # British Cave Research Association's grades as 1 sd: compass (deg), distance (m).
 GRADES: Final = ((5, 0.5, 0.05), (4, 0.85, 0.1), (3, 1.25, 0.25))
 
-# Each node's field as it mostly was in the dive; None without a magnetometer.
+# Each node's median field in the dive; None without a magnetometer.
 UsualFields: TypeAlias = dict[str, Field | None]
 
 
 def off_fields(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> dict[str, float]:
-    """Return how far each node's field is from its usual one, as a share of what is tolerated."""
+    """Return the deviation of each node's field from its usual one, as a share of the tolerance."""
     return {end.node: off_usual(end.field, usual.get(end.node), limits) for end in shot.ends}
 
 
 def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str]:
-    """Return the nodes whose compasses are not to be believed.
+    """Return the nodes whose compasses are disturbed.
 
-    A field beyond its limits is enough. Where the sights contradict each other, so is a smaller difference from the
+    A field beyond its limits is enough. If the sights contradict each other, so is a smaller difference from the
     usual field, if it is clearly larger than the other node's.
     """
     off = off_fields(shot, usual, limits)
@@ -47,9 +47,9 @@ def disturbed(shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str
 
 
 def disturbed_alike(legs: list[Leg], off: list[dict[str, float]]) -> list[Leg]:
-    """Return legs in which a node that was disturbed at a station is so in the leg before and after as well.
+    """Return the legs, with a node marked as disturbed if the leg before or after disturbs it at the same station.
 
-    off: each leg's off_fields. A node that turns about at its station stays beside what disturbs it.
+    off: each leg's off_fields. A node that turns round at its station stays beside the iron that disturbs it.
     """
 
     def at(leg: Leg, node: str) -> str:
@@ -66,7 +66,7 @@ def disturbed_alike(legs: list[Leg], off: list[dict[str, float]]) -> list[Leg]:
 
 
 def of_leg(leg: Leg, shot: Shot, usual: UsualFields, limits: AlarmSettings) -> list[str]:
-    """Return what is wrong with a leg, each as `check: what`."""
+    """Return a leg's alarms, each as `check: what is wrong`."""
     found = []
     if leg.azimuth_deg is not UNSET and leg.back_azimuth_deg is not UNSET:
         gap_deg = math.degrees(wrap(math.radians(leg.azimuth_deg - leg.back_azimuth_deg - 180)))

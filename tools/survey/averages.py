@@ -14,17 +14,17 @@ Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
 
 OUTLIER_SIGMAS: Final = 4.0
-# Median absolute deviation to standard deviation, of a normal distribution.
+# Ratio of standard deviation to median absolute deviation of a normal distribution.
 MAD_TO_SIGMA: Final = 1.4826
-# Readings within this time have the same error, whatever their rate: the node is held, and filters have a memory.
+# Readings within this time have the same error at any rate: the diver's hold and the filters change slowly.
 CORRELATION_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class Mean:
-    """A value with its standard deviation, in one unit; count: how many readings it is of.
+    """A value with its standard deviation, in one unit; count: the number of readings.
 
-    noise: the part of sigma that is new in each series of readings; the rest is slow and stays for a while.
+    noise: the part of sigma that is new in each series of readings; the rest varies slowly.
     """
 
     value: float
@@ -34,7 +34,7 @@ class Mean:
 
 
 def inliers(values: Floats, least_sigma: float) -> Bools:
-    """Return which of values (n,) or (n, k) are no outliers in any column.
+    """Return a mask (n,) of the values (n,) or (n, k) that are no outlier in any column.
 
     least_sigma: the least scatter that is assumed, so that one reading among equal ones is not an outlier.
     """
@@ -45,7 +45,7 @@ def inliers(values: Floats, least_sigma: float) -> Bools:
 
 
 def effective_count(stamps_s: Floats, values: Floats) -> float:
-    """Return how many independent readings a correlated series (n,) is worth, from 1 to n.
+    """Return the effective number of independent readings of a correlated series (n,), from 1 to n.
 
     n / (1 + 2 sum of autocorrelations), summed until the first that is not positive (Geyer 1992's initial
     positive sequence, lag by lag), and never more than one reading in CORRELATION_S.

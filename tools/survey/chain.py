@@ -1,4 +1,4 @@
-"""Which station each node of a pair stands at, rest after rest: by marks, depths, and the agreed procedure."""
+"""Find the station of each node of a pair at each rest: from marks, depths, and the agreed procedure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final, Literal
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.rests import same_line
 
-# A node that has not moved is at the depth it was at; turning about on its station changes it by less than this.
+# A node that stays at its station, also one that turns round, changes its depth by less than this.
 LEVEL_M: Final = 0.35
 
 Procedure = Literal["leapfrog", "stay"]
@@ -17,7 +17,7 @@ Procedure = Literal["leapfrog", "stay"]
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """One rest as the chain sees it. By node: depth_m, None without a gauge; named, stations by marks."""
+    """The chain's input from one rest. By node: depth_m, None without a gauge; named, stations by marks."""
 
     line_m: Floats
     depth_m: dict[str, float | None]
@@ -26,7 +26,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Standing:
-    """Where both nodes stand; `rear` came first, so that the leg goes from it. problem: in words, or empty."""
+    """The stations of both nodes; `rear` came first, so the leg starts there. problem: in words, or empty."""
 
     station: dict[str, str]
     rear: str
@@ -34,16 +34,16 @@ class Standing:
 
 
 def stand(stops: list[Stop], procedure: Procedure, first: str, taken: Iterable[str] = ()) -> list[Standing]:
-    """Return where both nodes stand at each stop.
+    """Return the stations of both nodes at each stop.
 
-    Stations without a mark are numbered in their order, by the numbers that are not taken; a later mark by such a
-    number means that station. first: the node at the first station.
+    Stations without a mark get the free numbers in order; a later mark by such a number means that station.
+    first: the node at the first station.
     """
     if not stops:
         return []
     nodes = list(stops[0].depth_m)
     in_use = set(taken)
-    # When each node came to its station, as a number: 0 and 1 at the beginning, later the stop's and one more.
+    # Order of arrival at the present station: 0 and 1 at the beginning, later the stop's number plus one.
     arrived = {node: int(node != first) for node in nodes}
     station: dict[str, str] = {}
     marked: set[str] = set()
@@ -56,7 +56,7 @@ def stand(stops: list[Stop], procedure: Procedure, first: str, taken: Iterable[s
             guessed = _guessed(stops[k - 1], stop, procedure, first, arrived)
             for node, name in stop.named.items():
                 if station[node] not in marked and name != station[node] and node not in guessed:
-                    # It has stood there since before, under a number: now it has a name.
+                    # The node has been there since before, under a number; now the station has a name.
                     result = [_renamed(standing, station[node], name) for standing in result]
                     station[node] = name
             moved, problem = _moved(stops[k - 1], stop, station, guessed)
@@ -87,7 +87,7 @@ def _renamed(standing: Standing, old: str, new: str) -> Standing:
 
 
 def _changed_depth(before: Stop, stop: Stop) -> set[str]:
-    """Return the nodes whose depth has changed by more than turning about does."""
+    """Return the nodes whose depth has changed by more than turning round explains."""
     changed = set()
     for node, now_m in stop.depth_m.items():
         before_m = before.depth_m[node]
@@ -97,7 +97,7 @@ def _changed_depth(before: Stop, stop: Stop) -> set[str]:
 
 
 def _guessed(before: Stop, stop: Stop, procedure: Procedure, first: str, arrived: dict[str, int]) -> set[str]:
-    """Return who moved between two stops as far as line, depths and procedure tell."""
+    """Return who moved between two stops, as far as line, depths and procedure show it."""
     if same_line(before.line_m, stop.line_m):
         return set()
     rear = _rear(arrived, first)
@@ -106,14 +106,14 @@ def _guessed(before: Stop, stop: Stop, procedure: Procedure, first: str, arrived
 
 
 def _moved(before: Stop, stop: Stop, station: dict[str, str], guessed: set[str]) -> tuple[set[str], str]:
-    """Return who moved by marks and guess, and what is wrong with that."""
+    """Return who moved, by marks and by the guess, and the contradiction between them, if any."""
     changed = _changed_depth(before, stop)
     moved = {node for node, name in stop.named.items() if name != station[node]}
     silent = set(station) - set(stop.named)
     if len(silent) == len(station):
         moved = set(guessed)
     elif silent and guessed and (silent & changed or not moved):
-        # One of them must have moved, and it is not the one that is said to stand where it stood.
+        # One of them must have moved, and not the one whose mark repeats its station.
         moved |= silent
     problem = ""
     for node in stop.named:

@@ -147,7 +147,7 @@ def _sheet(args: argparse.Namespace) -> Sheet:
 
 
 def _adjust(args: argparse.Namespace) -> int:
-    """Print the adjustment; return 1 where it finds a blunder or leaves out a leg that nobody has taken out."""
+    """Print the adjustment; return 1 if it finds a blunder or leaves out a leg that nobody has taken out."""
     from buddyline.tools.survey import report
 
     sheet = _sheet(args)

@@ -91,7 +91,7 @@ class Derived:
                     self.say(f"mark {mark.name} at {at}: no rest near it")
         for mark in points:
             name = mark.name or f"p{len(self.points) + 1}"
-            # Of several nodes that saw the point, the first with fixes enough.
+            # Of several nodes that saw the point, the first with enough fixes.
             found = [chain.point(mark, name) for chain in chains if mark.node in chain.readings.nodes]
             shot = next((one for one in found if isinstance(one, Leg)), None)
             if shot is not None:
@@ -157,7 +157,7 @@ class _Chain:
         for rest in every:
             if rest.too_short:
                 out.say(f"NO LEG: rest at {_time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
-        # A rest that follows one without a leg: who moved since is a guess.
+        # After a rest without a leg, it is a guess who has moved.
         doubtful = {id(rest) for before, rest in pairwise(every) if before.too_short}
         self.found = [rest for rest in every if not rest.too_short]
         if not self.found:
@@ -225,7 +225,7 @@ class _Chain:
         return replace(self._leg(shot, {other: station, mark.node: name}, other), note=mark.note)
 
     def _standing_at(self, stamp_ns: int, node: str) -> str | None:
-        """Return where a node stood: the station of the rests around, or its last mark's where there are none."""
+        """Return a node's station: that of the rests before and after, or its last mark's if there are none."""
         before = [i for i, rest in enumerate(self.found) if rest.start_ns <= stamp_ns]
         after = [i for i, rest in enumerate(self.found) if rest.end_ns >= stamp_ns]
         around = {self.standings[i].station[node] for i in (before[-1:] + after[:1])}
@@ -267,7 +267,7 @@ def one_leg(shot: Shot, station: dict[str, str], rear: str) -> Leg:
 
 
 def _rounded(mean: Mean | None, digits: int, scale: float, *names: str) -> dict[str, Any]:
-    """Return a mean's value, sigma and noise, as far as they have a name; nothing where it was not measured."""
+    """Return a mean's value, sigma and noise, rounded, under the given names; nothing if it was not measured."""
     if mean is None:
         return {}
     values = (mean.value, mean.sigma, mean.noise)

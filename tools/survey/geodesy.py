@@ -177,8 +177,8 @@ class Grid:
 
     Legs are as long on the map as on the ground: around `anchor`, the first fixed point, a projection's own scale
     counts for latitude and longitude alone, as cave programs have it. where: a latitude and longitude of the survey.
-    north: what the grid's north is. origin: latitude and longitude of east 0, north 0 of a local grid; None where no
-    place is known.
+    north: the kind of the grid's north, in words. origin: latitude and longitude of east 0, north 0
+    of a local grid; None if no place is known.
     """
 
     north: str
@@ -189,7 +189,7 @@ class Grid:
     anchor_m: tuple[float, float] = field(default=(0.0, 0.0))
 
     def declination_rad(self, when: date, position_m: Floats | None = None) -> float:
-        """Return the declination at a position (east, north, ...), or where the survey is; 0 where it is not known."""
+        """Return the declination at a position (east, north, ...), or where the survey is; 0 if it is not known."""
         return 0.0 if self.declination is None else self.declination.rad(self._place(position_m), when)
 
     def convergence_rad(self, position_m: Floats | None = None) -> float:
@@ -205,7 +205,7 @@ class Grid:
         return self.where if position_m is None else self.degrees(position_m) or self.where
 
     def degrees(self, position_m: Floats) -> tuple[float, float] | None:
-        """Return latitude and longitude of a position (east, north, ...); None where no place is known."""
+        """Return latitude and longitude of a position (east, north, ...); None if no place is known."""
         east_m, north_m = float(position_m[0]), float(position_m[1])
         if self.projection is not None:
             scale = self._scale
@@ -256,6 +256,6 @@ def grid_of(project: Project) -> Grid:
     if degrees and len(degrees) < len(project.fix):
         raise BuddylineError("fix: some in metres, some in degrees; name place.utm_zone or epsg, or use one of them")
     if known is None:
-        # Without a declination the map would be turned by an unknown angle.
+        # Without a declination the map would be rotated by an unknown angle.
         return Grid("magnetic")
     return Grid("true", known, where, origin=degrees[0] if degrees else None if project.fix else where)

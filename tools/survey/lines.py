@@ -1,4 +1,4 @@
-"""Legs as lines: one bearing out of both compasses, and the vector with its covariance that follows."""
+"""Legs as lines: one bearing from both compasses, and the leg's vector with its covariance."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, UnsetType
 
-# Where the sigmas of two sights differ by more than this factor, the better sight alone is better than their mean.
+# If the sigmas of two sights differ by more than this factor, the better sight is better than their mean.
 WORTH_BOTH: Final = math.sqrt(3)
-# Where two sights are further apart than this many sigmas, their sigmas are too small.
+# If two sights differ by more than this many sigmas, their sigmas are too small.
 CONTRADICT: Final = 2.5
-# Above this slope the clinometers give the horizontal distance better than the depths do.
+# On steeper legs the clinometers give the horizontal distance better than the depths do.
 STEEP_RAD: Final = math.radians(55.0)
 # Held depths are nearly exact in a leg, so that a horizontal misclosure moves no depth.
 ABSOLUTE_DEPTH_SIGMA_M: Final = 0.002
@@ -25,7 +25,7 @@ ABSOLUTE_DEPTH_SIGMA_M: Final = 0.002
 class SightPair:
     """Foresight and backsight in use, radians, magnetic for azimuths; sigmas as they are weighed.
 
-    back is as read, from the far station; gap: fore against back. None: not taken, or not believed.
+    back is as read, from the far station; gap: fore minus back. None: not measured, or not used.
     """
 
     fore: float | None
@@ -45,9 +45,9 @@ class SightPair:
 
 
 def bearing_of(leg: Leg, project: Project) -> SightPair | None:
-    """Return the compasses of a leg that are to be used; None where there are none.
+    """Return the azimuths of a leg that are used; None if there are none.
 
-    A disturbed compass gives way to an undisturbed one; a person's edit goes before both.
+    A disturbed compass is not used if the other one is undisturbed; a person's edit takes precedence.
     """
     fore, back, fore_sigma, back_sigma = map(
         _radians, (leg.azimuth_deg, leg.back_azimuth_deg, leg.azimuth_sigma_deg, leg.back_azimuth_sigma_deg)
@@ -67,7 +67,7 @@ def bearing_of(leg: Leg, project: Project) -> SightPair | None:
 
 
 def clino_of(leg: Leg) -> SightPair | None:
-    """Return the inclinations of a leg by the nodes' own tilt, up positive, as read; None where there are none."""
+    """Return the inclinations of a leg by the nodes' tilt, up positive, as read; None if there are none."""
     fore, back, fore_sigma, back_sigma = map(
         _radians,
         (leg.inclination_deg, leg.back_inclination_deg, leg.inclination_sigma_deg, leg.back_inclination_sigma_deg),
@@ -89,7 +89,7 @@ def _weighed(
         if max(fore_sigma, back_sigma) > WORTH_BOTH * min(fore_sigma, back_sigma):
             fore, back = (fore, None) if fore_sigma < back_sigma else (None, back)
         else:
-            # Where the two contradict each other, the truth is as far from their mean as they are.
+            # If the two contradict each other, the truth may be as far from their mean as they are.
             chi = abs(gap) / math.hypot(fore_sigma, back_sigma)
             grown = chi if chi > CONTRADICT else 1.0
             fore_sigma, back_sigma = grown * fore_sigma, grown * back_sigma
@@ -100,7 +100,7 @@ def _weighed(
 class Line:
     """A leg to adjust. vector_m: east, north, up of the grid; covariance (3, 3), m^2. turn_m: (3,), per rad of azimuth.
 
-    rise_m: up; its sigma; by_clino: whether it is the clinometers'. distance_sigma_m: as weighed. turn_rad: grid
+    rise_m: up, and its sigma; by_clino: it is the clinometers'. distance_sigma_m: as weighed. turn_rad: grid
     azimuth minus magnetic. read_rise_m, read_rise_sigma_m: of the leg's own two depths, where others are held.
     """
 
@@ -131,10 +131,10 @@ def line_of(
     alone: bool = False,
     read_m: tuple[float, float] | None = None,
 ) -> Line | None:
-    """Return a leg as a vector; None where it has no bearing or nothing that gives its rise.
+    """Return a leg as a vector; None if its bearing or its rise is unknown.
 
     turn_rad: grid azimuth minus magnetic. depths_m: stations held at these depths; others by their readings.
-    alone: the leg is not one of many in which the gauges err alike, so its rise has all of their error. read_m: its
+    alone: no other legs share the gauges' slow errors, so the rise has all of them. read_m: its
     own two depths, with zeros and levels taken off; by default as read.
     Distance, bearing and rise are independent; the run along follows from distance and rise, except for steep
     legs, where the clinometers give both.
@@ -164,10 +164,10 @@ def line_of(
         noises = leg.depth_from_noise_m, leg.depth_to_noise_m
         if held:
             rise_sigma_m = math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
-            # Held depths err as well; what that does to the run along is put on the distance.
+            # Held depths have errors as well; their effect on the horizontal distance is added to the distance's sigma.
             distance_sigma_m = math.hypot(distance_sigma_m, rise_m / distance_m * gauges_m)
         else:
-            # A node keeps its gauge, and mostly its place, from leg to leg: slow errors cancel along the line.
+            # A node keeps its gauge, and mostly its station, from leg to leg, so slow errors cancel along the line.
             rise_sigma_m = gauges_m if alone or UNSET in noises else _hypot(*noises)
         run_m = math.sqrt(distance_m**2 - rise_m**2)
         by_distance, by_other = (distance_m / run_m, 0.0), (-rise_m / run_m, 1.0)

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 WINDOW_NS: Final = 8 * S_NS
 CHECK_NS: Final = 2 * S_NS
-# The same alarm is not said again within this time.
+# The same alarm is not repeated within this time.
 QUIET_NS: Final = 20 * S_NS
 MEMORY: Final = 300
 LEARNED: Final = 5
@@ -41,7 +41,7 @@ _Stamped: TypeAlias = RelativePose | Attitude | Depth | Imu
 
 
 class LiveAlarms:
-    """Takes the messages of any number of nodes, in any order; returns alarms as marks on the node nearest to blame."""
+    """Takes messages of any number of nodes, in any order; returns alarms as marks of the node most likely at fault."""
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
         self._settings, self._limits = settings, limits
@@ -88,7 +88,7 @@ class LiveAlarms:
         return [mark for node, text in found if (mark := self._mark(node, text, now_ns))]
 
     def _field(self, node: NodeReadings, now_ns: int) -> str:
-        """Return what is wrong with a node's field now, and learn from it; empty where nothing is."""
+        """Return what is wrong with a node's present field, and learn the usual field from it; empty if nothing."""
         now = field_of(node, now_ns - CHECK_NS, now_ns)
         if now is None:
             return ""
@@ -98,7 +98,7 @@ class LiveAlarms:
         return text
 
     def _mark(self, node: str, text: str, stamp_ns: int) -> Mark | None:
-        """Return an alarm (`check: what`) as a mark; None where it was said a moment ago."""
+        """Return an alarm (`check: what`) as a mark; None if it was published a moment ago."""
         check, _, what = text.partition(": ")
         key = f"{node} {check}"
         if abs(stamp_ns - self._said_ns.get(key, -QUIET_NS)) < QUIET_NS:
@@ -119,7 +119,7 @@ class Watch:
     def attach(self) -> None:
         """Subscribe."""
         follow(self._bus, INFO.key_any(), self._refusals, self._take)
-        # In one, so that no pose closes a leg ahead of the depths that came before it.
+        # One subscription keeps the order: no pose may close a leg before the depths that were sent before it.
         keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE))
         follow(self._bus, keys, self._refusals, self._take, capacity=16384, history=False)
 

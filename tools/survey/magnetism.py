@@ -27,7 +27,7 @@ def field_of(node: NodeReadings, start_ns: int, end_ns: int) -> Field | None:
     if not known.any():
         return None
     mag_t, accel = mag_t[known], accel[known]
-    # The accelerometer of a node at rest feels up.
+    # At rest the specific force points up.
     up = accel / np.maximum(np.linalg.norm(accel, axis=1), 1e-9)[:, None]
     norm_t = np.linalg.norm(mag_t, axis=1)
     sine = np.clip(-(mag_t * up).sum(1) / np.maximum(norm_t, 1e-12), -1.0, 1.0)
@@ -35,7 +35,7 @@ def field_of(node: NodeReadings, start_ns: int, end_ns: int) -> Field | None:
 
 
 def usual_field(fields: Sequence[Field | None]) -> Field | None:
-    """Return the median of the known fields; None where none is known."""
+    """Return the median of the known fields; None if none is known."""
     known = [one for one in fields if one is not None]
     if not known:
         return None
@@ -48,7 +48,7 @@ def _differences(field: Field, usual: Field) -> tuple[float, float]:
 
 
 def off_usual(field: Field | None, usual: Field | None, limits: AlarmSettings) -> float:
-    """Return how far a field is from the usual one, as a share of what is tolerated; 0 where it is not known."""
+    """Return the deviation of a field from the usual one, as a share of the tolerance; 0 if it is not known."""
     if field is None or usual is None:
         return 0.0
     share, turn_deg = _differences(field, usual)
@@ -56,7 +56,7 @@ def off_usual(field: Field | None, usual: Field | None, limits: AlarmSettings) -
 
 
 def field_alarm(field: Field | None, usual: Field | None, limits: AlarmSettings) -> str:
-    """Say how a field differs from the usual one; empty where it does not, or is not known."""
+    """Return the difference of a field from the usual one in words; empty if it is small or not known."""
     if field is None or usual is None:
         return ""
     share, turn_deg = _differences(field, usual)

@@ -1,4 +1,4 @@
-"""`buddyline mark`: publish where a node stands, so that all logs record it."""
+"""`buddyline mark`: publish a node's station, a point or a note, so that all logs record it."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", default="", help="station or point: 1 to 12 of A-Z a-z 0-9 _ -")
     parser.add_argument("--node", required=True, metavar="NODE", help="the node that stands there")
     parser.add_argument("--kind", choices=KINDS, default="station", help="default: station")
-    parser.add_argument("--note", default="", metavar="TEXT", help="what there is to say of the place")
+    parser.add_argument("--note", default="", metavar="TEXT", help="a remark on the place")
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
     add_client_arguments(parser, SURVEYOR)
     parser.add_argument(
         "--seconds", type=float, metavar="S", help="give up after this long without a hub; default: wait for it"
     )
-    parser.add_argument("--linger", type=float, default=1.0, metavar="S", help="stay on the bus so long; default: 1")
+    parser.add_argument(
+        "--linger", type=float, default=1.0, metavar="S", help="stay on the bus for this long; default: 1"
+    )
 
 
 def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
-    """Return the message; raise BuddylineError where name, note or time cannot be used."""
+    """Return the message; raise BuddylineError if name, note or time cannot be used."""
     if args.kind != "note" and not STATION_NAME.match(args.name):
         raise BuddylineError(f"name {args.name!r}: use 1 to 12 of A-Z a-z 0-9 _ -")
     if args.kind == "note" and not args.note:
@@ -55,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     def publish(bus: Bus) -> None:
         nonlocal marked
         marked = bus.publisher(MARK, mark.node).put(mark)
-        # Who records subscribes to the cache as well: leaving at once could take the mark along.
+        # Stay for a while: a recorder that misses the mark fetches it from this process's cache.
         client.stop.wait(args.linger)
 
     status = client.run(publish)

@@ -20,7 +20,7 @@ from msgspec import UNSET
 # Chi^2 of three degrees of freedom that one leg in a thousand exceeds.
 BLUNDER_CHI2: Final = 16.27
 MOST_BLUNDERS: Final = 10
-# Legs that explain a misclosure nearly as well as the best one are named with it.
+# Legs that explain a misclosure nearly as well as the best one are listed with it.
 AS_GOOD: Final = 0.8
 EXACT_M: Final = 1e-4
 
@@ -62,13 +62,13 @@ class Loop:
 
     @property
     def error_m(self) -> float:
-        """How far it is from closing."""
+        """Length of the misclosure, m."""
         return math.hypot(*self.misclosure_m)
 
 
 @dataclass(frozen=True)
 class Residual:
-    """What the adjustment did to a leg. chi2: of the change, by its own covariance; None where nothing checks it."""
+    """A leg's residual. chi2: of the residual, by its own covariance; None if no loop checks the leg."""
 
     leg: Leg
     moved_m: Triple
@@ -77,7 +77,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Blunder:
-    """Legs of which one is wrong, the likeliest first, and how far off that would be."""
+    """Legs of which one is wrong, the likeliest first, and the error that it would have."""
 
     legs: tuple[str, ...]
     off_m: float
@@ -110,7 +110,7 @@ def station_depths(project: Project) -> dict[str, float]:
 
 
 def held_depths(project: Project) -> dict[str, float]:
-    """Return the stations held at their gauges' mean depth, and it; none where each leg keeps its readings."""
+    """Return the held stations and their gauges' mean depth; none if each leg keeps its readings."""
     return station_depths(project) if project.adjust.depth == "absolute" else {}
 
 
@@ -130,7 +130,7 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
     for fix in project.fix:
         altitude_m, altitude_sigma_m = fix.altitude_m, fix.altitude_sigma_m
         if altitude_m is UNSET or project.adjust.depth == "absolute":
-            # Depths are absolute: an altitude of its own would contradict them.
+            # Depths are absolute: a fixed altitude would contradict them.
             altitude_m, altitude_sigma_m = level_m - depths.get(fix.station, 0.0), 0.0
         sigmas_m = np.array([fix.sigma_m, fix.sigma_m, altitude_sigma_m])
         fixed[fix.station] = np.array([*grid.position_m(fix), altitude_m]), sigmas_m
@@ -143,7 +143,7 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
 
 
 def adjust(project: Project) -> Adjusted:
-    """Adjust the whole network; raise BuddylineError where there is nothing to adjust.
+    """Adjust the whole network; raise BuddylineError if there is nothing to adjust.
 
     Declination and convergence are each leg's own, so on a map grid a first adjustment tells where the legs are.
     """
@@ -182,7 +182,7 @@ def _adjust(project: Project, grid: Grid, at: dict[str, Floats]) -> Adjusted:
     common_rad = math.radians(project.settings.compass_common_deg)
     positions = solution.positions(common_rad)
     for held in project.station:
-        # An altitude is as good as the gauge: the gauge's slow error is in no leg's noise.
+        # An altitude is only as good as the gauge, whose slow error is not in any leg's noise.
         if held.name in positions and held.depth_sigma_m is not UNSET:
             positions[held.name].covariance[2, 2] += held.depth_sigma_m**2
     points = []
@@ -221,7 +221,7 @@ class _Solution:
 
     def __init__(self, lines: list[Line], fixed: Fixed) -> None:
         ends = dict.fromkeys(name for line in lines for name in (line.leg.from_, line.leg.to))
-        # Fixed points first; a survey without lines is its fixed points.
+        # Fixed points first; a survey without lines consists of its fixed points.
         names = list(dict.fromkeys([*(name for name in fixed if name in ends or not lines), *ends]))
         self.at = {name: i for i, name in enumerate(names)}
         self.start = np.array([self.at[line.leg.from_] for line in lines], dtype=int)
@@ -240,7 +240,7 @@ class _Solution:
         ):
             np.add.at(normal, (rows, columns), sign * self._weights)
         right = self._pushed(vectors[..., None])
-        # Coordinates count from the first fixed point, so that UTM's millions cost no digits.
+        # Coordinates are relative to the first fixed point, because UTM's millions would cost digits.
         origin = next((position for position, _ in fixed.values()), np.zeros(3))
         for name, (position, sigma_m) in fixed.items():
             if name in self.at:
@@ -262,7 +262,7 @@ class _Solution:
         return right
 
     def positions(self, common_rad: float) -> dict[str, Position]:
-        """Return all stations; common_rad: 1 sd of an error that turns every leg alike, in no single leg's sigma."""
+        """Return all stations; common_rad: 1 sd of an error that turns all legs alike, not in any leg's sigma."""
         turn = common_rad * self._turned()
         return {
             name: Position(name, self.x[i], self.covariance[i, i] + np.outer(turn[i], turn[i]))
@@ -372,7 +372,7 @@ def loops(lines: list[Line], fixed: Fixed) -> list[Loop]:
 
 
 def _blunders(lines: list[Line], fixed: Fixed) -> list[Blunder]:
-    """Name the worst leg, take it out, and look again; with it those that would explain it as well."""
+    """Find the worst leg, with those that would explain the misclosure as well; leave it out, and search again."""
     left = list(lines)
     found: list[Blunder] = []
     while len(left) > 1 and len(found) < MOST_BLUNDERS:

@@ -1,7 +1,7 @@
 """The project: one TOML file. A person writes the upper part, the lower part is derived from the dives.
 
-The text above the line MARKER is kept to the letter. The text below it is derived again from the dives' logs, which
-never change. The file as it was before is kept beside it.
+The text above the line MARKER is never changed. The text below it is derived again from the dives' logs, which
+never change. A copy of the file before each change is kept beside it.
 """
 
 from __future__ import annotations
@@ -179,12 +179,12 @@ class Leg(Config, frozen=True, kw_only=True):
 
     @property
     def name(self) -> str:
-        """How people and edits call it."""
+        """The leg's name in edits and reports: `from-to`."""
         return f"{self.from_}-{self.to}"
 
     @property
     def moment(self) -> datetime:
-        """When it began, UTC."""
+        """Begin of the shot, UTC."""
         return datetime.fromtimestamp(self.start_ns / S_NS, UTC)
 
 
@@ -199,7 +199,7 @@ class Station(Config, frozen=True, kw_only=True):
 
 
 class Problem(Config, frozen=True, kw_only=True):
-    """[[problem]]: a question that the dives leave open, in words."""
+    """[[problem]]: a question that the logs leave open, in words."""
 
     text: str
 
@@ -253,7 +253,7 @@ def load_project(path: Path | str) -> Project:
 
 
 def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
-    """Put what the dives give below the marker; keep the file as it was as `NAME.1`, `NAME.2`, ..."""
+    """Write the derived part below the marker; keep the old file as `NAME.1`, `NAME.2`, ..."""
     old = path.read_text(encoding="utf-8")
     upper = old.split(MARKER)[0].rstrip("\n")
     text = f"{upper}\n\n{MARKER}\n{_toml(derived)}"
@@ -268,7 +268,7 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
 
 
 def new_project(path: Path, name: str, logs: list[str]) -> None:
-    """Write a project file to fill in; raise BuddylineError where one exists."""
+    """Write a project file to fill in; raise BuddylineError if one exists."""
     text = TEMPLATE.format(name=_toml_value(name), logs=_toml_value(logs))
     write_new(path, text, hint="add the dive to it as another [[dive]]")
 
@@ -314,7 +314,7 @@ logs = {logs}
 
 
 def _toml(tables: dict[str, list[Any]]) -> str:
-    """Write arrays of tables, of structs whose values are scalars, lists of them, or flat dicts; empty ones not."""
+    """Write arrays of tables. Their structs have scalars, lists of scalars or flat dicts; empty values are left out."""
     lines: list[str] = []
     for name, rows in tables.items():
         for row in rows:
@@ -325,7 +325,7 @@ def _toml(tables: dict[str, list[Any]]) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Write a value: TOML's strings, numbers and arrays are JSON's, but for one forbidden character and for tables."""
+    """Write a value: TOML's strings, numbers and arrays are JSON's, except one forbidden character; tables differ."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_toml_value(key)} = {_toml_value(one)}" for key, one in value.items()) + " }"
     return json.dumps(value, ensure_ascii=False, allow_nan=False).replace("\x7f", "\\u007F")

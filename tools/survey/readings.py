@@ -17,7 +17,7 @@ from msgspec import UNSET
 
 # An attitude is interpolated between neighbours no further apart than this.
 ATTITUDE_GAP_NS: Final = 500_000_000
-# What the survey reads of each sensor: the message's fields and their length.
+# The message fields that the survey reads of each sensor, and their lengths.
 COLUMNS: Final[dict[type[Message], dict[str, int]]] = {
     Attitude: {"q_ned_body_xyzw": 4, "sigma_rad": 3},
     Depth: {"depth_m": 1, "sigma_m": 1},
@@ -152,7 +152,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
 def of_logs(paths: list[str]) -> list[PairReadings]:
     """Read a solved dive: its poses, and the nodes' own logs for what those lack (IMU, marks).
 
-    The solved log goes first: where it was solved with another calibration than the nodes', its own holds.
+    The solved log goes first, so that the calibration that it was solved with takes precedence over the nodes'.
     """
     with ExitStack() as stack:
         dives = sorted(open_each(paths, stack), key=lambda dive: not dive.nodes("pose"))

@@ -1,4 +1,4 @@
-"""The survey's report: one HTML file with plan, profile, legs, loops, and all that does not fit."""
+"""The survey's report: one HTML file with plan, profile, legs, loops, and all contradictions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Sheet
 from msgspec import UNSET
 
-# Numbers stand to the right, words to the left.
+# Numbers are aligned to the right, words to the left.
 CSS: Final = (
     "td,th{text-align:right;white-space:nowrap}td:last-child{text-align:left;white-space:normal;min-width:16em}"
 )
 
 
 def summary(sheet: Sheet) -> list[str]:
-    """Return what a person wants to know first, a line each."""
+    """Return the summary: lengths, loops, blunders and alarms, a line each."""
     project, adjusted = sheet.project, sheet.adjusted
     lines = [
         f"{sheet.title}: {len(adjusted.lines)} legs, {adjusted.length_m:.1f} m, {len(adjusted.positions)} stations, "

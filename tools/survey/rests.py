@@ -1,4 +1,4 @@
-"""Where in a dive both nodes rest, by the fixes and by the inertial sensors."""
+"""Find the rests of a dive, in which both nodes are held still, from fixes and inertial sensors."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from buddyline.tools.survey.readings import NodeReadings, PairReadings
 from buddyline.tools.survey.settings import SurveySettings
 from buddyline.tools.survey.sights import Sights
 
-# A speed is the slope over this time. Headings drift meanwhile: by this share of their stated sigma, at least by this.
+# Time over which a speed is the slope. Headings drift meanwhile, by this share of their stated sigma or this minimum.
 SLOPE_NS: Final = 4_000_000_000
 WANDER_RADPS: Final = 0.006
 WANDER_SHARE_HZ: Final = 0.23
-# A gap between fixes longer than this ends a rest, unless the line between the nodes is still the same.
+# A longer gap between fixes ends a rest, unless the line between the nodes is still the same.
 PAUSE_NS: Final = 5_000_000_000
-# Two lines are the same if they differ by less than this, and this share of the range.
+# Two lines are the same if they differ by less than this length plus this share of the range.
 SAME_M: Final = 0.25
 SAME_SHARE: Final = 0.06
 LEAST_RUN: Final = 3
 FEEL_NS: Final = 500_000_000
 GRAVITY_MPS2: Final = 9.80665
-# Rejections of triggers at which the nodes did not look at each other, or that the link lost.
+# Reasons that mean that a node looked away, or that the link lost a frame.
 UNSEEN: Final = ("unmatched", "no_info", "too_few_candidates", "late", "duplicate")
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Fixes at one rest of the pair: chosen (n,) of the dive's; unused: triggers in its time, by reason.
+    """Fixes at one rest of the pair: chosen (n,) of the dive's; unused: other triggers during the rest, by reason.
 
-    too_short: what it lacks to make a leg, in words; empty where it makes one.
+    too_short: why it makes no leg, in words; empty if it makes one.
     """
 
     chosen: Bools
@@ -47,8 +47,8 @@ class Rest:
 def rests(readings: PairReadings, seen: Sights, settings: SurveySettings) -> list[Rest]:
     """Return the rests of a dive in their order; too_short where not rest_s long with rest_fixes fixes.
 
-    A rest shorter than half of that is only a swimmer's pause and left out. Where poses were refused meanwhile, these
-    make up for missing fixes of a rest, though not of a leg.
+    Rests shorter than half of that are left out: they are a swimmer's pauses. Triggers that were rejected meanwhile
+    count as fixes of a rest, but not of a leg.
     """
     handled_by = [handled(node, seen.stamps_ns, settings) for node in readings.pair]
     yaw_rad = np.nan_to_num(seen.sigma_rad[:, :, 2].max(axis=0))
@@ -79,7 +79,7 @@ def _long_enough(count: int, span_ns: int, settings: SurveySettings, share: floa
 def _refused(
     readings: PairReadings, seen: Sights, still: Bools, found: list[Rest], settings: SurveySettings
 ) -> list[Rest]:
-    """Return stretches outside of the rests found in which both nodes saw lights, but hardly a pose came of it."""
+    """Return stretches outside the found rests in which both nodes saw lights but hardly any pose was found."""
     events = [(int(seen.stamps_ns[i]), "fix") for i in np.flatnonzero(still).tolist()]
     events += [(one.stamp_ns, one.reason) for one in readings.rejected if one.reason not in UNSEEN]
     groups: list[list[tuple[int, str]]] = []
@@ -104,13 +104,13 @@ def _refused(
 
 
 def same_line(one_m: Floats, other_m: Floats) -> bool:
-    """Tell whether two lines (3,), metres, NED, are between the same two places."""
+    """Return whether two lines (3,), m, NED, connect the same two places."""
     tolerance_m = SAME_M + SAME_SHARE * float(np.linalg.norm(one_m))
     return bool(np.linalg.norm(one_m - other_m) < tolerance_m)
 
 
 def speeds_mps(seen: Sights) -> Floats:
-    """Return how fast b moves relative to a at each fix, (n,): slope of the line over SLOPE_NS.
+    """Return the speed of b relative to a at each fix, (n,): the slope of the line over SLOPE_NS.
 
     Without any attitude, of the range alone.
     """
@@ -124,7 +124,7 @@ def speeds_mps(seen: Sights) -> Floats:
         if len(part) < LEAST_RUN:
             continue
         t_s = (stamps[part] - stamps[i]) / 1e9
-        # Halves' medians: one gross fix makes no motion.
+        # Medians of both halves, so that one gross error does not look like a motion.
         middle = len(part) // 2
         apart_s = float(t_s[middle:].mean() - t_s[:middle].mean())
         moved_m = np.median(value[part[middle:]], axis=0) - np.median(value[part[:middle]], axis=0)
@@ -133,7 +133,7 @@ def speeds_mps(seen: Sights) -> Floats:
 
 
 def handled(node: NodeReadings, stamps_ns: Ints, settings: SurveySettings) -> Bools:
-    """Tell, for each of stamps_ns (n,), whether the node is turned or jolted; False where it has no IMU."""
+    """Return, for each of stamps_ns (n,), whether the node is turned or jolted; False without an IMU."""
     turn = np.linalg.norm(node.imu["gyro_radps"], axis=1)
     jolt = np.abs(np.linalg.norm(node.imu["accel_mps2"], axis=1) - GRAVITY_MPS2)
     felt = [
@@ -151,7 +151,7 @@ def _around(series_ns: Ints, stamps_ns: Ints, within_ns: int) -> list[tuple[int,
 
 
 def _runs(seen: Sights, still: Bools) -> list[list[int]]:
-    """Return neighbouring fixes at rest, of one and the same line between the nodes."""
+    """Return runs of neighbouring fixes at rest that have the same line between the nodes."""
     runs: list[list[int]] = []
     last = -2
     for i in np.flatnonzero(still).tolist():
@@ -172,7 +172,7 @@ def _line_m(seen: Sights, run: list[int]) -> Floats:
 
 
 def _merged(runs: list[list[int]], seen: Sights) -> list[list[int]]:
-    """Join neighbouring runs between which nobody has moved: sight was lost, or someone swayed."""
+    """Join neighbouring runs between which no node has moved: lights were out of sight, or a diver swayed."""
     merged: list[list[int]] = []
     for run in runs:
         if len(run) < LEAST_RUN:

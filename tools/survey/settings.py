@@ -1,4 +1,4 @@
-"""What the survey assumes and tolerates: the project's [settings] and [alarms], every value with a default."""
+"""The survey's assumptions and tolerances: the project's [settings] and [alarms], each value with a default."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from msgspec import Meta, field
 
 
 class SurveySettings(Config, frozen=True, kw_only=True):
-    """How legs are made of a dive.
+    """[settings]: how legs are made from a dive.
 
-    procedure: which node moves, where neither marks nor depths show it: the nodes pass one another in turn
+    procedure: which node moves if neither marks nor depths show it: the nodes pass one another in turn
     (leapfrog), or node `first` stays. first: the node at the first station (default: the pair's first).
     rest_s, rest_fixes: the minimum for a leg. rest_speed_mps: below it the pair counts as resting.
     turn_radps, jolt_mps2: gyroscope and accelerometer above which a node is handled, not held.

@@ -1,4 +1,4 @@
-"""What every export is written from: who, when and where, fixed stations, and the readings leg by leg."""
+"""The common content of all exports: who, when and where, fixed stations, and each leg's readings."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Sheet:
         self.title = about.title or about.name
         self.team = about.team
         when = survey_date(project)
-        # The stated date, or the first leg's; empty where there is none.
+        # The stated date, or the first leg's; empty if there is none.
         self.date = when.strftime("%Y.%m.%d") if when else ""
 
     @property
@@ -71,7 +71,7 @@ class Sheet:
 
     @cached_property
     def why(self) -> str:
-        """Where the angle to north comes from, in words."""
+        """The origin of the angle to north, in words."""
         grid = self.adjusted.grid
         if grid.declination is None:
             return "declination not known: north is magnetic"
@@ -90,7 +90,7 @@ class Sheet:
 
     @property
     def instruments(self) -> dict[str, str]:
-        """The stated instruments, and ours where tape or compass are not stated."""
+        """The stated instruments; for tape and compass, if not stated, the nodes' own."""
         nodes = sorted({node for leg in self.project.leg for node in (leg.from_node, leg.to_node)})
         ours = {
             "tape": f"Buddyline optical range, nodes {' and '.join(nodes)}",
@@ -101,7 +101,7 @@ class Sheet:
 
     @property
     def notes(self) -> list[str]:
-        """The survey's notes, the stations', and every verdict on a leg."""
+        """The notes of the survey and of its stations, and every edit of a leg."""
         notes = [line for line in self.project.survey.notes.splitlines() if line.strip()]
         notes += [f"station {station.name}: {note}" for station in self.project.station for note in station.notes]
         for edit in self.project.edit:

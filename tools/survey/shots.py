@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class End:
-    """What one node says of a shot by its own sensors; None: not measured.
+    """One node's own measurements of a shot; None: not measured.
 
     azimuth (magnetic) and inclination (up): of the line to the other node, radians; both are known, or neither.
     """
@@ -68,7 +68,7 @@ def shoot(
     """
     unused = dict(unused or {})
     index = np.flatnonzero(chosen)
-    # Lines without any attitude count as zeros: then their range alone tells outliers.
+    # Lines without any attitude are zeros, so that only their range shows outliers.
     spread = np.column_stack([seen.range_m[index], np.nan_to_num(seen.line_m[index])])
     kept = inliers(spread, float(np.median(seen.across_sigma_m[index])) + settings.centering_m)
     if not kept.all():
@@ -76,7 +76,7 @@ def shoot(
     index = index[kept]
     range_m = seen.range_m[index]
     start_ns, end_ns = int(seen.stamps_ns[index[0]]), int(seen.stamps_ns[index[-1]])
-    # Both ends are held only so well; a fraction of the range is the calibration's.
+    # Each end is held with the sigma centering_m; the calibration adds a share of the range.
     floor_m = math.hypot(math.sqrt(2) * settings.centering_m, settings.range_share * float(range_m.mean()))
     along_m = float(np.median(seen.along_sigma_m[index]))
     gaps = seen.heading_gap_rad[index]
@@ -113,7 +113,7 @@ def _sight(
     held_m = math.sqrt(2) * settings.centering_m
 
     def mean(angles_rad: Floats, stated_rad: Floats, floor_deg: float, away_m: Floats) -> Mean:
-        """Average angles; an offset across the line turns them by its share of how far away the other is."""
+        """Average angles; an offset across the line turns them by the offset over the distance away_m."""
         far_m = max(float(away_m.mean()), 1e-3)
         stated = math.hypot(float(np.median(stated_rad)), across_m / far_m)
         return mean_of_slow(stamps_s, angles_rad, stated, math.hypot(math.radians(floor_deg), held_m / far_m))

@@ -13,7 +13,7 @@ from buddyline.tools.survey.sheet import Reading, Sheet
 
 @dataclass(frozen=True)
 class Language:
-    """How a language writes its data. command, comment: what begins them; ending: what closes a list of columns."""
+    """The form of a language. command, comment: their first characters; ending: closes a list of columns."""
 
     command: str
     comment: str
@@ -35,7 +35,7 @@ class Language:
         return f"{self.command}data diving from to {self.tape} compass backcompass fromdepth todepth{self.ending}"
 
     def data(self, sheet: Sheet, readings: Iterable[Reading], by_clino: Callable[[Reading], bool]) -> Iterator[str]:
-        """Yield every leg's row, and before it what has changed: standard deviations and the columns' names."""
+        """Yield every leg's row, after the standard deviations and column names if they have changed."""
         state: dict[str, str] = {}
         for reading in readings:
             clino = by_clino(reading)
@@ -91,7 +91,7 @@ THERION_INSTRUMENTS: Final = ("tape", "length", "compass", "backcompass", "clino
 
 
 def quoted(text: str) -> str:
-    """Return text between quotes, which it must not hold itself."""
+    """Return text in quotes; quotes in it are replaced."""
     return '"' + text.replace('"', "'").replace("\n", " ") + '"'
 
 

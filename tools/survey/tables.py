@@ -17,7 +17,7 @@ from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
 from msgspec import to_builtins
 
-# A station's columns and their digits after the point; empty where a value is not known.
+# A station's columns and their digits after the point; empty if a value is not known.
 STATION_DIGITS: Final = {
     "name": None,
     "kind": None,
@@ -25,7 +25,7 @@ STATION_DIGITS: Final = {
     **dict.fromkeys(("sigma_east_m", "sigma_north_m", "sigma_up_m"), 3),
     **{"ellipse_major_m": 3, "ellipse_minor_m": 3, "ellipse_azimuth_deg": 1, "latitude_deg": 8, "longitude_deg": 8},
 }
-# What of it a map shows.
+# The columns that go on a map.
 MAP_PROPERTIES: Final = ("name", "kind", "ellipse_major_m", "ellipse_minor_m", "ellipse_azimuth_deg", "sigma_up_m")
 
 FOOT_M: Final = 0.3048
@@ -57,7 +57,7 @@ def legs_csv(sheet: Sheet) -> str:
 
 
 def _station_rows(sheet: Sheet) -> list[dict[str, Any]]:
-    """Return adjusted stations and points, by STATION_DIGITS' columns; None: not known."""
+    """Return adjusted stations and points with the columns of STATION_DIGITS; None: not known."""
     depths = station_depths(sheet.project)
     rows = []
     stations = [("station", position) for position in sheet.adjusted.positions.values()]

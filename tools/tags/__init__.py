@@ -1,1 +1,1 @@
-"""Poses from AR tags: the yardstick beside the lights."""
+"""Poses from AR tags, to compare the poses from lights with."""

@@ -10,7 +10,7 @@ from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.tags.layout import FAMILIES, Layout
 from numpy.typing import NDArray
 
-# Water leaves little contrast: OpenCV's own 7 grey levels lose half of the range in turbid water.
+# Water leaves little contrast: with OpenCV's default of 7 grey levels, tags in turbid water are lost at half the range.
 _CONTRAST_LEVELS: Final = 3
 
 
@@ -26,7 +26,7 @@ class TagFinder:
         self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
 
     def find(self, picture: NDArray[np.uint8]) -> dict[int, list[Floats]]:
-        """Return the corners, (4, 2) px each, of all that reads as a tag of the layout, by id.
+        """Return the corners, (4, 2) px each, of everything that reads as a tag of the layout, by id.
 
         picture: (H, W, 3) BGR or (H, W) grey. One id may be read in several places, of which at most one is true.
         """

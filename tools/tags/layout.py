@@ -1,4 +1,4 @@
-"""Which tags a node carries, and where: out of NodeInfo, or of a JSON file."""
+"""The tags on a node and their places: from NodeInfo, or from a JSON file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Layout:
 
 
 def layout_of(tags: Iterable[ArTag], source: str) -> Layout:
-    """Return a layout; source: what errors name. Raises BuddylineError where it cannot be used."""
+    """Return a layout; source: its name in errors. Raises BuddylineError if it cannot be used."""
     listed = list(tags)
     if not listed:
         raise BuddylineError(f"{source}: holds no tags")

@@ -1,7 +1,7 @@
 """T_a_b from the tags that both nodes see of each other: least squares over all corners of both pictures.
 
-Readings that are no tags, or are of tags elsewhere, do not fit the layouts together with the others: the largest
-set of readings that one pose explains is taken.
+False readings, and tags that are not on a node, do not fit the layouts together with the others. So the largest set
+of readings that one pose explains is used.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from buddyline.protocol.messages import CameraModel
 from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
 from buddyline.tools.tags.layout import Layout
 
-# Noise of a refined corner, per axis, and how many residuals' worth that is believed against a picture's own.
+# Noise of a refined corner, per axis, and its weight against a picture's own residuals, as a number of residuals.
 CORNER_SIGMA_PX: Final = 0.5
 _PRIOR_COUNT: Final = 16
-# Readings that one pose explains leave no more than this, RMS per axis.
+# Largest residual of readings that one pose explains, RMS per axis.
 _FIT_PX: Final = 1.5
-# A second pose this much less likely (chi-square) is no rival; poses nearer than this are one.
+# A second pose that is this much less likely (chi-square) does not count; poses nearer than this are the same.
 _RIVAL_CHI2: Final = 9.0
 _SAME_RAD: Final = 0.1
-# One tag alone has nothing that checks it: it may be a false one, and glow at a corner turns it unseen.
+# A single tag cannot be checked: it may be false, and glow at a corner can turn it unnoticed.
 _READINGS: Final = 2
 _STEPS: Final = 25
-# Divers' noses and hulls aside, nothing is seen nearer than this.
+# Nodes do not come nearer to each other than this.
 _NEAR_M: Final = 0.05
 
 
@@ -49,7 +49,7 @@ class TagPose:
     """T_a_b from tags. covariance: (6, 6), as RelativePose has it. chi2: of the residuals over CORNER_SIGMA_PX.
 
     range_a_m, range_b_m: from A's and B's picture alone (the joint one where that shows no tag). twist_gap_rad:
-    between the turns about the line of sight that the two pictures give alone, 0 where one shows no tag.
+    difference of the rotations about the line of sight that each picture gives alone, 0 if one shows no tag.
     readings: how many were used; left_out: how many did not fit. residual_px: RMS per axis.
     """
 
@@ -76,7 +76,7 @@ class _Fit:
 def readings_of(
     found: Mapping[int, Sequence[Floats]], layout: Layout, camera: CameraModel, *, by_a: bool
 ) -> list[TagReading]:
-    """Return what a picture shows of the other node's tags; found: by id, corners (4, 2) px."""
+    """Return a picture's readings of the other node's tags; found: by id, corners (4, 2) px."""
     matrix = np.array([[camera.fx_px, 0.0, camera.cx_px], [0.0, camera.fy_px, camera.cy_px], [0.0, 0.0, 1.0]])
     undistort = cv2.fisheye.undistortPoints if camera.model == "fisheye" else cv2.undistortPoints
     focal_px = np.array([camera.fx_px, camera.fy_px])
@@ -94,7 +94,7 @@ def readings_of(
 
 
 def tag_pose(readings: Sequence[TagReading]) -> TagPose | None:
-    """Return T_a_b from all readings that fit together; None where too few do, or two poses explain them."""
+    """Return T_a_b from all readings that fit together; None if too few do, or two poses explain them."""
     best: list[TagReading] = []
     best_fit: _Fit | None = None
     everything = len({(reading.by_a, id(reading.points_m)) for reading in readings})
@@ -112,7 +112,7 @@ def tag_pose(readings: Sequence[TagReading]) -> TagPose | None:
         return None
     degrees = 8 * len(best) - 6
     variance_px2 = (_PRIOR_COUNT * CORNER_SIGMA_PX**2 + best_fit.squares_px2) / (_PRIOR_COUNT + degrees)
-    # The other reading of a square is the rival; one square a picture is enough to meet it.
+    # A square fits two poses. The second pose of one square in each picture is the rival to compare with.
     for seed in {reading.by_a: reading for reading in best}.values():
         for start in _starts(seed):
             rival = _fit(start, best)
@@ -148,7 +148,7 @@ def _angle(p_xyzw: Floats, q_xyzw: Floats) -> float:
 
 
 def _alone(chosen: Sequence[TagReading], joint: _Fit, *, by_a: bool) -> _Fit:
-    """Return the pose from one picture's tags, from the joint one on; the joint one where it has none."""
+    """Return the pose from one picture's tags, refined from the joint one; the joint one if it has no tags."""
     own = [reading for reading in chosen if reading.by_a is by_a]
     return (_fit((joint.t_m, joint.q_xyzw), own) or joint) if own else joint
 
@@ -162,7 +162,7 @@ def _gather(
         return [], None
     chosen = [seed]
     for reading in readings:
-        # One tag is in one place: a second reading of it cannot be true beside the first.
+        # A tag is in one place only: of two readings of it at most one is true.
         if any(reading.by_a is one.by_a and reading.points_m is one.points_m for one in chosen):
             continue
         wider = _fit((fit.t_m, fit.q_xyzw), [*chosen, reading])
@@ -201,7 +201,7 @@ def _cross(v: Floats) -> Floats:
 
 
 def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[Floats, Floats] | None:
-    """Return residuals (n,) in px and their derivatives (n, 6); None where a corner is not before its camera."""
+    """Return residuals (n,) in px and their derivatives (n, 6); None if a corner is not before its camera."""
     points, rays, focal_px, by_a = stack
     R = rotate(q_xyzw, np.eye(3)).T
     turned = np.where(by_a, points @ R.T, points - t_m)
@@ -221,7 +221,7 @@ def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[
 
 
 def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _Fit | None:
-    """Return the pose of least squares (Levenberg-Marquardt); None where it is not determined."""
+    """Return the pose of least squares (Levenberg-Marquardt); None if it is not determined."""
     stack = (
         np.concatenate([reading.points_m for reading in readings]),
         np.concatenate([reading.rays for reading in readings]),
