@@ -116,7 +116,12 @@ class PairTracker:
         self.forget()
 
     def _take(self, outcomes: Sequence[Message]) -> list[Message]:
-        stamps_ns = [one.stamp_ns for one in outcomes if isinstance(one, RelativePose | Rejected)]
+        # A late frame's stamp is old, or far from the dive's time: it does not carry the track on.
+        stamps_ns = [
+            one.stamp_ns
+            for one in outcomes
+            if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late")
+        ]
         known = [stream.calibration(max(stamps_ns)) for stream in self._streams] if stamps_ns else [None, None]
         if known[0] is None or known[1] is None:
             return []

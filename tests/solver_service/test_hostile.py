@@ -6,7 +6,16 @@ import pytest
 from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import MAX_MESSAGE_BYTES, encode
-from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, Rejected, RelativePose, SolverStatus
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    SolverStatus,
+    Track,
+)
 from buddyline.protocol.topics import key_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import MAX_NODES
@@ -40,6 +49,9 @@ class Solver:
     def results(self):
         self.service._publish(self.service.core.flush())
         return [m for m in self.bus.published if isinstance(m, RelativePose | Rejected)]
+
+    def track_stamps(self):
+        return [m.stamp_ns for m in self.bus.published if isinstance(m, Track) and m.mode == "filter"]
 
     def status(self):
         self.service.report()
@@ -161,6 +173,21 @@ def test_frames_of_a_time_an_hour_ahead_take_nothing_from_the_others(messages, h
     rest = [result for result, payload in zip(results, told, strict=True) if payload not in set(healthy)]
     assert {result.reason for result in rest} == {"late"}
     assert strange == len(rest) > 3
+
+
+def test_a_frame_an_hour_ahead_leaves_the_track_where_it_is():
+    messages, _ = dive_messages(seconds=4.0, seed=7, imu=True)
+    solver, undisturbed = Solver(), Solver()
+    frames = [message for message in messages if isinstance(message, Candidates)]
+    middle = frames[len(frames) // 2]
+    for message in messages:
+        undisturbed.take(message)
+        solver.take(message)
+        if message is middle:
+            solver.take(replace(message, stamp_ns=message.stamp_ns + HOUR_NS, trigger=message.trigger + 36_000))
+    assert len(solver.results()) == len(undisturbed.results()) + 1
+    assert solver.track_stamps() == undisturbed.track_stamps()
+    assert undisturbed.track_stamps()
 
 
 def test_a_node_whose_clock_is_an_hour_ahead_is_named(messages):
