@@ -26,7 +26,13 @@ from mcap.stream_reader import get_chunk_data_stream
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 256 * 1024 * 1024
+# Unpacked. Writers cut chunks at one to four megabytes, which a picture may exceed. 60 kB of zeros, packed, may unpack
+# to any size: without a limit they cost minutes and gigabytes.
+MAX_CHUNK_BYTES: Final = 64 * 1024 * 1024
 CHANNEL_NOTE: Final = "buddyline.channel"
+
+# Records of kinds from here on are for anybody's own use (MCAP specification, Opcodes).
+PRIVATE_OPCODE: Final = 0x80
 
 _HEAD_BYTES: Final = 9
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # start, end, uncompressed size, its checksum, length of the compression
@@ -95,7 +101,7 @@ def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | No
         raise MalformedError("ends within a record's head")
     opcode, length = head[0], int.from_bytes(head[1:], "little")
     end = offset + _HEAD_BYTES + length
-    if opcode not in _KNOWN and opcode < 0x80:
+    if opcode not in _KNOWN and opcode < PRIVATE_OPCODE:
         raise MalformedError(f"no record is of kind {opcode}")
     if end > size:
         raise MalformedError("ends within a record")
@@ -128,7 +134,7 @@ def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Sc
     file.seek(offset + _HEAD_BYTES)
     chunk = Chunk.read(ReadDataStream(BytesIO(file.read(end - offset - _HEAD_BYTES))))
     # The decompressor allocates the size that the frame claims.
-    if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MAX_RECORD_BYTES:
+    if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) > MAX_CHUNK_BYTES:
         raise MalformedError("a chunk too big to unpack")
     stream, length = get_chunk_data_stream(chunk, validate_crc=True)
     return list(_records_in(stream.read(length)))
@@ -150,6 +156,8 @@ def _records_in(content: bytes) -> Iterator[McapMessage | Schema | Channel]:
             yield Schema.read(ReadDataStream(BytesIO(content[at : at + length])))
         elif opcode == Opcode.CHANNEL:
             yield Channel.read(ReadDataStream(BytesIO(content[at : at + length])))
+        elif opcode < PRIVATE_OPCODE:
+            raise MalformedError(f"a record of kind {opcode} in a chunk")
         at += length
 
 
@@ -172,8 +180,8 @@ def _chunk_at(file: IO[bytes], offset: int, length: int) -> ChunkAt:
     data_bytes = int.from_bytes(file.read(8), "little")
     if name not in _COMPRESSIONS or _CHUNK_HEAD.size + name_bytes + 8 + data_bytes != length:
         raise MalformedError("a chunk whose lengths do not agree")
-    if uncompressed > MAX_RECORD_BYTES:
-        raise MalformedError(f"a chunk of {uncompressed} bytes")
+    if uncompressed > MAX_CHUNK_BYTES:
+        raise MalformedError(f"a chunk of {uncompressed} bytes unpacked, at most {MAX_CHUNK_BYTES} are read")
     return ChunkAt(offset, start_ns, end_ns)
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
-from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import Attitude, Depth, Message, NodeInfo, RelativePose, Track
 from buddyline.protocol.security import ROS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, TRACK, TRACK_LAG
@@ -36,6 +36,8 @@ MAP: Final = "map"
 NODE_NAME: Final = "buddyline"
 # Quality of service in rmw_zenoh's liveliness tokens: reliable, volatile, the last 10 kept, the rest default.
 QOS: Final = "::,10:,:,:,,"
+# builtin_interfaces/Time counts seconds in 32 bits, with a sign.
+END_OF_ROS_TIME_NS: Final = 2**31 * S_NS
 TRANSFORM_SPACING_NS: Final = S_NS // 20
 # After a track has been silent for this time, poses give B's transform again.
 TRACK_SILENT_NS: Final = S_NS
@@ -77,7 +79,9 @@ class Translation:
         self._base: str | None = None
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
-        """Yield the ROS messages for one of our messages."""
+        """Yield the ROS messages for one of our messages; raise MessageError where ROS cannot say its time."""
+        if isinstance(message, Attitude | Depth | RelativePose | Track) and message.stamp_ns >= END_OF_ROS_TIME_NS:
+            raise MessageError(f"stamp_ns {message.stamp_ns}: the time of ROS 2 ends in 2038")
         if isinstance(message, NodeInfo):
             self._infos[message.node] = message
         elif isinstance(message, Attitude):
@@ -297,8 +301,11 @@ def run(args: argparse.Namespace) -> int:
             def publish(envelope: Envelope) -> None:
                 # Each subscription has a thread of its own; sequence numbers must rise one by one.
                 with lock:
-                    for translated in translation.messages(envelope.message):
-                        graph.publish(translated)
+                    try:
+                        for translated in translation.messages(envelope.message):
+                            graph.publish(translated)
+                    except MessageError as error:
+                        client.refusals.note(envelope.key, error)
 
             follow(bus, INFO.key_any(), client.refusals, publish, capacity=64)
             for topic in (ATTITUDE, DEPTH, POSE, TRACK, TRACK_LAG):

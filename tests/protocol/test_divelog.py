@@ -3,11 +3,13 @@
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
 
 import pytest
+import zstandard
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter, read_logs
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime
@@ -102,6 +104,23 @@ def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
         assert len(reader.damage) == 1
         assert f"chunk at byte {offset}: " in reader.damage[0]
         assert "; 0.90 s of messages are lost, from 1.00 s on" in reader.damage[0]
+
+
+@pytest.mark.parametrize("megabytes", [60, 200])
+def test_a_chunk_that_unpacks_to_nothing_but_zeros_is_refused_at_once(tmp_path, megabytes):
+    """A zstd bomb: some kilobytes that would unpack to millions of records."""
+    write(tmp_path / "a.mcap", range(50), flush_every=10)
+    zeros = bytes(megabytes * 1024 * 1024)
+    packed = zstandard.compress(zeros)
+    content = struct.pack("<QQQII", 0, 10**9, len(zeros), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    data = (tmp_path / "a.mcap").read_bytes()
+    with DiveLogReader(tmp_path / "a.mcap") as reader:
+        offset = sorted(reader._contents.chunks)[1][2]
+    bomb = struct.pack("<BQ", 6, len(content)) + content
+    (tmp_path / "b.mcap").write_bytes(data[:offset] + bomb + data[offset:])
+    with DiveLogReader(tmp_path / "b.mcap", trust_index=False) as reader:
+        assert ticks_of(reader) == [*range(50)]
+        assert str(offset) in reader.damage[0]
 
 
 def test_chunks_are_cut_by_the_second_of_log_time(tmp_path):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
+from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.ros2 import RosGraph, RosMessage, Translation, attachment, dds_type, name_of, type_store
@@ -129,6 +130,14 @@ def test_everything_can_be_encoded_and_read_back(store: Any) -> None:
         payload = store.serialize_cdr(message.value, message.type_name)
         again = store.deserialize_cdr(payload, message.type_name)
         assert bytes(store.serialize_cdr(again, message.type_name)) == bytes(payload)
+
+
+def test_a_time_that_ros_cannot_say_is_refused_and_the_next_goes_over(store: Any) -> None:
+    translation = Translation(store.types)
+    with pytest.raises(MessageError, match="2038"):
+        list(translation.messages(depth("a", 2**31 * S_NS, 12.5)))
+    (last,) = translation.messages(depth("a", 2**31 * S_NS - 1, 12.5))
+    assert store.serialize_cdr(last.value, last.type_name)
 
 
 def test_names_of_ros_begin_with_a_letter() -> None:
