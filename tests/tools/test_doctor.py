@@ -297,7 +297,8 @@ def test_a_simulated_rig_is_well(name, monkeypatch):
     }
 
 
-def test_a_pi_without_anything_attached_names_each():
+def test_on_a_pi_without_camera_and_sensors_each_is_a_problem(monkeypatch):
+    monkeypatch.setattr(rig, "SENSE_S", 0.5)
     config = load_node_config(EXAMPLES / "pi.toml")
     config = msgspec.structs.replace(config, sensors=msgspec.structs.replace(config.sensors, i2c_bus=250))
     found = rig.check_camera(config)
