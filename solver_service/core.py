@@ -8,7 +8,7 @@ within the matching window, and with any other nodes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS, trigger_index
@@ -111,7 +111,12 @@ class SolverCore:
 
     def flush(self) -> list[Message]:
         """Resolve all pending triggers with the data at hand, at the end of the dive."""
-        return [message for pair in self.pairs.values() for message in pair.finish()]
+        return list(self.finish())
+
+    def finish(self) -> Iterator[Message]:
+        """Yield what `flush` returns, as it is made: a whole dive's track takes much memory."""
+        for pair in self.pairs.values():
+            yield from pair.finish()
 
     def report(self, stamp_ns: int, receive_ns: int, bad_messages: int, problems: list[str]) -> list[SolverStatus]:
         """Return each pair's status. bad_messages: number of refused messages. problems: added to each pair's own."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, deque
+from collections.abc import Iterator
 from typing import Final, TypeAlias
 
 from buddyline.protocol import __version__
@@ -80,10 +81,12 @@ class PairCore:
         settled, self._settled = self._settled, []
         return settled + (self.tracker.take(settled) if self.tracker is not None else [])
 
-    def finish(self) -> list[Message]:
-        """Return the last outcomes and the rest of the track, at the end of the dive."""
+    def finish(self) -> Iterator[Message]:
+        """Yield the last outcomes and the rest of the track, at the end of the dive."""
         self.resolve(None, everything=True)
-        return self.settle() + (self.tracker.finish() if self.tracker is not None else [])
+        yield from self.settle()
+        if self.tracker is not None:
+            yield from self.tracker.finish()
 
     def _solve(self) -> None:
         if not self._unsettled:

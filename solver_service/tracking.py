@@ -6,8 +6,9 @@ same track.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -28,10 +29,10 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
-from buddyline.solver_service.track.dive import NodeRecord, smooth
+from buddyline.solver_service.track.dive import NodeRecord, feed, joined, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.foresight import ForeseenLight, foresee
-from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
 from msgspec import UNSET
@@ -52,17 +53,6 @@ class TrackSettings:
     expect: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """What one node's stream holds of a stretch of time. imu_values: (N, 6) accelerometer, gyroscope."""
-
-    frames: list[FrameSeen]
-    imu_stamps_ns: Stamps
-    imu_values: Floats
-    attitudes: list[AttitudeSeen]
-    depths: list[DepthSeen]
-
-
 class PairTracker:
     """Follows a pair. The past up to a trigger is taken once its outcome is known; what comes later is left out."""
 
@@ -79,7 +69,7 @@ class PairTracker:
         self._nodes: tuple[TrackNode, TrackNode] | None = None
         self._filter: TrackFilter | None = None
         self._lag: TrackLag | None = None
-        self._pieces: tuple[list[Piece], list[Piece]] = ([], [])
+        self._pieces: tuple[list[NodeRecord], list[NodeRecord]] = ([], [])
         self._fixes: list[FixSeen] = []
         self._first_ns: int | None = None
         self._taken_ns = -1
@@ -129,7 +119,7 @@ class PairTracker:
         messages: list[Message] = []
         if self._infos is not None and not all(map(_same_rig, infos, self._infos)):
             # The track of the old rigs ends here.
-            messages = self._end(self._settled_ns)
+            messages = list(self._end(self._settled_ns))
             self.forget()
         if self._infos is None:
             self._infos, self._nodes = infos, (_node_of(*known[0]), _node_of(*known[1]))
@@ -147,11 +137,14 @@ class PairTracker:
             self._fixes += fixes
         return messages + self._advance(self._frontier_ns())
 
-    def finish(self) -> list[Message]:
-        """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one."""
+    def finish(self) -> Iterable[Message]:
+        """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one.
+
+        The smooth track's messages are made as they are read, for they take more memory than all they are made from.
+        """
         return self._end(self._settled_ns + S_NS)
 
-    def _end(self, end_ns: int) -> list[Message]:
+    def _end(self, end_ns: int) -> Iterable[Message]:
         """Take what is left up to end_ns, and tell what the end of a track tells."""
         if self._nodes is None or self._settled_ns < 0:
             return []
@@ -162,13 +155,14 @@ class PairTracker:
                     messages += self._messages(self._lag.finish(), "lag")
                 if "smooth" not in self._settings.modes:
                     return messages
-                found = smooth((self._record(0), self._record(1)), self._fixes, self._due(self._first_ns or 0, end_ns))
+                a, b = map(joined, self._pieces)
+                found = smooth((a, b), self._fixes, self._due(self._first_ns or 0, end_ns))
             except (ArithmeticError, ValueError) as error:
                 self._start_anew(str(error))
                 return []
         self._note(found.problems)
         self._note(self._dark_lamps(found.dark))
-        return messages + self._messages(found.rows, "smooth")
+        return chain(messages, self._messages(found.rows, "smooth"))
 
     def _make_filter(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         live = self._settings.modes & {"filter", "lag"}
@@ -192,7 +186,7 @@ class PairTracker:
             if "smooth" in self._settings.modes:
                 self._pieces[node].append(piece)
             if self._filter is not None:
-                _feed(self._filter, node, piece)
+                feed(self._filter, node, piece)
         self._taken_ns = to_ns
         return self._live(to_ns)
 
@@ -205,7 +199,7 @@ class PairTracker:
         if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
             raise ArithmeticError("no finite covariance")
         self._note(self._filter.problems)
-        messages = self._messages(rows, "filter") if "filter" in self._settings.modes else []
+        messages = list(self._messages(rows, "filter")) if "filter" in self._settings.modes else []
         if self._lag is not None:
             self._lag.ask(due)
             messages += self._messages(self._lag.rows(), "lag")
@@ -236,12 +230,16 @@ class PairTracker:
         first = -(-start_ns // self._period_ns)
         return [k * self._period_ns for k in range(first, end_ns // self._period_ns + 1)]
 
-    def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> Piece:
+    def _piece(self, stream: NodeStream, node: int, start_ns: int, end_ns: int) -> NodeRecord:
+        if self._nodes is None:
+            raise RuntimeError("no calibration yet")
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
-        return Piece(
+        return NodeRecord(
+            node=self._nodes[node],
             frames=[_frame_of(frame) for frame in map(view_of, stream.frames.between(start_ns, end_ns))],
             imu_stamps_ns=stamps_ns,
-            imu_values=values,
+            accel_mps2=values[:, :3],
+            gyro_radps=values[:, 3:],
             attitudes=[self._attitude(each, node) for each in stream.attitude.between(start_ns, end_ns)],
             depths=[
                 DepthSeen(each.stamp_ns, each.depth_m, each.sigma_m) for each in stream.depth.between(start_ns, end_ns)
@@ -257,27 +255,13 @@ class PairTracker:
                 R = rotation_exp(np.array([0.0, 0.0, a - b])) @ R
         return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
 
-    def _record(self, node: int) -> NodeRecord:
-        pieces = self._pieces[node]
-        values = np.concatenate([piece.imu_values for piece in pieces] or [np.zeros((0, 6))])
-        if self._nodes is None:
-            raise RuntimeError("no calibration yet")
-        return NodeRecord(
-            node=self._nodes[node],
-            frames=[frame for piece in pieces for frame in piece.frames],
-            imu_stamps_ns=np.concatenate([piece.imu_stamps_ns for piece in pieces] or [np.zeros(0, np.int64)]),
-            accel_mps2=values[:, :3],
-            gyro_radps=values[:, 3:],
-            attitudes=[each for piece in pieces for each in piece.attitudes],
-            depths=[each for piece in pieces for each in piece.depths],
-        )
-
     def _note(self, problems: Iterable[str]) -> None:
         self._problems += [problem for problem in problems if problem not in self._problems]
 
-    def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> list[Message]:
+    def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> Iterator[Message]:
         node_a, node_b = (stream.node for stream in self._streams)
-        return [track_message(row, node_a, node_b, mode, oriented=self._oriented) for row in rows]
+        oriented = self._oriented
+        return (track_message(row, node_a, node_b, mode, oriented=oriented) for row in rows)
 
 
 def track_message(row: TrackRow, node_a: str, node_b: str, mode: TrackMode, *, oriented: bool) -> Track:
@@ -314,16 +298,6 @@ def _expected_light(seen: ForeseenLight) -> ExpectedLight:
         rate_pxps=(float(seen.rate_pxps[0]), float(seen.rate_pxps[1])),
         sigma_rate_pxps=seen.sigma_rate_pxps,
     )
-
-
-def _feed(track: TrackFilter, node: int, piece: Piece) -> None:
-    track.add_imu(node, piece.imu_stamps_ns, piece.imu_values[:, :3], piece.imu_values[:, 3:])
-    for attitude in piece.attitudes:
-        track.add_attitude(node, attitude)
-    for depth in piece.depths:
-        track.add_depth(node, depth)
-    for frame in piece.frames:
-        track.add_frame(node, frame)
 
 
 def _node_of(info: NodeInfo, rig: Rig) -> TrackNode:

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
                 for envelope in sound:
                     writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
                 _write(writer, core.handle_many(envelope.message for envelope in sound))
-            _write(writer, core.flush())
+            _write(writer, core.finish())
         bad = dive.refused
     _summarize(args, core, bad, time.monotonic() - began_s)
     if not core.counts.total():

@@ -20,6 +20,8 @@ for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
 _IDENTITY: Final[Floats] = np.eye(3)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
+# Up to so many rotations, Python's numbers are faster than arrays.
+_FEW: Final = 8
 
 
 def inner(a: Floats, b: Floats) -> Floats:
@@ -47,6 +49,8 @@ def matrix_to_quat(R: Floats) -> Floats:
     Which component is divided by follows from the matrix (Shepperd 1978), so that no rotation is near a
     singularity.
     """
+    if R.size > 9 * _FEW:
+        return _quats_of_many(R.reshape(-1, 9)).reshape(*R.shape[:-2], 4)
     if R.ndim > 2:
         return np.array([matrix_to_quat(each) for each in R.reshape(-1, 3, 3)]).reshape(*R.shape[:-2], 4)
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
@@ -60,6 +64,22 @@ def matrix_to_quat(R: Floats) -> Floats:
     largest = max(range(4), key=lambda row: rows[row][row])
     norm = math.hypot(*rows[largest])
     return np.array(rows[largest]) / norm
+
+
+def _quats_of_many(R: Floats) -> Floats:
+    """The same of rotations (N, 9), without a loop."""
+    a, b, c, d, e, f, g, h, i = R.T
+    rows = np.array(
+        (
+            (1.0 + a - e - i, b + d, c + g, h - f),
+            (b + d, 1.0 - a + e - i, f + h, c - g),
+            (c + g, f + h, 1.0 - a - e + i, d - b),
+            (h - f, c - g, d - b, 1.0 + a + e + i),
+        )
+    )
+    largest = np.argmax(rows[range(4), range(4)], axis=0)
+    quats: Floats = rows[largest, :, range(len(R))]
+    return quats / np.sqrt(inner(quats, quats))[:, None]
 
 
 def rotation_exp(w_rad: Floats) -> Floats:
@@ -87,6 +107,15 @@ def _one_exp(x: float, y: float, z: float) -> Floats:
 
 def rotation_log(R: Floats) -> Floats:
     """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3), at most pi long."""
+    if R.size > 9 * _FEW:
+        quats = matrix_to_quat(R)
+        vectors, scalar = quats[..., :3], quats[..., 3]
+        sines = np.copysign(np.sqrt(inner(vectors, vectors)), scalar)
+        small = np.abs(sines) <= 1e-12
+        angles = 2.0 * np.arctan2(np.abs(sines), np.abs(scalar))
+        ratios = np.where(small, np.copysign(2.0, scalar), angles / np.where(small, 1.0, sines))
+        turns: Floats = ratios[..., None] * vectors
+        return turns
     if R.ndim > 2:
         return np.array([rotation_log(each) for each in R.reshape(-1, 3, 3)]).reshape(R.shape[:-1])
     x, y, z, w = matrix_to_quat(R).tolist()

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from itertools import chain
+from typing import Final, TypeVar
 
 import numpy as np
+from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.estimate import Estimate, Guide, Step
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
-from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.smoother import rows_between, smoothed
+from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
-from buddyline.solver_service.track.state import CLOCK, PHI, R_, State
+from buddyline.solver_service.track.state import CLOCK, NAV, PHI, R_, State
+from buddyline.solver_service.track.stepping import Guide
+from buddyline.solver_service.track.trail import Trail
 
-_BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 # How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
 UNTOLD_CLOCK_S: Final = 0.1
 CLOCK_LEFT_S: Final = 0.003
@@ -30,11 +33,16 @@ FAR_WITHOUT_S: Final = 0.05
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
 BROAD_R_M: Final = 0.5
 BROAD_TURN_RAD: Final = 0.15
+# A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
+PIECE_NS: Final = 10 * S_NS
+MARGIN_NS: Final = S_NS
+_BEGINNING_NS, _END_NS = -(2**62), 2**62
+Stamped = TypeVar("Stamped", AttitudeSeen, DepthSeen, FixSeen, FrameSeen)
 
 
 @dataclass(frozen=True, eq=False)
 class NodeRecord:
-    """All that one node recorded on a dive. Inertial columns: stamps (N,), accel and gyro (N, 3), body frame."""
+    """What one node recorded, in order of stamps. Inertial columns: stamps (N,), accel and gyro (N, 3), body frame."""
 
     node: TrackNode
     frames: Sequence[FrameSeen]
@@ -44,21 +52,67 @@ class NodeRecord:
     attitudes: Sequence[AttitudeSeen] = ()
     depths: Sequence[DepthSeen] = ()
 
+    def between(self, start_ns: int, end_ns: int) -> NodeRecord:
+        """Give what was recorded from start_ns on and before end_ns."""
+        first, last = np.searchsorted(self.imu_stamps_ns, (start_ns, end_ns))
+        return replace(
+            self,
+            frames=_between(self.frames, start_ns, end_ns),
+            imu_stamps_ns=self.imu_stamps_ns[first:last],
+            accel_mps2=self.accel_mps2[first:last],
+            gyro_radps=self.gyro_radps[first:last],
+            attitudes=_between(self.attitudes, start_ns, end_ns),
+            depths=_between(self.depths, start_ns, end_ns),
+        )
+
+
+def _between(items: Sequence[Stamped], start_ns: int, end_ns: int) -> Sequence[Stamped]:
+    first, last = (bisect.bisect_left(items, stamp_ns, key=_stamp_of) for stamp_ns in (start_ns, end_ns))
+    return items[first:last]
+
+
+def _stamp_of(item: AttitudeSeen | DepthSeen | FixSeen | FrameSeen) -> int:
+    return item.stamp_ns
+
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
     """A dive's track.
 
-    constants: the last state, which holds what was learned of the units and clocks. dark: lamps that were dark at the
-    end: node, light, for how long (s).
+    rows: made as they are read, once. constants: the last state, which holds what was learned of the units and clocks.
+    dark: lamps that were dark at the end: node, light, for how long (s).
     """
 
-    rows: list[TrackRow]
+    rows: Iterable[TrackRow]
     constants: State | None
     clock_offset_s: float
     clock_sigma_s: float
     problems: list[str]
     dark: list[tuple[int, int, float]] = field(default_factory=list)
+
+
+def joined(pieces: Sequence[NodeRecord]) -> NodeRecord:
+    """Give the record of which these, at least one, are the pieces in order of time."""
+    return replace(
+        pieces[-1],
+        frames=[frame for piece in pieces for frame in piece.frames],
+        imu_stamps_ns=np.concatenate([piece.imu_stamps_ns for piece in pieces]),
+        accel_mps2=np.concatenate([piece.accel_mps2 for piece in pieces]),
+        gyro_radps=np.concatenate([piece.gyro_radps for piece in pieces]),
+        attitudes=[each for piece in pieces for each in piece.attitudes],
+        depths=[each for piece in pieces for each in piece.depths],
+    )
+
+
+def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
+    """Give a filter what a node recorded."""
+    track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps)
+    for attitude in record.attitudes:
+        track.add_attitude(node, attitude)
+    for depth in record.depths:
+        track.add_depth(node, depth)
+    for frame in record.frames:
+        track.add_frame(node, frame)
 
 
 def filter_of(
@@ -68,29 +122,43 @@ def filter_of(
     clock_sigma_s: float = CLOCK_S,
 ) -> TrackFilter:
     """Make a filter that keeps its steps and holds a whole dive."""
-    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=clock_sigma_s)
-    track.clock_ns = clock_ns
+    track = _empty_filter(records, clock_ns, clock_sigma_s)
     for node, record in enumerate(records):
-        track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps)
-        for attitude in record.attitudes:
-            track.add_attitude(node, attitude)
-        for depth in record.depths:
-            track.add_depth(node, depth)
-        for frame in record.frames:
-            track.add_frame(node, frame)
+        feed(track, node, record)
     for fix in fixes:
         track.add_fix(fix)
     return track
+
+
+def _empty_filter(records: tuple[NodeRecord, NodeRecord], clock_ns: int, clock_sigma_s: float) -> TrackFilter:
+    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=clock_sigma_s)
+    track.clock_ns = clock_ns
+    return track
+
+
+def pass_over(track: TrackFilter, records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen]) -> None:
+    """Bring a filter through a dive, fed piece by piece, so that it holds a minute of samples at a time."""
+    frames_ns = np.array([frame.stamp_ns for record in records for frame in record.frames], dtype=np.int64)
+    start_ns = _BEGINNING_NS
+    for end_ns in [*((np.unique(frames_ns // PIECE_NS) + 1) * PIECE_NS).tolist(), _END_NS]:
+        for node, record in enumerate(records):
+            shift_ns = track.clock_ns if node else 0
+            feed(track, node, record.between(start_ns + shift_ns, end_ns + shift_ns))
+        for fix in _between(fixes, start_ns, end_ns):
+            track.add_fix(fix)
+        track.advance(end_ns - MARGIN_NS if end_ns < _END_NS else last_ns(records))
+        start_ns = end_ns
 
 
 def smooth(
     records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
 ) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    end_ns, told_ns = last_ns(records), clock_ns
+    records, fixes = (_in_order(records[0]), _in_order(records[1])), sorted(fixes, key=_stamp_of)
+    told_ns = clock_ns
     for _ in range(CLOCK_ROUNDS):
-        first = filter_of(records, fixes, clock_ns, UNTOLD_CLOCK_S)
-        first.advance(end_ns)
+        first = _empty_filter(records, clock_ns, UNTOLD_CLOCK_S)
+        pass_over(first, records, fixes)
         parts = parts_of(first)
         if not parts:
             return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
@@ -105,14 +173,14 @@ def smooth(
         return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
         # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
-        only = filter_of(records, fixes, told_ns, CLOCK_WITHOUT_S)
-        only.advance(end_ns)
-        return rows_of(only, parts_of(only), outputs_ns)
+        only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
+        pass_over(only, records, fixes)
+        return _smoothed(only, parts_of(only), outputs_ns)
     # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
     learned = parts[-1]
     shift_s = learned.state.clock_s
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
-    second = filter_of(records, (), clock_ns + round(shift_s * 1e9), clock_sigma_s)
+    second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
     second.restarts = False
     told = sum(part.told for part in parts)
     if told > 100:
@@ -120,14 +188,27 @@ def smooth(
     # A track that has just begun has not yet learned how much its units shake.
     strain = max(part.strain for part in parts)
     for part in parts:
-        results = smoothed(part.steps)
-        guide_by(second, part.steps, results)
-        state = replace(results[0][0], clock_s=0.0)
-        second.begin(part.steps[0].t_s - 0.01, part.end_s, *broad_start(second, state), strain)
+        path = smoothed(part.steps)
+        guide_by(second, path)
+        state = replace(path.state(0), clock_s=0.0)
+        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *broad_start(second, state), strain)
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-    del first, parts, part, learned, results
-    second.advance(end_ns)
-    return rows_of(second, parts_of(second), outputs_ns)
+    del first, parts, part, learned, path
+    pass_over(second, records, ())
+    return _smoothed(second, parts_of(second), outputs_ns)
+
+
+def _in_order(record: NodeRecord) -> NodeRecord:
+    order = np.argsort(record.imu_stamps_ns, kind="stable")
+    return replace(
+        record,
+        frames=sorted(record.frames, key=_stamp_of),
+        imu_stamps_ns=record.imu_stamps_ns[order],
+        accel_mps2=record.accel_mps2[order],
+        gyro_radps=record.gyro_radps[order],
+        attitudes=sorted(record.attitudes, key=_stamp_of),
+        depths=sorted(record.depths, key=_stamp_of),
+    )
 
 
 def last_ns(records: tuple[NodeRecord, NodeRecord]) -> int:
@@ -157,26 +238,25 @@ def broad_start(track: TrackFilter, state: State) -> tuple[State, Floats]:
     return state, P
 
 
-def guide_by(track: TrackFilter, steps: Sequence[Step], results: Sequence[tuple[State, Floats]]) -> None:
+def guide_by(track: TrackFilter, path: Path) -> None:
     """Tell a filter what a pass knew at each picture."""
-    for step, (state, P) in zip(steps, results, strict=True):
-        for look in step.looks:
-            key = look.sight.stamp_ns, look.sight.node
-            track.guides[key] = Guide(look.sight.t_s - step.t_s, state, P[_BLOCK], step.rates_radps, look.chosen)
+    for step, looks in enumerate(path.looks):
+        for look in looks:
+            track.guides[look.node, look.stamp_ns] = Guide(path, step, look)
 
 
-def rows_of(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:
-    """Smooth each part and give its rows at the asked stamps."""
-    rows: list[TrackRow] = []
-    last: tuple[State, Floats] | None = None
-    stamps = sorted(outputs_ns)
-    times = np.array([track.between(stamp) for stamp in stamps])
+def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:
+    """Smooth each part."""
+    paths = []
     for part in parts:
-        results = smoothed(part.steps)
-        last = results[-1]
-        rows += rows_between(part.steps, results, times, stamps)
-    if last is None:
+        paths.append(smoothed(part.steps))
+        part.steps = Trail()
+    if not paths:
         return Smoothed([], None, track.clock_ns * 1e-9, math.inf, track.problems)
-    state, P = last
-    clock_s = track.clock_ns * 1e-9 + state.clock_s
-    return Smoothed(rows, state, clock_s, math.sqrt(P[CLOCK, CLOCK]), track.problems, track.lamps.dark())
+    stamps = sorted(outputs_ns)
+    times_s = np.array([track.between(stamp) for stamp in stamps])
+    constants = paths[-1].state(-1)
+    clock_s = track.clock_ns * 1e-9 + constants.clock_s
+    sigma_s = math.sqrt(paths[-1].covariance(-1)[NAV, NAV])
+    rows = chain.from_iterable(rows_between(path, times_s, stamps) for path in paths)
+    return Smoothed(rows, constants, clock_s, sigma_s, track.problems, track.lamps.dark())

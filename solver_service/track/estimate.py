@@ -1,4 +1,4 @@
-"""One hypothesis of a track, its steps, and what a pass over a dive leaves to the next."""
+"""One hypothesis of a track."""
 
 from __future__ import annotations
 
@@ -7,53 +7,10 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
-from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.state import State
+from buddyline.solver_service.track.trail import Trail
 
 CHALLENGE_S: Final = 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """One picture within a step, and the lights that were used: (candidate, light, variance)."""
-
-    sight: Sight
-    chosen: tuple[tuple[int, int, float], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One step of a track as the smoother needs it.
-
-    before: predicted; after, covariance: with what was seen at t_s. F (NAV, SIZE), Q (NAV, NAV), walk: how it came here
-    from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
-    """
-
-    t_s: float
-    before: State
-    after: State
-    covariance: Floats
-    F: Floats
-    Q: Floats
-    walk: Floats
-    rates_radps: Floats
-    light_s: float
-    lights: int
-    looks: tuple[Look, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Guide:
-    """What a whole pass over the dive knew at one picture: for the next pass to decide its lights again.
-
-    after_s: the picture's time after the pass's step.
-    """
-
-    after_s: float
-    state: State
-    covariance: Floats
-    rates_radps: Floats
-    chosen: tuple[tuple[int, int, float], ...]
 
 
 @dataclass(eq=False)
@@ -82,7 +39,7 @@ class Estimate:
     trigger: list[tuple[float, int, int]] = field(default_factory=list)
     attitude_s: list[float] = field(default_factory=lambda: [-np.inf, -np.inf])
     depth_s: float = -np.inf
-    steps: list[Step] = field(default_factory=list)
+    steps: Trail = field(default_factory=Trail)
     confirmed: bool = False
     strain: float = 1.0
     surprise: float = 0.0

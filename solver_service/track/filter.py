@@ -16,7 +16,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNo
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import Sight, light_positions, residuals
-from buddyline.solver_service.track.output import TrackRow, at_one_time, pose_of, row_of
+from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
 from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import State
@@ -48,8 +48,8 @@ REFUSED_TO_SAY: Final = 10
 FAR_CLOCK_S: Final = 0.15
 # Longest step, without a picture, over which a track tells its present state.
 BRIDGED_S: Final = 1.0
-# What is older than this is dropped in a live filter.
-MEMORY_S: Final = 5.0
+# What is older than this is dropped: the noise of slow sensors is learned from so much.
+MEMORY_S: Final = 30.0
 
 
 class TrackFilter(TrackSteps):
@@ -93,8 +93,10 @@ class TrackFilter(TrackSteps):
                 self._take_fix(t_s, what)
             else:
                 self._take_sight(t_s, what)
-        if math.isfinite(self._keep_s):
-            self._forget_before(end_s - MEMORY_S)
+        if math.isinf(self._keep_s):
+            # Without rows in between, an estimate stays where the last picture was.
+            end_s = min([end_s, *(estimate.t_s for estimate in [*self._estimates(), *self._waiting[:1]])])
+        self._forget_before(end_s - MEMORY_S)
         return rows
 
     def present(self, t_s: float) -> tuple[State, Floats, Floats] | None:
@@ -158,12 +160,12 @@ class TrackFilter(TrackSteps):
             self.challengers = self.challengers[-3:]
 
     def _agrees(self, estimate: Estimate, t_s: float, fix: FixSeen) -> bool:
-        row = self._predict(estimate, t_s, TOGETHER_S)
-        t_a_b, covariance, _, _ = pose_of(*row, estimate.rates_radps)
-        R_a_b = at_one_time(row[0], estimate.rates_radps).R
-        R_a_b = R_a_b[0].T @ R_a_b[1]
-        gap = np.concatenate((fix.t_a_b_m - t_a_b, rotation_log(fix.R_a_b @ R_a_b.T)))
-        S = covariance + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
+        state, P = self._predict(estimate, t_s, TOGETHER_S)
+        now = at_one_time(state, estimate.rates_radps)
+        J = (pose_jacobian(now) @ at_one_time_jacobian(state, estimate.rates_radps))[:6]
+        toward = now.R[0].T
+        gap = np.concatenate((fix.t_a_b_m - toward @ now.r_m, rotation_log(fix.R_a_b @ (toward @ now.R[1]).T)))
+        S = J @ P[BLOCK] @ J.T + fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)
         return float(gap @ np.linalg.solve(S, gap)) < CONTRADICTS
 
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
@@ -212,7 +214,7 @@ class TrackFilter(TrackSteps):
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
                 # Nothing is told of it any more: another start is as good.
                 main.end_s = main.light_s + 1.0
-                main.steps = [step for step in main.steps if step.t_s < main.end_s]
+                main.steps.drop_after(main.end_s)
                 self.finished.append(main)
                 self.main = main = None
         if main is not None and main.confirmed:
@@ -221,7 +223,7 @@ class TrackFilter(TrackSteps):
                 if challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL:
                     # What went wrong did so after the last fix that agreed.
                     main.end_s = min(challenger.start_s, main.agreed_s)
-                    main.steps = [step for step in main.steps if step.t_s <= main.end_s]
+                    main.steps.drop_after(main.end_s)
                     self.finished.append(main)
                     self.main = challenger
                     self.challengers = []
@@ -282,7 +284,7 @@ class TrackFilter(TrackSteps):
             without=list(estimate.without),
             evidence_by=list(estimate.evidence_by),
             told_by=list(estimate.told_by),
-            steps=list(estimate.steps),
+            steps=estimate.steps.copy(),
             unseen_by=None,
         )
         self._step(base, t_s, None)
@@ -305,7 +307,7 @@ class TrackFilter(TrackSteps):
                     trigger=list(base.trigger),
                     attitude_s=list(base.attitude_s),
                     without=list(base.without),
-                    steps=list(base.steps),
+                    steps=base.steps.copy(),
                 )
                 gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
                 child.evidence += gain + math.log(0.2)
@@ -314,7 +316,7 @@ class TrackFilter(TrackSteps):
                 chosen = ((k, light, START_PX**2),)
                 self._update_lights(child, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
                 if child.steps:
-                    child.steps[-1] = replace(child.steps[-1], after=child.state, covariance=child.covariance)
+                    child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
                 self.challengers.append(child)
 
     def _force(self, estimate: Estimate, sight: Sight, lights: tuple[int, int]) -> None:
@@ -333,6 +335,12 @@ class TrackFilter(TrackSteps):
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)
         state, P = self._predict(main, t_s)
-        return row_of(
-            stamp_ns, state, P, main.rates_radps, len({(n, i) for _, n, i in main.trigger}), t_s - main.light_s
-        )
+        lights = np.array((len({(n, i) for _, n, i in main.trigger}),))
+        return rows_of(
+            (stamp_ns,),
+            State.of_row(state.to_row()[None]),
+            P[BLOCK][None],
+            main.rates_radps[None],
+            lights,
+            np.array((t_s - main.light_s,)),
+        )[0]

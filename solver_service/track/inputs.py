@@ -26,7 +26,7 @@ class TrackNode:
     imu_delay_ns: int | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class FrameSeen:
     """The light candidates of one picture.
 
@@ -41,7 +41,7 @@ class FrameSeen:
     score: Floats = field(default_factory=lambda: np.zeros(0))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class FixSeen:
     """A pose that one trigger's lights gave by themselves: T_a_b and its covariance (6, 6), as RelativePose has it."""
 
@@ -51,7 +51,7 @@ class FixSeen:
     covariance: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class AttitudeSeen:
     """One attitude message: R_ned_body (3, 3) and the sigmas (3,) of roll, pitch and yaw in rad."""
 
@@ -60,7 +60,7 @@ class AttitudeSeen:
     sigma_rad: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class DepthSeen:
     """One depth message."""
 

@@ -45,4 +45,4 @@ class TrackLag:
         self._done_s = ready_s
         self._due = self._due[len(ready) :]
         times_s = np.array([self._track.between(stamp) for stamp in ready])
-        return rows_between(main.steps, smoothed(main.steps), times_s, ready)
+        return list(rows_between(smoothed(main.steps), times_s, ready))

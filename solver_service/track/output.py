@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.direction import direction_of
-from buddyline.solver_service.geometry.rotation import Floats, matrix_to_quat, rotation_exp, skew
-from buddyline.solver_service.track.state import CLOCK, NAV, PHI, R_, SIZE, V_, State
+from buddyline.solver_service.geometry.rotation import Floats, inner, matrix_to_quat, rotation_exp, skew
+from buddyline.solver_service.track.lights import COLUMNS
+from buddyline.solver_service.track.state import NAV, PHI, R_, V_, State
+from numpy.typing import NDArray
 
 # A position no better than this share of the range is not told.
 WORST_SHARE: Final = 0.2
@@ -37,74 +39,85 @@ class TrackRow:
 
 
 def at_one_time(state: State, rates_radps: Floats) -> State:
-    """Bring both nodes' parts to one time, between their clocks as a fix's stamp is: A half the offset back, B on."""
-    half_s = 0.5 * state.clock_s
-    turns = rotation_exp(rates_radps * np.array(((-half_s,), (half_s,))))
+    """Bring both nodes' parts to one time, between their clocks as a fix's stamp is: A half the offset back, B on.
+
+    Here and below: states may be a batch, with leading axes.
+    """
+    half_s = 0.5 * np.asarray(state.clock_s)[..., None]
+    turns = rotation_exp(rates_radps * np.stack((-half_s, half_s), axis=-2))
     return state.moved(state.r_m + half_s * state.v_mps, state.v_mps, state.R @ turns)
 
 
 def at_one_time_jacobian(state: State, rates_radps: Floats) -> Floats:
-    """Give the errors (NAV, SIZE) of the state at one time by the state's."""
-    J = np.zeros((NAV, SIZE))
-    J[:, :NAV] = np.eye(NAV)
-    J[R_, V_] = 0.5 * state.clock_s * np.eye(3)
-    turned_a = -0.5 * (state.R[0] @ rates_radps[0])
-    J[PHI[0], CLOCK] = turned_a
-    J[PHI[1], CLOCK] = 0.5 * (state.R[1] @ rates_radps[1])
+    """Give the errors (..., NAV, C) of the state at one time by the state's errors of COLUMNS."""
+    J = np.zeros((*state.r_m.shape[:-1], NAV, len(COLUMNS)))
+    J[..., range(NAV), range(NAV)] = 1.0
+    J[..., range(3), range(3, 6)] = 0.5 * np.asarray(state.clock_s)[..., None]
+    turned = 0.5 * (state.R @ rates_radps[..., None])[..., 0]
+    J[..., PHI[0], NAV] = -turned[..., 0, :]
+    J[..., PHI[1], NAV] = turned[..., 1, :]
     # The errors are those of plus: r turns with phi_A, which the clock turns here.
-    across = skew(turned_a)
-    J[R_, CLOCK] = 0.5 * state.v_mps - across @ state.r_m
-    J[V_, CLOCK] = -across @ state.v_mps
+    across = skew(turned[..., 0, :])
+    J[..., R_, NAV] = 0.5 * state.v_mps + (across @ state.r_m[..., None])[..., 0]
+    J[..., V_, NAV] = (across @ state.v_mps[..., None])[..., 0]
     return J
 
 
 def pose_jacobian(now: State) -> Floats:
-    """Give the errors (9, NAV) of t_a_b, of the rotation and of v_a_b by those of a state at one time.
+    """Give the errors (..., 12, NAV) of t_a_b, of the rotation, of v_a_b and of t_ned by those of a state at one time.
 
     t = R_A^T r with r = exp(phi_A) r + dr, so dt = R_A^T dr whatever phi_A is, and w = R_A^T (phi_B - phi_A).
     """
-    toward = now.R[0].T
-    J = np.zeros((9, NAV))
-    J[0:3, R_] = toward
-    J[3:6, PHI[0]], J[3:6, PHI[1]] = -toward, toward
-    J[6:9, V_] = toward
+    toward = np.swapaxes(now.R[..., 0, :, :], -1, -2)
+    J = np.zeros((*toward.shape[:-2], 12, NAV))
+    J[..., 0:3, R_] = toward
+    J[..., 3:6, PHI[0]], J[..., 3:6, PHI[1]] = -toward, toward
+    J[..., 6:9, V_] = toward
+    J[..., 9:12, R_] = np.eye(3)
+    J[..., 9:12, PHI[0]] = -skew(now.r_m)
     return J
 
 
-def pose_of(state: State, P: Floats, rates_radps: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Give t_a_b_m (3,), its and the rotation's covariance (6, 6), v_a_b_mps (3,) and its covariance (3, 3)."""
-    now = at_one_time(state, rates_radps)
-    toward = now.R[0].T
-    J = pose_jacobian(now) @ at_one_time_jacobian(state, rates_radps)
-    whole = J @ P @ J.T
-    return toward @ now.r_m, whole[:6, :6], toward @ now.v_mps, whole[6:, 6:]
+def rows_of(
+    stamps_ns: Sequence[int],
+    states: State,
+    P: Floats,
+    rates_radps: Floats,
+    lights: NDArray[np.int64],
+    ages_s: Floats,
+) -> list[TrackRow | None]:
+    """Give the rows of a batch of states (N), None where a position is no better than WORST_SHARE of the range.
 
-
-def row_of(stamp_ns: int, state: State, P: Floats, rates_radps: Floats, lights: int, age_s: float) -> TrackRow | None:
-    """Give the row of a state, None where its position is no better than WORST_SHARE of the range."""
-    now = at_one_time(state, rates_radps)
-    r, toward = now.r_m, now.R[0].T
-    range_m = math.sqrt(float(r @ r))
-    J = np.zeros((12, NAV))
-    J[:9] = pose_jacobian(now)
-    J[9:, R_] = np.eye(3)
-    J[9:, PHI[0]] = -skew(r)
-    J = J @ at_one_time_jacobian(state, rates_radps)
-    whole = J @ P @ J.T
-    covariance, v_covariance, of_ned = whole[:6, :6], whole[6:9, 6:9], whole[9:, 9:]
-    if not np.isfinite(whole).all() or math.sqrt(float(np.trace(covariance[:3, :3]))) > WORST_SHARE * range_m:
-        return None
-    return TrackRow(
-        stamp_ns=stamp_ns,
-        t_a_b_m=toward @ r,
-        q_a_b_xyzw=matrix_to_quat(now.R[0].T @ now.R[1]),
-        covariance=covariance,
-        v_a_b_mps=toward @ now.v_mps,
-        v_covariance=v_covariance,
-        lights=lights,
-        age_s=age_s,
-        range_m=range_m,
-        t_ned_m=r.copy(),
-        sigma_ned_m=np.sqrt(np.diag(of_ned)),
-        **vars(direction_of(r, of_ned)),
-    )
+    P (N, C, C): the covariances of COLUMNS.
+    """
+    now = at_one_time(states, rates_radps)
+    toward = np.swapaxes(now.R[:, 0], -1, -2)
+    J = pose_jacobian(now) @ at_one_time_jacobian(states, rates_radps)
+    whole = J @ P @ np.swapaxes(J, -1, -2)
+    ranges_m = np.sqrt(inner(now.r_m, now.r_m))
+    told = np.isfinite(whole).all(axis=(1, 2))
+    told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * ranges_m
+    # Absurd values leave a covariance that is none.
+    told[told] = np.linalg.eigvalsh(whole[told, 9:, 9:])[:, 0] >= 0.0
+    t = (toward @ now.r_m[..., None])[..., 0]
+    v = (toward @ now.v_mps[..., None])[..., 0]
+    turn = matrix_to_quat(toward @ now.R[:, 1])
+    return [
+        TrackRow(
+            stamp_ns=stamp_ns,
+            t_a_b_m=t[i],
+            q_a_b_xyzw=turn[i],
+            covariance=whole[i, :6, :6],
+            v_a_b_mps=v[i],
+            v_covariance=whole[i, 6:9, 6:9],
+            lights=int(lights[i]),
+            age_s=float(ages_s[i]),
+            range_m=float(ranges_m[i]),
+            t_ned_m=now.r_m[i],
+            sigma_ned_m=np.sqrt(np.diag(whole[i, 9:, 9:])),
+            **vars(direction_of(now.r_m[i], whole[i, 9:, 9:])),
+        )
+        if told[i]
+        else None
+        for i, stamp_ns in enumerate(stamps_ns)
+    ]

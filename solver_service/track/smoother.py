@@ -2,80 +2,134 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
-from buddyline.solver_service.track.estimate import Step
-from buddyline.solver_service.track.output import TrackRow, row_of
-from buddyline.solver_service.track.state import NAV, State
+from buddyline.solver_service.track.lights import COLUMNS
+from buddyline.solver_service.track.output import TrackRow, rows_of
+from buddyline.solver_service.track.state import NAV, ROW, State
 from buddyline.solver_service.track.strapdown import predicted
+from buddyline.solver_service.track.trail import Look, Trail
+from numpy.typing import NDArray
+
+# What rows and pictures need of a covariance: of COLUMNS, half.
+_UPPER: Final = np.triu_indices(len(COLUMNS))
+_BLOCK_UPPER: Final = COLUMNS[_UPPER[0]], COLUMNS[_UPPER[1]]
+# So many rows are made at once.
+TOGETHER: Final = 256
 
 
-def smoothed(steps: Sequence[Step]) -> list[tuple[State, Floats]]:
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Smoothed steps as columns, in order of time.
+
+    t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
+    covariance of COLUMNS, its upper half.
+    """
+
+    t_s: Floats
+    light_s: Floats
+    lights: NDArray[np.int64]
+    rates_radps: Floats
+    states: Floats
+    halves: Floats
+    looks: Sequence[tuple[Look, ...]]
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.t_s)
+
+    def state(self, k: int) -> State:
+        """Give the state at a step."""
+        return State.of_row(self.states[k])
+
+    def covariance(self, k: NDArray[np.intp] | int) -> Floats:
+        """Give the covariance (..., C, C) of COLUMNS at steps."""
+        halves = self.halves[k]
+        P = np.empty((*halves.shape[:-1], len(COLUMNS), len(COLUMNS)))
+        P[..., _UPPER[0], _UPPER[1]] = P[..., _UPPER[1], _UPPER[0]] = halves
+        return P
+
+
+def smoothed(steps: Trail) -> Path:
     """Give the state and covariance of each step by all steps' measurements.
 
     Backward, C = P F^T (P-)^-1 with P- = F P F^T + Q; the state is off its filtered one by C (x+1 - x-), its covariance
     P + C (P+1 - P-) C^T.
     """
-    state, P = steps[-1].after, steps[-1].covariance
-    out = [(state, P)]
-    for k in range(len(steps) - 2, -1, -1):
-        step, later = steps[k], steps[k + 1]
-        P_before = predicted(step.covariance, later.F, later.Q, later.walk)
-        across = step.covariance.copy()
-        across[:, :NAV] = step.covariance @ later.F.T
-        gain = np.linalg.solve(P_before, across.T).T
-        error = gain @ state.minus(later.before)
-        P = step.covariance + gain @ (P - P_before) @ gain.T
-        P = 0.5 * (P + P.T)
-        state = step.after.plus(error)
-        out.append((state, P))
-    out.reverse()
-    return out
+    count = len(steps)
+    looks: list[tuple[Look, ...]] = [()] * count
+    path = Path(
+        t_s=np.empty(count),
+        light_s=np.empty(count),
+        lights=np.empty(count, np.int64),
+        rates_radps=np.empty((count, 2, 3)),
+        states=np.empty((count, ROW)),
+        halves=np.empty((count, len(_UPPER[0]))),
+        looks=looks,
+    )
+    later = None
+    for k, step in zip(range(count - 1, -1, -1), steps.backward(), strict=True):
+        if later is None:
+            state, P = step.after, step.covariance
+        else:
+            P_before = predicted(step.covariance, later.F, later.Q, later.walk)
+            across = step.covariance.copy()
+            across[:, :NAV] = step.covariance @ later.F.T
+            gain = np.linalg.solve(P_before, across.T).T
+            error = gain @ state.minus(later.before)
+            P = step.covariance + gain @ (P - P_before) @ gain.T
+            P = 0.5 * (P + P.T)
+            state = step.after.plus(error)
+        path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
+        path.rates_radps[k], path.states[k], path.halves[k] = step.rates_radps, state.to_row(), P[_BLOCK_UPPER]
+        looks[k] = step.looks
+        later = step
+    return path
 
 
-def rows_between(
-    steps: Sequence[Step], results: Sequence[tuple[State, Floats]], times_s: Floats, stamps_ns: Sequence[int]
-) -> list[TrackRow]:
-    """Give the smoothed steps' rows at times (N,) within them, by Hermite interpolation."""
-    at = np.array([step.t_s for step in steps])
-    rows: list[TrackRow] = []
-    if len(at) < 2:
-        return rows
-    for i in np.flatnonzero((times_s >= at[0] - 1e-3) & (times_s <= at[-1] + 1e-3)).tolist():
-        k = min(max(int(np.searchsorted(at, times_s[i], side="right")) - 1, 0), len(at) - 2)
-        row = _row_between(steps, results, k, float(times_s[i]), stamps_ns[i])
-        if row is not None:
-            rows.append(row)
-    return rows
+def rows_between(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> Iterator[TrackRow]:
+    """Yield the smoothed steps' rows at times (N,) within them, by Hermite interpolation."""
+    if len(path) < 2:
+        return
+    within = np.flatnonzero((times_s >= path.t_s[0] - 1e-3) & (times_s <= path.t_s[-1] + 1e-3))
+    for start in range(0, len(within), TOGETHER):
+        some = within[start : start + TOGETHER]
+        with np.errstate(all="ignore"):
+            rows = _rows_together(path, times_s[some], [stamps_ns[i] for i in some.tolist()])
+        yield from (row for row in rows if row is not None)
 
 
-def _row_between(
-    steps: Sequence[Step], results: Sequence[tuple[State, Floats]], k: int, t_s: float, stamp_ns: int
-) -> TrackRow | None:
-    one, two = steps[k], steps[k + 1]
-    (state, P), (after, P_after) = results[k], results[k + 1]
-    span = max(two.t_s - one.t_s, 1e-6)
-    a = (t_s - one.t_s) / span
+def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> list[TrackRow | None]:
+    one = np.clip(np.searchsorted(path.t_s, times_s, side="right") - 1, 0, len(path) - 2)
+    two = one + 1
+    span = np.maximum(path.t_s[two] - path.t_s[one], 1e-6)
+    a = (times_s - path.t_s[one]) / span
     # Cubic Hermite polynomials: of the end point, and of the slopes at both ends.
-    end, slope0, slope1 = a * a * (3.0 - 2.0 * a), a * (1.0 - a) ** 2, a * a * (a - 1.0)
-    r = state.r_m + end * (after.r_m - state.r_m) + span * (slope0 * state.v_mps + slope1 * after.v_mps)
-    v = state.v_mps + a * (after.v_mps - state.v_mps)
-    R = []
-    for node in (0, 1):
-        turn = rotation_log(state.R[node].T @ after.R[node])
-        rates = one.rates_radps[node], two.rates_radps[node]
-        if k == 0:
-            rates = turn / span, turn / span
-        R.append(state.R[node] @ rotation_exp(end * turn + span * (slope0 * rates[0] + slope1 * rates[1])))
-    b = min(max(a, 0.0), 1.0)
-    near = one if b < 1.0 else two
-    return row_of(
-        stamp_ns,
-        state.moved(r, v, np.stack(R)),
-        (1.0 - b) * P + b * P_after,
-        (1.0 - b) * one.rates_radps + b * two.rates_radps,
-        near.lights,
-        max(t_s - near.light_s, 0.0),
+    end, slope0, slope1 = a * a * (3.0 - 2.0 * a), span * a * (1.0 - a) ** 2, span * a * a * (a - 1.0)
+    before, after = State.of_row(path.states[one]), State.of_row(path.states[two])
+    r = before.r_m + end[:, None] * (after.r_m - before.r_m)
+    r += slope0[:, None] * before.v_mps + slope1[:, None] * after.v_mps
+    v = before.v_mps + a[:, None] * (after.v_mps - before.v_mps)
+    turn = rotation_log(np.swapaxes(before.R, -1, -2) @ after.R)
+    # The first step has no turn rates of its own.
+    first = (one == 0)[:, None, None]
+    mean_rate = turn / span[:, None, None]
+    rates = [np.where(first, mean_rate, path.rates_radps[k]) for k in (one, two)]
+    R = before.R @ rotation_exp(
+        end[:, None, None] * turn + slope0[:, None, None] * rates[0] + slope1[:, None, None] * rates[1]
+    )
+    b = np.clip(a, 0.0, 1.0)
+    b3 = b[:, None, None]
+    near = np.where(b < 1.0, one, two)
+    return rows_of(
+        stamps_ns,
+        before.moved(r, v, R),
+        (1.0 - b3) * path.covariance(one) + b3 * path.covariance(two),
+        (1.0 - b3) * path.rates_radps[one] + b3 * path.rates_radps[two],
+        path.lights[near],
+        np.maximum(times_s - path.light_s[near], 0.0),
     )

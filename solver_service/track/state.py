@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -23,6 +24,11 @@ SIZE: Final = 40
 NAV: Final = 12
 """The first errors, which move; the others are constants or walk slowly."""
 
+# The shapes of a state's fields, where each ends in a row, and how long a row is.
+_SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
+_ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES])
+ROW: Final = int(_ENDS[-1])
+
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -31,7 +37,8 @@ class State:
     r_m, v_mps (3,): of B's camera from A's. R (2, 3, 3): each camera to level. gyro_bias_radps, accel_bias_mps2,
     mount_rad, lever_m (2, 3): in camera axes; mount: the small turn that brings the unit's axes, as stated, to the
     true ones. delay_s (2,): the unit's stamps minus true time. clock_s: B's clock minus A's. depth_offset_m: what
-    B's gauge shows too much against A's.
+    B's gauge shows too much against A's. As rows of numbers states are kept; several rows make a batch of states, each
+    array with leading axes.
     """
 
     r_m: Floats
@@ -81,6 +88,18 @@ class State:
         error[CLOCK] = self.clock_s - other.clock_s
         error[DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
         return error
+
+    def to_row(self) -> Floats:
+        """Return all numbers as one row (ROW,)."""
+        return np.concatenate([np.ravel(part) for part in vars(self).values()])
+
+    @classmethod
+    def of_row(cls, rows: Floats) -> State:
+        """Return the state of a row, or the batch of rows (..., ROW)."""
+        parts = np.split(rows, _ENDS[:-1], axis=-1)
+        lead = rows.shape[:-1]
+        shaped = [part.reshape((*lead, *shape)) for part, shape in zip(parts, _SHAPES, strict=True)]
+        return cls(*(part if part.ndim else float(part) for part in shaped))  # type: ignore[arg-type]
 
     def moved(self, r_m: Floats, v_mps: Floats, R: Floats) -> State:
         """Return the same constants elsewhere."""

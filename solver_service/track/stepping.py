@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import Association, associate
-from buddyline.solver_service.track.estimate import Estimate, Guide, Look, Step
+from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals
+from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
+from buddyline.solver_service.track.trail import Look, Step
 
 # How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
 HOLD_S: Final = 0.05
@@ -41,8 +44,23 @@ COLOURED: Final = 2.0
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Guide:
+    """What a whole pass over the dive knew at one picture, for the next pass to decide its lights again.
+
+    path, step: of the pass. look: the picture.
+    """
+
+    path: Path
+    step: int
+    look: Look
+
+
 class TrackSteps(TrackIntake):
-    """Moves estimates by what has come in. unrest: how much of the guessed motion's noise is taken."""
+    """Moves estimates by what has come in. unrest: how much of the guessed motion's noise is taken.
+
+    guides: by node and stamp of a picture.
+    """
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float) -> None:
         super().__init__(nodes)
@@ -109,12 +127,11 @@ class TrackSteps(TrackIntake):
             looks = (self._take_lights(estimate, sight),)
         if not self._keep_s:
             return
-        while estimate.steps and estimate.steps[0].t_s < t_s - self._keep_s:
-            estimate.steps.pop(0)
+        estimate.steps.drop_before(t_s - self._keep_s)
         lights = sum(len(look.chosen) for look in looks)
         if together:
-            last = estimate.steps[-1]
-            estimate.steps[-1] = replace(
+            last = estimate.steps.last
+            estimate.steps.last = replace(
                 last,
                 after=estimate.state,
                 covariance=estimate.covariance,
@@ -138,6 +155,8 @@ class TrackSteps(TrackIntake):
                     looks=looks,
                 )
             )
+            if math.isinf(self._keep_s):
+                estimate.steps.pack()
 
     def _take_lights(self, estimate: Estimate, sight: Sight) -> Look:
         observer = sight.node
@@ -155,7 +174,7 @@ class TrackSteps(TrackIntake):
             detection = detection * np.where(inside, 1.0, 0.02)
         clutter = max(len(sight.index) - 1.0, 1.0) / camera.area_px2
         y, H = residuals(sight.bearings, sight.tangents, X, D)
-        guide = self.guides.get((sight.stamp_ns, observer))
+        guide = self.guides.get((observer, sight.stamp_ns))
         if guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
@@ -173,7 +192,7 @@ class TrackSteps(TrackIntake):
                 estimate.unseen_by = None
             estimate.bars += len(found.chosen) == 2
             estimate.told_by[observer] += 1
-        return Look(sight, found.chosen)
+        return Look(observer, sight.stamp_ns, sight.t_s, found.chosen)
 
     def _expected(self, estimate: Estimate, observer: int) -> Floats:
         lights_m = self.nodes[1 - observer].rig.lights_m
@@ -187,14 +206,15 @@ class TrackSteps(TrackIntake):
         The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
         """
         lights_m = self.nodes[1 - sight.node].rig.lights_m
-        dt_s = sight.dt_s + guide.after_s
-        X, D = light_positions(guide.state, sight.node, lights_m, guide.rates_radps, dt_s)
+        path, chosen = guide.path, guide.look.chosen
+        dt_s = sight.dt_s + (guide.look.t_s - float(path.t_s[guide.step]))
+        X, D = light_positions(path.state(guide.step), sight.node, lights_m, path.rates_radps[guide.step], dt_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
-        P = guide.covariance
-        if guide.chosen:
-            H_used = np.concatenate([H[k, light] for k, light, _ in guide.chosen])
-            y_used = np.concatenate([y[k, light] for k, light, _ in guide.chosen])
-            R = np.diag(np.repeat([variance for _, _, variance in guide.chosen], 2))
+        P = path.covariance(guide.step)
+        if chosen:
+            H_used = np.concatenate([H[k, light] for k, light, _ in chosen])
+            y_used = np.concatenate([y[k, light] for k, light, _ in chosen])
+            R = np.diag(np.repeat([variance for _, _, variance in chosen], 2))
             across = P @ H_used.T
             rest = R - H_used @ across
             # Rounding, and pictures that share a step, can leave less than nothing.

@@ -59,3 +59,14 @@ def test_a_batch_gives_what_each_gives_alone(turns):
 @given(DIRECTIONS, DIRECTIONS)
 def test_skew_is_the_cross_product(a, b):
     np.testing.assert_allclose(skew(np.array(a)) @ b, np.cross(a, b), atol=1e-14)
+
+
+def test_many_rotations_are_turned_back_as_each_alone():
+    rng = np.random.default_rng(5)
+    angles = np.array([0.0, 1e-14, 1e-9, 1e-4, 1.0, 2.0, 3.0, math.pi - 1e-7, math.pi])
+    directions = rng.normal(size=(5, len(angles), 3))
+    R = rotation_exp(directions / np.linalg.norm(directions, axis=-1, keepdims=True) * angles[:, None])
+    one_by_one = [matrix_to_quat(each) for each in R.reshape(-1, 3, 3)]
+    np.testing.assert_allclose(matrix_to_quat(R).reshape(-1, 4), one_by_one, atol=1e-15)
+    one_by_one = [rotation_log(each) for each in R.reshape(-1, 3, 3)]
+    np.testing.assert_allclose(rotation_log(R).reshape(-1, 3), one_by_one, atol=1e-15)

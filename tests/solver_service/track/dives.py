@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
 from buddyline.solver_service.track.dive import NodeRecord
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
+from buddyline.solver_service.track.output import TrackRow
 
 EPOCH_NS = 1_764_000_000_000_000_000
 GRAVITY = np.array((0.0, 0.0, 9.80665))
@@ -277,13 +279,14 @@ class Score:
     rows: int
 
 
-def score(dive: Dive, rows: list) -> Score:  # type: ignore[type-arg]
+def score(dive: Dive, rows: Iterable[TrackRow]) -> Score:
     """Judge rows of a track."""
+    told = list(rows)
     place = {stamp: i for i, stamp in enumerate(dive.stamps_ns)}
     first, last = dive.fixes[0].stamp_ns, dive.fixes[-1].stamp_ns
     asked = [stamp for stamp in dive.stamps_ns if first <= stamp <= last]
     errors, nees, by_position, by_rotation, covered, wrong = [], [], [], [], 0, 0
-    for row in rows:
+    for row in told:
         i = place[row.stamp_ns]
         x, y, z, w = row.q_a_b_xyzw
         R = rotation_exp(_vector(x, y, z, w))
@@ -297,7 +300,7 @@ def score(dive: Dive, rows: list) -> Score:  # type: ignore[type-arg]
         covered += first <= row.stamp_ns <= last and sigma < 0.05 * row.range_m
         wrong += error - 3.0 * sigma > 0.1 * row.range_m
     means = [float(np.mean(values)) if values else np.nan for values in (nees, by_position, by_rotation)]
-    return Score(np.array(errors), *means, covered / max(len(asked), 1), wrong, len(rows))
+    return Score(np.array(errors), *means, covered / max(len(asked), 1), wrong, len(told))
 
 
 def _vector(x: float, y: float, z: float, w: float) -> Floats:

@@ -296,7 +296,7 @@ def test_absurd_input_never_crashes(dive: Dive, harm: str) -> None:
     else:
         bare = {"imu_stamps_ns": np.zeros(0, np.int64), "accel_mps2": np.zeros((0, 3)), "gyro_radps": np.zeros((0, 3))}
         a, b = (replace(r, attitudes=(), depths=(), **bare) for r in (a, b))
-    rows = smooth((a, b), fixes, dive.stamps_ns).rows
+    rows = list(smooth((a, b), fixes, dive.stamps_ns).rows)
     assert all(np.isfinite(row.covariance).all() and np.isfinite(row.t_a_b_m).all() for row in rows)
     if rows:
         assert score(dive, rows).wrong == 0

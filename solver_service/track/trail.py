@@ -1,0 +1,148 @@
+"""The steps of a track in their order: the newest as they are, the older packed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.state import NAV, ROW, SIZE, State
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """One picture within a step, and the lights that were used: (candidate, light, variance)."""
+
+    node: int
+    stamp_ns: int
+    t_s: float
+    chosen: tuple[tuple[int, int, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of a track as the smoother needs it.
+
+    before: predicted; after, covariance: with what was seen at t_s. F (NAV, SIZE), Q (NAV, NAV), walk: how it came here
+    from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
+    """
+
+    t_s: float
+    before: State
+    after: State
+    covariance: Floats
+    F: Floats
+    Q: Floats
+    walk: Floats
+    rates_radps: Floats
+    light_s: float
+    lights: int
+    looks: tuple[Look, ...] = ()
+
+
+# So many steps are packed at once.
+PACK = 128
+_UPPER = np.triu_indices(SIZE)
+_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), (len(_UPPER[0]),), (NAV, SIZE), (NAV, NAV), (SIZE - NAV,))
+_ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pack:
+    """Steps as rows of numbers: the first row (W,), and of the others the columns (N, V) in which any differs from it.
+
+    Half of each covariance is kept, and nothing of what never changes: zeros of the transition, most constants.
+    """
+
+    first: Floats
+    changes: NDArray[np.bool_]
+    rows: Floats
+    looks: tuple[tuple[Look, ...], ...]
+
+    def steps(self) -> list[Step]:
+        """Give the steps again, in their order."""
+        whole = np.repeat(self.first[None], len(self.rows), axis=0)
+        whole[:, self.changes] = self.rows
+        return [_step_of(row, looks) for row, looks in zip(whole, self.looks, strict=True)]
+
+
+def _packed(steps: list[Step]) -> _Pack:
+    rows = np.array([_row_of(step) for step in steps])
+    changes = (rows != rows[0]).any(axis=0)
+    return _Pack(rows[0].copy(), changes, rows[:, changes], tuple(step.looks for step in steps))
+
+
+def _row_of(step: Step) -> Floats:
+    numbers = np.array((step.t_s, step.light_s, step.lights))
+    parts = step.rates_radps, step.F, step.Q, step.walk
+    rates, F, Q, walk = (part.ravel() for part in parts)
+    return np.concatenate(
+        (numbers, rates, step.before.to_row(), step.after.to_row(), step.covariance[_UPPER], F, Q, walk)
+    )
+
+
+def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
+    parts = np.split(row, _ENDS[:-1])
+    t_s, light_s, lights, rates, before, after, half, F, Q, walk = (
+        part.reshape(shape) for part, shape in zip(parts, _SHAPES, strict=True)
+    )
+    covariance = np.empty((SIZE, SIZE))
+    covariance[_UPPER] = covariance.T[_UPPER] = half
+    states = State.of_row(before), State.of_row(after)
+    return Step(float(t_s), *states, covariance, F, Q, walk, rates, float(light_s), int(lights), looks)
+
+
+class Trail:
+    """Steps of one estimate in order of time."""
+
+    def __init__(self) -> None:
+        self._packs: list[_Pack] = []
+        self._new: list[Step] = []
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return sum(len(pack.rows) for pack in self._packs) + len(self._new)
+
+    def copy(self) -> Trail:
+        """Return another with the same steps so far."""
+        copy = Trail()
+        copy._packs, copy._new = list(self._packs), list(self._new)
+        return copy
+
+    def append(self, step: Step) -> None:
+        """Add the newest step."""
+        self._new.append(step)
+
+    @property
+    def last(self) -> Step:
+        """The newest step."""
+        return self._new[-1]
+
+    @last.setter
+    def last(self, step: Step) -> None:
+        self._new[-1] = step
+
+    def pack(self) -> None:
+        """Pack what is older than the last PACK steps; the newest may yet be replaced."""
+        while len(self._new) >= 2 * PACK:
+            self._packs.append(_packed(self._new[:PACK]))
+            del self._new[:PACK]
+
+    def drop_before(self, t_s: float) -> None:
+        """Drop the steps before t_s; of a trail that is not packed."""
+        while self._new and self._new[0].t_s < t_s:
+            self._new.pop(0)
+
+    def drop_after(self, t_s: float) -> None:
+        """Drop the steps later than t_s."""
+        self._new = [step for step in self._new if step.t_s <= t_s]
+        while self._packs and not self._new:
+            self._new = [step for step in self._packs.pop().steps() if step.t_s <= t_s]
+
+    def backward(self) -> Iterator[Step]:
+        """Yield the steps, the newest first."""
+        yield from reversed(self._new)
+        for pack in reversed(self._packs):
+            yield from reversed(pack.steps())
