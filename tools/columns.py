@@ -6,15 +6,17 @@ say) the first counts, as does the first of two outcomes of a trigger. Unknown n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Attitude,
+    Blob,
     Candidates,
     Depth,
     Imu,
@@ -50,6 +52,7 @@ Texts: TypeAlias = NDArray[np.str_]
 Pair: TypeAlias = tuple[str, str]
 
 M = TypeVar("M", bound=Message)
+C = TypeVar("C", bound="Columns")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,23 +74,20 @@ class Columns:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseColumns(Columns):
-    """Relative poses T_a_b, which map B's camera frame into A's.
+class EstimateColumns(Columns):
+    """Estimates of T_a_b, which maps B's camera frame into A's.
 
-    trigger (n,). t_a_b_m (n, 3), m. q_a_b_xyzw (n, 4). covariance (n, 6, 6): position (m), then the small rotation w
-    (rad) with R_true = exp(w) R_a_b, both in A's camera frame. range_m, chi2 (n,). lights (n,): from how many of the
-    four lights. method (n,): "refined", "three_lights", ... With an attitude of A: t_ned_m, sigma_ned_m (n, 3),
-    azimuth_rad (from north, clockwise), inclination_rad (up) and their sigmas (n,), which count the compass's error.
+    t_a_b_m (n, 3), m. q_a_b_xyzw (n, 4). covariance (n, 6, 6): position (m), then the small rotation w (rad) with
+    R_true = exp(w) R_a_b, both in A's camera frame. range_m (n,). lights (n,): number of different lights used. With
+    an attitude of A: t_ned_m, sigma_ned_m (n, 3), azimuth_rad (from north, clockwise), inclination_rad (up) and their
+    sigmas (n,), which count the compass's error.
     """
 
-    trigger: Integers
     t_a_b_m: Floats
     q_a_b_xyzw: Floats
     covariance: Floats
     range_m: Floats
-    chi2: Floats
     lights: Integers
-    method: Texts
     t_ned_m: Floats
     sigma_ned_m: Floats
     azimuth_rad: Floats
@@ -98,38 +98,32 @@ class PoseColumns(Columns):
     @property
     def sigma_m(self) -> Floats:
         """Standard deviations of the position along A's camera axes, (n, 3)."""
-        return _sigma_m(self.covariance)
+        sigma_m: Floats = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
+        return sigma_m
 
 
 @dataclass(frozen=True, eq=False)
-class TrackColumns(Columns):
-    """The fused estimate of T_a_b, also between poses. Columns as in PoseColumns, and:
+class PoseColumns(EstimateColumns):
+    """The poses of triggers: trigger, chi2 (n,); method (n,): "refined", "three_lights", ..."""
 
-    v_a_b_mps (n, 3): velocity of B's camera relative to A's, in A's camera frame, A's turning not counted;
-    v_covariance (n, 3, 3). lights (n,): number of different lights used at the last trigger. age_s (n,): since a light
-    was last used. mode: "smooth" (whole dive), "lag" (a second later), "filter" (live); empty if there is no track.
+    trigger: Integers
+    chi2: Floats
+    method: Texts
+
+
+@dataclass(frozen=True, eq=False)
+class TrackColumns(EstimateColumns):
+    """The fused estimate, also between triggers.
+
+    v_a_b_mps (n, 3): velocity of B's camera relative to A's, in A's camera frame, without the part that comes from A's
+    rotation; v_covariance (n, 3, 3). lights: at the last trigger. age_s (n,): time since a light was last used.
+    mode: "smooth" (whole dive), "lag" (a second later), "filter" (live); empty if there is no track.
     """
 
-    t_a_b_m: Floats
-    q_a_b_xyzw: Floats
-    covariance: Floats
     v_a_b_mps: Floats
     v_covariance: Floats
-    lights: Integers
     age_s: Floats
-    range_m: Floats
-    t_ned_m: Floats
-    sigma_ned_m: Floats
-    azimuth_rad: Floats
-    sigma_azimuth_rad: Floats
-    inclination_rad: Floats
-    sigma_inclination_rad: Floats
     mode: str
-
-    @property
-    def sigma_m(self) -> Floats:
-        """Standard deviations of the position along A's camera axes, (n, 3)."""
-        return _sigma_m(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +226,7 @@ class DiveColumns:
 
     def truth(self, pair: Pair | None = None) -> TruthColumns:
         """Return the true poses; pair: may be left out where there is one."""
-        return truth_columns(self._of_pair(TRUTH, Truth, pair))
+        return columns_of(TruthColumns, self._of_pair(TRUTH, Truth, pair))
 
     def rejections(self, pair: Pair | None = None) -> RejectionColumns:
         """Return the triggers without a pose; pair: may be left out where there is one."""
@@ -240,33 +234,15 @@ class DiveColumns:
 
     def attitudes(self, node: str) -> AttitudeColumns:
         """Return a node's attitudes."""
-        found = self._of_node(ATTITUDE, Attitude, node)
-        return AttitudeColumns(
-            _stamps([one.stamp_ns for one in found]),
-            _floats([one.q_ned_body_xyzw for one in found], 4),
-            _floats([one.sigma_rad for one in found], 3),
-        )
+        return columns_of(AttitudeColumns, self._of_node(ATTITUDE, Attitude, node))
 
     def depths(self, node: str) -> DepthColumns:
         """Return a node's depths."""
-        found = self._of_node(DEPTH, Depth, node)
-        return DepthColumns(
-            _stamps([one.stamp_ns for one in found]),
-            _floats([one.depth_m for one in found]),
-            _floats([one.sigma_m for one in found]),
-            _floats([_known(one.pressure_pa) for one in found]),
-            _floats([_known(one.temperature_degc) for one in found]),
-        )
+        return columns_of(DepthColumns, self._of_node(DEPTH, Depth, node))
 
     def imu(self, node: str) -> ImuColumns:
         """Return a node's inertial samples."""
-        found = self._of_node(IMU, Imu, node)
-        return ImuColumns(
-            _stamps([one.stamp_ns for one in found]),
-            _floats([one.accel_mps2 for one in found], 3),
-            _floats([one.gyro_radps for one in found], 3),
-            _floats([_NOWHERE if one.mag_t is UNSET else one.mag_t for one in found], 3),
-        )
+        return columns_of(ImuColumns, self._of_node(IMU, Imu, node))
 
     def candidates(self, node: str) -> CandidateColumns:
         """Return a node's light candidates; of a dive of pictures there are none before `buddyline detect`."""
@@ -306,7 +282,14 @@ class DiveColumns:
         return ", ".join(map(str, self._logs))
 
 
-_NOWHERE = (np.nan, np.nan, np.nan)
+_THREE = ("t_a_b_m", "t_ned_m", "sigma_ned_m", "v_a_b_mps", "sigma_rad", "accel_mps2", "gyro_radps", "mag_t")
+# The shape of a column's values by its name; the others are single values.
+_SHAPES = dict.fromkeys(_THREE, (3,)) | {
+    "q_a_b_xyzw": (4,),
+    "q_ned_body_xyzw": (4,),
+    "covariance": (6, 6),
+    "v_covariance": (3, 3),
+}
 _OF_NODES = (INFO, IMAGE, CANDIDATES, ATTITUDE, DEPTH, IMU)
 _OF_PAIRS = (POSE, REJECTED, TRACK, TRACK_LAG, TRUTH)
 BEST_FIRST: tuple[TrackMode, ...] = ("smooth", "lag", "filter")
@@ -325,20 +308,27 @@ def _stamp_ns(message: Message) -> int:
     return stamp_ns
 
 
+def columns_of(kind: type[C], messages: Sequence[Message | Blob], **own: Any) -> C:
+    """Return messages as columns, in their order: each column is the messages' field of its name, unless in own."""
+    given: dict[str, Any] = dict(own)
+    for name, value_type in ((field.name, field.type) for field in fields(kind) if field.name not in own):
+        values = [getattr(message, name) for message in messages]
+        shape = _SHAPES.get(name, ())
+        if value_type == "Floats":
+            unknown = np.full(math.prod(shape), np.nan) if shape else np.nan
+            values = [unknown if value is UNSET else value for value in values]
+            given[name] = np.array(values, np.float64).reshape(-1, *shape)
+        elif value_type == "Integers":
+            given[name] = np.array([-1 if value is UNSET else value for value in values], np.int64)
+        else:
+            given[name] = np.array(values, np.str_)
+    return kind(**given)
+
+
 def pose_columns(poses: Sequence[RelativePose]) -> PoseColumns:
     """Return the poses, in their order, as columns."""
-    return PoseColumns(
-        _stamps([pose.stamp_ns for pose in poses]),
-        _stamps([pose.trigger for pose in poses]),
-        _floats([pose.t_a_b_m for pose in poses], 3),
-        _floats([pose.q_a_b_xyzw for pose in poses], 4),
-        _floats([pose.covariance for pose in poses], 36).reshape(-1, 6, 6),
-        _floats([pose.range_m for pose in poses]),
-        _floats([pose.chi2 for pose in poses]),
-        _stamps([sum(index >= 0 for index in (*pose.blobs_a, *pose.blobs_b)) for pose in poses]),
-        _texts([pose.method for pose in poses]),
-        *_ned_columns(poses),
-    )
+    lights = [sum(index >= 0 for index in (*pose.blobs_a, *pose.blobs_b)) for pose in poses]
+    return columns_of(PoseColumns, poses, lights=np.array(lights, np.int64))
 
 
 def of_mode(tracks: Sequence[Track], mode: TrackMode | None = None) -> list[Track]:
@@ -350,91 +340,26 @@ def of_mode(tracks: Sequence[Track], mode: TrackMode | None = None) -> list[Trac
 
 def track_columns(tracks: Sequence[Track]) -> TrackColumns:
     """Return a track's estimates, in their order and of one mode, as columns."""
-    return TrackColumns(
-        _stamps([one.stamp_ns for one in tracks]),
-        _floats([one.t_a_b_m for one in tracks], 3),
-        _floats([one.q_a_b_xyzw for one in tracks], 4),
-        _floats([one.covariance for one in tracks], 36).reshape(-1, 6, 6),
-        _floats([one.v_a_b_mps for one in tracks], 3),
-        _floats([one.v_covariance for one in tracks], 9).reshape(-1, 3, 3),
-        _stamps([one.lights for one in tracks]),
-        _floats([one.age_s for one in tracks]),
-        _floats([one.range_m for one in tracks]),
-        *_ned_columns(tracks),
-        tracks[0].mode if tracks else "",
-    )
-
-
-def _ned_columns(
-    found: Sequence[RelativePose] | Sequence[Track],
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Return place and sigma in NED, azimuth and sigma, inclination and sigma."""
-    return (
-        _floats([_NOWHERE if one.t_ned_m is UNSET else one.t_ned_m for one in found], 3),
-        _floats([_NOWHERE if one.sigma_ned_m is UNSET else one.sigma_ned_m for one in found], 3),
-        _floats([_known(one.azimuth_rad) for one in found]),
-        _floats([_known(one.sigma_azimuth_rad) for one in found]),
-        _floats([_known(one.inclination_rad) for one in found]),
-        _floats([_known(one.sigma_inclination_rad) for one in found]),
-    )
-
-
-def _sigma_m(covariance: Floats) -> Floats:
-    sigma_m: Floats = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, :3])
-    return sigma_m
-
-
-def truth_columns(truths: Sequence[Truth]) -> TruthColumns:
-    """Return true poses, in their order, as columns."""
-    return TruthColumns(
-        _stamps([one.stamp_ns for one in truths]),
-        _stamps([-1 if one.trigger is UNSET else one.trigger for one in truths]),
-        _floats([one.t_a_b_m for one in truths], 3),
-        _floats([one.q_a_b_xyzw for one in truths], 4),
-    )
+    return columns_of(TrackColumns, tracks, mode=tracks[0].mode if tracks else "")
 
 
 def rejection_columns(rejected: Sequence[Rejected]) -> RejectionColumns:
     """Return rejections, in their order, as columns."""
-    return RejectionColumns(
-        _stamps([one.stamp_ns for one in rejected]),
-        _stamps([one.trigger for one in rejected]),
-        _texts([one.reason for one in rejected]),
-        _texts([one.detail for one in rejected]),
-    )
+    return columns_of(RejectionColumns, rejected)
 
 
 def candidate_columns(frames: Sequence[Candidates]) -> CandidateColumns:
     """Return the candidates of frames, in their order, as columns."""
-    blobs = [(frame, index, blob) for frame in frames for index, blob in enumerate(frame.blobs)]
-    return CandidateColumns(
-        _stamps([frame.stamp_ns for frame, _, _ in blobs]),
-        _stamps([frame.trigger for frame, _, _ in blobs]),
-        _stamps([index for _, index, _ in blobs]),
-        _floats([blob.u_px for _, _, blob in blobs]),
-        _floats([blob.v_px for _, _, blob in blobs]),
-        _floats([blob.sigma_px for _, _, blob in blobs]),
-        _floats([blob.area_px for _, _, blob in blobs]),
-        _floats([blob.peak for _, _, blob in blobs]),
-        _floats([blob.elongation for _, _, blob in blobs]),
-        _floats([_known(blob.score) for _, _, blob in blobs]),
-        _stamps([frame.stamp_ns for frame in frames]),
-        _stamps([frame.trigger for frame in frames]),
+    of_blobs = [(frame.stamp_ns, frame.trigger, index) for frame in frames for index in range(len(frame.blobs))]
+    of_frames = [(frame.stamp_ns, frame.trigger) for frame in frames]
+    stamps_ns, triggers, indices = np.array(of_blobs, np.int64).reshape(-1, 3).T
+    frame_stamps_ns, frame_triggers = np.array(of_frames, np.int64).reshape(-1, 2).T
+    return columns_of(
+        CandidateColumns,
+        [blob for frame in frames for blob in frame.blobs],
+        stamp_ns=stamps_ns,
+        trigger=triggers,
+        blob=indices,
+        frame_stamp_ns=frame_stamps_ns,
+        frame_trigger=frame_triggers,
     )
-
-
-def _known(value: object) -> float:
-    return value if isinstance(value, float | int) else np.nan
-
-
-def _stamps(values: list[int]) -> Integers:
-    return np.array(values, dtype=np.int64)
-
-
-def _floats(values: Sequence[float] | Sequence[Sequence[float]], width: int = 0) -> Floats:
-    column = np.array(values, dtype=np.float64)
-    return column.reshape(-1, width) if width else column
-
-
-def _texts(values: list[str]) -> Texts:
-    return np.array(values, dtype=np.str_)

@@ -7,7 +7,7 @@ import csv
 import io
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
@@ -112,17 +112,20 @@ def tum_lines(poses: Iterable[RelativePose | Track | Truth]) -> Iterator[str]:
 
 def csv_lines(poses: Iterable[RelativePose], rejected: Iterable[Rejected], *, reasons: bool) -> Iterator[str]:
     """Yield a header and a row a pose by time; reasons: with two more columns, and rows for rejections."""
-    fields = _CSV_FIELDS + (_REASON_FIELDS if reasons else ())
+    results: list[RelativePose | Rejected] = sorted([*poses, *rejected], key=lambda result: result.stamp_ns)
+    yield from _csv(_CSV_FIELDS + (_REASON_FIELDS if reasons else ()), map(_csv_row, results))
+
+
+def _csv(names: Sequence[str], rows: Iterable[dict[str, object]]) -> Iterator[str]:
     text = io.StringIO()
-    writer = csv.DictWriter(text, fields, restval="", lineterminator="\n")
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    yield text.getvalue()
-    results: list[RelativePose | Rejected] = [*poses, *rejected]
-    for result in sorted(results, key=lambda result: result.stamp_ns):
+    for row in rows:
+        yield text.getvalue()
         text.seek(0)
         text.truncate()
-        writer.writerow(_csv_row(result))
-        yield text.getvalue()
+        writer.writerow(row)
+    yield text.getvalue()
 
 
 def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
@@ -145,22 +148,18 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
 
 def track_csv_lines(track: Iterable[Track]) -> Iterator[str]:
     """Yield a header and a row for each sample of a track, in the order given."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, _TRACK_FIELDS, restval="", lineterminator="\n")
-    writer.writeheader()
-    yield text.getvalue()
-    for one in track:
-        text.seek(0)
-        text.truncate()
-        row: dict[str, object] = {name: getattr(one, name) for name in ("stamp_ns", "node_a", "node_b", "mode")}
-        row |= _place(one) | {"lights": one.lights, "age_s": one.age_s}
-        row |= dict(zip(("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps"), one.v_a_b_mps, strict=True))
-        for i, k in _UPPER:
-            row[f"cov_{_AXES[i]}_{_AXES[k]}"] = one.covariance[6 * i + k]
-            if k < 3:
-                row[f"cov_v{_AXES[i]}_v{_AXES[k]}"] = one.v_covariance[3 * i + k]
-        writer.writerow(row)
-        yield text.getvalue()
+    yield from _csv(_TRACK_FIELDS, map(_track_csv_row, track))
+
+
+def _track_csv_row(one: Track) -> dict[str, object]:
+    row: dict[str, object] = {name: getattr(one, name) for name in ("stamp_ns", "node_a", "node_b", "mode")}
+    row |= _place(one) | {"lights": one.lights, "age_s": one.age_s}
+    row |= dict(zip(("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps"), one.v_a_b_mps, strict=True))
+    for i, k in _UPPER:
+        row[f"cov_{_AXES[i]}_{_AXES[k]}"] = one.covariance[6 * i + k]
+        if k < 3:
+            row[f"cov_v{_AXES[i]}_v{_AXES[k]}"] = one.v_covariance[3 * i + k]
+    return row
 
 
 def _place(result: RelativePose | Track) -> dict[str, object]:

@@ -161,7 +161,7 @@ def test_errors_name_what_is_wrong(tmp_path):
         dive.poses(("b", "c"))
     with pytest.raises(buddyline.BuddylineError, match=r"none\.mcap"):
         buddyline.open_dive(tmp_path / "none.mcap")
-    with pytest.raises(buddyline.BuddylineError, match="no dive log"):
+    with pytest.raises(buddyline.BuddylineError, match="give at least one dive log"):
         buddyline.open_dive()
     with pytest.raises(buddyline.BuddylineError, match="method = 'guess'"):
         buddyline.solve(CAVERN, method="guess")

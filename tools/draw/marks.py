@@ -16,6 +16,7 @@ LEFT_COLOUR: Final = "#ff5c5c"
 RIGHT_COLOUR: Final = "#4be37a"
 OTHER_COLOUR: Final = "#ffd34d"
 _MIME: Final = {"jpeg": "image/jpeg", "jpg": "image/jpeg", "png": "image/png"}
+_RING_PX: Final = 22
 # Blue, green, red, as OpenCV has them.
 _LIKELY = (80, 255, 80)
 _UNLIKELY = (60, 60, 255)
@@ -72,15 +73,13 @@ def _write(marked: NDArray[np.uint8], text: str, at: tuple[float, float], size: 
     cv2.putText(marked, text, (u, v), cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
-def mark_lights(
-    image: NDArray[np.uint8], blobs: Sequence[Blob], chosen: tuple[int, int], radius_px: int = 22
-) -> NDArray[np.uint8]:
+def mark_lights(image: NDArray[np.uint8], blobs: Sequence[Blob], chosen: tuple[int, int]) -> NDArray[np.uint8]:
     """Return a BGR picture with the chosen left light circled in red, the right one in green; -1: none chosen."""
     marked = image.copy()
     for index, colour in zip(chosen, (_UNLIKELY, _LIKELY), strict=True):
         if index >= 0:
             at_px = round(blobs[index].u_px), round(blobs[index].v_px)
-            cv2.circle(marked, at_px, radius_px, colour, 2, cv2.LINE_AA)
+            cv2.circle(marked, at_px, _RING_PX, colour, 2, cv2.LINE_AA)
     return marked
 
 
