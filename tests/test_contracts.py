@@ -144,7 +144,7 @@ def test_geometry_is_numpy_and_the_standard_library(tree, plant, text, foreign):
     assert bool(found) == bool(foreign)
 
 
-def test_a_circle_is_found(tree, plant):
+def test_an_import_cycle_is_found(tree, plant):
     plant("tools/planted.py", "from buddyline.tools.planted_too import f\n")
     plant("tools/planted_too.py", "def f():\n    import buddyline.tools.planted\n")
     assert circles(tree) == [["buddyline.tools.planted", "buddyline.tools.planted_too"]]

@@ -86,12 +86,12 @@ def dead_links(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
-def test_what_a_document_names_is_there(path: Path) -> None:
+def test_files_and_commands_named_in_documents_exist(path: Path) -> None:
     assert dead_links(path) == []
     assert wrong(path.read_text(encoding="utf-8")) == []
 
 
-def test_the_readme_leads_to_every_other_document() -> None:
+def test_the_readme_links_to_every_other_document() -> None:
     readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
     linked = {target.partition("#")[0] for target in LINK.findall(readme)}
     assert {f"docs/{path.name}" for path in (REPOSITORY / "docs").glob("*.md")} <= linked
@@ -111,7 +111,7 @@ def test_the_readme_leads_to_every_other_document() -> None:
         ("`make install EXTRAS=keys,moniter`", "no extra moniter"),
     ],
 )
-def test_what_is_not_there_is_found(text: str, says: str) -> None:
+def test_a_missing_file_or_command_is_found(text: str, says: str) -> None:
     assert [line.endswith(says) for line in wrong(text)] == [True]
 
 

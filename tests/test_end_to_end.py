@@ -99,7 +99,7 @@ def wait_until_gone(pids):
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_demo_that_is_gone_leaves_nothing_running(number):
+def test_a_killed_demo_leaves_nothing_running(number):
     demo = Process("demo", "--environment", "basin", "--rate", "4")
     try:
         demo.wait_for(" s  ")
@@ -173,7 +173,7 @@ def test_node_and_solver_wait_for_the_hub_and_a_second_node_is_refused(tmp_path)
         assert "buddyline/node/a/info" in reader.keys
 
 
-def test_stored_dive_through_a_node(tmp_path):
+def test_a_node_detects_in_stored_pictures(tmp_path):
     import cv2
     import numpy as np
 

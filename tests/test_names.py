@@ -26,7 +26,7 @@ def test_no_class_name_stands_for_two_things():
     assert doubles(REPOSITORY) == {}, "choose another name: one class name, one thing"
 
 
-def test_a_double_is_found(tmp_path):
+def test_a_duplicate_class_name_is_found(tmp_path):
     for folder, text in (
         ("node", "class Light:\n    pass\n"),
         ("tools", "def f():\n    class _Light:\n        pass\n"),

@@ -69,7 +69,7 @@ def test_offline_every_pair_has_an_outcome_for_every_trigger(three_logs, offline
 
 
 @pytest.mark.parametrize("nodes", [["a,c"], ["c", "a"]])
-def test_offline_nodes_restrict(three_logs, offline, tmp_path, nodes):
+def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_path, nodes):
     logs, _ = three_logs
     done = buddyline("solve", *logs, "-o", tmp_path / "out.mcap", "--json", "--nodes", *nodes)
     summary = json.loads(done.stdout)

@@ -87,7 +87,7 @@ def test_ned_of_enu_is_the_change_of_axes_for_any_attitude():
         assert matrix(ned_of_enu(q, 0.0)) == pytest.approx(R_ned_enu @ quaternion_to_matrix(q), abs=1e-12)
 
 
-def test_it_starts_at_rest_within_five_seconds():
+def test_the_filter_starts_within_five_seconds_at_rest():
     assert 3.0 <= calm_run().times_s[0] <= 5.0
 
 
@@ -100,7 +100,7 @@ def test_tilt_and_heading_in_swell(seed):
     assert not any(run.problems)
 
 
-def test_a_disturbance_is_flagged_and_hardly_felt():
+def test_a_disturbance_is_flagged_and_hardly_turns_the_heading():
     """15 uT fixed to the rig, a third of a horizontal field of 22 uT, turns a bare compass by up to 40 deg."""
     run = disturbed_run()
     flagged = np.array([bool(problem) for problem in run.problems])
@@ -185,7 +185,7 @@ def test_declination_turns_to_true_north(declination_deg):
         assert np.degrees(run.errors_rad[-1, 2]) == pytest.approx(declination_deg, abs=1.5)
 
 
-def test_a_gyroscope_bias_of_five_degrees_a_second_is_taken_off():
+def test_a_gyroscope_bias_of_five_degrees_a_second_is_removed():
     run = estimate(swell.simulate(20.0, gyro_bias_radps=np.radians(5.0)), VqfAttitude(SOUND, HERE))
     assert run.times_s[0] < 5
     assert run.tilt_rms_deg() < 0.5
@@ -205,7 +205,7 @@ def test_a_gyroscope_that_cools_after_a_rested_start_is_followed(cooling_dps):
     assert not any(run.problems)
 
 
-def test_without_rest_it_starts_late_and_says_how_bad_it_is():
+def test_without_rest_the_filter_starts_late_with_a_large_sigma():
     run = estimate(swell.simulate(30.0, rest_s=0.0), VqfAttitude(SOUND, HERE))
     assert 20 < run.times_s[0] < 21
     assert np.degrees(run.sigmas_rad[0, 0]) > 4
@@ -256,7 +256,7 @@ def test_samples_missing_for_seconds_are_survived():
     assert np.degrees(out.sigma_rad[0]) < 5
 
 
-def test_uneven_and_missing_samples_do_not_lose_the_turn():
+def test_uneven_and_missing_samples_do_not_lose_the_rotation():
     """Every fifth sample missing and the rest up to 3 ms late, as on a busy Pi."""
     dive = swell.simulate(24.0)
     rng = np.random.default_rng(5)
@@ -272,7 +272,7 @@ def test_uneven_and_missing_samples_do_not_lose_the_turn():
     assert np.degrees(np.abs(errors).max()) < 2.5
 
 
-def test_the_same_stamp_twice_is_passed_over():
+def test_a_repeated_stamp_is_skipped():
     dive = swell.simulate(4.0)
     estimator = VqfAttitude(SOUND, HERE)
     for s in dive.samples:

@@ -30,7 +30,7 @@ def chronyc(tmp_path, monkeypatch):
     return install
 
 
-def test_a_clock_that_follows_another(chronyc):
+def test_figures_of_a_synchronised_clock_are_read(chronyc):
     chronyc('[ "$*" = "-n -c tracking" ] || exit 9', f"echo '{FOLLOWS}'")
     tracking = read_tracking(10.0)
     assert (tracking.source, tracking.stratum, tracking.synchronised, tracking.local) == ("127.0.0.1", 9, True, False)
@@ -48,7 +48,7 @@ def test_a_clock_that_follows_another(chronyc):
 
 
 @pytest.mark.parametrize(("line", "source", "synchronised"), [(SERVES, "local", True), (LOST, "", False)])
-def test_an_offset_from_nothing_is_not_told(line, source, synchronised):
+def test_an_unsynchronised_clock_has_no_offset(line, source, synchronised):
     tracking = decode_tracking(line)
     assert tracking.synchronised is synchronised
     assert tracking.status_fields() == {"clock_source": source}
@@ -63,36 +63,36 @@ def test_garbage_is_refused_and_quoted(line):
         decode_tracking(line)
 
 
-def test_a_chronyd_that_does_not_run(chronyc):
+def test_a_chronyd_that_does_not_run_is_named(chronyc):
     chronyc("echo '506 Cannot talk to daemon'", "exit 1")
     with pytest.raises(ChronyError, match=r"506 Cannot talk to daemon: chronyd does not run \(systemctl"):
         read_tracking(10.0)
 
 
-def test_a_chronyc_that_fails_without_output(chronyc):
+def test_a_chronyc_that_fails_without_output_is_an_error(chronyc):
     chronyc("exit 3")
     with pytest.raises(ChronyError, match="status 3"):
         read_tracking(10.0)
 
 
-def test_bytes_that_are_no_text(chronyc):
+def test_output_that_is_no_text_is_an_error(chronyc):
     chronyc("printf '\\377\\376\\000'")
     with pytest.raises(ChronyError, match="chronyc said"):
         read_tracking(10.0)
 
 
-def test_a_chronyc_that_hangs(chronyc):
+def test_a_chronyc_that_hangs_is_given_up(chronyc):
     chronyc("exec sleep 60")
     with pytest.raises(ChronyError, match=r"no answer for 0\.1 s"):
         read_tracking(0.1)
 
 
-def test_no_chrony(tmp_path, monkeypatch):
+def test_without_chrony_there_are_no_figures(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert read_tracking() is None
 
 
-def test_a_chronyc_that_may_not_be_run(chronyc, tmp_path, monkeypatch):
+def test_a_chronyc_that_may_not_be_run_is_an_error(chronyc, tmp_path, monkeypatch):
     chronyc("exit 0")
     (tmp_path / "chronyc").write_bytes(b"\x00not a program")
     monkeypatch.setenv("PATH", str(tmp_path))

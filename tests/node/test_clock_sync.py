@@ -39,7 +39,7 @@ def test_a_beacon_says_when_the_other_was_heard():
     assert b.beacon(ManualClock(NOW_NS), 0.1 + HEARD_FOR_S + 0.01).heard == []
 
 
-def test_own_forged_and_broken_beacons_are_not_heard():
+def test_own_forged_and_broken_beacons_are_ignored():
     a = Beacons("a", "boot")
     a.hear(received(of("a", NOW_NS)), 0.0)
     a.hear(received(of("b", NOW_NS), key=CLOCK.key("c")), 0.0)

@@ -18,7 +18,7 @@ def config(camera, width_px, height_px):
     return NodeConfig(node="a", camera=CameraConfig(width_px=width_px, height_px=height_px), calibration=calibration)
 
 
-def test_a_calibration_of_these_pictures_is_taken():
+def test_a_calibration_of_this_picture_size_is_accepted():
     info = config(CAMERA, 1640, 1232).node_info(1, "", "", 0)
     assert (info.width_px, info.camera.cx_px) == (1640, 830.0)
 
@@ -29,7 +29,7 @@ def test_a_calibration_of_another_resolution_is_refused(size):
         config(CAMERA, *size).node_info(1, "", "", 0)
 
 
-def test_a_principal_point_a_little_off_is_a_lens():
+def test_a_principal_point_slightly_off_centre_is_accepted():
     assert config(replace(CAMERA, cx_px=900.0), 1640, 1232).node_info(1, "", "", 0)
 
 

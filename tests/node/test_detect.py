@@ -33,12 +33,12 @@ def test_a_plain_lamp_is_found_first_in_every_environment(method, environment):
     ],
     ids=["1x1 grey", "1x1", "one row", "black", "grey"],
 )
-def test_a_picture_with_nothing_in_it_gives_nothing(method, image):
+def test_an_empty_picture_gives_no_candidates(method, image):
     assert make_detector(method).detect(image) == []
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_all_white_is_no_likely_light(method):
+def test_an_all_white_picture_gives_no_likely_light(method):
     found = make_detector(method).detect(np.full((120, 160, 3), 255, np.uint8))
     assert all(d.blob.score < 0.5 for d in found)
 

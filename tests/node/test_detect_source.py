@@ -68,7 +68,7 @@ def test_a_lamp_at_the_border_is_found_there(at):
 
 
 @pytest.mark.parametrize("width", [200, 640, 820, 1111, 1640])
-def test_sizes_of_pictures_do_not_matter(width):
+def test_the_picture_size_does_not_matter(width):
     height = width * 3 // 4
     at = (0.6 * width, 0.4 * height)
     image = lamp_picture([at], size=(width, height), core_px=max(1.6, width / 400))
@@ -114,7 +114,7 @@ def test_candidates_are_in_order_of_their_score():
     assert len(scores) > 1
 
 
-def test_noise_of_a_high_gain_is_no_light():
+def test_noise_of_a_high_gain_gives_no_likely_light():
     dark = lamp_picture([], ground=20.0, noise=12.0, seed=8)
     found = make_detector().detect(dark)
     assert all(d.blob.score < 0.5 for d in found)

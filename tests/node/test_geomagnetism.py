@@ -25,7 +25,7 @@ NOV_2025_NS = 1_764_000_000_000_000_000
         (datetime(2027, 7, 2, 12, tzinfo=UTC), -80.0, -120.0, 68.49),
     ],
 )
-def test_published_values(moment, latitude, longitude, declination_deg):
+def test_the_field_matches_the_models_published_values(moment, latitude, longitude, declination_deg):
     pytest.importorskip("pygeomag", reason="pygeomag is not installed: make install EXTRAS=pi")
     field = earth_field(latitude, longitude, int(moment.timestamp()) * 10**9)
     assert np.degrees(field.declination_rad) == pytest.approx(declination_deg, abs=0.011)
@@ -33,7 +33,7 @@ def test_published_values(moment, latitude, longitude, declination_deg):
     assert np.sign(field.dip_rad) == (1 if latitude > 0 else -1)
 
 
-def test_declination_moves_with_the_date_and_goes_on_past_the_model():
+def test_declination_changes_with_the_date_also_after_the_models_end():
     pytest.importorskip("pygeomag", reason="pygeomag is not installed: make install EXTRAS=pi")
     year_ns = 31_557_600 * 10**9
     one, two, far = (earth_field(59.9, 10.75, NOV_2025_NS + n * year_ns).declination_rad for n in (0, 1, 6))
@@ -53,7 +53,7 @@ def test_without_pygeomag_the_extra_is_named(monkeypatch):
         earth_field(60.0, 10.0, NOV_2025_NS)
 
 
-def test_calibration_undoes_what_the_rig_does():
+def test_calibration_undoes_the_rigs_magnetism():
     rng = np.random.default_rng(2)
     A = np.eye(3) + rng.normal(0, 0.05, (3, 3))
     offset_t = rng.normal(0, 10e-6, 3)

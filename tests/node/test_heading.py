@@ -51,13 +51,13 @@ class Node:
 
 
 @pytest.mark.parametrize("angle", [-7.0, -math.pi, 0.0, 3.0, 9.0])
-def test_wrap(angle):
+def test_angles_wrap_to_within_pi(angle):
     assert -math.pi <= wrap(angle) <= math.pi
     assert math.sin(wrap(angle)) == pytest.approx(math.sin(angle), abs=1e-12)
 
 
 @pytest.mark.parametrize("delta_rad", [0.0, 2.0, 3.1, -3.1])
-def test_it_finds_the_angle_and_becomes_sure(delta_rad):
+def test_the_filter_finds_the_angle_and_its_sigma_shrinks(delta_rad):
     node = Node(HeadingFilter(HERE))
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
     node.run(60, delta_rad)
@@ -66,7 +66,7 @@ def test_it_finds_the_angle_and_becomes_sure(delta_rad):
     assert math.degrees(node.heading.sigma_rad(TILT_SIGMA)) < 5
 
 
-def test_it_follows_a_drifting_gyroscope_across_pi():
+def test_the_filter_follows_a_drifting_gyroscope_across_pi():
     node = Node(HeadingFilter(HERE))
     delta_rad = node.run(120, 3.0, drift_radps=math.radians(0.1))
     assert node.off_deg(delta_rad) < 2.0
@@ -109,7 +109,7 @@ def test_a_rig_field_is_not_taken_for_the_earths_while_the_node_turns():
     assert node.heading.problem == ""
 
 
-def test_started_beside_steel_it_finds_back_without_knowing_the_place():
+def test_started_beside_steel_the_filter_recovers_without_a_known_place():
     """A boat's field at the start, learned for the Earth's; the true one shows by standing still in a turn."""
     node = Node(HeadingFilter(None))
     node.run(10, 1.0 + math.radians(40), norm_t=62e-6, dip_rad=DIP_RAD - 0.3)
@@ -122,7 +122,7 @@ def test_started_beside_steel_it_finds_back_without_knowing_the_place():
     assert math.degrees(node.heading.sigma_rad(TILT_SIGMA)) < 5
 
 
-def test_a_first_reading_that_was_a_little_off_is_no_alarm_for_the_whole_dive():
+def test_a_first_reading_slightly_off_raises_no_lasting_alarm():
     """Started on a deck, 10 % and 4 deg from the field of the place; the node hardly turns."""
     node = Node(HeadingFilter(None), swing_rad=math.radians(10))
     node.run(3, 1.0, norm_t=43e-6, dip_rad=DIP_RAD + 0.07)
@@ -141,7 +141,7 @@ def test_a_steady_field_of_another_strength_is_not_adopted_where_the_place_is_kn
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
 
 
-def test_an_unmeasured_turn_opens_the_gate():
+def test_an_unmeasured_rotation_widens_the_gate():
     node = Node(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.heading.widen(math.radians(30))
@@ -151,7 +151,7 @@ def test_an_unmeasured_turn_opens_the_gate():
     assert node.off_deg(1.0 + math.radians(40)) < 3
 
 
-def test_a_turn_of_any_size_starts_anew():
+def test_an_unmeasured_rotation_of_any_size_restarts_the_filter():
     node = Node(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.heading.widen(math.pi)

@@ -21,7 +21,7 @@ def frame(stamp_ns=0, row_time_ns=0):
     return Frame(np.zeros((101, 200, 3), np.uint8), stamp_ns, row_time_ns)
 
 
-def test_rows_have_their_own_times():
+def test_each_blob_has_its_rows_exposure_time():
     blobs, _ = blobs_of([detection(5.0, 0.0), detection(5.0, 50.0), detection(5.0, 100.0)], frame(row_time_ns=1000))
     assert [blob.dt_ns for blob in blobs] == [-50_000, 0, 50_000]
 
@@ -46,6 +46,6 @@ def test_triggers_are_the_nearest_and_come_once():
     assert pipeline.residual_s == pytest.approx(0.001)
 
 
-def test_unknown_device_names_the_known():
+def test_an_unknown_device_is_refused_with_the_known_names():
     with pytest.raises(BuddylineError, match="simulated, stored, picamera2"):
         load(CAMERAS, "camera", "webcam")

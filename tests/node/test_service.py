@@ -309,7 +309,7 @@ def test_a_node_without_its_camera_at_the_start_runs_says_so_and_takes_it_later(
 
 @pytest.mark.skipif(shutil.which("chronyd") is None, reason="chrony is not on this machine")
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_chrony_takes_the_examples(name):
+def test_chrony_accepts_the_example_configurations(name):
     """-p reads a configuration and prints it."""
     path = REPOSITORY / "node/examples" / f"chrony-{name}.conf"
     done = subprocess.run([shutil.which("chronyd"), "-p", "-f", str(path)], capture_output=True, text=True, check=False)

@@ -154,7 +154,7 @@ def test_two_worlds_agree_in_any_order_of_calls():
     np.testing.assert_array_equal(picture, two.render("b", stamps[3]))
 
 
-def test_another_seed_is_another_dive():
+def test_each_seed_gives_another_dive():
     truths = {World(Scenario(seed=seed)).truth(5 * S_NS, 0).t_a_b_m for seed in range(5)}
     assert len(truths) == 5
 
@@ -174,7 +174,7 @@ def test_the_dive_stays_in_the_water_and_within_its_ranges(environment):
     assert scenario.far_m * 0.8 < max(ranges_m) < scenario.far_m + 0.5
 
 
-def test_lights_are_mostly_in_view_but_not_always():
+def test_lights_are_in_view_most_of_the_time():
     world = World(Scenario(seed=5))
     all_four = []
     for stamp_ns in range(0, 200 * S_NS, 2 * S_NS):

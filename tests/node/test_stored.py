@@ -19,7 +19,7 @@ def encoded(picture, suffix=".png"):
     return cv2.imencode(suffix, picture)[1].tobytes()
 
 
-def test_grey_colour_and_alpha():
+def test_grey_colour_and_alpha_pictures_are_decoded():
     assert np.array_equal(decode_picture(encoded(GREY), "x"), GREY)
     colour = np.dstack((GREY, GREY, GREY))
     assert np.array_equal(decode_picture(encoded(colour), "x"), colour)
@@ -36,7 +36,7 @@ def test_grey_colour_and_alpha():
         (encoded(GREY.astype(np.uint16)), "16 bits"),
     ],
 )
-def test_what_cannot_be_used_is_named(data, says):
+def test_unusable_pictures_are_refused_by_name(data, says):
     with pytest.raises(PictureError, match=says) as refused:
         decode_picture(data, "folder/7.png")
     assert "folder/7.png" in str(refused.value)

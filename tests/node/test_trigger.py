@@ -66,14 +66,14 @@ def lock_for(camera: FreeCamera, period_ns: int = PERIOD_NS, frames: int = 1) ->
 @pytest.mark.parametrize("ppm", [-40.0, -10.0, 0.0, 25.0, 40.0])
 @pytest.mark.parametrize("line_ns", [1000.0, IMX219_LINE_NS, 31_000.0])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_locks_within_two_seconds_and_stays(ppm, line_ns, seed):
+def test_the_phase_locks_within_two_seconds_and_stays(ppm, line_ns, seed):
     camera = FreeCamera(ppm=ppm, line_ns=line_ns, seed=seed)
     times_s, off_ns = camera.run(lock_for(camera), 60.0, PERIOD_NS)
     assert np.abs(off_ns[times_s >= 2.0]).max() <= LOCKED_NS
 
 
 @pytest.mark.parametrize(("rate_hz", "frames"), [(7, 2), (3, 4), (30, 1), (10, 2)])
-def test_any_rate_and_number_of_frames(rate_hz, frames):
+def test_the_phase_locks_at_any_rate_and_number_of_frames(rate_hz, frames):
     """A seventh of a second is no whole number of ns: the grid must not slide away with the years."""
     period_ns = round(1e9 / rate_hz)
     camera = FreeCamera(ppm=30.0)
@@ -88,7 +88,7 @@ def test_a_shorter_latency_than_assumed_does_no_harm(latency):
     assert np.abs(off_ns[times_s >= 2.0]).max() <= LOCKED_NS
 
 
-def test_without_the_lock_forty_ppm_run_away():
+def test_without_the_lock_a_drift_of_forty_ppm_accumulates():
     """The simulation is no easy one: the same camera left alone."""
     camera = FreeCamera(ppm=40.0)
     lock = lock_for(camera)
@@ -115,7 +115,7 @@ def test_no_frame_is_asked_to_be_shorter_than_the_camera_can():
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_lost_frames_delay_and_do_not_mislead(seed):
+def test_lost_frames_delay_the_lock_without_disturbing_it(seed):
     camera = FreeCamera(ppm=40.0, lost=0.1, seed=seed)
     times_s, off_ns = camera.run(lock_for(camera), 30.0, PERIOD_NS)
     assert np.abs(off_ns[times_s >= 3.0]).max() <= 1.5 * LOCKED_NS

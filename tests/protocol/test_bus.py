@@ -124,7 +124,7 @@ def test_a_message_arrives_as_it_was_sent(client: Connect) -> None:
     assert decode(received.payload, Rejected) == rejected(7)
 
 
-def test_bytes_go_out_as_they_are(client: Connect) -> None:
+def test_payloads_are_sent_unchanged(client: Connect) -> None:
     inbox = Inbox()
     client().subscribe(topics.EVERYTHING, inbox)
     client().publisher(topics.IMU, "a").put_bytes(b'{"from": "a log"}')
@@ -141,7 +141,7 @@ def test_a_publishers_messages_come_in_order_and_once(client: Connect) -> None:
     assert inbox.triggers == list(range(500))
 
 
-def test_a_late_joiner_gets_what_came_before_then_what_comes_then(client: Connect) -> None:
+def test_a_late_joiner_gets_the_history_before_new_messages(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(100):
         publisher.put(rejected(trigger))
@@ -221,7 +221,7 @@ def test_the_newest_message_is_known_after_its_publisher_is_gone(client: Connect
     assert reader.newest(topics.POSE) == []
 
 
-def test_without_history_only_what_comes_from_now_on(client: Connect) -> None:
+def test_without_history_only_new_messages_come(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(10):
         publisher.put(rejected(trigger))
@@ -238,7 +238,7 @@ def test_without_history_only_what_comes_from_now_on(client: Connect) -> None:
     assert subscription.missed == 0
 
 
-def test_only_the_keys_asked_for_come(client: Connect) -> None:
+def test_only_the_subscribed_keys_come(client: Connect) -> None:
     node, asked, all_of_b = client(), Inbox(), Inbox()
     bus = client()
     bus.subscribe("buddyline/node/*/depth", asked)
@@ -250,7 +250,7 @@ def test_only_the_keys_asked_for_come(client: Connect) -> None:
     assert [r.key for r in all_of_b.wait_for(1)] == ["buddyline/node/b/status"]
 
 
-def test_an_unsound_message_is_refused_and_a_foreign_one_too(client: Connect) -> None:
+def test_an_invalid_message_and_one_of_another_topic_are_refused(client: Connect) -> None:
     publisher = client().publisher(topics.DEPTH, "a")
     with pytest.raises(MessageError, match="depth_m"):
         publisher.put(Depth(node="a", stamp_ns=1, depth_m=math.nan, sigma_m=0.1))
@@ -258,12 +258,12 @@ def test_an_unsound_message_is_refused_and_a_foreign_one_too(client: Connect) ->
         publisher.put(rejected(1))
 
 
-def test_a_node_id_that_is_none_is_refused(client: Connect) -> None:
+def test_an_invalid_node_id_is_refused(client: Connect) -> None:
     with pytest.raises(topics.BuddylineError, match="a/b"):
         client().publisher(topics.DEPTH, "a/b")
 
 
-def test_a_slow_handler_loses_the_oldest_and_is_told_how_many(client: Connect) -> None:
+def test_a_slow_handler_loses_the_oldest_messages_and_they_are_counted(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     begun, go_on = threading.Event(), threading.Event()
 
@@ -284,7 +284,7 @@ def test_a_slow_handler_loses_the_oldest_and_is_told_how_many(client: Connect) -
     assert (subscription.dropped, subscription.missed) == (25, 0)
 
 
-def test_a_handler_that_stands_still_does_not_starve_another(client: Connect) -> None:
+def test_a_blocked_handler_does_not_starve_another(client: Connect) -> None:
     bus, node, inbox = client(), client(), Inbox()
     go_on = threading.Event()
     bus.subscribe("buddyline/pair/*/*/rejected", lambda _: go_on.wait(PATIENCE_S) and None, capacity=2)
@@ -297,7 +297,7 @@ def test_a_handler_that_stands_still_does_not_starve_another(client: Connect) ->
     go_on.set()
 
 
-def test_an_exception_in_a_handler_is_the_buss_failure(client: Connect) -> None:
+def test_an_exception_in_a_handler_becomes_the_buss_failure(client: Connect) -> None:
     bus, node, inbox = client(), client(), Inbox()
     failed = threading.Event()
 
@@ -404,7 +404,7 @@ def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     assert inbox.triggers == list(range(200))
 
 
-def test_a_handler_may_publish(client: Connect) -> None:
+def test_a_handler_can_publish(client: Connect) -> None:
     """As the solver does."""
     solver, node, inbox = client(), client(), Inbox()
     answers = solver.publisher(topics.REJECTED, "a", "b")
@@ -440,5 +440,5 @@ def test_a_handler_may_publish(client: Connect) -> None:
         ("a/@alive/**", "a/@alive/b", True),
     ],
 )
-def test_key_expressions(key_expr: str, key: str, matches: bool) -> None:
+def test_key_expressions_match_chunks(key_expr: str, key: str, matches: bool) -> None:
     assert key_matches(key_expr, key) is matches

@@ -35,7 +35,7 @@ def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> Non
     assert handled == ["first", "huge"]
 
 
-def test_a_handler_that_never_ends_does_not_hold_up_closing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_handler_that_never_ends_does_not_delay_closing(caplog: pytest.LogCaptureFixture) -> None:
     go_on, handled = threading.Event(), []
 
     def handle(item: int) -> None:
@@ -72,7 +72,7 @@ def test_the_first_failure_is_kept() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [7.0, 10.0, 29.0, 30.0])
-def test_a_rate_cap_lets_its_rate_through(rate_hz: float) -> None:
+def test_a_rate_cap_passes_its_rate(rate_hz: float) -> None:
     clock = ManualClock()
     cap = RateCap(rate_hz, clock)
     passed = 0
@@ -82,7 +82,7 @@ def test_a_rate_cap_lets_its_rate_through(rate_hz: float) -> None:
     assert passed == pytest.approx(10 * rate_hz, abs=1)
 
 
-def test_a_rate_cap_outlives_pauses_and_a_clock_set_back() -> None:
+def test_a_rate_cap_works_after_pauses_and_a_clock_set_back() -> None:
     clock = ManualClock(1000 * S_NS)
     cap = RateCap(1.0, clock)
     assert cap.passes()
@@ -99,7 +99,7 @@ def test_a_rate_cap_of_zero_or_less_is_refused(rate_hz: float) -> None:
         RateCap(rate_hz, ManualClock())
 
 
-def test_caches_hold_a_minute_of_streams_and_one_of_states() -> None:
+def test_caches_hold_a_minute_of_streams_and_the_latest_state() -> None:
     assert cache_depth(topics.INFO, 60.0) == 1
     assert cache_depth(topics.IMAGE, 60.0) == 0
     assert cache_depth(topics.ATTITUDE, 60.0) == 6000

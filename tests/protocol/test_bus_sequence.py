@@ -126,7 +126,7 @@ def test_without_recovery_losses_are_counted_and_skipped() -> None:
     assert listener.sequence.missed == 2
 
 
-def test_superseded_states_are_no_loss() -> None:
+def test_replaced_states_do_not_count_as_lost() -> None:
     listener = Listener()
     for number in (3, 9, 8, 12):
         assert listener.accept(A, number, newest_only=True) is None
@@ -134,7 +134,7 @@ def test_superseded_states_are_no_loss() -> None:
     assert listener.sequence.missed == 0
 
 
-def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_for_publishers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sequence, "MAX_HELD", 3)
     monkeypatch.setattr(sequence, "MAX_PUBLISHERS", 2)
     listener = Listener()

@@ -55,7 +55,7 @@ class Inbox:
             assert self._changed.wait_for(lambda: key in self.keys, PATIENCE_S), self.keys
 
 
-def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
+def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
@@ -119,7 +119,7 @@ def test_each_publishes_its_own_and_no_more_and_all_read(keys: Path) -> None:
         assert [received.payload for received in remembered] == [b'{"stamp_ns":1}']
 
 
-def test_a_node_taken_from_the_hubs_list_is_neither_heard_nor_told_anything(keys: Path) -> None:
+def test_a_node_removed_from_the_hubs_list_can_neither_publish_nor_read(keys: Path) -> None:
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"])),
@@ -208,7 +208,7 @@ def test_endpoint_and_tls_table_must_agree(keys: Path) -> None:
         open_hub("tcp/127.0.0.1:7447", tls=tls(keys, "hub"))
 
 
-def test_a_hub_without_tls_is_waited_for_and_what_is_missing_is_said(keys: Path) -> None:
+def test_a_hub_without_tls_is_waited_for_and_the_reason_is_logged(keys: Path) -> None:
     endpoint, said, stop = free_endpoint(), [], threading.Event()
 
     def on_wait(text: str) -> None:
@@ -277,7 +277,7 @@ def test_only_a_rejected_certificate_ends_the_wait(keys: Path, answer: Callable[
         assert refusal(endpoint, tls(keys, "node-a")) is None
 
 
-def test_a_hub_that_closes_in_mid_handshake_is_tried_again_until_it_is_well(keys: Path) -> None:
+def test_a_hub_that_closes_during_the_handshake_is_tried_again(keys: Path) -> None:
     endpoint, stop, joined = tls_endpoint(), threading.Event(), []
 
     def attempt() -> None:
@@ -339,7 +339,7 @@ def at(keys: Path, endpoint: str) -> str:
     return endpoint
 
 
-def test_a_node_that_is_refused_records_all_the_same_and_says_so(keys: Path, tmp_path: Path) -> None:
+def test_a_refused_node_still_records_and_reports_the_refusal(keys: Path, tmp_path: Path) -> None:
     """Processes from the files as `buddyline keys` wrote them, but for the endpoint."""
     own = copy_of(keys, tmp_path / "own")
     at(own, tls_endpoint())

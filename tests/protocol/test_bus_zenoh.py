@@ -326,7 +326,7 @@ def test_a_connection_that_receives_nothing_is_cut_and_made_again(
         assert inbox.wait_for(3) == [0, 1, 2]
 
 
-def test_only_the_connection_asked_for_is_cut() -> None:
+def test_only_the_given_connection_is_cut() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
         with socket.create_connection(address) as first, socket.create_connection(address) as second:
@@ -341,7 +341,7 @@ def test_only_the_connection_asked_for_is_cut() -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs /proc")
-def test_nothing_listens_but_the_hub_and_stdout_is_ours() -> None:
+def test_only_the_hub_listens_and_zenoh_prints_nothing() -> None:
     endpoint = free_endpoint()
     port = int(endpoint.rpartition(":")[2])
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xff\xfe", b"null", b"[" * 100_000, b"{" * 50, b"{}", b'{"node":'])
-def test_garbage_is_refused(payload):
+def test_malformed_payloads_are_refused(payload):
     with pytest.raises(MessageError):
         decode(payload, Attitude)
 
@@ -30,7 +30,7 @@ def test_no_invalid_message_is_encoded():
         encode(Depth(node="A", stamp_ns=0, depth_m=1.0, sigma_m=0.02))
 
 
-def test_numbers_go_out_as_floats_and_unknown_is_left_out():
+def test_floats_stay_floats_and_unset_fields_are_left_out():
     out = encode(Depth(node="a", stamp_ns=7, depth_m=np.float64(3), sigma_m=1))
     assert out == b'{"node":"a","stamp_ns":7,"depth_m":3.0,"sigma_m":1.0}'
 
@@ -41,7 +41,7 @@ def test_numbers_go_out_as_floats_and_unknown_is_left_out():
         max_size=64,
     )
 )
-def test_round_trip(values):
+def test_messages_survive_encoding_and_decoding(values):
     blobs = [
         Blob(u_px=u, v_px=v, sigma_px=s, area_px=1.0, peak=p, elongation=1.0, score=p / 255.0) for u, v, s, p in values
     ]
@@ -56,7 +56,7 @@ def test_any_bytes_decode_or_are_refused(payload):
             assert isinstance(decode(payload, schema), schema)
 
 
-def test_every_kind_of_payload_has_its_stamp():
+def test_every_message_type_has_its_stamp():
     depth = Depth(node="a", stamp_ns=1_764_000_000_000_000_001, depth_m=3.0, sigma_m=1.0)
     time = FoxgloveTime(sec=1_764_000_000, nsec=2)
     image = CompressedImage(timestamp=time, frame_id="a_camera", data=b"x", format="jpeg")

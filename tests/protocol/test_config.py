@@ -24,12 +24,12 @@ def test_errors_name_field_and_value(text, says):
         assert word in str(refused.value)
 
 
-def test_missing_file_is_named(tmp_path):
+def test_a_missing_configuration_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"none\.toml"):
         load_config(tmp_path / "none.toml", NodeConfig)
 
 
-def test_defaults_and_hash():
+def test_defaults_apply_and_change_the_hash_when_overridden():
     config = parse_config('node = "a"', NodeConfig, "a.toml")
     assert config.camera.name == "simulated"
     assert config_sha256(config) == config_sha256(NodeConfig(node="a"))

@@ -36,7 +36,7 @@ def ticks_of(reader):
     return [record.open().message.stamp_ns // TICK_NS for record in reader.records()]
 
 
-def test_round_trip_and_independent_reader(tmp_path):
+def test_a_log_is_readable_here_and_by_the_mcap_library(tmp_path):
     write(tmp_path / "a.mcap", range(100))
     with DiveLogReader(tmp_path / "a.mcap") as reader:
         assert ticks_of(reader) == list(range(100))
@@ -49,7 +49,7 @@ def test_round_trip_and_independent_reader(tmp_path):
             assert (channel.message_encoding, message.publish_time) == ("json", message.log_time)
 
 
-def test_never_overwrites(tmp_path):
+def test_an_existing_log_is_never_overwritten(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"precious")
     with pytest.raises(BuddylineError, match="exists"):
         DiveLogWriter(tmp_path / "a.mcap")
@@ -64,7 +64,7 @@ def test_out_of_order_messages_come_in_order(tmp_path):
         assert ticks_of(reader) == list(range(200))
 
 
-def test_several_logs_read_as_one(tmp_path):
+def test_several_logs_are_merged_by_time(tmp_path):
     write(tmp_path / "a.mcap", range(0, 100, 2))
     write(tmp_path / "b.mcap", range(1, 100, 2), node="b")
     with DiveLogReader(tmp_path / "a.mcap") as a, DiveLogReader(tmp_path / "b.mcap") as b:
@@ -72,7 +72,7 @@ def test_several_logs_read_as_one(tmp_path):
         assert [r.key for r in read_logs([a, b], lambda key: "/b/" in key)] == ["buddyline/node/b/depth"] * 50
 
 
-def test_cut_at_any_byte_loses_only_the_chunk_in_progress(tmp_path):
+def test_a_log_cut_at_any_byte_loses_only_its_last_chunk(tmp_path):
     write(tmp_path / "a.mcap", range(50), flush_every=5)
     whole = (tmp_path / "a.mcap").read_bytes()
     kept = 0
@@ -149,7 +149,7 @@ def test_a_log_is_readable_before_its_first_message(tmp_path):
         assert "without having been closed" in reader.damage[0]
 
 
-def test_an_index_that_is_damaged_hides_no_chunk(tmp_path):
+def test_a_damaged_index_hides_no_chunk(tmp_path):
     write(tmp_path / "a.mcap", range(50))
     whole = (tmp_path / "a.mcap").read_bytes()
     with DiveLogReader(tmp_path / "a.mcap") as reader:
@@ -173,7 +173,7 @@ def test_a_file_that_is_no_log_is_refused(tmp_path, content, says):
     assert "x.mcap" in str(refused.value)
 
 
-def test_kill_loses_at_most_two_seconds(tmp_path):
+def test_a_killed_recorder_loses_at_most_two_seconds(tmp_path):
     program = textwrap.dedent(
         """
         import sys, time
@@ -199,7 +199,7 @@ def test_kill_loses_at_most_two_seconds(tmp_path):
     assert stamps[-1] - found[-1] <= 2_000_000_000
 
 
-def test_recorder_writes_everything_and_says_where_it_failed(tmp_path):
+def test_the_recorder_writes_everything_and_names_the_file_that_failed(tmp_path):
     with Recorder(tmp_path / "a.mcap") as recorder:
         for second in range(1000):
             message = depth(second)
@@ -209,7 +209,7 @@ def test_recorder_writes_everything_and_says_where_it_failed(tmp_path):
     assert (recorder.written, recorder.dropped) == (1000, 0)
 
 
-def test_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
+def test_the_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
     monkeypatch.setattr("buddyline.protocol.recorder.MAX_QUEUED_BYTES", 1000)
     with Recorder(tmp_path / "a.mcap") as recorder:
         with recorder._ready:  # the writing thread cannot take anything meanwhile
@@ -225,7 +225,7 @@ def test_recorder_drops_pictures_before_candidates(tmp_path, monkeypatch):
     assert recorder.dropped == 4
 
 
-def test_image_stamp_is_its_publish_time(tmp_path):
+def test_an_image_stamp_is_its_publish_time(tmp_path):
     image = CompressedImage(timestamp=FoxgloveTime(sec=3, nsec=4), frame_id="a_camera", data=b"x", format="jpeg")
     with DiveLogWriter(tmp_path / "a.mcap") as writer:
         writer.write_message(image)

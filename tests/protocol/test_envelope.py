@@ -25,13 +25,13 @@ def test_an_envelope_has_the_topic_and_ids_of_its_key():
     assert (envelope.topic, envelope.ids, envelope.message) == (REJECTED, ("a", "b"), rejected)
 
 
-def test_bus_and_log_open_the_same():
+def test_messages_of_bus_and_log_are_decoded_alike():
     payload = encode(DEPTH_A)
     received = Received(DEPTH_KEY, payload, 9, "application/json;buddyline.Depth")
     assert received.open() == Record(DEPTH_KEY, "buddyline.Depth", 9, 5, payload).open()
 
 
-def test_a_message_on_the_key_of_another_is_refused():
+def test_a_message_on_another_senders_key_is_refused():
     with pytest.raises(MessageError, match="node 'a' on key buddyline/node/b/mark"):
         open_envelope("buddyline/node/b/mark", encode(Mark(node="a", stamp_ns=1)))
     rejected = encode(Rejected(node_a="a", node_b="b", stamp_ns=1, trigger=1, reason="late"))
@@ -54,7 +54,7 @@ def test_a_picture_of_another_node_is_refused_and_a_frame_of_any_other_name_is_n
 
 
 @pytest.mark.parametrize("key", ["", "buddyline/node/a/unknown", "buddyline/node/A/depth", "elsewhere/node/a/depth"])
-def test_a_key_that_is_no_topic_is_refused(key):
+def test_an_unknown_key_is_refused(key):
     with pytest.raises(MessageError, match="not a Buddyline topic"):
         open_envelope(key, encode(DEPTH_A))
 
@@ -74,7 +74,7 @@ def test_refusals_are_counted_by_key_and_logged_less_and_less_often(caplog):
     ]
 
 
-def test_refusals_of_countless_keys_take_bounded_memory(caplog):
+def test_refusals_of_many_keys_take_bounded_memory(caplog):
     refusals = Refusals()
     for i in range(1000):
         refusals.open(Received(f"buddyline/node/n{i}/depth", b"{", 1, ""))

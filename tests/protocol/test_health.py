@@ -16,7 +16,7 @@ def test_a_stream_is_stale_by_its_topic_or_by_its_own_slow_period():
     assert stale_after_s(CANDIDATES, 5.0) == 15.0
 
 
-def test_what_has_a_rate_is_stale_after_more_than_one_period():
+def test_a_stream_is_not_stale_within_one_period():
     for topic in TOPICS:
         if topic.stale_s and topic.rate_hz:
             assert topic.stale_s > 1.0 / topic.rate_hz, topic.name

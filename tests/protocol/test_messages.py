@@ -92,6 +92,6 @@ def test_an_invalid_field_is_refused_and_named(schema, sound, change, named):
 
 
 @pytest.mark.parametrize("field", sorted(ATTITUDE))
-def test_missing_field_is_named(field):
+def test_a_missing_field_is_named(field):
     with pytest.raises(MessageError, match=field):
         decode(dumps({name: value for name, value in ATTITUDE.items() if name != field}), Attitude)

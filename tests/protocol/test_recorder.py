@@ -73,7 +73,7 @@ def recording(path, min_free_bytes=0):
     return Recorder(path, pictures=PictureLog(path, "a-*", min_free_bytes, metadata={"node": "a"}))
 
 
-def test_pictures_stand_beside_the_log_and_are_found_with_it(tmp_path):
+def test_pictures_are_in_files_beside_the_log_and_read_with_it(tmp_path):
     path = tmp_path / "a-1.mcap"
     with recording(path, min_free_bytes=MIB) as recorder:  # files of half a MiB
         sender = Sender(recorder)
@@ -92,7 +92,7 @@ def test_pictures_stand_beside_the_log_and_are_found_with_it(tmp_path):
     assert found == [(DEPTH if i % 2 else PICTURE, i) for i in range(1, 25)]
 
 
-def test_the_oldest_pictures_go_first_and_only_this_nodes(tmp_path):
+def test_only_this_nodes_pictures_are_deleted_the_oldest_first(tmp_path):
     with small_disk(tmp_path / "disk", 6 * 1024) as disk:
         for name in ("a-0.pictures", "b-0.pictures"):
             (disk / name).mkdir()
@@ -198,7 +198,7 @@ def test_a_disk_that_is_read_only_from_the_start_is_refused(tmp_path):
         recording(disk / "a-1.mcap")
 
 
-def test_memory_is_bounded_and_pictures_go_before_messages(tmp_path, monkeypatch):
+def test_memory_is_bounded_and_pictures_are_dropped_before_messages(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
     monkeypatch.setattr(DiveLogWriter, "write", _refuse)
     recorder = recording(tmp_path / "a-1.mcap")

@@ -93,7 +93,7 @@ def test_a_process_that_was_frozen_is_not_stuck(watched):
     assert watched.failure is not None
 
 
-def test_a_signal_within_a_wait_for_the_stop_ends_the_service():
+def test_a_signal_ends_a_service_that_waits():
     """The signal comes while the main thread holds the lock of the event that the handler is to set."""
     program = """
 import os, signal

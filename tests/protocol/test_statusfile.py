@@ -31,7 +31,7 @@ def test_the_path_of_the_status_file(monkeypatch, configured, variables, path):
     assert (None if found is None else str(found.path)) == path
 
 
-def test_it_is_whole_and_goes_with_the_service(tmp_path):
+def test_the_status_file_is_always_complete_and_removed_at_the_end(tmp_path):
     file = StatusFile(tmp_path / "run" / "node-a.json")
     for problems in ([], ["disk: full"]):
         file.write("node a", problems, STATUS)

@@ -67,7 +67,7 @@ def test_without_a_manager_nothing_is_sent(monkeypatch, address):
     assert notifier._socket is None
 
 
-def test_a_manager_that_goes_away_stops_nothing(manager):
+def test_a_vanished_service_manager_does_not_stop_the_service(manager):
     notifier = Notifier()
     manager.close()
     notifier.ready()

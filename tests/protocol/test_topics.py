@@ -9,7 +9,7 @@ from buddyline.protocol.schemas import json_schema
 from buddyline.protocol.topics import CANDIDATES, POSE, TOPICS, key_of, parse_key
 
 
-def test_keys_parse_back():
+def test_keys_parse_to_their_topic_and_ids():
     for topic in TOPICS:
         ids = ("alpha_1", "b")[: len(topic.id_fields)]
         assert parse_key(topic.key(*ids)) == (topic, ids)
@@ -23,18 +23,18 @@ def test_bad_node_ids_are_refused(bad):
         CANDIDATES.key(bad)
 
 
-def test_wrong_number_of_ids():
+def test_a_wrong_number_of_ids_is_refused():
     with pytest.raises(ValueError, match="2 node ids"):
         POSE.key("a")
 
 
-def test_an_image_goes_by_its_frame():
+def test_an_images_node_comes_from_its_frame_id():
     image = CompressedImage(timestamp=FoxgloveTime(sec=1, nsec=2), frame_id="b_camera", data=b"x", format="jpeg")
     assert key_of(image) == "buddyline/node/b/image"
     assert image.stamp_ns == 1_000_000_002
 
 
-def test_schemas_are_flat():
+def test_json_schemas_are_flat():
     for topic in TOPICS:
         text = json_schema(topic.schema)
         schema = json.loads(text)

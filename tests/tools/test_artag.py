@@ -54,7 +54,7 @@ def test_perfect_corners_give_the_pose_from_both_pictures_or_one():
         assert abs(pose.range_a_m - pose.range_b_m) < 1e-5
 
 
-def test_the_covariance_is_that_of_the_errors():
+def test_the_covariance_matches_the_errors():
     rng = np.random.default_rng(2)
     nees = []
     for _ in range(12):
@@ -76,12 +76,12 @@ def test_a_false_tag_is_left_out(twice):
     assert np.linalg.norm(pose.t_a_b_m - T_M) < 0.03
 
 
-def test_small_far_squares_have_two_readings_and_give_no_pose():
+def test_small_far_tags_fit_two_poses_and_give_none():
     seen_a, _ = _corners(0.0, np.random.default_rng(4), np.array([0.0, 0.0, 9.0]))
     assert tag_pose(_readings(seen_a, {})) is None
 
 
-def test_one_tag_is_no_evidence():
+def test_one_tag_alone_gives_no_pose():
     seen_a, seen_b = _corners(0.0, np.random.default_rng(5))
     assert tag_pose(_readings({3: seen_a[3]}, {})) is None
     assert tag_pose(_readings({3: seen_a[3]}, {0: seen_b[0]})).readings == 2
@@ -145,7 +145,7 @@ def test_a_dive_of_pictures_becomes_poses_on_their_own_topic_that_evaluate_measu
     assert result["accuracy"]["translation_m"]["median"] < 0.05
 
 
-def test_a_dive_without_tags_is_one_line(tmp_path, capsys):
+def test_a_dive_without_tags_gives_a_one_line_error(tmp_path, capsys):
     dive = str(tmp_path / "d.mcap")
     assert main(["simulate", dive, "--images", "--seconds", "1.2", "--rate", "4", "--width", "200"]) == 0
     assert main(["artag", dive, "-o", str(tmp_path / "t.mcap")]) == 2

@@ -74,7 +74,7 @@ def test_everything_is_there_once_and_in_order(dive):
     assert times == sorted(times)
 
 
-def test_the_nodes_own_copy_is_kept_and_the_difference_said(dive, tmp_path, capsys):
+def test_the_nodes_own_copy_is_kept_and_differences_are_reported(dive, tmp_path, capsys):
     directory, _, _ = dive
     (picture,) = [record for record in read(directory / "out.mcap") if record.key.endswith("/image")]
     assert picture.open().message.data == b"whole picture"
@@ -87,7 +87,7 @@ def test_the_nodes_own_copy_is_kept_and_the_difference_said(dive, tmp_path, caps
     assert "image: 1 topside, 1 now, 1 differ" in capsys.readouterr().err
 
 
-def test_it_is_solved_as_the_nodes_own_logs_are(dive, tmp_path):
+def test_a_backfilled_log_solves_like_the_nodes_own_logs(dive, tmp_path):
     directory, _, _ = dive
     own = [str(directory / name) for name in ("a.mcap", "b.mcap")]
     assert main(["solve", *own, "-o", str(tmp_path / "own.mcap")]) == 0

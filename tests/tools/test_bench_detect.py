@@ -14,7 +14,7 @@ def one_round(monkeypatch):
     monkeypatch.setattr(detect, "find_spec", lambda name: None)
 
 
-def test_times_stand_beside_those_of_other_finders(capsys):
+def test_times_are_compared_with_other_finders(capsys):
     assert main(["detect", "--pictures", "2", "--width", "205", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["source"] == "cavern"
@@ -33,7 +33,7 @@ def test_memory_after_a_tenth_and_after_all_pictures(capsys):
     assert resident_kib["20"] - resident_kib["2"] < 20_000
 
 
-def test_auto_stands_beside_every_preset(capsys, monkeypatch):
+def test_auto_is_compared_with_every_preset(capsys, monkeypatch):
     monkeypatch.setattr(presets, "RENDERED", ("night_reef",))
     assert main(["presets", "--pictures", "3", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
@@ -45,7 +45,7 @@ def test_auto_stands_beside_every_preset(capsys, monkeypatch):
 @pytest.mark.parametrize(
     "words", [["detect", "--pictures", "0"], ["detect", "--frames", "1"], ["presets", "--pictures", "0"]]
 )
-def test_what_cannot_be_measured_is_one_line(words, capsys):
+def test_bad_arguments_give_a_one_line_error(words, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err
     assert error.startswith("bench: ")

@@ -24,6 +24,6 @@ def test_a_whole_node_is_measured(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("argv", [["--seconds", "0"], ["--rate", "0"], ["--width", "1"]])
-def test_what_cannot_be_measured_is_one_line(argv, capsys):
+def test_bad_arguments_give_a_one_line_error(argv, capsys):
     assert main(["node", *argv]) == 2
     assert capsys.readouterr().err.startswith("bench: ")

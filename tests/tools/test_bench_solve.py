@@ -22,7 +22,7 @@ def test_the_times_of_the_solver_come_with_those_of_eq_1(capsys, monkeypatch):
     assert "number to the 1.00" in table
 
 
-def test_errors_stand_over_the_bound_and_choices_beside_the_range_gap(capsys, monkeypatch):
+def test_errors_are_compared_with_the_bound_and_choices_with_the_range_gap(capsys, monkeypatch):
     monkeypatch.setattr(accuracy, "RANGES_M", (2.0,))
     monkeypatch.setattr(accuracy, "BANDS_M", ((2.0, 4.0),))
     monkeypatch.setattr(accuracy, "FALSE", (2,))
@@ -35,7 +35,7 @@ def test_errors_stand_over_the_bound_and_choices_beside_the_range_gap(capsys, mo
     assert "RMSE over the bound" in accuracy.table(figures)
 
 
-def test_simulated_lights_fall_where_they_are_said_to():
+def test_simulated_lights_project_to_their_stated_places():
     trigger = simulate(np.random.default_rng(1), (3.0, 3.0), false=3, sigma_px=0.0)
     seen = [view.pixels[list(pair)] for view, pair in zip(trigger.views, (trigger.pair_a, trigger.pair_b), strict=True)]
     np.testing.assert_allclose(np.concatenate(seen), images(trigger.t_a_b_m, trigger.R_a_b))
@@ -44,7 +44,7 @@ def test_simulated_lights_fall_where_they_are_said_to():
 @pytest.mark.parametrize(
     "argv", [["solve", "--candidates", "1"], ["solve", "--repeats", "0"], ["accuracy", "--triggers", "0"]]
 )
-def test_what_cannot_be_measured_is_one_line(argv, capsys):
+def test_bad_arguments_give_a_one_line_error(argv, capsys):
     assert main(argv) == 2
     error = capsys.readouterr().err
     assert error.startswith("bench: ")

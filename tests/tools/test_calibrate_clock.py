@@ -76,7 +76,7 @@ def test_swapped_nodes_give_the_opposite_however_far_apart_the_clocks_are(offset
     assert back.offset_s == pytest.approx(-offset_s, abs=1e-4)
 
 
-def test_sigmas_cover_the_errors_and_not_by_far():
+def test_sigmas_cover_the_errors_without_excess():
     offsets, drifts, errors_s = [], [], []
     for seed in range(40):
         ways_s = np.random.default_rng(1000 + seed).uniform(0, 4e-4)
@@ -99,7 +99,7 @@ def test_the_quickest_exchanges_count_most():
 
 
 @pytest.mark.parametrize("by_s", [1.0, -1.0, 0.005])
-def test_a_clock_that_is_set_meanwhile_is_noticed_and_cuts(by_s):
+def test_a_clock_that_is_set_meanwhile_is_noticed_and_splits_the_windows(by_s):
     exchanges = exchanges_of(beacons(seconds=20, step=(10.0, by_s)))
     assert steps(exchanges)
     parts = [estimate(part) for part in windows(exchanges)]
@@ -107,7 +107,7 @@ def test_a_clock_that_is_set_meanwhile_is_noticed_and_cuts(by_s):
     assert parts[-1].offset_s == pytest.approx(0.003 + by_s, abs=3e-4)
 
 
-def test_no_step_where_there_was_none():
+def test_drift_and_jitter_are_no_clock_step():
     for seed in range(20):
         assert not steps(exchanges_of(beacons(seed, seconds=60, drift=40e-6, excess_s=0.01)))
 
@@ -133,7 +133,7 @@ def test_one_lucky_exchange_does_not_make_the_drift_certain():
     assert 0.3 < np.std(pulls) < 1.3
 
 
-def test_one_way_alone_tells_nothing():
+def test_beacons_in_one_direction_give_no_offset():
     legs = OneWayTimes()
     for beacon in beacons():
         if beacon.node == "a":
@@ -144,7 +144,7 @@ def test_one_way_alone_tells_nothing():
         estimate(legs.exchanges("a", "b"))
 
 
-def test_too_few_are_no_window():
+def test_too_few_exchanges_give_no_window():
     assert windows(exchanges_of(beacons(seconds=1.5))) == []
     short = estimate(exchanges_of(beacons(seconds=3)))
     assert short.drift is None
@@ -164,7 +164,7 @@ def status(**clock):
     )
 
 
-def test_a_good_pair_is_told_with_chronys_figures():
+def test_a_good_pair_is_reported_with_chronys_figures():
     follows = status(clock_source="192.0.2.1", clock_offset_s=1e-5, clock_rms_s=2e-5, clock_bound_s=3e-4)
     heard = heard_of(beacons(offset_s=0.0005), follows)
     found = reports(heard, None)
@@ -185,14 +185,14 @@ def test_a_good_pair_is_told_with_chronys_figures():
         ({"offset_s": 0.0, "base_s": (0.02, 0.0)}, "too slow to measure: the clocks may differ by 10.0 ms more"),
     ],
 )
-def test_what_stands_against_a_pair_is_named(pair, words):
+def test_a_pairs_clock_problem_is_named(pair, words):
     heard = heard_of(beacons(excess_s=1e-5, **pair))
     (found,) = reports(heard, None)
     assert words in found.problem()
     assert words in as_text([found], heard)
 
 
-def test_a_dive_without_a_link_tells_what_to_solve_with():
+def test_a_dive_without_a_link_gives_the_offset_to_solve_with():
     said = beacons(seconds=30, drift=10e-6, offset_s=0.0) + beacons(
         1, seconds=30, drift=10e-6, offset_s=0.0, begin_s=600.0
     )
@@ -218,7 +218,7 @@ def test_nothing_to_compare_is_an_error_that_says_what_to_do(said, words):
         reports(heard_of(said), None)
 
 
-def test_a_node_that_falls_silent_meanwhile_is_named(monkeypatch):
+def test_a_node_that_becomes_silent_meanwhile_is_named(monkeypatch):
     monkeypatch.setattr(clock_report, "SILENT_S", 0.2)
     network = LocalNetwork()
     with network.connect() as node, network.connect() as tool:
@@ -237,12 +237,12 @@ def test_a_node_that_falls_silent_meanwhile_is_named(monkeypatch):
         thread.join()
 
 
-def test_no_hub_is_said_within_the_time():
+def test_a_missing_hub_is_reported_in_time():
     with pytest.raises(BuddylineError, match="no hub at tcp"):
         clock_report.listen(ClientConfig(connect=free_endpoint()), 3.0, connect_within_s=0.2)
 
 
-def test_logs_of_a_dive(tmp_path, capsys):
+def test_the_offset_is_read_from_a_dives_logs(tmp_path, capsys):
     said = beacons(seconds=12, offset_s=0.0)
     for node in "ab":
         with DiveLogWriter(tmp_path / f"{node}.mcap") as writer:

@@ -64,7 +64,7 @@ def test_without_noise_the_bars_are_exact():
     assert found.chi2 < 0.3
 
 
-def test_errors_are_what_the_sigmas_say():
+def test_errors_match_the_sigmas():
     """Twelve bars: a centimetre of ruler error comes down to a millimetre or two, as predicted."""
     scores, before, after = [], [], []
     for seed in range(6):

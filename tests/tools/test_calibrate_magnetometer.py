@@ -67,7 +67,7 @@ def test_uncalibrated_headings_are_far_off():
 
 @pytest.mark.parametrize(("tilt_deg", "limit_deg"), [(180.0, 0.5), (90.0, 1.0), (65.0, 1.5)])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_iron_is_taken_off(tilt_deg, limit_deg, seed):
+def test_hard_and_soft_iron_are_removed(tilt_deg, limit_deg, seed):
     found = fit(*turned_rig(tilt_deg, seed=seed), norm_t=FIELD_T)
     assert np.abs(heading_errors_deg(found.offset_t, found.matrix)).max() < limit_deg
     assert found.norm_t == FIELD_T

@@ -58,7 +58,7 @@ def test_each_subcommand_has_an_example(command):
         assert f"example: buddyline {command.name} {name}" in parser.format_help().replace("\n", " ")
 
 
-def test_unknown_command_is_guessed(capsys):
+def test_an_unknown_command_gets_a_suggestion(capsys):
     status, _, err = run(capsys, "slove")
     assert status == 2
     assert "solve" in err
@@ -95,7 +95,7 @@ def test_output_that_exists_is_kept(capsys, dive_log, tmp_path):
     ids=["missing", "empty", "text"],
 )
 @pytest.mark.parametrize("command", ["solve", "play", "detect", "evaluate", "export"])
-def test_bad_logs_are_one_line_and_exit_2(capsys, tmp_path, command, content, says):
+def test_bad_logs_give_a_one_line_error_and_exit_2(capsys, tmp_path, command, content, says):
     path = tmp_path / "bad.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -109,7 +109,7 @@ def test_bad_logs_are_one_line_and_exit_2(capsys, tmp_path, command, content, sa
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_dive_without_calibration(capsys, tmp_path):
+def test_a_dive_without_calibration_is_refused(capsys, tmp_path):
     messages, _ = dive_messages(seconds=1.0)
     with DiveLogWriter(tmp_path / "dive.mcap") as writer:
         for message in messages:
@@ -130,7 +130,7 @@ def test_dive_without_calibration(capsys, tmp_path):
     assert status == 0
 
 
-def test_two_logs_of_different_rigs(capsys, tmp_path):
+def test_logs_of_different_rigs_are_refused(capsys, tmp_path):
     for name, seed in (("one", 3), ("two", 4)):
         messages, _ = dive_messages(seconds=1.0, seed=seed)
         with DiveLogWriter(tmp_path / f"{name}.mcap") as writer:
@@ -142,7 +142,7 @@ def test_two_logs_of_different_rigs(capsys, tmp_path):
         assert word in err
 
 
-def test_one_node_alone(capsys, tmp_path):
+def test_one_node_alone_is_an_error(capsys, tmp_path):
     messages, _ = dive_messages(seconds=1.0)
     with DiveLogWriter(tmp_path / "a.mcap") as writer:
         for message in messages:
@@ -153,7 +153,7 @@ def test_one_node_alone(capsys, tmp_path):
     assert "both nodes" in err
 
 
-def test_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path):
+def test_a_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path):
     data = dive_log.read_bytes()
     with DiveLogWriter(tmp_path / "chunked.mcap") as writer:
         for i, message in enumerate(dive_messages(seconds=3.0)[0]):
@@ -183,7 +183,7 @@ def test_bad_arguments_name_the_value(capsys, dive_log, tmp_path, words, says):
     assert says in err
 
 
-def test_configuration_typo_is_named(capsys, tmp_path):
+def test_a_configuration_typo_is_named(capsys, tmp_path):
     (tmp_path / "a.toml").write_text('node = "a"\n[camera]\nnmae = "stored"\n')
     status, _, err = run(capsys, "node", "--config", tmp_path / "a.toml")
     assert status == 2
@@ -211,12 +211,12 @@ def test_help_of_every_command_is_quick_because_it_imports_nothing_heavy():
     assert "buddyline.tools.arguments" in out
 
 
-def test_choices_are_those_that_the_solver_has():
+def test_offered_choices_match_the_solvers():
     assert get_args(Method) == METHODS
 
 
 @pytest.mark.parametrize("words", [["plan"], ["plan", "--help"], ["calibrate", "--help"]])
-def test_a_terminal_that_knows_ascii_alone_is_no_error(words):
+def test_a_terminal_limited_to_ascii_is_no_error(words):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run(
         [sys.executable, "-m", "buddyline", *words], capture_output=True, text=True, env=environment, check=False

@@ -46,7 +46,7 @@ def test_poses_are_those_of_the_log(solved):
     assert poses.time_s[-1] == pytest.approx((said[-1]["stamp_ns"] - said[0]["stamp_ns"]) / 1e9)
 
 
-def test_in_memory_and_by_command_are_the_same(solved):
+def test_solving_in_memory_and_by_command_give_the_same(solved):
     dive, memory = buddyline.open_dive(solved), buddyline.solve(CAVERN)
     assert memory.pair == ("a", "b")
     assert dive.pairs == [("a", "b")]
@@ -59,7 +59,7 @@ def test_in_memory_and_by_command_are_the_same(solved):
     np.testing.assert_array_equal(memory.rejections.reason, rejections.reason)
 
 
-def test_the_track_of_memory_is_that_of_the_log(solved):
+def test_the_track_in_memory_equals_that_of_the_log(solved):
     memory, dive = buddyline.solve(CAVERN).track, buddyline.open_dive(solved).track()
     said = [entry.message for entry in read_log(solved) if entry.topic == "track"]
     said.sort(key=lambda one: one["stamp_ns"])
@@ -90,7 +90,7 @@ def test_a_track_can_be_left_out_and_a_mode_must_be_known():
         buddyline.solve(CAVERN, track_hz=0.0)
 
 
-def test_of_a_recording_s_tracks_the_best_is_taken(tmp_path, solved):
+def test_the_best_track_of_a_recording_is_taken(tmp_path, solved):
     tracks = [entry for entry in read_log(solved) if entry.topic == "track"][:10]
     live = [entry.saying(mode="filter") for entry in tracks]
     late = [replace(entry.saying(mode="lag"), key=entry.key.replace("/track", "/track_lag")) for entry in tracks[:4]]
@@ -100,7 +100,7 @@ def test_of_a_recording_s_tracks_the_best_is_taken(tmp_path, solved):
     assert len(dive.track(mode="smooth")) == 0
 
 
-def test_sensors_truth_and_candidates():
+def test_sensors_truth_and_candidates_are_columns():
     dive = buddyline.open_dive(CAVERN)
     assert dive.nodes == ["a", "b"]
     assert dive.infos["a"].width_px == 820
@@ -133,7 +133,7 @@ def test_of_two_samples_with_one_stamp_the_first_counts(tmp_path):
     assert np.isnan(found.pressure_pa).all()
 
 
-def test_damage_is_told_and_the_rest_is_used():
+def test_damage_is_reported_and_the_rest_is_used():
     dive = buddyline.open_dive(DATA / "basin_damaged.mcap")
     assert len(dive.attitudes("a")) > 300
     assert any("basin_damaged.mcap" in line and "byte" in line for line in dive.losses)
@@ -173,7 +173,7 @@ def test_errors_name_what_is_wrong(tmp_path):
         buddyline.solver  # noqa: B018
 
 
-def test_detection_in_an_array():
+def test_lights_are_detected_in_an_array():
     picture = np.zeros((200, 300), np.uint8)
     rows, columns = np.mgrid[:200, :300]
     picture[:] = np.clip(20 + 300 * np.exp(-((rows - 80.25) ** 2 + (columns - 120.5) ** 2) / 18), 0, 255)
@@ -181,7 +181,7 @@ def test_detection_in_an_array():
     assert (blob.u_px, blob.v_px) == (pytest.approx(120.5, abs=0.1), pytest.approx(80.25, abs=0.1))
 
 
-def test_a_calibration_out_of_a_log_or_json(tmp_path):
+def test_a_calibration_is_read_from_a_log_or_json(tmp_path):
     info = buddyline.read_info(CAVERN)
     assert info == buddyline.open_dive(CAVERN).infos["a"]
     entry = next(entry for entry in read_log(CAVERN) if entry.topic == "info")
@@ -209,7 +209,7 @@ def test_importing_the_library_imports_nothing_else():
     assert {name.partition(".")[0] for name in imported} - ours <= set(sys.stdlib_module_names)
 
 
-def test_the_checks_are_all_of_the_solvers():
+def test_the_librarys_checks_match_the_solvers():
     from buddyline.solver_service.choices import CHECKS
 
     assert buddyline.ALL_CHECKS == CHECKS

@@ -127,7 +127,7 @@ def test_damage_is_named_and_what_is_left_is_used(run, name, damage, tmp_path):
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # viser's
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in NOT_ENOUGH])
-def test_whole_dives_are_no_losses(run, name):
+def test_undamaged_dives_report_no_losses(run, name):
     status, err, _ = run(name, None)
     assert (status, [line for line in err.splitlines() if line.startswith("buddyline ")]) == (0, [])
 
@@ -190,7 +190,7 @@ def test_an_interrupted_command_leaves_nothing_under_the_wanted_name(run, name, 
 
 
 @pytest.mark.parametrize("command", ["detect", "tune"])
-def test_marked_pictures_take_the_place_of_none(dives, tmp_path, capsys, command):
+def test_marked_pictures_replace_no_file(dives, tmp_path, capsys, command):
     originals = tmp_path / "photos"
     assert main(["detect", str(dives / "pictures.mcap"), "--draw", str(originals)]) == 0
     before = {path: path.read_bytes() for path in originals.iterdir()}
@@ -199,7 +199,7 @@ def test_marked_pictures_take_the_place_of_none(dives, tmp_path, capsys, command
     assert {path: path.read_bytes() for path in originals.iterdir()} == before
 
 
-def test_pictures_of_one_name_out_of_two_folders_are_both_marked(dives, tmp_path, capsys):
+def test_two_pictures_of_the_same_name_are_both_marked(dives, tmp_path, capsys):
     for name in ("one", "two"):
         assert main(["detect", str(dives / "pictures.mcap"), "--draw", str(tmp_path / name)]) == 0
     assert main(["detect", str(tmp_path / "one"), str(tmp_path / "two"), "--draw", str(tmp_path / "marked")]) == 0
@@ -208,7 +208,7 @@ def test_pictures_of_one_name_out_of_two_folders_are_both_marked(dives, tmp_path
 
 
 @pytest.mark.parametrize("name", [name for name, words in COMMANDS.items() if "-o" in words])
-def test_no_output_takes_the_place_of_a_file(run, name, tmp_path):
+def test_no_output_replaces_an_existing_file(run, name, tmp_path):
     target = tmp_path / next(word for word in COMMANDS[name] if word.startswith("OUT"))
     target.write_bytes(b"precious")
     status, err, _ = run(name, None)

@@ -62,7 +62,7 @@ def test_the_line_shows_the_track_with_its_sigma_and_how_long_it_saw_no_light():
     assert "no light for 1.2 s" in watch.dashboard.screen()
 
 
-def test_a_stale_track_gives_way_to_the_last_pose_and_that_is_said():
+def test_a_stale_track_is_replaced_by_the_last_pose_with_a_note():
     watch = running()
     watch.now_s = 2.0
     line = watch.dashboard.line()
@@ -97,7 +97,7 @@ def test_the_summary_has_the_track_s_errors_beside_the_poses():
     assert "track, a second later" in text
 
 
-def test_a_run_without_a_track_has_no_figures_of_it():
+def test_a_run_without_a_track_has_no_track_figures():
     watch = Watch()
     watch.now_s = 1.0
     assert summary_text(watch.dashboard.summary({})).startswith("no pose in 1 s")

@@ -82,7 +82,7 @@ def test_a_picture_of_absurd_size_is_refused_by_its_header_and_the_rest_is_done(
     assert "1_huge.png: its header says 60000x60000 px; at most 100 megapixels are read" in err
 
 
-def test_only_unusable_pictures_is_a_failure(tmp_path, capsys):
+def test_only_unusable_pictures_give_exit_status_1(tmp_path, capsys):
     (tmp_path / "a.png").write_bytes(b"no picture")
     assert main(["detect", str(tmp_path)]) == 1
     assert capsys.readouterr().out == ""
@@ -106,7 +106,7 @@ def test_a_configuration_overrides_a_preset(tmp_path):
     assert make_detector(detector.method, detector.environment, detector.overrides).detect(dim) == []
 
 
-def test_tune_proposes_what_finds_the_lights_and_shows_its_pictures(tmp_path, capsys):
+def test_tune_proposes_values_that_find_the_lights_and_marks_the_pictures(tmp_path, capsys):
     dim = [lamp_picture([AT], size=(200, 150), core=140.0, core_px=2.5, seed=k) for k in range(2)]
     dive = write_dive(tmp_path / "d.mcap", [encoded(picture) for picture in dim])
     words = ["tune", str(dive), "--method", "paper", "--environment", "night_reef", "--draw", str(tmp_path / "t")]
@@ -121,7 +121,7 @@ def test_tune_proposes_what_finds_the_lights_and_shows_its_pictures(tmp_path, ca
     assert sorted(path.name for path in (tmp_path / "t").iterdir()) == ["a_100.png", "a_101.png"]
 
 
-def test_tune_goes_by_likely_candidates_where_nothing_is_known(tmp_path, capsys):
+def test_without_truth_tune_uses_the_likely_candidates(tmp_path, capsys):
     (tmp_path / "p.png").write_bytes(encoded(PICTURE))
     (tmp_path / "q.png").write_bytes(b"broken")
     words = ["tune", str(tmp_path), "--method", "paper", "--environment", "lake", "--draw", str(tmp_path / "t")]
@@ -144,7 +144,7 @@ def test_tune_goes_by_likely_candidates_where_nothing_is_known(tmp_path, capsys)
         (["p.png", "--pictures", "0"], "--pictures"),
     ],
 )
-def test_tune_says_in_one_line_what_it_cannot_use(tmp_path, monkeypatch, capsys, words, says):
+def test_tune_refuses_bad_input_in_one_line(tmp_path, monkeypatch, capsys, words, says):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "p.png").write_bytes(encoded(PICTURE))
     (tmp_path / "dark.png").write_bytes(encoded(np.zeros_like(PICTURE)))

@@ -112,7 +112,7 @@ def test_calibration(info, shape, level, word):
     assert (found.level, word in found.text) == (level, True), found
 
 
-def test_a_calibration_of_this_camera_is_well():
+def test_a_calibration_of_this_camera_is_accepted():
     assert judge_rig.calibration(None, INFO_A, (1232, 1640)).level == "ok"
 
 
@@ -177,7 +177,7 @@ def test_a_calibrated_magnetometer_that_is_silent_is_a_problem(mag_t, level, mon
     assert levels(found) == {"imu": "ok", "compass": level, "imu place": "warning"}
 
 
-def test_the_place_of_an_inertial_unit_is_asked_for():
+def test_a_missing_place_of_the_inertial_unit_is_a_warning():
     entered = CALIBRATION.calibration
     assert judge_rig.imu_place(entered, chips=False).level == "skipped"
     missing = judge_rig.imu_place(entered, chips=True)
@@ -185,7 +185,7 @@ def test_the_place_of_an_inertial_unit_is_asked_for():
     assert judge_rig.imu_place(msgspec.structs.replace(entered, imu_m=(0.0, -0.05, 0.1)), chips=True).level == "ok"
 
 
-def test_the_files_of_a_pi(tmp_path, monkeypatch):
+def test_the_pis_system_files_are_read(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert machine.temperature_degc(tmp_path) is None
     assert machine.throttled(tmp_path) is None
@@ -213,7 +213,7 @@ def test_the_files_of_a_pi(tmp_path, monkeypatch):
     assert machine.throttled(tmp_path) == 0x50005
 
 
-def test_space_is_that_of_the_nearest_place_that_is_there(tmp_path):
+def test_free_space_is_that_of_the_nearest_existing_folder(tmp_path):
     free_bytes, error = machine.space(tmp_path / "not" / "yet")
     assert free_bytes > 0
     assert error == ""
@@ -229,7 +229,7 @@ def levels(findings):
     return {finding.name: finding.level for finding in findings}
 
 
-def test_hub_and_nodes():
+def test_hub_and_nodes_on_the_bus_are_judged():
     absent = bus.check_bus(bus.Seen(error="no hub at tcp/x", no_hub=True), "tcp/x", None)
     assert levels(absent) == {"hub": "warning", "nodes": "skipped"}
     refused = bus.check_bus(bus.Seen(error="certificate expired"), "tcp/x", None)
@@ -246,7 +246,7 @@ def test_hub_and_nodes():
     }
 
 
-def test_a_bus_is_seen_for_a_moment():
+def test_the_bus_is_watched_for_the_given_time():
     network = LocalNetwork()
     with network.connect() as node, network.connect() as doctor:
         node.declare_alive("node/a")
@@ -257,7 +257,7 @@ def test_a_bus_is_seen_for_a_moment():
     assert (seen.alive, seen.infos["a"].node, seen.statuses["a"].problem) == ({"node/a"}, "a", "hot")
 
 
-def test_what_hangs_or_fails_is_named_and_hides_nothing(capsys, monkeypatch):
+def test_a_check_that_hangs_or_fails_is_named_and_hides_no_other(capsys, monkeypatch):
     monkeypatch.setattr(diagnosis, "SAY_AFTER_S", 0.05)
     forever = threading.Event()
 
@@ -281,7 +281,7 @@ def test_what_hangs_or_fails_is_named_and_hides_nothing(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
-def test_a_simulated_rig_is_well(name, monkeypatch):
+def test_a_simulated_rig_has_no_problem(name, monkeypatch):
     monkeypatch.setattr(rig, "LISTEN_S", 1.0)
     config = load_node_config(EXAMPLES / f"{name}.toml")
     with monkeypatch.context() as patched:
@@ -308,7 +308,7 @@ def test_on_a_pi_without_camera_and_sensors_each_is_a_problem(monkeypatch):
     assert "no /dev/i2c-250" in sensors[0].text
 
 
-def test_a_camera_that_gives_nothing(monkeypatch):
+def test_a_camera_without_frames_is_a_problem(monkeypatch):
     class Silent:
         problem = ""
 

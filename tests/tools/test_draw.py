@@ -46,7 +46,7 @@ class TestMarks:
         assert named["R"] == pytest.approx(409.5 + OFFSET_PX, abs=30)
         assert len(list(root.iter("circle"))) == 3
 
-    def test_of_one_light_only_that_one_is_named(self) -> None:
+    def test_if_one_light_is_chosen_only_that_one_is_named(self) -> None:
         drawn = marked_svg(None, frame("a", 0), (-1, 0))
         assert [text.text for text in ET.fromstring(drawn).iter("text")] == ["R"]
 
@@ -57,7 +57,7 @@ class TestMarks:
 
 
 class TestFigures:
-    def test_an_inline_figure_holds_its_text_and_asks_for_nothing(self) -> None:
+    def test_an_inline_figure_contains_its_text_and_makes_no_request(self) -> None:
         figure, (axis,) = figures.new_figure(4.0, 3.0)
         axis.plot(*figures.broken(np.array([0.0, 1.0, 9.0]), np.array([1.0, 2.0, 3.0])))
         axis.set_title("<range> & $cost$", parse_math=False)
@@ -91,7 +91,7 @@ class TestFigures:
 
 
 class TestPage:
-    def test_what_a_page_shows_cannot_become_markup(self) -> None:
+    def test_text_on_a_page_cannot_become_markup(self) -> None:
         assert "<b>" not in table([["<b>", "<b>\n<b>"]], ("<b>",)) + section("<b>", "x") + page("<b>")
 
     def test_a_section_without_content_has_no_heading(self) -> None:

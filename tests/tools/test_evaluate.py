@@ -97,7 +97,7 @@ def test_covariance_convention_known_answer():
     assert result.errors.range_m[0] == pytest.approx(np.linalg.norm(t_est) - np.linalg.norm(t_est + d))
 
 
-def test_honest_covariances_give_a_mean_of_six_and_three():
+def test_true_covariances_give_a_mean_nees_of_six_and_three():
     rng = np.random.default_rng(11)
     spread = rng.normal(size=(6, 6)) * [0.02, 0.01, 0.03, 0.002, 0.001, 0.004]
     P = spread.T @ spread
@@ -117,7 +117,7 @@ def test_honest_covariances_give_a_mean_of_six_and_three():
     assert result.accuracy.honest3 == pytest.approx(0.95, abs=5 * math.sqrt(0.95 * 0.05 / 2000))
 
 
-def test_covariance_that_is_none_has_no_normalized_error():
+def test_an_invalid_covariance_has_no_normalized_error():
     broken = COVARIANCE.copy()
     broken[0, 1] = broken[1, 0] = 2e-4
     zero = np.zeros((6, 6))
@@ -165,7 +165,7 @@ def test_truth_without_triggers_is_interpolated_between_its_instants():
     assert result.errors.rotation_rad[0] == pytest.approx(0.05)
 
 
-def test_sparse_truth_is_taken_only_close_by():
+def test_sparse_truth_is_used_only_near_its_instants():
     near, far = pose(0, stamp_ns=FIRST * PERIOD_NS + 10_000_000), pose(10)
     result = measure([near, far], truths=[truth(0, trigger=UNSET), truth(20, trigger=UNSET)])
     assert (result.poses, result.without_truth, len(result.errors)) == (2, 1, 1)
@@ -223,7 +223,7 @@ MARKED = [light_truth(node, 0) for node in "ab"]
         ((0, 1), (0, 7), 0),
     ],
 )
-def test_right_pair(light_truths, blobs_a, blobs_b, right):
+def test_a_right_pair_uses_the_true_lights_left_and_right(light_truths, blobs_a, blobs_b, right):
     pairing = pair_of([pose(0, blobs_a=blobs_a, blobs_b=blobs_b)], light_truths)
     assert pairing.marked == bool(light_truths)
     partial = int(-1 in blobs_b)
@@ -249,7 +249,7 @@ def test_only_triggers_with_all_four_lights_count():
     assert pair_of([pose(0)], [], [frame("a", 0)]) is None
 
 
-def test_triggers_in_view_end_somehow():
+def test_every_trigger_in_view_has_one_ending():
     lights = [light_truth(node, k) for node in "ab" for k in range(4)]
     frames = [frame(node, k) for node in "ab" for k in range(3)] + [frame("a", 3, (FALSE,)), frame("b", 3)]
     result = measure([pose(0)], [rejection(1), rejection(3, "too_few_candidates")], [truth(0)], frames, lights)
@@ -267,7 +267,7 @@ def test_unknown_candidates_leave_the_pair_unknown():
     assert measure([pose(0)], truths=[truth(0)]).triggers.unanswered is None
 
 
-def test_triggers_and_rates():
+def test_triggers_are_counted_with_their_rates():
     frames = [frame(node, k) for node in "ab" for k in range(11)]
     poses = [pose(0), pose(1), pose(6)]
     triggers = measure(poses, [rejection(k) for k in (2, 3, 4)], [truth(0)], frames).triggers
@@ -345,7 +345,7 @@ def test_projection_agrees_with_the_simulators_own(camera):
     assert project(points, camera) == pytest.approx(sim_project(points, camera), abs=1e-6)
 
 
-def test_projection_knows_where_a_lens_model_ends():
+def test_projection_stops_at_the_fold_of_the_lens_model():
     assert np.isnan(project(np.array([[0.1, 0.0, -2.0]]), PINHOLE)).all()
     folding = CameraModel(
         model="pinhole", fx_px=900.0, fy_px=900.0, cx_px=410.0, cy_px=300.0, distortion=[-0.3, 0.0, 0.0, 0.0, 0.0]
@@ -357,7 +357,7 @@ def test_projection_knows_where_a_lens_model_ends():
     assert project(np.empty((0, 3)), PINHOLE).shape == (0, 2)
 
 
-def test_projection_is_where_the_contract_puts_the_lights():
+def test_projected_lights_follow_the_protocols_left_and_right():
     """The other's left light stands to the right in the picture."""
     pixels = project(np.array([[0.44, 0.0, 3.0]]), INFOS["a"].camera)
     assert pixels[0] == pytest.approx([409.5 + OFFSET_PX, 307.5])

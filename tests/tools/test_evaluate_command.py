@@ -68,7 +68,7 @@ def test_figures_as_json(tmp_path, capsys):
     assert "errors" not in figures
 
 
-def test_table_says_what_a_person_asks(tmp_path, capsys):
+def test_the_table_has_the_main_figures(tmp_path, capsys):
     solved = write_log(tmp_path / "o.mcap", *SOLVED, *TRUTHS, *LIGHTS)
     assert main(["evaluate", solved]) == 0
     text = capsys.readouterr().out
@@ -77,7 +77,7 @@ def test_table_says_what_a_person_asks(tmp_path, capsys):
     assert "nan" not in text
 
 
-def test_what_poses_say_in_ned_is_judged_by_true_ned_alone(tmp_path, capsys):
+def test_poses_in_ned_are_judged_by_true_ned_only(tmp_path, capsys):
     # A looks north, B is 3 m ahead: truly at (3, 0, 0).
     north = [
         NodePose(
@@ -116,7 +116,7 @@ def test_what_poses_say_in_ned_is_judged_by_true_ned_alone(tmp_path, capsys):
     assert evaluated(capsys, without)["ned"] is None
 
 
-def test_candidates_and_truth_may_stand_in_further_logs(tmp_path, capsys):
+def test_candidates_and_truth_may_be_in_further_logs(tmp_path, capsys):
     poses = write_log(tmp_path / "o.mcap", *(m for m in SOLVED if not isinstance(m, NodeInfo | Candidates)))
     dives = [
         write_log(tmp_path / f"{node}.mcap", *(m for m in SOLVED if getattr(m, "node", "") == node)) for node in "ab"
@@ -126,7 +126,7 @@ def test_candidates_and_truth_may_stand_in_further_logs(tmp_path, capsys):
     assert evaluated(capsys, poses, *dives, "--truth", beside)["pairing"]["right_share"] == 0.75
 
 
-def test_truth_named_wins_and_may_be_of_the_other_direction(tmp_path, capsys):
+def test_truth_from_the_named_log_wins_and_may_be_inverted(tmp_path, capsys):
     solved = write_log(tmp_path / "o.mcap", *SOLVED, *(truth(k, (0.0, 0.0, 9.0)) for k in range(4)))
     beside = write_log(tmp_path / "t.mcap", *(inverted(each) for each in TRUTHS), pair="b/a")
     assert evaluated(capsys, solved)["accuracy"]["wrong"] == 3
@@ -135,7 +135,7 @@ def test_truth_named_wins_and_may_be_of_the_other_direction(tmp_path, capsys):
     assert figures["accuracy"]["rotation_rad"]["median"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_poses_of_the_first_log_that_holds_any(tmp_path, capsys, caplog):
+def test_poses_of_the_first_log_with_poses_are_used(tmp_path, capsys, caplog):
     solved = write_log(tmp_path / "o.mcap", *SOLVED, *TRUTHS)
     live = write_log(tmp_path / "live.mcap", *(pose(k, (0.0, 0.0, 5.0)) for k in range(4)))
     assert evaluated(capsys, solved, live)["accuracy"]["wrong"] == 0
@@ -149,7 +149,7 @@ def test_candidates_alone_are_measured(tmp_path, capsys):
     assert figures["pairing"]["right"] is None
 
 
-def test_what_cannot_be_evaluated_is_one_line(tmp_path, capsys):
+def test_logs_that_cannot_be_evaluated_give_a_one_line_error(tmp_path, capsys):
     solved = write_log(tmp_path / "o.mcap", *SOLVED)
     assert "--truth" in refused(capsys, solved)
     assert "solve it first" in refused(capsys, write_log(tmp_path / "c.mcap", *INFOS.values(), frame("a", 0), *TRUTHS))
@@ -163,7 +163,7 @@ def test_what_cannot_be_evaluated_is_one_line(tmp_path, capsys):
     assert "missing.mcap" in refused(capsys, solved, "--truth", tmp_path / "missing.mcap")
 
 
-def test_several_pairs_ask_for_one(tmp_path, capsys):
+def test_several_pairs_need_a_choice(tmp_path, capsys):
     other = pose(0, node_a="a", node_b="c")
     both = write_log(tmp_path / "o.mcap", *SOLVED, other, *TRUTHS)
     assert "--pair" in refused(capsys, both)
@@ -172,7 +172,7 @@ def test_several_pairs_ask_for_one(tmp_path, capsys):
     assert "A/B" in refused(capsys, both, "--pair", "a-b")
 
 
-def test_bad_messages_and_damage_are_told_and_do_no_harm(tmp_path, capsys):
+def test_bad_messages_and_damage_are_reported_and_the_rest_is_evaluated(tmp_path, capsys):
     def damaged(path):
         assert main(["evaluate", str(path), "--json"]) == 1
         out, err = capsys.readouterr()

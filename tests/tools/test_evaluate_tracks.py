@@ -43,7 +43,7 @@ def truths(count):
     )
 
 
-def test_an_honest_track_has_a_nees_of_its_degrees_of_freedom():
+def test_a_true_covariance_gives_a_nees_of_its_degrees_of_freedom():
     rng = np.random.default_rng(1)
     tracks = [track(k, [0, 0, 4] + SIGMA_M * rng.standard_normal(3)) for k in range(2000)]
     (figures,) = tracks_figures(tracks, [Pose(0), Pose(1999 * PERIOD_NS)], truths(2000))
@@ -54,7 +54,7 @@ def test_an_honest_track_has_a_nees_of_its_degrees_of_freedom():
     assert figures.rotation_rad.median == pytest.approx(0.0, abs=1e-12)
 
 
-def test_errors_in_gaps_stand_apart_and_wrong_means_beyond_sigma_and_range():
+def test_errors_in_gaps_are_separate_and_wrong_needs_sigma_and_range():
     tracks = [track(0, [0, 0, 4.0]), track(1, [0, 0, 4.5], age_s=1.0), track(2, [0, 0, 4.5], sigma_m=0.4)]
     (figures,) = tracks_figures(tracks, [Pose(0), Pose(2 * PERIOD_NS)], truths(3))
     assert (figures.wrong, figures.wrong_in_gaps) == (1, 1)

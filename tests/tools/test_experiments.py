@@ -31,7 +31,7 @@ def test_errors_go_into_their_range_bin():
     assert row["range_rmse_m"] == pytest.approx(np.sqrt(14e-4 / 3), rel=1e-6)
 
 
-def test_near_poses_are_held_against_the_papers_8_cm():
+def test_near_poses_are_compared_with_the_papers_8_cm():
     errors, _ = _errors([0.01, 0.07, -0.09, 0.5])
     assert numbers.near_share(errors) == 0.5
     assert numbers.near_share(_errors([0.01], range_m=6.0)[0]) is None

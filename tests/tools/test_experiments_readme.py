@@ -28,7 +28,7 @@ class Light:
 '''
 
 
-def test_the_table_is_of_this_code():
+def test_the_readme_table_was_measured_with_this_code():
     assert written_hash(README.read_text()) == deciding_hash(), (
         f"the table in README.md is older than what decides poses (detector or solver); write it anew: {COMMAND}"
     )
@@ -45,7 +45,7 @@ def test_the_table_is_of_this_code():
         ("(range_m, 1.0)", "(range_m,\n            1.0)"),
     ],
 )
-def test_words_do_not_count(old, new):
+def test_comments_and_docstrings_do_not_change_the_hash(old, new):
     assert old in SOURCE
     assert deciding_hash([SOURCE.replace(old, new)]) == deciding_hash([SOURCE])
 
@@ -54,17 +54,17 @@ def test_words_do_not_count(old, new):
     ("old", "new"),
     [("3.0", "3.1"), ("> 3", ">= 3"), ("= 2.0", "= 2.5"), ("hypot", "dist"), ("range_m, 1.0", "1.0, range_m")],
 )
-def test_what_decides_counts(old, new):
+def test_deciding_code_changes_the_hash(old, new):
     assert old in SOURCE
     assert deciding_hash([SOURCE.replace(old, new)]) != deciding_hash([SOURCE])
 
 
-def test_modules_that_are_moved_or_renamed_do_not_count():
+def test_moved_or_renamed_modules_do_not_change_the_hash():
     assert deciding_hash([SOURCE, "x = 1"]) == deciding_hash(["x = 1", SOURCE])
     assert deciding_hash([SOURCE]) != deciding_hash([SOURCE, "x = 1"])
 
 
-def test_detector_and_solver_decide():
+def test_the_hash_covers_detector_and_solver():
     names = {f"{path.parent.name}/{path.name}" for path in deciding_modules()}
     assert {"detect/centre.py", "geometry/trigger.py", "solver_service/core.py", "node/pipeline.py"} <= names
     assert not any(name.startswith(("tools/", "protocol/", "sim/", "drivers/")) for name in names)

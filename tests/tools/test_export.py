@@ -82,7 +82,7 @@ def test_output_file_is_written_once(solved, tmp_path, capsys):
     assert "cannot be written" in refused(capsys, solved, "--format", "tum", "-o", tmp_path / "none" / "poses.tum")
 
 
-def test_nothing_to_export_is_one_line(tmp_path, solved, capsys):
+def test_nothing_to_export_gives_a_one_line_error(tmp_path, solved, capsys):
     bare = write_log(tmp_path / "t.mcap", truth(0))
     assert "solve it first" in refused(capsys, bare, "--format", "csv")
     assert "no truth" in refused(capsys, write_log(tmp_path / "p.mcap", pose(0)), "--format", "tum", "--truth")
@@ -120,7 +120,7 @@ def tracked(tmp_path):
     return rows, write_log(tmp_path / "t.mcap", pose(0), pose(1, **ned), rejection(2), truth(0), *rows, late, live)
 
 
-def test_csv_of_a_track_is_the_log_s(tracked, capsys):
+def test_csv_of_a_track_equals_the_log(tracked, capsys):
     rows, log = tracked
     assert main(["export", log, "--format", "csv"]) == 0
     captured = capsys.readouterr()
@@ -151,7 +151,7 @@ def test_csv_of_a_track_is_the_log_s(tracked, capsys):
         assert read("range_m") == [one.range_m]
 
 
-def test_tum_is_the_track_where_there_is_one_unless_poses_are_asked_for(tracked, capsys):
+def test_tum_has_the_track_unless_poses_are_asked_for(tracked, capsys):
     rows, log = tracked
     lines = exported(capsys, log, "--format", "tum").splitlines()
     first = min(rows, key=lambda one: one.stamp_ns)

@@ -111,7 +111,7 @@ def test_an_output_is_named_and_never_overwritten(tmp_path: Path, capsys: pytest
         export_foxglove(opened, Path(dive))
 
 
-def test_a_track_moves_b_and_leaves_a_path(tmp_path: Path) -> None:
+def test_a_track_moves_b_and_draws_its_path(tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
     messages: list[Message] = list(INFOS.values())

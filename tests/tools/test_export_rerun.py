@@ -18,7 +18,7 @@ pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def test_rerun_takes_pictures_cameras_and_transforms_without_set_up(tmp_path: Path) -> None:
+def test_rerun_reads_pictures_cameras_and_transforms_without_set_up(tmp_path: Path) -> None:
     rerun = installed(tmp_path / "venv")
     messages: list[Message] = list(INFOS.values())
     for k in range(5):

@@ -42,7 +42,7 @@ def settings(path):
     return dict(pairs)
 
 
-def test_a_node_on_a_pi(root, tmp_path, capsys):
+def test_a_nodes_unit_has_its_devices_and_chrony(root, tmp_path, capsys):
     assert install("node", "--config", node_config(tmp_path), "--root", root, "--run-as", "pi") == 0
     unit = settings(unit_of(root, "node"))
     program = tmp_path / "a venv" / "bin" / "buddyline"
@@ -60,7 +60,7 @@ def test_a_node_on_a_pi(root, tmp_path, capsys):
     ("camera", "sensors", "groups"),
     [("picamera2", "none", "video"), ("stored", "i2c", "i2c"), ("simulated", "simulated", None)],
 )
-def test_only_the_groups_of_its_devices(root, tmp_path, camera, sensors, groups):
+def test_a_unit_has_only_the_groups_of_its_devices(root, tmp_path, camera, sensors, groups):
     config = node_config(tmp_path, camera, sensors)
     assert install("node", "--config", config, "--root", root, "--run-as", "pi") == 0
     unit = settings(unit_of(root, "node"))
@@ -72,14 +72,14 @@ def test_only_the_groups_of_its_devices(root, tmp_path, camera, sensors, groups)
     ("directory", "writable"),
     [("/var/lib/buddyline/dives", None), ("dives", None), ("/data/my dives", '"-/data/my dives"')],
 )
-def test_it_may_write_where_it_records(root, tmp_path, directory, writable):
+def test_a_unit_may_write_where_its_node_records(root, tmp_path, directory, writable):
     assert install("node", "--config", node_config(tmp_path, directory=directory), "--root", root) == 0
     assert settings(unit_of(root, "node")).get("ReadWritePaths") == writable
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not on this machine")
 @pytest.mark.parametrize("user", [False, True])
-def test_systemd_takes_them(root, tmp_path, monkeypatch, user):
+def test_systemd_accepts_the_units(root, tmp_path, monkeypatch, user):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     config = node_config(tmp_path, directory="/data/my dives, 100 %")
     where = ["--user"] if user else ["--root", root, "--run-as", "root"]
@@ -140,19 +140,19 @@ def test_the_next_commands_are_named(root, tmp_path, monkeypatch, capsys):
         (["hub", "--user", "--root", "x"], "neither"),
     ],
 )
-def test_what_makes_no_unit_is_one_line(root, words, says, capsys):
+def test_bad_arguments_of_a_unit_give_a_one_line_error(root, words, says, capsys):
     assert install(*words) == 2
     assert says in capsys.readouterr().err
     assert not root.exists()
 
 
-def test_a_program_that_is_not_installed_is_said(root, tmp_path, monkeypatch, capsys):
+def test_a_program_that_is_not_installed_is_reported(root, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(install_service.sys, "executable", str(tmp_path / "python"))
     assert install("hub", "--print") == 2
     assert "make install" in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_is_said(root, tmp_path, capsys):
+def test_a_place_that_cannot_be_written_is_reported(root, tmp_path, capsys):
     root.mkdir()
     (root / "etc").write_text("")
     assert install("hub", "--root", root) == 2

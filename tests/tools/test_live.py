@@ -65,7 +65,7 @@ def test_time_over_with_a_hub_is_no_error(monkeypatch):
             LiveClient("test", ClientConfig(connect=endpoint)).run(fails)
 
 
-def test_a_child_says_how_it_died_and_what_it_takes():
+def test_a_child_reports_how_it_died_and_its_load():
     child, dead = Child("hub", "--listen", free_endpoint()), Child("hub", "--config", "none.toml", name="second")
     try:
         assert child.load().rss_bytes > 2**20

@@ -53,7 +53,7 @@ def test_messages_come_in_order_and_break_ends(bus):
     assert found == [0, 1, 2]
 
 
-def test_only_one_nodes_where_it_is_named(bus):
+def test_only_the_named_nodes_messages_come(bus):
     with stream(ids=("b",)) as depths:
         bus.publisher(DEPTH, "a").put(depth(1))
         bus.publisher(DEPTH, "b").put(depth(2, "b"))
@@ -69,7 +69,7 @@ def test_tracks_come_at_once_or_a_second_later_and_better(bus):
         assert next(iter(later)).mode == "lag"
 
 
-def test_what_was_said_before_is_not_given(bus):
+def test_earlier_messages_are_not_given(bus):
     publisher = bus.publisher(DEPTH, "a")
     publisher.put(depth(1))
     with stream() as depths:
@@ -110,7 +110,7 @@ def test_a_slow_loop_loses_the_oldest_and_they_are_counted(network, monkeypatch)
         assert next(iter(depths)).stamp_ns == 6
 
 
-def test_unsound_messages_are_counted_and_left_out(bus):
+def test_invalid_messages_are_counted_and_left_out(bus):
     with stream() as depths:
         publisher = bus.publisher(DEPTH, "a")
         publisher.put(depth(1, "b"))

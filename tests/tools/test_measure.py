@@ -12,7 +12,7 @@ from buddyline.tools.measure.tables import cells_of, markdown_table, number, per
 from buddyline.tools.measure.turns import by_turns, fastest_s
 
 
-def test_works_are_done_by_turns_after_a_round_to_warm_up():
+def test_works_run_by_turns_after_a_warm_up_round():
     done, ticks = [], itertools.count()
     works = {"a": lambda: done.append("a"), "b": lambda: (done.append("b"), next(ticks))}
     times = by_turns(works, 2, clock_s=lambda: float(next(ticks)))
@@ -26,7 +26,7 @@ def test_the_fastest_of_several_counts():
     assert fastest_s(lambda: None, 3, lambda: next(clock)) == 1.0
 
 
-def test_what_a_process_takes():
+def test_the_load_of_a_process_is_measured():
     before = load_of()
     with open(os.devnull):
         assert load_of().files == before.files + 1
@@ -36,7 +36,7 @@ def test_what_a_process_takes():
         load_of(2**22 + 1)
 
 
-def test_tables(capsys):
+def test_tables_have_aligned_columns(capsys):
     rows = cells_of(
         [{"name": "a", "ms": {"x": 1.25}}, {"name": "longer", "ms": {"x": 10.0}}], {"": "{name}", "ms": "{ms[x]:.1f}"}
     )

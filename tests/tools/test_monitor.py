@@ -64,7 +64,7 @@ class TestPicture:
         take(picture, pose(1, t_ned_m=(1.0, 2.0, 3.0), azimuth_rad=1.1, inclination_rad=-0.9), at(5))
         assert picture.points[-1].t_m == (1.0, 2.0, 3.0)
 
-    def test_stale_within_a_second(self) -> None:
+    def test_a_silent_track_is_stale_within_a_second(self) -> None:
         picture = watched(5)
         assert not picture.is_stale(at(4) + S_NS // 2)
         assert picture.is_stale(at(4) + S_NS)
@@ -118,7 +118,7 @@ class TestHealth:
         assert not picture.is_stale(at(0) + 38 * S_NS // 10)
         assert picture.is_stale(at(0) + 12 * S_NS)
 
-    def test_nothing_yet(self) -> None:
+    def test_without_messages_the_advice_is_to_start_everything(self) -> None:
         assert "start hub, nodes and solver" in words(PairPicture(), 5)
 
     def test_a_killed_node_is_named_with_what_to_do(self) -> None:
@@ -142,20 +142,20 @@ class TestHealth:
             feed(picture, k, "a")
         assert sentence(findings(picture, at(50))[0], at(50)) == "Node b is silent, for 2.1 s."
 
-    def test_a_dead_hub_is_told_from_dead_nodes(self) -> None:
+    def test_a_dead_hub_is_distinguished_from_dead_nodes(self) -> None:
         picture = watched()
         said = findings(picture, at(29) + 5 * S_NS)
         assert [finding.name for finding in said] == ["bus"]
         assert said[0].since_ns == at(29)
 
-    def test_the_solver_is_missed(self) -> None:
+    def test_a_missing_solver_is_named(self) -> None:
         picture = watched()
         picture.alive("solver/any", False, at(29))
         assert "The solver has left the bus" in words(picture, at(30))
         picture.alive("solver/any", True, at(30))
         assert "The solver is silent" in words(watched(1), at(0) + S_NS) + words(_unsolved(), at(60))
 
-    def test_what_a_node_reports_is_passed_on_with_its_beginning(self) -> None:
+    def test_a_nodes_reported_problem_is_shown_with_its_begin(self) -> None:
         picture = watched()
         for k, figure in ((30, "2.1"), (40, "3.1"), (50, "4.1")):
             take(picture, status("a", at(k), f"camera: nothing for {figure} s"), at(k))
@@ -164,7 +164,7 @@ class TestHealth:
         assert [finding.since_ns for finding in said] == [at(30)]
 
     @pytest.mark.parametrize("reason", sorted(REASONS))
-    def test_each_reason_is_said_in_plain_words_with_advice(self, reason: str) -> None:
+    def test_each_rejection_reason_has_plain_words_and_advice(self, reason: str) -> None:
         picture = watched()
         for k in range(30, 60):
             for message in (frame("a", k), frame("b", k), rejection(k, reason)):
@@ -183,7 +183,7 @@ class TestHealth:
 
 
 class TestTrack:
-    def test_the_track_stands_for_b_and_says_how_long_it_saw_no_light(self) -> None:
+    def test_the_track_is_shown_with_the_time_since_the_last_light(self) -> None:
         picture = watched()
         take(picture, track(29, (0.0, 0.0, 3.5), age_s=1.0), at(29))
         shown = picture.shown(at(31))
@@ -193,7 +193,7 @@ class TestTrack:
         assert "3.50 m" in drawn
         assert "No light for 1.2 s." in drawn
 
-    def test_a_stale_track_gives_way_to_the_last_pose_and_says_so(self) -> None:
+    def test_a_stale_track_is_replaced_by_the_last_pose_with_words(self) -> None:
         picture = watched(20)
         take(picture, track(19, (0.0, 0.0, 3.5)), at(19))
         for k in range(20, 31):
@@ -204,7 +204,7 @@ class TestTrack:
         assert shown.note == "no track for 1.1 s, the last pose"
         assert "The track has ended, for 1.1 s." in words(picture, at(30))
 
-    def test_without_any_track_the_last_pose_stands_for_b(self) -> None:
+    def test_without_a_track_the_last_pose_is_shown(self) -> None:
         shown = watched().shown(at(29))
         assert shown is not None
         assert (shown.estimate, shown.note) == (pose(29), "no track, the last pose")
@@ -248,7 +248,7 @@ class TestTrack:
         assert panel.headline(picture, at(59)).count("3.00 m") == 1
 
     @pytest.mark.parametrize("live", [True, False])
-    def test_what_the_solver_names_is_passed_on(self, live: bool) -> None:
+    def test_the_solvers_problem_is_shown(self, live: bool) -> None:
         picture = watched()
         take(picture, solver_status(at(29), "the inertial unit of a is mounted otherwise"), at(29))
         assert "The solver reports: the inertial unit of a" in words(picture, at(29), live=live)
@@ -273,7 +273,7 @@ def _unsolved() -> PairPicture:
 
 
 class TestLive:
-    def test_what_comes_over_the_bus_is_in_the_picture_and_bad_messages_change_nothing(self) -> None:
+    def test_messages_update_the_picture_and_bad_ones_change_nothing(self) -> None:
         network = LocalNetwork(ManualClock(at(30)))
         picture, refusals = PairPicture(), Refusals("t")
         with network.connect() as nodes, network.connect() as topside:
@@ -293,7 +293,7 @@ class TestLive:
         assert picture.nodes["a"].attitude == attitude("a", at(1))
         assert refusals.count == 1
 
-    def test_who_leaves_the_bus_is_seen(self) -> None:
+    def test_a_process_that_leaves_the_bus_is_noticed(self) -> None:
         network, picture = LocalNetwork(ManualClock(at(30))), watched()
         with network.connect() as topside:
             with network.connect() as node:
@@ -319,7 +319,7 @@ class TestPanel:
             assert "<script>alert" not in drawn(picture, at(31))
         assert "<img" not in panel.camera(picture, picture.nodes["a"], at(30))
 
-    def test_a_picture_carries_its_own_candidates_not_the_newest(self) -> None:
+    def test_a_picture_is_shown_with_its_own_candidates(self) -> None:
         picture = watched(5)
         take(picture, image("a", at(2)), at(4))
         drawn = panel.camera(picture, picture.nodes["a"], at(4))
@@ -334,7 +334,7 @@ class TestPanel:
         words = panel.judged_picture(picture, picture.nodes["a"])[1]
         assert "more than one arrangement fits (two, alike)" in words
 
-    def test_the_lights_that_a_pose_chose_are_told_by_node(self) -> None:
+    def test_the_chosen_lights_of_a_pose_are_given_by_node(self) -> None:
         solved = pose(0, blobs_a=(1, 0), blobs_b=(0, -1))
         assert [panel.chosen_lights(solved, node) for node in "abc"] == [(1, 0), (0, -1), (-1, -1)]
 
@@ -428,14 +428,14 @@ class TestScene:
             assert seen @ ahead / np.linalg.norm(seen) > math.cos(math.radians(40))
         assert eye[2] < target[2]
 
-    def test_a_view_is_left_by_who_swims_out_of_it(self) -> None:
+    def test_a_node_outside_the_view_is_noticed(self) -> None:
         eye, target = fit(np.array([3.0, 0.0, 0.0]), 1.6)
         fov_rad = math.radians(75)
         assert holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
         assert not holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]))
         assert not holds(eye, target, fov_rad, np.array([eye + 0.1 * (eye - target)]))
 
-    def test_age_is_a_colour(self) -> None:
+    def test_the_trails_colour_shows_its_age(self) -> None:
         colours = age_colours(np.array([0.0, 60.0, 500.0]), 120.0).astype(int)
         assert np.all(np.diff(colours[:, 0]) < 0)
 
@@ -460,5 +460,5 @@ class TestCoverage:
         assert (colours[0, :50, 1] > 120).all()
         assert (colours[0, 50:, 2] > 180).all()
 
-    def test_times_are_said_as_people_say_them(self) -> None:
+    def test_times_are_shown_in_minutes_and_hours(self) -> None:
         assert [clock_words(s) for s in (0.0, 59.96, 61.5, 3661.0)] == ["0:00.0", "1:00.0", "1:01.5", "1:01:01.0"]

@@ -93,7 +93,7 @@ class TestPlayback:
 
 
 class TestReadingFromATime:
-    def test_chunks_before_it_and_of_other_topics_are_not_read(self, tmp_path: Path) -> None:
+    def test_earlier_chunks_and_other_topics_are_not_read(self, tmp_path: Path) -> None:
         path = tmp_path / "d.mcap"
         with DiveLogWriter(path) as writer:
             writer.write_message(INFOS["a"], at(0))
@@ -119,7 +119,7 @@ class TestReadingFromATime:
 
 
 class TestReport:
-    def test_the_page_is_whole_and_asks_nothing_of_any_network(self, dive: str) -> None:
+    def test_the_page_is_complete_and_makes_no_request(self, dive: str) -> None:
         with Dive([dive]) as opened:
             page = report_html(opened, solved_pair(opened, None))
         outside = _Addresses()
@@ -145,7 +145,7 @@ class TestReport:
         assert times[-1] == pytest.approx((TICKS - 2) / 10, abs=0.2)
         assert [keyframe[4] for keyframe in frames].count(False) == 2
 
-    def test_the_track_is_told_beside_the_poses(self, tmp_path: Path) -> None:
+    def test_the_track_is_reported_beside_the_poses(self, tmp_path: Path) -> None:
         messages: list[Message] = [*INFOS.values(), pose(0), pose(99), *map(truth, range(100))]
         # Without a light from 3 s to 5 s; the track is too uncertain to count from 4 s on.
         for k in range(100):
@@ -182,13 +182,13 @@ class TestReport:
             errors = summarize(opened, ("a", "b")).errors()
         np.testing.assert_allclose([errors.translation_m, errors.range_m], [[0.02] * 5] * 2, atol=1e-9)
 
-    def test_pictures_are_shown_with_what_became_of_them(self, dive: str) -> None:
+    def test_pictures_are_shown_with_their_outcomes(self, dive: str) -> None:
         with Dive([dive]) as opened:
             shots = summarize(opened, ("a", "b")).shots
         assert list(shots) == ["a"]
         assert shots["a"].words.startswith("Pose at 3.00 m")
 
-    def test_of_several_pairs_the_chosen_one_is_told_and_the_others_named(self, tmp_path: Path) -> None:
+    def test_the_chosen_pair_is_reported_and_the_others_are_named(self, tmp_path: Path) -> None:
         others = [pose(k, (0.0, 0.0, 7.0), node_b="c") for k in range(9)]
         path = write_log(tmp_path / "three.mcap", *INFOS.values(), info("c"), *map(pose, range(5)), *others)
         with Dive([path]) as opened:

@@ -14,7 +14,7 @@ from tests.disks import small_disk
 DEPTH = Depth(node="a", stamp_ns=5, depth_m=3.0, sigma_m=0.1)
 
 
-def test_a_file_has_its_name_when_it_is_whole(tmp_path):
+def test_a_file_gets_its_name_only_when_it_is_complete(tmp_path):
     with new_file(tmp_path / "a.txt") as part:
         part.write_text("half")
         assert not (tmp_path / "a.txt").exists()
@@ -40,7 +40,7 @@ def test_a_part_that_another_command_writes_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("taken", [False, True])
-def test_a_file_system_without_hard_links_does_too(tmp_path, monkeypatch, taken):
+def test_a_file_system_without_hard_links_works(tmp_path, monkeypatch, taken):
     def refuse(*_):
         if taken:
             (tmp_path / "a.txt").write_text("theirs")
@@ -56,7 +56,7 @@ def test_a_file_system_without_hard_links_does_too(tmp_path, monkeypatch, taken)
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", kept)]
 
 
-def test_a_link_that_leads_nowhere_is_not_written_through(tmp_path):
+def test_a_dangling_link_is_not_written_through(tmp_path):
     (tmp_path / "a.txt").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(BuddylineError, match="exists"):
         write_new(tmp_path / "a.txt", "ours")
@@ -83,7 +83,7 @@ def test_a_full_disk_leaves_no_log_of_half_a_dive(tmp_path):
         assert list(disk.iterdir()) == []
 
 
-def test_a_log_is_whole_when_it_has_its_name(tmp_path):
+def test_a_log_gets_its_name_only_when_it_is_complete(tmp_path):
     with new_dive_log(tmp_path / "a.mcap", {"command": "test"}) as writer:
         writer.write_message(DEPTH)
     with DiveLogReader(tmp_path / "a.mcap") as reader:

@@ -38,7 +38,7 @@ def depth(node: str, depth_m: float) -> Depth:
     return Depth(node=node, stamp_ns=NOW_NS, depth_m=depth_m, sigma_m=0.02)
 
 
-def test_nothing_else_decodes_a_payload():
+def test_only_the_envelope_decodes_payloads():
     found = {
         str(path.relative_to(ROOT))
         for folder in ("buddyline", "protocol", "node", "solver_service", "tools")
@@ -71,7 +71,7 @@ def watch_of(bus, took):
 
 
 @pytest.mark.parametrize("client", [monitor_of, follower_of, watch_of])
-def test_a_depth_on_another_nodes_key_is_believed_by_no_live_client(client):
+def test_live_clients_refuse_a_depth_on_another_nodes_key(client):
     network = LocalNetwork()
     with network.connect() as nodes, network.connect() as topside:
         taken = client(topside, None)
@@ -86,7 +86,7 @@ def test_a_depth_on_another_nodes_key_is_believed_by_no_live_client(client):
     assert found["a"] == 1.0
 
 
-def test_the_dashboard_believes_no_status_on_another_nodes_key():
+def test_the_dashboard_refuses_a_status_on_another_nodes_key():
     network = LocalNetwork()
     with network.connect() as nodes, network.connect() as topside:
         dashboard = Dashboard("cavern", 1, NOW_NS, 10.0)
@@ -119,7 +119,7 @@ def test_commands_count_and_name_what_is_on_another_nodes_key(misplaced, tmp_pat
     assert "node 'a' on key buddyline/node/b/candidates" in err
 
 
-def test_playback_and_report_believe_no_depth_on_another_nodes_key(misplaced):
+def test_playback_and_report_refuse_a_depth_on_another_nodes_key(misplaced):
     with Dive([misplaced]) as dive:
         playback = Playback(dive)
         playback.seek(playback.end_ns)

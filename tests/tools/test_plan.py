@@ -18,7 +18,7 @@ from buddyline.tools.plan import described, expected, light_reach_m, with_baseli
 FACING = np.array([[0.0, 1.0, 0.0, 0.0]])
 
 
-def test_the_bound_is_that_of_the_geometrys_description():
+def test_the_bound_matches_the_geometrys_description():
     info = with_baseline(described(None), 0.88)
     camera = info.camera
     sigma_px = 0.5 * camera.fx_px / 1800.0
@@ -27,7 +27,7 @@ def test_the_bound_is_that_of_the_geometrys_description():
         assert math.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(bound_m, rel=0.12)
 
 
-def test_errors_of_simulated_dives_are_those_of_the_plan(tmp_path, capsys):
+def test_errors_of_simulated_dives_match_the_plan(tmp_path, capsys):
     info = with_baseline(described(None), 0.88)
     dive, out = str(tmp_path / "d.mcap"), str(tmp_path / "p.mcap")
     words = ["--seconds", "22", "--rate", "3", "--seed", "901", "--undisturbed", "--lost", "0", "--gross", "0"]
@@ -61,7 +61,7 @@ def test_wider_lights_measure_farther_and_visibility_ends_it(capsys):
     assert clear["reach_m"] > clear["far_m"] > 5.0
 
 
-def test_the_table_says_what_ends_it(capsys):
+def test_the_table_names_what_limits_the_range(capsys):
     assert main(["plan", "--visibility", "3"]) == 0
     text = capsys.readouterr().out
     assert "visibility of 3 m ends it" in text
@@ -94,7 +94,7 @@ def test_the_plot_is_written_once(tmp_path, capsys):
         (["--camera", "no.toml"], "no.toml"),
     ],
 )
-def test_what_cannot_be_planned_is_one_line(words, named, capsys):
+def test_bad_values_give_a_one_line_error(words, named, capsys):
     assert main(["plan", *words]) == 2
     err = capsys.readouterr().err
     assert named in err

@@ -64,12 +64,12 @@ def test_everything_but_what_a_solver_made_is_sent(log):
     assert len(played.messages(Imu)) == 2 * 200
 
 
-def test_pace_follows_speed(log):
+def test_the_playback_rate_follows_speed(log):
     assert Played(log).clock.now_ns() - 5 == pytest.approx(1.98e9, abs=1e8)
     assert Played(log, speed=4.0).clock.now_ns() - 5 == pytest.approx(1.98e9 / 4, abs=3e7)
 
 
-def test_a_part_comes_with_its_calibration(log):
+def test_a_part_of_a_dive_is_sent_with_its_calibration(log):
     played = Played(log, start_s=0.5, end_s=1.0)
     stamps = [message.stamp_ns for message in played.messages(Candidates)]
     assert len(stamps) == 10
@@ -77,7 +77,7 @@ def test_a_part_comes_with_its_calibration(log):
     assert len(played.messages(NodeInfo)) == 2
 
 
-def test_laps_carry_times_and_triggers_on(log):
+def test_laps_continue_times_and_triggers(log):
     frames = Played(log, laps=2).messages(Candidates)
     first, second = frames[: len(frames) // 2], frames[len(frames) // 2 :]
     for one, other in zip(first, second, strict=True):
@@ -139,7 +139,7 @@ def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
     assert max(solver.ahead_ns) < 1_700_000_000
 
 
-def test_fast_playback_without_a_solver_waits_for_nobody(log, monkeypatch):
+def test_fast_playback_without_a_solver_does_not_wait(log, monkeypatch):
     monkeypatch.setattr(play, "SOLVER_SILENT_S", math.inf)
     network, stop = LocalNetwork(), threading.Event()
     with Dive([log]) as dive, network.connect() as bus:

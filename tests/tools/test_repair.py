@@ -45,7 +45,7 @@ def repaired(path, capsys, status=1):
     return found, capsys.readouterr().err
 
 
-def test_a_log_that_was_not_closed(log, capsys):
+def test_an_unclosed_log_is_repaired(log, capsys):
     path, chunks = log
     path.write_bytes(path.read_bytes()[: chunks[7] + 40])
     found, said = repaired(path, capsys)
@@ -54,7 +54,7 @@ def test_a_log_that_was_not_closed(log, capsys):
 
 
 @pytest.mark.parametrize("shift", [0, 13, -13], ids=["overwritten", "bytes added", "bytes missing"])
-def test_garbage_in_the_middle_is_passed_over(log, capsys, shift):
+def test_garbage_in_the_middle_is_skipped(log, capsys, shift):
     path, chunks = log
     data = path.read_bytes()
     begin, end = chunks[3] - 20, chunks[5] + 30
@@ -66,7 +66,7 @@ def test_garbage_in_the_middle_is_passed_over(log, capsys, shift):
     assert "skipped" in said
 
 
-def test_a_length_that_leads_astray_costs_its_own_chunk_alone(log, capsys):
+def test_a_wrong_length_costs_only_its_own_chunk(log, capsys):
     path, chunks = log
     data = bytearray(path.read_bytes())
     # Far enough to skip two whole chunks, and end in the middle of a third.
@@ -87,7 +87,7 @@ def test_a_chunk_with_a_wrong_checksum_is_left_out(log, capsys):
     assert f"chunk at byte {chunks[4]}" in said
 
 
-def test_a_destroyed_beginning(log, capsys):
+def test_a_log_with_a_destroyed_beginning_is_repaired(log, capsys):
     path, chunks = log
     data = bytearray(path.read_bytes())
     data[8 : chunks[1]] = bytes(chunks[1] - 8)
@@ -98,7 +98,7 @@ def test_a_destroyed_beginning(log, capsys):
     assert "10 messages are lost before" in said
 
 
-def test_a_whole_log_loses_nothing_and_is_said_to_be_whole(log, capsys):
+def test_a_complete_log_loses_nothing_and_is_reported_as_complete(log, capsys):
     path, _ = log
     found, said = repaired(path, capsys, status=0)
     assert found == list(range(COUNT))
@@ -129,7 +129,7 @@ def test_what_can_be_read_of_a_log_cut_at_any_byte_can_be_repaired(log, tmp_path
     assert kept == COUNT
 
 
-def test_numbers_that_tell_nothing_are_not_interpreted():
+def test_missing_sequence_numbers_are_not_interpreted():
     assert missing(np.zeros(5, np.int64), np.arange(5)) == []
     assert missing(np.empty(0, np.int64), np.empty(0, np.int64)) == []
     assert missing(np.arange(5)[::-1].copy(), np.arange(5)) == []

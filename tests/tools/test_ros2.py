@@ -62,7 +62,7 @@ def test_depth_is_height_under_the_surface(store: Any) -> None:
     assert value.pose.covariance[0] == 1e6
 
 
-def test_a_pose_goes_over_as_it_is_with_its_covariance(store: Any) -> None:
+def test_a_pose_is_published_unchanged_with_its_covariance(store: Any) -> None:
     value = of(translated(store, pose(0)), "/buddyline/a/b/pose")
     assert value.header.frame_id == "a_camera"
     assert value.pose.pose.position.z == 3.0
@@ -89,7 +89,7 @@ def test_a_track_is_an_odometry_with_its_twist_in_b_s_frame(store: Any) -> None:
     assert of_twist[5, 5] == 1e6
 
 
-def test_where_b_is_follows_the_track_that_is_not_late(store: Any) -> None:
+def test_the_transform_of_b_follows_the_track_that_is_not_late(store: Any) -> None:
     def transforms(*messages: Message) -> int:
         return sum(message.topic == "/tf" for message in translated(store, *messages))
 
@@ -132,7 +132,7 @@ def test_everything_can_be_encoded_and_read_back(store: Any) -> None:
         assert bytes(store.serialize_cdr(again, message.type_name)) == bytes(payload)
 
 
-def test_a_time_that_ros_cannot_say_is_refused_and_the_next_goes_over(store: Any) -> None:
+def test_a_time_beyond_ros_range_is_refused_and_the_next_is_sent(store: Any) -> None:
     translation = Translation(store.types)
     with pytest.raises(MessageError, match="2038"):
         list(translation.messages(depth("a", 2**31 * S_NS, 12.5)))

@@ -25,7 +25,7 @@ def test_a_dive_is_written_with_its_truth_and_says_how_it_was_made(tmp_path, cap
     assert (metadata["environment"], metadata["baseline_a_m"], metadata["rate_hz"]) == ("basin", "0.6", "10.0")
 
 
-def test_the_same_words_give_the_same_file_and_another_seed_another(tmp_path):
+def test_the_same_arguments_give_the_same_file_and_another_seed_another(tmp_path):
     files = []
     for name, seed in (("one", "5"), ("two", "5"), ("three", "6")):
         _simulated(tmp_path / name, "--seed", seed)
@@ -51,7 +51,7 @@ def test_pictures_are_as_wide_as_asked_for(tmp_path):
         (["--width", "1"], "width_px"),
     ],
 )
-def test_what_cannot_be_simulated_is_one_line_and_leaves_no_file(words, named, tmp_path, capsys):
+def test_bad_arguments_give_a_one_line_error_and_no_file(words, named, tmp_path, capsys):
     path = tmp_path / "d.mcap"
     assert main(["simulate", str(path), *words]) == 2
     err = capsys.readouterr().err

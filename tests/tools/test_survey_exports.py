@@ -84,7 +84,7 @@ def test_cavern_agrees_to_the_centimetre(tmp_path, make, place, depth):
 
 @CAVERN
 @pytest.mark.parametrize("style", ["diving", "normal"])
-def test_cavern_takes_all_legs_in_one_style(tmp_path, style):
+def test_cavern_accepts_all_legs_in_one_style(tmp_path, style):
     project, adjusted = survey(depth="readings")
     text = survex.svx(Sheet(project, adjusted), style)
     assert (survex.SURVEX.diving in text) == (style == "diving")
@@ -121,7 +121,7 @@ def test_cavern_agrees_on_crossing_loops_side_shots_and_steep_legs(tmp_path):
 
 
 @CAVERN
-def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
+def test_cavern_accepts_contradicting_sights_without_a_warning(tmp_path):
     course = world.line(np.random.default_rng(6), 4)
     legs = world.readings_of(course, np.random.default_rng(2))
     legs[1] = replace(legs[1], back_azimuth_deg=(legs[1].back_azimuth_deg + 15) % 360)
@@ -133,7 +133,7 @@ def test_cavern_takes_contradicting_sights_without_a_warning(tmp_path):
 
 @CAVERN
 @pytest.mark.parametrize("place", list(PLACES))
-def test_cavern_takes_cartesian_vectors(tmp_path, place):
+def test_cavern_accepts_cartesian_vectors(tmp_path, place):
     project, adjusted = survey(world.line, **PLACES[place])
     said, _, found = world.cavern(tmp_path, survex.svx_cartesian(Sheet(project, adjusted)))
     assert not said
@@ -182,7 +182,7 @@ def test_an_unknown_declination_is_never_written():
         tables.geojson(Sheet(project, adjusted))
 
 
-def test_readings_people_instruments_and_notes_are_in_the_export():
+def test_the_export_has_readings_people_instruments_and_notes():
     project, adjusted = survey(**PLACES["declination"])
     project = replace(
         project,
@@ -207,7 +207,7 @@ def test_readings_people_instruments_and_notes_are_in_the_export():
                 assert float(word) == pytest.approx(angle, abs=1e-3)
 
 
-def test_tables():
+def test_tables_and_geojson_hold_every_leg_and_station():
     point = replace(survey()[0].leg[0], to="amphora", note="neck up")
     project, adjusted = survey(points=[point], **PLACES["utm"])
     legs = list(csv.DictReader(io.StringIO(tables.legs_csv(Sheet(project, adjusted)))))

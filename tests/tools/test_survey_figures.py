@@ -19,7 +19,7 @@ def rms(values):
     return math.sqrt(float((np.array(values) ** 2).mean()))
 
 
-def test_loops_close_as_their_sigmas_say():
+def test_loops_close_within_their_sigmas():
     figures = run(CAMPAIGNS["loops"], 42)
     print(*table(figures), sep="\n")
     assert len(figures["V: auto, readings"]) >= 40
@@ -35,7 +35,7 @@ def test_loops_close_as_their_sigmas_say():
 
 
 @pytest.mark.parametrize(("name", "worse"), [("lines", 1.5), ("lines-4deg-disturbed", 2.0)])
-def test_open_lines_end_as_near_as_their_compasses_let_them(name, worse):
+def test_open_lines_end_within_their_compasses_errors(name, worse):
     figures = run(CAMPAIGNS[name], 20)
     print(*table(figures), sep="\n")
     # By hand it is one compass of 1.5 degrees, here two of 1.5 or 4.

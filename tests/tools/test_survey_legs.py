@@ -36,7 +36,7 @@ def derived(messages, **settings):
     return result
 
 
-def test_legs_of_a_leapfrog(messages):
+def test_a_leapfrog_dive_gives_its_legs(messages):
     found = derived(messages)
     assert [(leg.from_, leg.to) for leg in found.legs] == [(str(k), str(k + 1)) for k in range(5)]
     assert [leg.from_node for leg in found.legs] == ["a", "b", "a", "b", "a"]
@@ -86,14 +86,14 @@ def test_a_mark_of_an_earlier_station_closes_the_loop(messages):
     assert derived([*messages, mark]).legs[-1].to == "0"
 
 
-def test_a_mark_that_is_no_name_is_said_and_changes_nothing(messages):
+def test_a_mark_with_an_invalid_name_is_reported_and_ignored(messages):
     mark = Mark(node="a", stamp_ns=world.START_NS, name="not a name!")
     found = derived([*messages, mark])
     assert found.legs == derived(messages).legs
     assert "no station's name" in found.problems[0].text
 
 
-def test_a_point_of_interest_hangs_on_the_station_of_the_other(messages):
+def test_a_point_is_measured_from_the_other_nodes_station(messages):
     leg = derived(messages).legs[2]
     mark = Mark(node=leg.to_node, stamp_ns=leg.end_ns - 10**9, kind="point", name="amphora", note="neck up")
     found = derived([*messages, mark])
@@ -106,14 +106,14 @@ def test_a_point_of_interest_hangs_on_the_station_of_the_other(messages):
     assert adjusted.points[0].ellipse[0] > 0.02
 
 
-def test_a_point_without_fixes_is_said(messages):
+def test_a_point_without_fixes_is_reported(messages):
     mark = Mark(node="b", stamp_ns=world.START_NS - 10**12, kind="point", name="wreck")
     found = derived([*messages, mark])
     assert not found.points
     assert "wreck" in found.problems[0].text
 
 
-def test_walking_about_a_fixed_node_keeps_its_station():
+def test_moving_round_a_fixed_node_keeps_its_station():
     rng = np.random.default_rng(4)
     places = np.array([[0.0, 0, 10], [5, 1, 9.0], [4, -3, 11.0], [6, 2, 10.2]])
     course = world.Course(places, [(0, 1, 0), (0, 2, 0), (0, 3, 0)], ["0", "1", "2", "3"])
@@ -132,7 +132,7 @@ def test_a_handled_node_is_not_at_rest(messages):
     assert len(derived(shaken).legs) == 4
 
 
-def test_a_rest_too_short_for_a_leg_is_said(messages):
+def test_a_rest_too_short_for_a_leg_is_reported(messages):
     third = derived(messages).legs[2]
     middle = (third.start_ns + third.end_ns) // 2
     cut = [
@@ -146,7 +146,7 @@ def test_a_rest_too_short_for_a_leg_is_said(messages):
     assert any(alarm.startswith("stations: a rest before") for alarm in found.legs[2].alarms)
 
 
-def test_a_rest_in_which_poses_were_refused_is_said(messages):
+def test_a_rest_with_rejected_poses_is_reported(messages):
     third = derived(messages).legs[2]
     kept = 0
     refused = []
@@ -175,7 +175,7 @@ def test_a_compass_that_states_more_may_wander_more_while_its_node_rests():
     assert len(found.legs) == 8
 
 
-def test_rests_that_follow_at_once_are_two_legs():
+def test_consecutive_rests_are_two_legs():
     messages = world.dive(COURSE, np.random.default_rng(3), rest_s=8.0, swim_s=0.0)
     shorter = [m for m in messages if not _approaching(m)]
     assert [(leg.from_, leg.to) for leg in derived(shorter).legs] == [(str(k), str(k + 1)) for k in range(5)]
@@ -211,7 +211,7 @@ def test_true_headings_give_the_same_magnetic_legs(messages):
         assert one.azimuth_deg == pytest.approx(other.azimuth_deg, abs=2e-3)
 
 
-def test_disturbed_field_is_seen_and_its_compass_left():
+def test_a_disturbed_field_is_noticed_and_its_compass_not_used():
     rng = np.random.default_rng(11)
     course = world.line(rng, 5)
     flaws = world.Flaws(compass_deg=0.5)
@@ -231,7 +231,7 @@ def test_disturbed_field_is_seen_and_its_compass_left():
     assert np.linalg.norm((adjusted.positions["5"].position_m - adjusted.positions["0"].position_m - end)[:2]) < 1.0
 
 
-def test_the_same_alarms_come_live():
+def test_live_alarms_equal_the_offline_ones():
     rng = np.random.default_rng(11)
     course = world.line(rng, 3)
 
@@ -251,14 +251,14 @@ def stop(line, a=10.0, b=10.0):
     return Stop(np.array(line, dtype=float), {"a": a, "b": b})
 
 
-def test_depths_tell_who_has_moved():
+def test_depths_show_which_node_has_moved():
     stops = [stop((5, 0, 0)), stop((4, 2, 0), b=12.0), stop((-4, 1, 0), a=14.0, b=12.0), stop((3, 3, 1), a=9, b=9)]
     standings = stand(stops, "leapfrog", "a")
     assert [s.station["a"] + s.station["b"] for s in standings] == ["01", "02", "32", "54"]
     assert [bool(s.problem) for s in standings] == [False, False, False, True]
 
 
-def test_without_other_evidence_the_procedure_tells():
+def test_without_other_evidence_the_procedure_decides():
     level = [stop((5, 0, 0)), stop((-5, 0, 0)), stop((5, 1, 0))]
     assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "a")] == ["01", "21", "23"]
     assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "b")] == ["10", "12", "32"]
@@ -267,7 +267,7 @@ def test_without_other_evidence_the_procedure_tells():
     assert [s.station["a"] + s.station["b"] for s in stand(again, "leapfrog", "a")] == ["01", "01"]
 
 
-def test_marks_go_before_depths():
+def test_marks_take_precedence_over_depths():
     moved = Stop(np.array([-4.0, 0.0, 0.0]), {"a": 13.0, "b": 10.0}, {"b": "X"})
     standing = stand([stop((5, 0, 0)), moved], "leapfrog", "a")[1]
     assert standing.station == {"a": "2", "b": "X"}
@@ -312,7 +312,7 @@ def test_correlated_readings_count_for_less():
     assert mean_of_white(stamps, slow, 0.1, 0.0).sigma > mean_of_white(stamps, white, 0.1, 0.0).sigma
 
 
-def test_ranges():
+def test_trigger_numbers_are_written_as_ranges():
     assert ranges([3, 4, 5, 9, 7, 4]) == "3-5 7 9"
     assert ranges([]) == ""
 
@@ -375,7 +375,7 @@ def test_a_second_dive_takes_numbers_of_its_own(messages):
     assert not any("taken for" in problem.text for problem in found.problems)
 
 
-def test_a_mark_by_hand_goes_before_the_log_s_and_equate_joins_stations(messages):
+def test_a_mark_by_hand_takes_precedence_and_equate_joins_stations(messages):
     plain = derived(messages)
     leg = plain.legs[2]
     wrong = Mark(node=leg.to_node, stamp_ns=leg.end_ns, name="T21")

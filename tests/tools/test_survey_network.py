@@ -85,7 +85,7 @@ def test_a_blunder_is_named():
     assert again.left_out[0][1] == "taken out: line slack"
 
 
-def test_legs_in_a_row_share_the_blame():
+def test_legs_in_a_row_are_named_together_as_the_blunder():
     course = world.loop(np.random.default_rng(8), 12)
     course.legs += [(2, 8, 0), (5, 11, 0), (3, 10, 0), (0, 6, 0)]
     legs = world.readings_of(course, np.random.default_rng(1))
@@ -97,7 +97,7 @@ def test_legs_in_a_row_share_the_blame():
     assert len(one_loop.blunders[0].legs) > 1
 
 
-def test_nothing_checks_an_open_traverse_and_that_is_said():
+def test_an_open_traverse_is_reported_as_unchecked():
     course = world.line(np.random.default_rng(1), 12)
     adjusted = adjust(world.project_of(world.readings_of(course, np.random.default_rng(1))))
     assert all(one.chi2 is None for one in adjusted.residuals)
@@ -117,7 +117,7 @@ def test_two_fixed_points_close_a_loop():
     assert off.loops[0].error_m == pytest.approx(3.0, abs=0.01)
 
 
-def test_legs_that_hang_in_the_air_are_left_out():
+def test_unconnected_legs_are_left_out():
     course = world.line(np.random.default_rng(4), 6)
     legs = world.readings_of(course, np.random.default_rng(1))
     del legs[2]
@@ -128,7 +128,7 @@ def test_legs_that_hang_in_the_air_are_left_out():
     assert "4" not in adjusted.positions
 
 
-def test_a_fix_of_no_station_is_an_error():
+def test_a_fixed_point_without_a_station_is_an_error():
     legs = world.readings_of(world.line(np.random.default_rng(4), 3), np.random.default_rng(1))
     with pytest.raises(BuddylineError, match="no leg has this station"):
         adjust(world.project_of(legs, fix=[FixedPoint(station="entrance", east_m=0.0, north_m=0.0)]))
@@ -139,7 +139,7 @@ def test_a_project_without_legs_is_an_error():
         adjust(Project())
 
 
-def test_the_undisturbed_compass_is_taken_and_an_edit_goes_before():
+def test_the_undisturbed_compass_is_used_unless_an_edit_decides():
     course = world.line(np.random.default_rng(4), 1)
     (leg,) = world.readings_of(course, np.random.default_rng(1))
     project = Project()
@@ -164,7 +164,7 @@ def test_steep_legs_follow_the_clinometers():
     assert line_of(replace(leg, distance_m=3.0, inclination_deg=-80.0, back_inclination_deg=80.0), Project(), 0.0, {})
 
 
-def test_utm_known_place_and_back():
+def test_utm_of_a_known_place_and_back():
     # The CN Tower, as given in the literature on UTM: zone 17N, 630084 m east, 4833438 m north.
     latitude, longitude = 43 + 38 / 60 + 33.24 / 3600, -(79 + 23 / 60 + 13.7 / 3600)
     utm = Projection(utm_epsg("17N"))

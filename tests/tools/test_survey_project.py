@@ -86,7 +86,7 @@ def test_exports_and_reports_refuse_to_overwrite(tmp_path, logs, words):
         assert precious.read_bytes() == before
 
 
-def test_what_people_write_stays_and_the_old_file_is_kept(tmp_path, logs):
+def test_hand_written_text_stays_and_the_old_file_is_kept(tmp_path, logs):
     path = tmp_path / "cave.toml"
     run("legs", path, "--dive", *logs)
     first = path.read_text()
@@ -177,7 +177,7 @@ def test_a_bad_project_is_refused_and_named(tmp_path, text, said):
         load_project(path)
 
 
-def test_known_errors_are_said(tmp_path, logs):
+def test_known_errors_are_reported(tmp_path, logs):
     path = tmp_path / "cave.toml"
     run("legs", path, "--dive", *logs)
     with pytest.raises(BuddylineError, match="exists"):
@@ -193,7 +193,7 @@ def test_known_errors_are_said(tmp_path, logs):
         run("legs", tmp_path / "new.toml", "--dive", logs[0])
 
 
-def test_notes_survive_any_character(tmp_path, logs, messages):
+def test_notes_may_contain_any_character(tmp_path, logs, messages):
     path = tmp_path / "cave.toml"
     note = 'a "quoted" \\ note\nof two lines\t\x07é'
     with DiveLogWriter(tmp_path / "m.mcap") as writer:
@@ -219,7 +219,7 @@ def test_a_mark_by_command():
             mark.mark_of(mark_arguments(*words), 5)
 
 
-def test_live_alarms_go_out_on_the_bus(messages):
+def test_live_alarms_are_published_on_the_bus(messages):
     network = LocalNetwork()
     heard, came = [], threading.Event()
 

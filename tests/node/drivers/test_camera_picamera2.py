@@ -102,7 +102,7 @@ def test_colour_comes_as_bgr(sensor):
     assert frame.image.max() == frame.image.min()
 
 
-def test_pictures_are_in_colour_where_nothing_else_is_asked_for(sensor, monkeypatch):
+def test_pictures_are_in_colour_by_default(sensor, monkeypatch):
     monkeypatch.setattr("buddyline.node.drivers.camera_picamera2.boottime_ns", sensor.boottime_ns)
     for asked, dimensions in (({}, 3), ({"colour": False}, 2)):
         config = NodeConfig(node="a", camera=CameraConfig(name="picamera2", **asked))
@@ -130,7 +130,7 @@ def test_everything_is_fixed_before_the_start(sensor):
 @pytest.mark.parametrize(
     ("model", "blanking"), [("imx708", 40), ("imx708", 58), ("imx219", 32), ("imx219", 50), ("imx999", 21)]
 )
-def test_the_line_is_measured_whatever_the_kernels_blanking_is(sensor, model, blanking):
+def test_the_line_time_is_measured_with_any_blanking_of_the_kernel(sensor, model, blanking):
     """A line 1.3 % too short puts the middle of exposure of the middle row off by 114 us on the IMX708."""
     sensor.model, sensor.blanking, sensor.line_ns = model, blanking, 13_365.1
     seen = []
@@ -143,7 +143,7 @@ def test_the_line_is_measured_whatever_the_kernels_blanking_is(sensor, model, bl
     assert camera.row_time_ns == pytest.approx(2 * 13_365.1, abs=5)
 
 
-def test_module_3_gets_a_fixed_focus(sensor):
+def test_camera_module_3_gets_a_fixed_focus(sensor):
     sensor.controls |= {"AfMode", "LensPosition"}
     sensor.model = "imx708"
     seen = []
@@ -170,7 +170,7 @@ def test_the_widest_view_with_enough_pixels_is_chosen(sensor):
 
 
 @pytest.mark.parametrize("rate_hz", [1, 5, 7, 20])
-def test_other_rates(sensor, rate_hz):
+def test_frames_lock_at_other_rates_too(sensor, rate_hz):
     period_ns = round(1e9 / rate_hz)
     sensor.ppm = -30.0
     camera = make(sensor, period_ns=period_ns)
@@ -227,7 +227,7 @@ def test_metadata_without_a_time_is_refused(sensor, name):
     assert camera.skipped["no_time"] == 1
 
 
-def test_an_error_out_of_the_camera_thread_opens_the_camera_anew(sensor, caplog):
+def test_an_error_of_the_camera_thread_reopens_the_camera(sensor, caplog):
     camera = make(sensor)
     frames(camera, 5)
     sensor.job_error = RuntimeError("failed to queue request")
@@ -239,7 +239,7 @@ def test_an_error_out_of_the_camera_thread_opens_the_camera_anew(sensor, caplog)
     assert camera.problem == ""
 
 
-def test_a_camera_that_stops_delivering_is_opened_until_it_delivers(sensor, caplog):
+def test_a_camera_that_stops_delivering_is_reopened_until_it_delivers(sensor, caplog):
     camera = make(sensor)
     frames(camera, 10)
     sensor.silent_from = 0
@@ -316,7 +316,7 @@ def test_a_close_that_hangs_does_not_hold_the_node_up(sensor, monkeypatch, caplo
     camera.close()
 
 
-def test_a_close_that_fails_is_only_told(sensor, caplog):
+def test_a_failing_close_is_only_logged(sensor, caplog):
     camera = make(sensor)
 
     def fail() -> None:
@@ -328,7 +328,7 @@ def test_a_close_that_fails_is_only_told(sensor, caplog):
     assert "Unable to stop preview" in caplog.text
 
 
-def test_no_camera(sensor):
+def test_a_missing_camera_is_named(sensor):
     sensor.cameras = []
     with pytest.raises(DeviceError, match=r"none found.*rpicam-hello"):
         make(sensor)
@@ -396,7 +396,7 @@ def test_a_client_without_its_server_says_that_it_is_not_locked(sensor, phase_ms
     assert (camera.problem == "") == (phase_ms == 0)
 
 
-def test_without_picamera2_it_is_said_how_to_get_it(monkeypatch):
+def test_without_picamera2_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "picamera2", None)
     with pytest.raises(DeviceError, match="apt install python3-picamera2"):
         open_camera(NodeConfig(node="a", camera=CameraConfig(name="picamera2")), ManualClock(START_NS))

@@ -38,7 +38,7 @@ def test_splashes_do_not_set_a_zero():
 
 
 @pytest.mark.parametrize("under_m", [0.45, 0.7])
-def test_a_start_under_water_is_no_zero(under_m):
+def test_a_start_under_water_gives_no_zero(under_m):
     """With air at 101.3 kPa, 0.7 m of water are 108.2 kPa: no air is that heavy."""
     zero = SurfaceZero()
     feed(zero, [STANDARD_AIR_PA + 997.0 * 9.80665 * under_m] * ZERO_SAMPLES)
@@ -54,7 +54,7 @@ def test_swell_and_one_low_reading_leave_the_zero_alone():
     assert zero.problem == ""
 
 
-def test_started_under_water_keeps_the_standard_and_says_how_wrong_it_may_be():
+def test_a_start_under_water_takes_standard_pressure_with_its_uncertainty():
     zero = SurfaceZero()
     feed(zero, [130_000.0] * 100)
     assert not zero.measured
@@ -62,7 +62,7 @@ def test_started_under_water_keeps_the_standard_and_says_how_wrong_it_may_be():
 
 
 @pytest.mark.parametrize(("pressure_pa", "surface_pa"), [(104_000.0, 101_000.0), (101_500.0, 101_500.0)])
-def test_the_days_zero_outlives_a_restart(pressure_pa, surface_pa):
+def test_the_days_zero_survives_a_restart(pressure_pa, surface_pa):
     """At 30 cm a restart must not make that the surface; weather since the morning may."""
     zero = SurfaceZero(remembered_pa=101_000.0)
     feed(zero, [pressure_pa] * ZERO_SAMPLES)
@@ -80,7 +80,7 @@ def test_sigma_grows_with_depth():
 HOUR_NS = 3600 * 10**9
 
 
-def test_a_zero_is_kept_for_half_a_day(tmp_path):
+def test_a_stored_zero_is_valid_for_half_a_day(tmp_path):
     path = tmp_path / "dives" / "a-surface.json"
     save_zero(path, 100 * HOUR_NS, 98_765.0)
     assert load_zero(path, 101 * HOUR_NS) == 98_765.0
@@ -90,11 +90,11 @@ def test_a_zero_is_kept_for_half_a_day(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"stamp_ns": 1}', '{"stamp_ns": 1, "surface_pa": 3e5}'])
-def test_a_damaged_file_is_no_zero(tmp_path, text):
+def test_a_damaged_file_gives_no_zero(tmp_path, text):
     path = tmp_path / "zero.json"
     path.write_text(text)
     assert load_zero(path, 2) is None
 
 
-def test_no_file_is_no_zero(tmp_path):
+def test_a_missing_file_gives_no_zero(tmp_path):
     assert load_zero(tmp_path / "zero.json", 2) is None

@@ -198,7 +198,7 @@ def test_one_sensor_absent_leaves_the_other(config, clock, board):
     imu.close()
 
 
-def test_a_nack_in_mid_dive_is_named_and_over(config, clock, board, gauge, caplog):
+def test_a_nack_in_mid_dive_is_named_until_it_is_over(config, clock, board, gauge, caplog):
     imu, _ = open_sensors(config, clock)
     collect(imu, clock, 1.0)
     board[0x6B].absent = True
@@ -222,7 +222,7 @@ def test_a_nack_in_mid_dive_is_named_and_over(config, clock, board, gauge, caplo
     imu.close()
 
 
-def test_none_leaves_a_sensor_out(config, clock, adapter):
+def test_the_name_none_leaves_a_sensor_out(config, clock, adapter):
     only = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", imu="none"), record=config.record)
     (depth,) = open_sensors(only, clock)
     assert depth.name == "depth"
@@ -271,7 +271,7 @@ def test_a_zero_taken_under_water_is_noticed_and_corrected(config, clock, board,
     imu.close()
 
 
-def test_the_mount_is_the_configurations(config, clock, board):
+def test_the_mount_comes_from_the_configuration(config, clock, board):
     upside_down = NodeConfig(
         node="a", sensors=SensorsConfig(name="i2c", mount_xyzw=(1.0, 0.0, 0.0, 0.0)), record=config.record
     )
@@ -297,7 +297,7 @@ def test_declination_comes_with_the_position(config, clock, adapter):
 
 
 @pytest.mark.parametrize("step_s", [-3600, -1, 1, 3600])
-def test_the_metronome_outlives_a_clock_that_is_set(clock, step_s):
+def test_the_metronome_goes_on_after_the_clock_is_set(clock, step_s):
     turn = Metronome(10 * MS_NS, clock)
     for _ in range(5):
         turn.wait(NEVER)

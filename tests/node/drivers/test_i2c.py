@@ -30,7 +30,7 @@ def test_registers_go_over_real_smbus2(bus: I2cBus, gyro):
     assert bus.read(CHIP, 0x0F, 1) == b"\xd7"
 
 
-def test_without_the_mark_a_burst_stays_on_one_register(bus: I2cBus, gyro):
+def test_without_the_auto_increment_bit_a_burst_stays_on_one_register(bus: I2cBus, gyro):
     bus.write(CHIP, 0x20, 0x6F)
     low = bus.read(CHIP, 0x20, 3)
     assert low == b"\x6f\x6f\x6f"

@@ -122,7 +122,7 @@ def test_a_mount_that_is_no_rotation_is_refused(R, adapter, bus, clock, sky):
         open_imu(bus, "auto", R, clock)
 
 
-def test_nothing_on_the_bus(adapter, bus, clock):
+def test_an_empty_bus_is_an_error_that_names_the_units(adapter, bus, clock):
     with pytest.raises(DeviceError, match=r"bus 1: no minimu9_v3 or .*minimu9_v6 answers.*i2cdetect"):
         open_imu(bus, "auto", clock=clock)
 
@@ -174,7 +174,7 @@ def test_a_brown_out_in_mid_dive_is_set_up_again(unit, adapter, bus, clock, sky)
     assert (sample.mag_t is None) == (unit == "lsm6ds")
 
 
-def test_a_brown_out_that_nobody_saw_is_never_published(unit, adapter, bus, clock, sky):
+def test_an_unnoticed_brown_out_publishes_no_wrong_sample(unit, adapter, bus, clock, sky):
     chips = plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
     device.read()
@@ -236,7 +236,7 @@ def test_a_setting_lost_without_zeros_is_found_within_a_second(unit, adapter, bu
     assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
 
 
-def test_a_chip_that_starts_slowly_gets_its_time_and_publishes_no_zero(unit, adapter, bus, clock, sky):
+def test_a_slowly_starting_chip_is_waited_for_and_publishes_no_zero(unit, adapter, bus, clock, sky):
     sky.silent = {"gyro"}
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
@@ -326,7 +326,7 @@ def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sk
 @pytest.mark.parametrize(
     ("cls", "name"), [(MinImu9V3, "v3"), (MinImu9V5, "v5"), (MinImu9V6, "v6"), (Lsm6dsAlone, "six")]
 )
-def test_find_answers_none_on_an_empty_bus(cls, name, bus, clock):
+def test_find_returns_none_on_an_empty_bus(cls, name, bus, clock):
     assert cls.find(name, bus, np.eye(3), clock) is None
 
 

@@ -47,7 +47,7 @@ WORDS_02BA = with_crc(0x15 << 5, C_02BA)
         (5500000, -1321376, -2119, 37895, 609, 28131368, 12136494, -2728, 37827),
     ],
 )
-def test_30ba_vectors(d2, dT, temp, p1, ti, offi, sensi, temp2, p2):
+def test_30ba_matches_the_datasheet_examples(d2, dT, temp, p1, ti, offi, sensi, temp2, p2):
     terms = first_order_30ba(C_30BA, d2)
     assert (terms.dt, terms.temp) == (dT, temp)
     assert (D1_30BA * terms.sens >> 21) - terms.off >> 13 == p1
@@ -87,7 +87,7 @@ def test_pressure_does_not_jump_where_the_orders_meet():
         assert max(abs(b - a) for a, b in pairwise(pressures)) <= 2
 
 
-def test_crc_of_the_vector():
+def test_crc_matches_the_datasheet_example():
     assert crc4(WORDS_30BA) == 9
     assert decode_prom(WORDS_30BA) == C_30BA
 
@@ -101,7 +101,7 @@ def test_crc_finds_each_flipped_bit(word: int, bit: int):
         decode_prom(words)
 
 
-def test_a_prom_of_zeros_is_no_prom():
+def test_a_prom_of_zeros_is_refused():
     with pytest.raises(BuddylineError, match="checksum"):
         decode_prom([0] * 7)
 
@@ -110,12 +110,12 @@ def test_a_prom_of_zeros_is_no_prom():
     ("kind", "c1", "model"),
     [(0x1A, 34982, "30ba"), (0x00, 34982, "30ba"), (0x15, 46372, "02ba"), (0x00, 46372, "02ba"), (0x7F, 46372, "02ba")],
 )
-def test_model_by_type_and_sensitivity(kind, c1, model):
+def test_the_model_follows_from_type_and_sensitivity(kind, c1, model):
     assert decode_model((kind << 5, c1, 0, 0, 0, 0, 0)) == model
 
 
 @pytest.mark.parametrize(("kind", "c1"), [(0x1A, 46372), (0x15, 34982), (0x1A, 12000), (0x00, 60000)])
-def test_a_model_in_doubt_is_refused(kind, c1):
+def test_an_unclear_model_is_refused(kind, c1):
     with pytest.raises(BuddylineError, match="name the depth sensor"):
         decode_model((kind << 5, c1, 0, 0, 0, 0, 0))
 
@@ -157,7 +157,7 @@ def test_samples_come_at_20_hz_between_imu_readings(bus: I2cBus, chip: Ms5837Wir
     assert all(b - a == 50 * MS_NS for a, b in pairwise(stamps))
 
 
-def test_no_step_moves_the_clock(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
+def test_no_step_waits(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
     """Waiting is the caller's: a step that slept would move the manual clock."""
     device = Ms5837.open(bus, None, clock)
     for _ in range(20):
@@ -195,7 +195,7 @@ def test_an_absent_chip_is_refused_at_start(bus: I2cBus, clock: ManualClock):
         Ms5837.open(bus, None, clock)
 
 
-def test_a_chip_that_goes_and_comes_back(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
+def test_a_chip_that_disappears_and_returns_is_read_again(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
     device = Ms5837.open(bus, None, clock)
     run(device, clock, 0.5)
     chip.absent = True
@@ -220,7 +220,7 @@ def test_single_nacks_in_mid_dive_cost_at_most_a_sample(bus, chip, clock, nacks)
     assert all(sample.pressure_pa == 399980.0 for sample in samples)
 
 
-def test_zero_is_an_error_never_a_depth(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
+def test_a_raw_zero_is_an_error_and_never_a_depth(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
     device = Ms5837.open(bus, None, clock)
     chip.d1 = 0
     samples, errors = run(device, clock, 0.5)
@@ -271,7 +271,7 @@ def test_a_clock_that_steps_leaves_no_gap_and_no_wrong_value(bus, chip, adapter,
 
 
 @pytest.mark.parametrize("bit_hz", [100_000, 400_000])
-def test_a_bus_that_takes_its_time_is_allowed_for(bus: I2cBus, adapter: Adapter, chip: Ms5837Wire, clock, bit_hz):
+def test_a_slow_bus_is_tolerated(bus: I2cBus, adapter: Adapter, chip: Ms5837Wire, clock, bit_hz):
     """The conversion begins when the command has gone out, which is after the reading before it."""
     adapter.bit_hz = bit_hz
     device = Ms5837.open(bus, None, clock)

@@ -17,7 +17,7 @@ def test_line_time_of_the_imx219s_binned_mode():
 
 @pytest.mark.parametrize("exposure_us", [1000, 4000, 20_000])
 @pytest.mark.parametrize("error", [-0.04, -0.013, 0.0, 0.013, 0.04])
-def test_whole_numbers_of_lines_tell_the_line(exposure_us, error):
+def test_durations_of_whole_lines_determine_the_line_time(exposure_us, error):
     """IMX708's binned mode: 1296 + 40 lines of 13.365 us; durations in whole microseconds, as libcamera gives them."""
     true_ns = 13_365.1
     timer = LineTimer(true_ns * (1 + error))
@@ -36,7 +36,7 @@ def test_a_duration_that_is_no_whole_number_of_lines_is_left_out():
     assert timer.line_ns == pytest.approx(18_904, abs=5)
 
 
-def test_a_sensor_not_known_is_good_to_a_few_percent_and_says_so(caplog):
+def test_an_unknown_sensor_is_good_to_a_few_percent_and_is_logged(caplog):
     with caplog.at_level(logging.WARNING):
         assert first_line_ns("imx999", 23_895, 1232) == pytest.approx(18_904, rel=0.04)
     assert "imx999" in caplog.text
@@ -99,5 +99,5 @@ def test_a_machine_that_is_always_interrupted_still_gets_an_answer():
     assert abs(wall_offset_ns(busy.boottime, busy.wall) - 7_000_000_000) < 100_000
 
 
-def test_boottime_goes_on():
+def test_boottime_advances():
     assert 0 < boottime_ns() <= boottime_ns()
