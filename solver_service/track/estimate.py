@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import bisect
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track.state import State
-from buddyline.solver_service.track.trail import Trail
+from buddyline.solver_service.track.trail import Chosen, Trail
 
 CHALLENGE_S: Final = 4.0
 
@@ -20,10 +21,15 @@ class Estimate:
     strain: by how much the units' noise is greater than their samples show, learned from the lights' residuals.
     evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
 
-    agreed_s: when a fix last agreed with it; inf where none ever bore on it.
+    agreed_s: when a fix last agreed with it; inf where none ever bore on it. agreed: how many did.
 
     detection (2, 2): by observer and light, how likely the light is found where it is in the picture. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
+
+    missed: of how many pictures of each node on end, in which lights should be, none was used.
+    fit: log likelihood of the lights used.
+    course: its evidence over time; used: the lights of each picture, by stamp and node: both while it is not confirmed.
+    given: the lights to use, where that is decided already.
     """
 
     t_s: float
@@ -43,6 +49,7 @@ class Estimate:
     confirmed: bool = False
     strain: float = 1.0
     surprise: float = 0.0
+    fit: float = 0.0
     told: int = 0
     end_s: float = np.inf
     skip_s: float = 0.02
@@ -51,9 +58,36 @@ class Estimate:
     searched: bool = False
     bars: int = 0
     told_by: list[int] = field(default_factory=lambda: [0, 0])
+    missed: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
     agreed_s: float = np.inf
+    agreed: int = 0
+    used: dict[tuple[int, int], Chosen] = field(default_factory=dict)
+    given: dict[tuple[int, int], Chosen] = field(default_factory=dict)
+    course: list[tuple[float, float]] = field(default_factory=list)
     last_seen: Floats | None = None
+
+    def copied(self, **changes: object) -> Estimate:
+        """Give an estimate that goes its own way from here."""
+        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "course")
+        own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
+        own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}
+        return replace(self, **(own | changes))  # type: ignore[arg-type]
+
+    def gained_since(self, t_s: float) -> float:
+        """Give the evidence gained after t_s."""
+        at = bisect.bisect_right(self.course, t_s, key=_first)
+        return self.evidence - (self.course[at - 1][1] if at else 0.0)
+
+
+def lead(one: Estimate, other: Estimate) -> float:
+    """Give by how much one has explained the pictures better since both exist."""
+    since_s = max(one.start_s, other.start_s)
+    return one.gained_since(since_s) - other.gained_since(since_s)
+
+
+def _first(item: tuple[float, float]) -> float:
+    return item[0]
 
 
 def alike(one: Estimate, other: Estimate) -> bool:

@@ -4,41 +4,40 @@ from __future__ import annotations
 
 import heapq
 import math
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track import anchors
-from buddyline.solver_service.track.association import Association
-from buddyline.solver_service.track.estimate import Estimate, alike
+from buddyline.solver_service.track.estimate import Estimate, alike, lead
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
 from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lamps import LampWatch
-from buddyline.solver_service.track.lights import Sight, light_positions, residuals
+from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
-from buddyline.solver_service.track.search import starts
+from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import State
-from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TOGETHER_S, TrackSteps
+from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TOGETHER_S
 
 # Log odds by which a track must explain its pictures better than clutter, or a challenger better than the track.
 CONFIRMED: Final = 25.0
 REPLACED: Final = 20.0
+REFUTED: Final = 40.0
 MUTUAL: Final = 7.0
 BARS: Final = 4
+# Another's lamp stands in place of a hidden one for a second, before the motion tells.
+TOLD: Final = 12
+# So many fixes must agree with what starts from one of them, to confirm it, and to replace a confirmed track.
+FIXES_TO_CONFIRM: Final = 2
+FIXES_TO_REPLACE: Final = 3
+# A rival that began so much later than the best is younger.
+LATE_S: Final = 0.1
 GIVEN_UP: Final = -15.0
 # A confirmed track is given up when no light has told of it for so long and its place is this share of the range off.
 LOST_S: Final = 3.0
 LOST_SHARE: Final = 0.3
 LOST_RANGE_M: Final = 10.0
-# A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
-SEARCH_EVERY_S: Final = 0.45
-SEARCH_AFTER_S: Final = 3.0
-SEARCH_PATIENCE_S: Final = 8.0
-MAX_TENTATIVE: Final = 12
-# The noise of the lights that a start is made of: one in thirty is off by many pixels.
-START_PX: Final = 2.5
 # What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a start is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
@@ -52,7 +51,7 @@ BRIDGED_S: Final = 1.0
 MEMORY_S: Final = 30.0
 
 
-class TrackFilter(TrackSteps):
+class TrackFilter(TrackPool):
     """The track of nodes a (0) and b (1). Samples and events may be added in any order before `advance` passes them.
 
     keep_s: for how long steps are kept to smooth over; inf: all. clock_sigma_s: how far B's clock may be off, 1 sd.
@@ -61,16 +60,10 @@ class TrackFilter(TrackSteps):
     def __init__(
         self, node_a: TrackNode, node_b: TrackNode, *, keep_s: float = 0.0, clock_sigma_s: float = CLOCK_S
     ) -> None:
-        super().__init__((node_a, node_b), keep_s)
-        self.clock_sigma_s = clock_sigma_s
-        self.main: Estimate | None = None
-        self.challengers: list[Estimate] = []
+        super().__init__((node_a, node_b), keep_s, clock_sigma_s)
         self.finished: list[Estimate] = []
-        self.restarts = True
         self.lamps = LampWatch()
         self._waiting: list[Estimate] = []
-        self._searched_s = -np.inf
-        self._fix_s = -np.inf
         self._refused = 0
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
@@ -119,11 +112,9 @@ class TrackFilter(TrackSteps):
             self._report(f"{self.both}: their clocks are far apart: no live track")
         return apart
 
-    def _estimates(self) -> list[Estimate]:
-        return ([self.main] if self.main else []) + self.challengers
-
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
+        self._remember(t_s, sight)
         if self._waiting and t_s >= self._waiting[0].t_s:
             if self.main is not None:
                 self.finished.append(self.main)
@@ -133,7 +124,9 @@ class TrackFilter(TrackSteps):
                 if estimate.unseen_by == sight.node and not estimate.confirmed:
                     self._fork(estimate, t_s, sight)
                 self._step(estimate, t_s, sight)
-                if estimate is self.main and estimate.confirmed and estimate.last_seen is not None:
+                if not estimate.confirmed:
+                    estimate.course.append((t_s, estimate.evidence))
+                elif estimate is self.main and estimate.last_seen is not None:
                     self.lamps.take(1 - sight.node, t_s, estimate.last_seen)
         self._judge(t_s)
         self._search(t_s, sight)
@@ -147,6 +140,7 @@ class TrackFilter(TrackSteps):
             if self._agrees(estimate, t_s, fix):
                 agreed = True
                 estimate.agreed_s = t_s
+                estimate.agreed += 1
         if agreed:
             return
         started = self._start(t_s, fix)
@@ -156,6 +150,8 @@ class TrackFilter(TrackSteps):
             self.main = started
         else:
             started.baseline = self.main.evidence
+            # Which lamps are dark is known already.
+            started.detection = self.main.detection.copy()
             self.challengers.append(started)
             self.challengers = self.challengers[-3:]
 
@@ -181,7 +177,7 @@ class TrackFilter(TrackSteps):
                 why = "another's lights, or a wrong mount"
                 self._report(f"{self.both}: attitudes and fixes contradict each other: {why}")
             return None
-        estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s)
+        estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s, agreed=1)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s
         estimate.light_s = t_s
@@ -220,111 +216,74 @@ class TrackFilter(TrackSteps):
         if main is not None and main.confirmed:
             for challenger in self.challengers:
                 gained = main.evidence - challenger.baseline
-                if challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL:
+                better = challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL
+                if better and self._is_whole(challenger, FIXES_TO_REPLACE, math.inf):
                     # What went wrong did so after the last fix that agreed.
                     main.end_s = min(challenger.start_s, main.agreed_s)
                     main.steps.drop_after(main.end_s)
                     self.finished.append(main)
-                    self.main = challenger
+                    self.main = self._again(challenger)
                     self.challengers = []
-                    challenger.confirmed = True
+                    self.main.confirmed = True
                     return
-            self.challengers = [c for c in self.challengers if t_s - c.start_s < c.patience_s and c.evidence > GIVEN_UP]
+            recent = [one for one in self.challengers if t_s - one.start_s < one.patience_s]
+            self.challengers = self._thinned(t_s, recent)
             return
         if not self.restarts:
             return
-        pool = sorted(self._estimates(), key=lambda estimate: -estimate.evidence)
+        pool = self._thinned(t_s, self._estimates())
+        best = max(
+            pool,
+            key=lambda one: min((lead(one, other) for other in pool if other is not one), default=0.0),
+            default=None,
+        )
+        self.main, self.challengers = best, [one for one in pool if one is not best]
+        if (
+            best
+            and best.evidence > CONFIRMED
+            and min(best.evidence_by) > MUTUAL
+            and self._is_whole(best, FIXES_TO_CONFIRM, 2 * BARS)
+        ):
+            if not all(self._leads(best, rival) for rival in self.challengers):
+                return
+            self.main = self._again(best)
+            self.main.confirmed = True
+
+    @staticmethod
+    def _thinned(t_s: float, pool: list[Estimate]) -> list[Estimate]:
+        """Give those that are worth following, each pose once, the best first."""
         alive: list[Estimate] = []
-        for estimate in pool:
+        for estimate in sorted(pool, key=lambda one: -one.evidence):
             over = t_s - estimate.start_s > estimate.patience_s and (alive or estimate.evidence < CONFIRMED)
-            if estimate.evidence < GIVEN_UP or over:
+            if estimate.evidence < GIVEN_UP or over or any(lead(other, estimate) > REFUTED for other in pool):
                 continue
             if not any(alike(estimate, better) for better in alive):
                 alive.append(estimate)
-        alive = alive[:MAX_TENTATIVE]
-        self.main, self.challengers = (alive[0], alive[1:]) if alive else (None, [])
-        rival = max((c.evidence for c in self.challengers), default=0.0)
-        # Both must see each other: who sees a third's bar alone is in front of nobody.
-        best = self.main
-        if best and best.evidence > max(rival, 0.0) + CONFIRMED and min(best.evidence_by) > MUTUAL:
-            # A start without a fix may be of chance lights; whole bars, and lights in both pictures, are no chance.
-            best.confirmed = not best.searched or (best.bars >= BARS and min(best.told_by) >= BARS)
+        return alive[:MAX_TENTATIVE]
 
-    def _search(self, t_s: float, sight: Sight) -> None:
-        """Start from this picture alone, where nothing is confirmed."""
-        if not self.restarts or (self.main and self.main.confirmed) or t_s - self._searched_s < SEARCH_EVERY_S:
-            return
-        if self._fix_s == -np.inf:
-            self._fix_s = t_s - SEARCH_AFTER_S + 0.5
-        if t_s - self._fix_s < SEARCH_AFTER_S:
-            return
-        of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes)
-        if of_a is None or of_b is None or max(t_s - of_a[0], t_s - of_b[0]) > 0.2:
-            return
-        self._searched_s = t_s
-        for state, P, lights in starts(self.nodes, sight, (of_a[1], of_b[1]), self.clock_sigma_s):
-            estimate = Estimate(t_s, state, P, t_s, skip_s=0.006, patience_s=SEARCH_PATIENCE_S)
-            estimate.unseen_by = 1 - sight.node
-            estimate.searched = True
-            estimate.attitude_s = [t_s, t_s]
-            estimate.rates_radps = np.zeros((2, 3))
-            self._force(estimate, sight, lights)
-            self._open(estimate)
-            self.challengers.append(estimate)
+    def _leads(self, best: Estimate, rival: Estimate) -> bool:
+        """Whether a rival is refuted: one that began later need only have fallen back."""
+        late = rival.start_s > best.start_s + LATE_S
+        return lead(best, rival) > (0.0 if late else CONFIRMED)
 
-    def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
-        """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""
-        if len(self.challengers) > 3 * MAX_TENTATIVE:
-            return
-        base = replace(
-            estimate,
-            detection=estimate.detection.copy(),
-            trigger=list(estimate.trigger),
-            attitude_s=list(estimate.attitude_s),
-            without=list(estimate.without),
-            evidence_by=list(estimate.evidence_by),
-            told_by=list(estimate.told_by),
-            steps=estimate.steps.copy(),
-            unseen_by=None,
-        )
-        self._step(base, t_s, None)
-        lights_m = self.nodes[1 - sight.node].rig.lights_m
-        offset_s = sight.dt_s + (t_s - base.t_s)
-        X, D = light_positions(base.state, sight.node, lights_m, base.rates_radps, offset_s)
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
-        log_clutter = math.log(max(len(y) - 1.0, 1.0) / self.nodes[sight.node].rig.camera.area_px2)
-        for k in range(len(y)):
-            for light in (0, 1):
-                if not np.isfinite(y[k, light]).all():
-                    continue
-                S = H[k, light] @ base.covariance[BLOCK] @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
-                chi2 = float(y[k, light] @ np.linalg.solve(S, y[k, light]))
-                if chi2 > 12.0:
-                    continue
-                child = replace(
-                    base,
-                    detection=base.detection.copy(),
-                    trigger=list(base.trigger),
-                    attitude_s=list(base.attitude_s),
-                    without=list(base.without),
-                    steps=base.steps.copy(),
-                )
-                gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
-                child.evidence += gain + math.log(0.2)
-                child.evidence_by = list(base.evidence_by)
-                child.told_by = list(base.told_by)
-                chosen = ((k, light, START_PX**2),)
-                self._update_lights(child, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
-                if child.steps:
-                    child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
-                self.challengers.append(child)
+    @staticmethod
+    def _is_whole(estimate: Estimate, fixes: int, bars: float) -> bool:
+        """Whether enough has been seen of an estimate: by chance, or another's lamp, a single fix may be wrong.
 
-    def _force(self, estimate: Estimate, sight: Sight, lights: tuple[int, int]) -> None:
-        lights_m = self.nodes[1 - sight.node].rig.lights_m
-        X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, sight.dt_s)
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
-        chosen = tuple((k, light, START_PX**2) for light, k in enumerate(lights))
-        self._update_lights(estimate, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+        A start without a fix may be of chance lights: whole bars, and lights in both pictures, are no chance; who sees
+        a third's bar alone is in front of nobody. fixes, bars: how many must agree with what starts from a fix.
+        """
+        if not estimate.searched and estimate.agreed >= fixes:
+            return True
+        if estimate.searched:
+            return estimate.bars >= BARS and min(estimate.told_by) >= TOLD
+        return estimate.bars >= bars and min(estimate.told_by) >= bars
+
+    def _again(self, estimate: Estimate) -> Estimate:
+        """Give an estimate as it is to be followed from now on."""
+        if not estimate.searched or any(estimate.without):
+            return estimate
+        return self._replayed(estimate)
 
     def _row(self, t_s: float, stamp_ns: int) -> TrackRow | None:
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:

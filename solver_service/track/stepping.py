@@ -175,12 +175,17 @@ class TrackSteps(TrackIntake):
         clutter = max(len(sight.index) - 1.0, 1.0) / camera.area_px2
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         guide = self.guides.get((observer, sight.stamp_ns))
-        if guide is None:
+        given = estimate.given.get((observer, sight.stamp_ns))
+        if given is not None:
+            found = Association(given, np.zeros(2), 0.0, 0)
+        elif guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
+        if any(inside) and not wide:
+            estimate.missed[observer] = 0 if found.chosen else estimate.missed[observer] + 1
         estimate.last_seen = found.seen if all(inside) and not wide else None
         for light in (0, 1):
             if inside[light]:
@@ -188,6 +193,8 @@ class TrackSteps(TrackIntake):
                 estimate.detection[observer, light] = min(max(old + 0.05 * (found.seen[light] - old), 0.02), 0.97)
         if found.chosen:
             self._update_lights(estimate, found, y, H, sight)
+            if not estimate.confirmed:
+                estimate.used[observer, sight.stamp_ns] = found.chosen
             if estimate.unseen_by == observer:
                 estimate.unseen_by = None
             estimate.bars += len(found.chosen) == 2
@@ -230,7 +237,11 @@ class TrackSteps(TrackIntake):
         rows_H = np.zeros((len(rows_y), SIZE))
         rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in found.chosen])
         noise = np.diag(np.repeat([variance for _, _, variance in found.chosen], 2))
+        if estimate.searched and not estimate.confirmed:
+            _, log_det = np.linalg.slogdet(rows_H @ estimate.covariance @ rows_H.T + noise)
+            estimate.fit -= 0.5 * float(log_det)
         chi2 = self._apply(estimate, rows_H, rows_y, noise)
+        estimate.fit -= 0.5 * chi2
         # Residuals that are too large say that the units shake or drift more than their samples show by themselves.
         excess = min(chi2, MOST_CHI2 * len(rows_y)) - len(rows_y)
         estimate.strain = float(np.clip(estimate.strain * np.exp(STRAIN_GAIN * excess), 1.0, MOST_STRAIN))

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.state import NAV, ROW, SIZE, State
 from numpy.typing import NDArray
 
+Chosen: TypeAlias = tuple[tuple[int, int, float], ...]
+"""The lights of one picture that are used: (candidate, light, variance)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """One picture within a step, and the lights that were used: (candidate, light, variance)."""
+    """One picture within a step, and the lights that were used."""
 
     node: int
     stamp_ns: int
     t_s: float
-    chosen: tuple[tuple[int, int, float], ...]
+    chosen: Chosen
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,191 @@
+"""The estimates that are followed while nothing is confirmed: starts without a fix, forks, and a second, exact pass."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.track.association import Association
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.intake import newest_before
+from buddyline.solver_service.track.lights import Sight, light_positions, residuals
+from buddyline.solver_service.track.search import starts
+from buddyline.solver_service.track.start import CLOCK_S, constants_of
+from buddyline.solver_service.track.state import PHI, R_, State
+from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TrackSteps
+
+# A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
+SEARCH_EVERY_S: Final = 0.45
+SEARCH_BESIDE_S: Final = 2.0
+SEARCH_AFTER_S: Final = 3.0
+SEARCH_PATIENCE_S: Final = 8.0
+MAX_TENTATIVE: Final = 24
+# So many pictures on end without a light, while the other node's have some: a track may be a wrong one.
+ONE_SIDED: Final = 30
+# For how long pictures are kept, and longer for what is followed.
+SIGHTS_S: Final = 2.0
+# The noise of the lights that a start is made of: one in thirty is off by many pixels.
+START_PX: Final = 2.5
+# How little a replay believes of the state that it starts from: a share of the range, rad, and the sigmas learned.
+REPLAY_SHARE: Final = 0.1
+REPLAY_RAD: Final = 0.15
+REPLAY_SIGMAS: Final = 3.0
+REPLAYS: Final = 2
+REPLAY_EVERY_S: Final = 0.5
+
+
+class TrackPool(TrackSteps):
+    """Holds the main estimate and its challengers, and finds starts without a fix."""
+
+    def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float, clock_sigma_s: float = CLOCK_S) -> None:
+        super().__init__(nodes, keep_s)
+        self.clock_sigma_s = clock_sigma_s
+        self.main: Estimate | None = None
+        self.challengers: list[Estimate] = []
+        self.restarts = True
+        self._sights: deque[tuple[float, Sight]] = deque()
+        self._searched_s = -np.inf
+        self._fix_s = -np.inf
+
+    def _estimates(self) -> list[Estimate]:
+        return ([self.main] if self.main else []) + self.challengers
+
+    def _remember(self, t_s: float, sight: Sight) -> None:
+        """Keep the pictures that a start may be replayed with."""
+        self._sights.append((t_s, sight))
+        followed_s = [one.start_s for one in self._estimates() if one.searched and not one.confirmed]
+        while self._sights[0][0] < min([t_s - SIGHTS_S, *followed_s]):
+            self._sights.popleft()
+
+    def _replayed(self, estimate: Estimate) -> Estimate:
+        """Give an estimate anew from its start, from the state that it has come to since.
+
+        A start's first updates are far from linear: its covariance is too small for what they left.
+        """
+        for _ in range(REPLAYS):
+            state = self._rewound(estimate, estimate.start_s)
+            learned = REPLAY_SIGMAS * np.sqrt(np.diag(estimate.covariance))
+            range_m = float(np.linalg.norm(state.r_m))
+            _, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
+            P = np.diag(variances)
+            P[R_, R_] = np.diag(np.maximum(learned[R_], REPLAY_SHARE * range_m) ** 2)
+            level = REPLAY_RAD**2 * np.eye(3)
+            P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
+            P[PHI[1], PHI[1]] = level + np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2)
+            again = Estimate(
+                estimate.start_s, state, P, estimate.start_s, given=estimate.used, used=estimate.used, searched=True
+            )
+            self._open(again)
+            for t_s, sight in self._sights:
+                if estimate.start_s <= t_s <= estimate.t_s:
+                    self._step(again, t_s, sight)
+            estimate = estimate.copied(
+                t_s=again.t_s,
+                state=again.state,
+                covariance=again.covariance,
+                strain=again.strain,
+                surprise=again.surprise,
+                told=again.told,
+                fit=again.fit,
+                evidence=estimate.evidence + again.fit - estimate.fit,
+                steps=again.steps,
+                attitude_s=again.attitude_s,
+                depth_s=again.depth_s,
+                rates_radps=again.rates_radps,
+            )
+        return estimate
+
+    def _rewound(self, estimate: Estimate, to_s: float) -> State:
+        """Give the state at an earlier time: the samples, taken off again."""
+        state, t_s = estimate.state, estimate.t_s
+        while t_s > to_s + 1e-6:
+            since_s = max(to_s, t_s - TICK_S)
+            span_s = t_s - since_s
+            # Where it came from follows from how far it has turned, whatever it was turned to.
+            at = replace(estimate, t_s=since_s, state=state.moved(state.r_m, state.v_mps, np.stack((np.eye(3),) * 2)))
+            turns = [part.R for part in self.increments(at, t_s)]
+            R = np.stack([now @ turn.T for now, turn in zip(state.R, turns, strict=True)])
+            at.state = state.moved(state.r_m, state.v_mps, R)
+            a, b = self.increments(at, t_s)
+            v_mps = state.v_mps - (b.dv_mps - a.dv_mps)
+            state = state.moved(state.r_m - v_mps * span_s - (b.dp_m - a.dp_m), v_mps, R)
+            t_s = since_s
+        return state
+
+    def _search(self, t_s: float, sight: Sight) -> None:
+        """Start from this picture alone, where nothing is confirmed, or what is explains one node's pictures only."""
+        every_s = SEARCH_EVERY_S
+        if self.main and self.main.confirmed:
+            every_s = SEARCH_BESIDE_S if max(self.main.missed) > ONE_SIDED and min(self.main.missed) == 0 else math.inf
+        if not self.restarts or t_s - self._searched_s < every_s:
+            return
+        if self._fix_s == -np.inf:
+            self._fix_s = t_s - SEARCH_AFTER_S + 0.5
+        if t_s - self._fix_s < SEARCH_AFTER_S:
+            return
+        of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes)
+        if of_a is None or of_b is None or max(t_s - of_a[0], t_s - of_b[0]) > 0.2:
+            return
+        self._searched_s = t_s
+        attitudes = of_a[1], of_b[1]
+        for state, P, lights in starts(self.nodes, sight, attitudes, self.clock_sigma_s):
+            estimate = Estimate(t_s, state, P, t_s, skip_s=0.006, patience_s=SEARCH_PATIENCE_S)
+            estimate.unseen_by = 1 - sight.node
+            self._begin_searched(estimate, [(sight, tuple((k, light) for light, k in enumerate(lights)))])
+
+    def _begin_searched(self, estimate: Estimate, seen: Sequence[tuple[Sight, tuple[tuple[int, int], ...]]]) -> None:
+        """Follow a start without a fix, of these (candidate, light) of pictures."""
+        estimate.searched = True
+        estimate.attitude_s = [estimate.t_s, estimate.t_s]
+        estimate.rates_radps = np.zeros((2, 3))
+        for sight, lights in seen:
+            self._force(estimate, sight, lights)
+        if self.main and self.main.confirmed:
+            estimate.baseline = self.main.evidence
+            estimate.detection = self.main.detection.copy()
+        self._open(estimate)
+        self.challengers.append(estimate)
+
+    def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
+        """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""
+        if len(self.challengers) > 3 * MAX_TENTATIVE:
+            return
+        base = estimate.copied(unseen_by=None)
+        self._step(base, t_s, None)
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        offset_s = sight.dt_s + (t_s - base.t_s)
+        X, D = light_positions(base.state, sight.node, lights_m, base.rates_radps, offset_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        log_clutter = math.log(max(len(y) - 1.0, 1.0) / self.nodes[sight.node].rig.camera.area_px2)
+        for k in range(len(y)):
+            for light in (0, 1):
+                if not np.isfinite(y[k, light]).all():
+                    continue
+                S = H[k, light] @ base.covariance[BLOCK] @ H[k, light].T + sight.sigma_px[k] ** 2 * np.eye(2)
+                chi2 = float(y[k, light] @ np.linalg.solve(S, y[k, light]))
+                if chi2 > 12.0:
+                    continue
+                child = base.copied()
+                gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
+                child.evidence += gain + math.log(0.2)
+                chosen = ((k, light, START_PX**2),)
+                self._update_lights(child, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+                child.used[sight.node, sight.stamp_ns] = chosen
+                if child.steps:
+                    child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
+                self.challengers.append(child)
+
+    def _force(self, estimate: Estimate, sight: Sight, lights: tuple[tuple[int, int], ...]) -> None:
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        offset_s = sight.dt_s + (sight.t_s - estimate.t_s)
+        X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, offset_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        chosen = tuple((k, light, START_PX**2) for k, light in lights)
+        if np.isfinite([y[k, light] for k, light in lights]).all():
+            self._update_lights(estimate, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+            estimate.used[sight.node, sight.stamp_ns] = chosen

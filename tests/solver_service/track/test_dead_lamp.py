@@ -1,0 +1,74 @@
+"""A lamp that is dark for a whole dive: a track from the other three lights, never a wrong one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.node.sim.dive import messages
+from buddyline.node.sim.scenario import ENVIRONMENTS, DivePlan, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.messages import LightTruth, NodePose, Track, Truth
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.track.dive import filter_of, last_ns
+from buddyline.solver_service.track.inputs import FixSeen
+from buddyline.solver_service.tracking import TrackSettings
+
+from tests.solver_service.track.dives import Dive, Setting, make, score
+
+LAMPS = ((1, 0), (1, 1), (0, 0), (0, 1))
+START_NS = 1_764_000_000_000_000_000
+
+
+def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> Dive:
+    """A dive that lacks a lamp; its `fixes`, for the scores' span, are those that it would have with it."""
+    setting = Setting(seconds=seconds, dead=(lamp,))
+    return replace(make(seed, setting), fixes=make(seed, replace(setting, dead=())).fixes)
+
+
+def test_the_live_track_is_honest_from_its_start_on() -> None:
+    judged = []
+    for seed, lamp in enumerate(LAMPS):
+        dive = dead_lamp_dive(40 + seed, lamp, 14.0)
+        rows = filter_of(dive.records, ()).advance(last_ns(dive.records), dive.stamps_ns)
+        judged.append(score(dive, rows))
+    assert sum(one.wrong for one in judged) == 0
+    assert np.mean([one.covered for one in judged]) > 0.4
+    assert np.mean([one.nees for one in judged]) < 2.0
+
+
+def test_one_wrong_fix_replaces_no_track() -> None:
+    """Another diver's lamp in place of a dark one: the fix is wrong, and fits for a while."""
+    dive = dead_lamp_dive(40, LAMPS[0], 14.0)
+    k = int(np.searchsorted(dive.stamps_ns, dive.stamps_ns[0] + 6_000_000_000))
+    wrong = FixSeen(dive.stamps_ns[k], 1.3 * dive.t_a_b_m[k], dive.R_a_b[k], 1e-4 * np.eye(6))
+    rows = filter_of(dive.records, (wrong,)).advance(last_ns(dive.records), dive.stamps_ns)
+    judged = score(dive, rows)
+    assert judged.wrong == 0
+    assert judged.covered > 0.4
+
+
+@pytest.mark.slow
+def test_twenty_dives_with_a_dark_lamp() -> None:
+    wrong = 0
+    shares = []
+    for seed in range(20):
+        lamp = ("b.left", "b.right", "a.left", "a.right")[seed % 4]
+        scenario = Scenario(ENVIRONMENTS[seed % 5], seed=1000 + seed, start_ns=START_NS, dead_lamps=(lamp,))
+        world = World(scenario)
+        core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("smooth",))))
+        told = [
+            one
+            for _, _, message in messages(world, DivePlan(seconds=40.0, imu=True))
+            if not isinstance(message, Truth | LightTruth | NodePose)
+            for one in core.handle(message)
+        ]
+        tracks = [one for one in told + core.flush() if isinstance(one, Track)]
+        sigma_m = np.sqrt([one.covariance[0] + one.covariance[7] + one.covariance[14] for one in tracks])
+        off_m = np.array([np.subtract(one.t_a_b_m, world.truth(one.stamp_ns, 0).t_a_b_m) for one in tracks])
+        range_m = np.array([one.range_m for one in tracks])
+        wrong += int(((np.linalg.norm(off_m, axis=1) - 3.0 * sigma_m) > 0.1 * range_m).sum())
+        shares.append((sigma_m < 0.05 * range_m).sum() / (40.0 * 20.0))
+    assert wrong == 0
+    assert min(shares) > 0.85
+    assert np.median(shares) > 0.95
