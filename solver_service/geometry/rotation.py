@@ -22,6 +22,7 @@ _IDENTITY: Final[Floats] = np.eye(3)
 _TINY: Final = 1e-100
 # Up to so many rotations, Python's numbers are faster than arrays.
 _FEW: Final = 8
+_FEWER: Final = 4
 
 
 def inner(a: Floats, b: Floats) -> Floats:
@@ -84,8 +85,9 @@ def _quats_of_many(R: Floats) -> Floats:
 
 def rotation_exp(w_rad: Floats) -> Floats:
     """Turn rotation vectors (..., 3) into matrices (..., 3, 3) (Rodrigues)."""
-    if w_rad.size == 3:
-        return _one_exp(*w_rad.ravel().tolist()).reshape(*w_rad.shape, 3)
+    if w_rad.size <= 3 * _FEWER:
+        turns = [_one_exp(*turn) for turn in w_rad.reshape(-1, 3).tolist()]
+        return np.array(turns).reshape(*w_rad.shape, 3)
     half = np.maximum(0.5 * np.sqrt(inner(w_rad, w_rad)), _TINY)[..., None, None]
     # sin(x) / x and (1 - cos x) / x^2, without a division by zero.
     sine = np.sin(half) / half
@@ -94,15 +96,15 @@ def rotation_exp(w_rad: Floats) -> Floats:
     return R
 
 
-def _one_exp(x: float, y: float, z: float) -> Floats:
-    """The same of one: a tracker asks for one at a time, and Python's numbers are faster than arrays of three."""
+def _one_exp(x: float, y: float, z: float) -> tuple[float, ...]:
+    """The same of one, as nine numbers: a tracker asks for a few at a time."""
     half = max(0.5 * math.sqrt(x * x + y * y + z * z), _TINY)
     sine = math.sin(half) / half
     first, second = sine * math.cos(half), 0.5 * sine * sine
     xy, xz, yz = second * x * y, second * x * z, second * y * z
     xx, yy, zz = second * x * x, second * y * y, second * z * z
     a, b, c = first * x, first * y, first * z
-    return np.array(((1.0 - yy - zz, xy - c, xz + b), (xy + c, 1.0 - xx - zz, yz - a), (xz - b, yz + a, 1.0 - xx - yy)))
+    return 1.0 - yy - zz, xy - c, xz + b, xy + c, 1.0 - xx - zz, yz - a, xz - b, yz + a, 1.0 - xx - yy
 
 
 def rotation_log(R: Floats) -> Floats:

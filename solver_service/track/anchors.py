@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track.state import DEPTH_OFFSET, PHI, R_, SIZE, V_, State
 
 # For how long an attitude filter errs alike: tilt, heading. A message counts dt / (2 T) of an independent one.
@@ -43,14 +43,15 @@ def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) 
 
     ports_m (2, 3): of the ports, camera frames. h = (r + R_B p_B - R_A p_A)_z - v_z age + offset.
     """
-    arm_a, arm_b = state.R[0] @ ports_m[0], state.R[1] @ ports_m[1]
-    back = state.r_m - age_s * state.v_mps
-    h = back[2] + arm_b[2] - arm_a[2] + state.depth_offset_m
+    (xa, ya, za), (xb, yb, zb) = (state.R @ ports_m[:, :, None])[:, :, 0].tolist()
+    x, y, z = (state.r_m - age_s * state.v_mps).tolist()
+    h = z + zb - za + state.depth_offset_m
     H = np.zeros((1, SIZE))
     H[0, R_.start + 2] = 1.0
     H[0, V_.start + 2] = -age_s
-    H[0, PHI[0]] = -skew(back)[2] + skew(arm_a)[2]
-    H[0, PHI[1]] = -skew(arm_b)[2]
+    # Turning moves what stands at p by phi x p, of which this is the downward part.
+    H[0, PHI[0]] = y - ya, xa - x, 0.0
+    H[0, PHI[1]] = yb, -xb, 0.0
     H[0, DEPTH_OFFSET] = 1.0
     return np.array((shown_m - h,)), H
 

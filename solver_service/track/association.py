@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
+from numpy.typing import NDArray
 
 # A light is used where its marginal probability is above this.
 SURE: Final = 0.99
@@ -17,6 +18,9 @@ GROSS_PX: Final = 7.0
 # Beyond this chi^2 (2 degrees of freedom) an assignment is not weighed: a chance of 1e-6.
 GATE: Final = 27.6
 MAX_OPTIONS: Final = 10
+# The residual of a light behind the camera.
+NOWHERE_PX: Final = 1e8
+_LOG_SHARES: Final = np.log((1.0 - GROSS_SHARE, GROSS_SHARE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,64 +46,25 @@ def associate(
     y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
     detection (2,): how likely each light is to be among the candidates.
     """
-    K = len(y)
-    options: list[list[tuple[int, int]]] = [[], []]
-    singles: dict[tuple[int, int, int], float] = {}
-    blocks: dict[tuple[int, int], tuple[Floats, Floats]] = {}
-    log_clutter = math.log(clutter_per_px2)
-    for light in range(2):
-        if K == 0 or detection[light] <= 0.0:
-            continue
-        near = np.flatnonzero(np.isfinite(y[:, light]).all(1))
-        if not len(near):
-            continue
-        Hn, yn = H[near, light], y[near, light]
-        S = Hn @ P @ np.swapaxes(Hn, 1, 2)
-        found = []
-        for mode in range(2):
-            variance = sigma_px[near] ** 2 + (GROSS_PX**2 if mode else 0.0)
-            Sm = S + variance[:, None, None] * np.eye(2)
-            det = Sm[:, 0, 0] * Sm[:, 1, 1] - Sm[:, 0, 1] ** 2
-            chi2 = (
-                Sm[:, 1, 1] * yn[:, 0] ** 2 - 2.0 * Sm[:, 0, 1] * yn[:, 0] * yn[:, 1] + Sm[:, 0, 0] * yn[:, 1] ** 2
-            ) / det
-            share = GROSS_SHARE if mode else 1.0 - GROSS_SHARE
-            log_l = -0.5 * chi2 - 0.5 * np.log(det) - math.log(2.0 * math.pi) - log_clutter
-            log_l += math.log(share * detection[light])
-            found += [(float(log_l[j]), int(near[j]), mode) for j in np.flatnonzero(chi2 < GATE)]
-        found.sort(reverse=True)
-        for log_l, k, mode in found[:MAX_OPTIONS]:
-            options[light].append((k, mode))
-            singles[light, k, mode] = log_l
-            blocks[light, k] = (H[k, light], y[k, light])
+    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]] = ([], [])
+    if len(y):
+        y = np.where(np.isfinite(y), y, NOWHERE_PX)
+        _weigh_single(options, y, H, P, sigma_px, detection, math.log(clutter_per_px2))
     misses = [math.log(max(1.0 - detection[light], 1e-6)) for light in range(2)]
 
+    # Each case: for both lights the candidate and whether it is off by a gross error, None where the light is missing.
     cases: list[tuple[tuple[int, int] | None, tuple[int, int] | None]] = [(None, None)]
     logs = [misses[0] + misses[1]]
-    for light in range(2):
-        for option in options[light]:
-            cases.append((option, None) if light == 0 else (None, option))
-            logs.append(singles[light, *option] + misses[1 - light])
-    pairs = [(one, two) for one in options[0] for two in options[1] if one[0] != two[0]]
+    for log_l, k, mode in options[0]:
+        cases.append(((k, mode), None))
+        logs.append(log_l + misses[1])
+    for log_l, k, mode in options[1]:
+        cases.append((None, (k, mode)))
+        logs.append(log_l + misses[0])
+    pairs = [(one[1:], two[1:]) for one in options[0] for two in options[1] if one[1] != two[1]]
     if pairs:
-        Hp = np.stack([np.concatenate((blocks[0, a[0]][0], blocks[1, b[0]][0])) for a, b in pairs])
-        yp = np.stack([np.concatenate((blocks[0, a[0]][1], blocks[1, b[0]][1])) for a, b in pairs])
-        S = Hp @ P @ np.swapaxes(Hp, 1, 2)
-        extra = np.array([[GROSS_PX**2 * a[1]] * 2 + [GROSS_PX**2 * b[1]] * 2 for a, b in pairs])
-        noise = np.array([[sigma_px[a[0]] ** 2] * 2 + [sigma_px[b[0]] ** 2] * 2 for a, b in pairs])
-        S[:, range(4), range(4)] += extra + noise
-        chi2 = np.einsum("pi,pi->p", yp, np.linalg.solve(S, yp[..., None])[..., 0])
-        _, logdet = np.linalg.slogdet(S)
-        for (a, b), c, ld in zip(pairs, chi2.tolist(), logdet.tolist(), strict=True):
-            share = sum(math.log(GROSS_SHARE if mode else 1.0 - GROSS_SHARE) for mode in (a[1], b[1]))
-            cases.append((a, b))
-            logs.append(
-                -0.5 * (c + ld)
-                - 2.0 * math.log(2.0 * math.pi)
-                - 2.0 * log_clutter
-                + share
-                + math.log(detection[0] * detection[1])
-            )
+        cases += pairs
+        logs += _weigh_pairs(np.array(pairs), y, H, P, sigma_px, detection, math.log(clutter_per_px2))
     logs_array = np.array(logs)
     top = float(logs_array.max())
     weights = np.exp(logs_array - top)
@@ -121,3 +86,59 @@ def associate(
     taken = {light for _, light, _ in chosen}
     left = sum(1 for light in range(2) if light not in taken and seen[light] > 0.5)
     return Association(tuple(chosen), seen, top + math.log(total), left)
+
+
+def _weigh_single(
+    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]],
+    y: Floats,
+    H: Floats,
+    P: Floats,
+    sigma_px: Floats,
+    detection: Floats,
+    log_clutter: float,
+) -> None:
+    """Add, for each light, the likeliest candidates in their order: log of the density over clutter, candidate, mode.
+
+    mode: 1 where the candidate is off by a gross error.
+    """
+    S = H @ P @ np.swapaxes(H, -1, -2)
+    variance = _variances(sigma_px)[:, :, None]  # (2 modes, K, 1)
+    a, b, c = S[..., 0, 0] + variance, S[..., 0, 1], S[..., 1, 1] + variance
+    u, v = y[..., 0], y[..., 1]
+    det = a * c - b * b
+    chi2 = (c * (u * u) - 2.0 * b * (u * v) + a * (v * v)) / det
+    log_l = -0.5 * (chi2 + np.log(det)) - (math.log(2.0 * math.pi) + log_clutter) + _LOG_SHARES[:, None, None]
+    for mode, k, light in np.argwhere(chi2 < GATE).tolist():
+        if detection[light] > 0.0:
+            options[light].append((float(log_l[mode, k, light]) + math.log(detection[light]), k, mode))
+    for found in options:
+        found.sort(reverse=True)
+        del found[MAX_OPTIONS:]
+
+
+def _weigh_pairs(
+    pairs: NDArray[np.intp],
+    y: Floats,
+    H: Floats,
+    P: Floats,
+    sigma_px: Floats,
+    detection: Floats,
+    log_clutter: float,
+) -> list[float]:
+    """Give the logs of the joint densities over clutter; pairs (N, 2 lights, 2): candidate, mode."""
+    k, mode = pairs[:, :, 0], pairs[:, :, 1]
+    light = np.array((0, 1))
+    H_both = H[k, light].reshape(len(pairs), 4, -1)
+    y_both = y[k, light].reshape(len(pairs), 4)
+    S = H_both @ P @ np.swapaxes(H_both, 1, 2)
+    S[:, range(4), range(4)] += np.repeat(_variances(sigma_px)[mode, k], 2, axis=1)
+    chi2 = (y_both * np.linalg.solve(S, y_both[..., None])[..., 0]).sum(axis=1)
+    logs = -0.5 * (chi2 + np.linalg.slogdet(S)[1]) + _LOG_SHARES[mode].sum(axis=1)
+    logs += math.log(detection[0] * detection[1]) - 2.0 * (math.log(2.0 * math.pi) + log_clutter)
+    weighed: list[float] = logs.tolist()
+    return weighed
+
+
+def _variances(sigma_px: Floats) -> Floats:
+    """Give the variances (2 modes, K) of candidates that are off by a common, or by a gross error."""
+    return np.add.outer((0.0, GROSS_PX**2), sigma_px * sigma_px)

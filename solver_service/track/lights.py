@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 
 # The errors that move a light in a picture: NAV of them, and the clock's.
 COLUMNS: Final = np.array((*range(NAV), CLOCK))
+# After a step of Newton's method as small, the next is nothing.
+SMALL_PX: Final = 1e-4
 
 
 def light_positions(
@@ -30,8 +33,9 @@ def light_positions(
     displacement that A's own unknown velocity adds is counted to r.
     """
     other = 1 - observer
-    moving = bool(dt_s.any())
-    times = dt_s if moving else np.zeros(1)
+    # Without a rolling shutter all candidates are of one time.
+    alike = bool((dt_s == dt_s[:1]).all())
+    times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
     # What the other node has turned on, or has yet to turn, by its own clock.
     late_s = state.clock_s if observer == 0 else -state.clock_s
     R_observer = state.R[observer] @ _turns(rates_radps[observer], times)
@@ -53,7 +57,7 @@ def light_positions(
     D[..., 9:12] = -D[..., 6:9]
     clock = state.v_mps + swept if observer == 0 else -swept
     D[..., NAV] = (toward @ clock[..., None])[..., 0]
-    if not moving:
+    if alike:
         K = len(dt_s)
         X, D = np.broadcast_to(X, (K, *X.shape[1:])), np.broadcast_to(D, (K, *D.shape[1:]))
     return X, D
@@ -99,22 +103,27 @@ def pixel_of(camera: Camera, X: Floats) -> Floats | None:
 
     None where the camera cannot image it; the pixel may be outside of the picture.
     """
-    if X[2] <= 0.0 and camera.model == "pinhole":
-        return None
-    pixel: Floats = np.array((camera.cx_px, camera.cy_px))
+    x, y, z = X.tolist()
+    if camera.model == "pinhole":
+        if not z > 0.0:
+            return None
+        pixel = np.array((camera.cx_px + camera.fx_px * x / z, camera.cy_px + camera.fy_px * y / z))
+        if not any(camera.distortion):
+            return pixel if math.isfinite(pixel[0]) and math.isfinite(pixel[1]) else None
+    else:
+        flat = math.hypot(x, y)
+        stretch = math.atan2(flat, z) / max(flat, 1e-9)
+        pixel = np.array((camera.cx_px + camera.fx_px * x * stretch, camera.cy_px + camera.fy_px * y * stretch))
     with np.errstate(all="ignore"):
-        tangent_of_angle = np.hypot(X[0], X[1]) / max(abs(float(X[2])), 1e-9)
-        if camera.model == "pinhole":
-            pixel = pixel + np.array((camera.fx_px, camera.fy_px)) * X[:2] / X[2]
-        else:
-            angle = np.arctan2(np.hypot(X[0], X[1]), X[2])
-            pixel = pixel + camera.fx_px * X[:2] / max(tangent_of_angle * abs(float(X[2])), 1e-9) * angle
-        for _ in range(6 if any(camera.distortion) else 1):
+        for _ in range(6):
             bearings, tangents = camera.rays(pixel[None])
             depth = float(bearings[0] @ X)
-            if not np.isfinite(depth) or depth <= 0.0:
+            if not math.isfinite(depth) or depth <= 0.0:
                 return None
-            pixel = pixel + tangents[0] @ X / depth
+            step = tangents[0] @ X / depth
+            pixel = pixel + step
+            if abs(step[0]) + abs(step[1]) < SMALL_PX:
+                break
     return pixel
 
 

@@ -97,8 +97,7 @@ def rows_of(
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
     told = np.isfinite(whole).all(axis=(1, 2))
     told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * ranges_m
-    # Absurd values leave a covariance that is none.
-    told[told] = np.linalg.eigvalsh(whole[told, 9:, 9:])[:, 0] >= 0.0
+    sigma_ned_m = np.sqrt(np.maximum(whole[:, range(9, 12), range(9, 12)], 0.0))
     t = (toward @ now.r_m[..., None])[..., 0]
     v = (toward @ now.v_mps[..., None])[..., 0]
     turn = matrix_to_quat(toward @ now.R[:, 1])
@@ -114,7 +113,7 @@ def rows_of(
             age_s=float(ages_s[i]),
             range_m=float(ranges_m[i]),
             t_ned_m=now.r_m[i],
-            sigma_ned_m=np.sqrt(np.diag(whole[i, 9:, 9:])),
+            sigma_ned_m=sigma_ned_m[i],
             **vars(direction_of(now.r_m[i], whole[i, 9:, 9:])),
         )
         if told[i]

@@ -28,6 +28,7 @@ NAV: Final = 12
 _SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
 _ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES])
 ROW: Final = int(_ENDS[-1])
+_THREE: Final = 3.0 * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class State:
 
 def orthonormal(R: Floats) -> Floats:
     """Return near rotations (..., 3, 3) made exact to second order."""
-    cured: Floats = 0.5 * R @ (3.0 * np.eye(3) - np.swapaxes(R, -1, -2) @ R)
+    cured: Floats = 0.5 * R @ (_THREE - np.swapaxes(R, -1, -2) @ R)
     return cured
 
 

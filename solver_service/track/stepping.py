@@ -73,7 +73,7 @@ class TrackSteps(TrackIntake):
         state = estimate.state
         parts = []
         for node in (0, 1):
-            shift = float(np.clip(state.delay_s[node], -MAX_DELAY_S, MAX_DELAY_S))
+            shift = min(max(float(state.delay_s[node]), -MAX_DELAY_S), MAX_DELAY_S)
             grid, values, told = self.samples[node].between(estimate.t_s + shift, t_s + shift, t_s + HOLD_S)
             without = not told.any() and not self.samples[node].near(t_s + shift, t_s + HOLD_S)
             if without:
@@ -244,7 +244,7 @@ class TrackSteps(TrackIntake):
         estimate.fit -= 0.5 * chi2
         # Residuals that are too large say that the units shake or drift more than their samples show by themselves.
         excess = min(chi2, MOST_CHI2 * len(rows_y)) - len(rows_y)
-        estimate.strain = float(np.clip(estimate.strain * np.exp(STRAIN_GAIN * excess), 1.0, MOST_STRAIN))
+        estimate.strain = min(max(estimate.strain * math.exp(STRAIN_GAIN * excess), 1.0), MOST_STRAIN)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)

@@ -103,18 +103,23 @@ def integrate(
     h = np.diff(grid_s)
     w_mid, f_mid = 0.5 * (w[1:] + w[:-1]), 0.5 * (f[1:] + f[:-1])
     halves = rotation_exp(0.5 * h[:, None] * w_mid)
-    R, R_mid = R0, np.empty((len(h), 3, 3))
-    for j, half in enumerate(halves):
-        middle = R @ half
-        R_mid[j] = middle
-        R = middle @ half
-    R = orthonormal(R)
-    u = np.where(told[:, None], (R_mid @ f_mid[:, :, None])[:, :, 0], _AT_REST_MPS2)
+    starts, R = np.empty((len(h), 3, 3)), R0
+    for j, turn in enumerate(halves @ halves):
+        starts[j] = R
+        R = R @ turn
+    R, R_mid = orthonormal(R), starts @ halves
+    # Once over all that is turned to level: mount, the crosses with rate and force, force, rate, and the force's slope.
+    inner = np.empty((len(h), 3, 12))
+    inner[:, :, 0:3], inner[:, :, 3:6], inner[:, :, 6:9] = mount, skew(w_mid), skew(f_mid)
+    inner[:, :, 9], inner[:, :, 10] = f_mid, w_mid
+    inner[:, :, 11] = (f[1:] - f[:-1]) / np.maximum(h, 1e-9)[:, None]
+    turned = R_mid @ inner
+    whole_told = bool(told.all())
+    u = turned[:, :, 9] if whole_told else np.where(told[:, None], turned[:, :, 9], _AT_REST_MPS2)
     to_end = grid_s[-1] - 0.5 * (grid_s[1:] + grid_s[:-1])
     weights = np.stack((h, h * to_end))
     span = float(grid_s[-1] - grid_s[0])
     # Where no sample tells, the rates are an attitude filter's: it has a drift, but no mount, delay or lever arm.
-    whole_told = bool(told.all())
     lever = state.lever_m[node] if whole_told else np.zeros(3)
     spin0, spin1 = np.array((R0, R)) @ skew(w[[0, -1]])
     arm0, arm1 = spin0 @ lever, spin1 @ lever
@@ -124,20 +129,19 @@ def integrate(
     dp = dp - swing
 
     # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
-    R_unmounted = R_mid @ mount
-    bias_steps = -R_unmounted * h[:, None, None]
-    mount_steps = -R_mid @ skew(w_mid) * (h * told)[:, None, None]
-    delay_at = ((R_mid @ w_mid[:, :, None])[:, :, 0] - R0 @ w[0]) * whole_told
-    steps = np.concatenate((bias_steps, mount_steps), axis=2)
+    steps = turned[:, :, :6] * -h[:, None, None]
+    if not whole_told:
+        steps[:, :, 3:] *= told[:, None, None]
     whole = np.add.accumulate(steps, axis=0)
-    middle_error = whole - 0.5 * steps
-    by_attitude = np.concatenate((middle_error, delay_at[:, :, None]), axis=2)
-    force_error = -skew(u) @ by_attitude
-    force_error[:, :, 3:6] -= R_mid @ skew(f_mid)
-    force_error[:, :, 6] += (R_mid @ ((f[1:] - f[:-1]) / np.maximum(h, 1e-9)[:, None])[:, :, None])[:, :, 0]
+    by_attitude = np.empty((len(h), 3, 7))
+    by_attitude[:, :, :6] = whole - 0.5 * steps
+    by_attitude[:, :, 6] = (turned[:, :, 10] - R0 @ w[0]) * whole_told
+    force_error = skew(-u) @ by_attitude
+    force_error[:, :, 3:6] -= turned[:, :, 6:9]
+    force_error[:, :, 6] += turned[:, :, 11]
     of_force = weights * told
     both = (of_force @ force_error.reshape(len(h), 21)).reshape(2, 3, 7)
-    by_bias = -(of_force @ R_unmounted.reshape(len(h), 9)).reshape(2, 3, 3)
+    by_bias = -(of_force @ turned[:, :, :3].reshape(len(h), 9)).reshape(2, 3, 3)
     # An error of attitude at the start turns all that the samples say, the lever arm's part excepted.
     by_turn = skew(np.array((arm1 - arm0, swing)) - of_force @ u)
 
