@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from buddyline.node.devices import CameraDevice, Frame
+from buddyline.node.devices import CameraDevice, ExposureControl, Frame
 from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.samples import DeviceError
 from buddyline.protocol.clock import S_NS, Clock
@@ -52,6 +52,11 @@ class AwaitedCamera:
     def problem(self) -> str:
         """What is wrong with the camera; "" if nothing."""
         return self._health.problem if self._camera is None else self._camera.problem
+
+    @property
+    def exposure_control(self) -> ExposureControl | None:
+        """What changes its exposure; None before it is open."""
+        return None if self._camera is None else self._camera.exposure_control
 
     def info(self) -> NodeInfo | None:
         """Return None: the calibration is in the configuration."""

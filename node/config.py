@@ -23,6 +23,7 @@ OFF_CENTRE = 0.15
 class CameraConfig(Config, frozen=True, kw_only=True):
     """[camera]: its name and fixed settings. path: pictures of the `stored` camera.
 
+    exposure_us: fixes the exposure, with this gain; without it, exposure and gain follow [exposure].
     colour: of the Pi's camera. Luminance alone is a third of the memory; in caverns and lakes it loses lights.
     """
 
@@ -30,10 +31,25 @@ class CameraConfig(Config, frozen=True, kw_only=True):
     path: str = ""
     width_px: Annotated[int, Meta(ge=1, le=65535)] = 820
     height_px: Annotated[int, Meta(ge=1, le=65535)] = 616
-    exposure_us: Annotated[int, Meta(ge=1)] = 4000
+    exposure_us: Annotated[int, Meta(ge=1)] | None = None
     gain: Positive = 2.0
     colour: bool = True
     sync: Literal["off", "server", "client"] = "off"
+
+
+class ExposureConfig(Config, frozen=True, kw_only=True):
+    """[exposure]: the loop that locks the exposure to the other node's lamps.
+
+    target: light of the brighter lamp's core, as a share of what clips. context_every: one of so many triggers has
+    the scene's exposure; 0: none. flicker_hz: of lamps that are dimmed by pulses; exposures are whole periods of it.
+    longest_us, gain_max: bounds for both kinds of frames.
+    """
+
+    target: Annotated[float, Meta(gt=0, le=0.9)] = 0.6
+    context_every: Annotated[int, Meta(ge=0)] = 20
+    flicker_hz: Annotated[float, Meta(ge=0)] = 0.0
+    longest_us: Annotated[int, Meta(ge=10)] = 25_000
+    gain_max: Annotated[float, Meta(ge=1)] = 4.0
 
 
 class DetectorConfig(Config, frozen=True, kw_only=True):
@@ -121,6 +137,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     status_file: str = ""
     rate_hz: Annotated[float, Meta(gt=0, le=200)] = 10.0
     camera: CameraConfig = field(default_factory=CameraConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     calibration: CalibrationConfig | None = None

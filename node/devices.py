@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
+from buddyline.node.capture.exposure import Exposure, ExposurePlan, ExposureRange
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodeInfo
@@ -24,18 +25,34 @@ class Frame:
     """One picture: BGR (H, W, 3) or luminance (H, W), uint8.
 
     stamp_ns: middle of exposure of the middle row, wall clock. row_time_ns: from one row to the next.
+    exposure: what this very frame had, None where the camera does not tell. context: whether that was the scene's
+    exposure and not the lamps'; None where it is always the same.
     """
 
     image: NDArray[np.uint8]
     stamp_ns: int
     row_time_ns: int = 0
+    exposure: Exposure | None = None
+    context: bool | None = None
+
+
+class ExposureControl(Protocol):
+    """A camera whose exposure can be changed while it runs. range: what it can be asked for."""
+
+    @property
+    def range(self) -> ExposureRange: ...  # noqa: D102
+
+    def follow(self, plan: ExposurePlan) -> None:
+        """Expose by this plan as soon as it can; for any thread. Each frame tells what it had."""
+        ...
 
 
 class CameraDevice(Protocol):
     """Gives one frame per trigger; used by one thread.
 
     row_time_ns: from one row's exposure to the next, 0 for a global shutter. problem: what is wrong, "" if all
-    is well. skipped: frames that were not given out, by reason.
+    is well. skipped: frames that were not given out, by reason. exposure_control: None where the exposure is fixed, or
+    not known.
     """
 
     @property
@@ -46,6 +63,9 @@ class CameraDevice(Protocol):
 
     @property
     def problem(self) -> str: ...  # noqa: D102
+
+    @property
+    def exposure_control(self) -> ExposureControl | None: ...  # noqa: D102
 
     def info(self) -> NodeInfo | None:
         """Return the calibration that comes with the pictures; None: it is in the configuration."""

@@ -10,6 +10,7 @@ from buddyline.node.detect import Detection, Detector
 from buddyline.node.devices import Frame
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.messages import MAX_BLOBS, Blob, Candidates
+from msgspec import UNSET
 
 __all__ = ["Pipeline", "blobs_of"]
 
@@ -61,6 +62,9 @@ class Pipeline:
             height_px=height,
             blobs=blobs,
             truncated=truncated,
+            exposure_ns=UNSET if frame.exposure is None else frame.exposure.time_ns,
+            gain=UNSET if frame.exposure is None else frame.exposure.gain,
+            context=UNSET if frame.context is None else frame.context,
         )
         self._seq += 1
         return message

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
+from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.clock_watch import ClockWatch
 from buddyline.node.config import NodeConfig
@@ -29,7 +30,7 @@ from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.config import ConfigError, config_sha256
 from buddyline.protocol.health import stale_after_s
-from buddyline.protocol.messages import NodeInfo, NodeStatus
+from buddyline.protocol.messages import Candidates, NodeInfo, NodeStatus
 from buddyline.protocol.pictures import PictureLog
 from buddyline.protocol.recorder import Recorder, RecordError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
@@ -76,6 +77,7 @@ class NodeService(Service):
         self._seen_s = self._started_s + FIRST_S
         self._ended: set[str] = set()
         self._awaited: AwaitedCamera | None = None
+        self._exposure: ExposureLoop | None = None
         # Stored pictures may be far apart.
         self._watched = config.camera.name != "stored" and config.rate_hz >= 1.0
         self._detect_s: deque[float] = deque(maxlen=100)
@@ -235,7 +237,17 @@ class NodeService(Service):
             if candidates is None:
                 continue
             self.outlet.send(candidates)
+            self._expose(frame, candidates)
             self._images.send(frame)
+
+    def _expose(self, frame: Frame, candidates: Candidates) -> None:
+        """Lock the camera's exposure to the other node's lamps, where it can be changed."""
+        control = self.camera.exposure_control
+        if control is None:
+            return
+        if self._exposure is None:
+            self._exposure = ExposureLoop(self.config.exposure, control.range)
+        control.follow(self._exposure.update(frame, candidates.blobs))
 
     def _read(self, source: Source) -> None:
         while not self.stop.is_set():
@@ -367,6 +379,8 @@ class NodeService(Service):
         problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
         devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
         problems += [f"{name}: {text}" for name, text in devices if text]
+        if self._exposure is not None and self._exposure.problem:
+            problems.append(f"exposure: {self._exposure.problem}")
         # A simulated world is on this machine's own clock, whoever keeps that.
         if self._clock_sync.problem and self.config.camera.name != "simulated":
             problems.append(f"clock: {self._clock_sync.problem}")

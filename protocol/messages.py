@@ -148,6 +148,8 @@ class Candidates(Message, frozen=True, kw_only=True):
     stamp_ns: middle of exposure of the image's middle row. trigger: round(stamp_ns / trigger_period_ns).
     seq: sequence number, from 0 at each boot. truncated: number of candidates left out. elsewhere: only where parts of
     the picture were not searched: how many candidates the last search of the whole picture found in these parts.
+    exposure_ns, gain: of this frame. context: whether it was exposed for the scene and not for the lamps. All three are
+    absent where not known.
     """
 
     node: NodeId
@@ -160,6 +162,9 @@ class Candidates(Message, frozen=True, kw_only=True):
     blobs: Annotated[list[Blob], Meta(max_length=MAX_BLOBS)]
     truncated: Count = 0
     elsewhere: Count | UnsetType = UNSET
+    exposure_ns: Count | UnsetType = UNSET
+    gain: Positive | UnsetType = UNSET
+    context: bool | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         """Check that every blob is inside the picture."""

@@ -7,7 +7,7 @@ import math
 import sys
 from dataclasses import asdict, fields
 
-from buddyline.node.sim.scenario import ENVIRONMENTS, INERTIAL_GRADES, TRAJECTORIES, DivePlan, Scenario
+from buddyline.node.sim.scenario import ENVIRONMENTS, EXPOSURES, INERTIAL_GRADES, TRAJECTORIES, DivePlan, Scenario
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.tools.progress import Progress
 
@@ -24,6 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rate", type=float, default=plan.rate_hz, metavar="HZ", help="triggers; default: %(default)s")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: %(default)s")
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
+    parser.add_argument(
+        "--exposure",
+        choices=EXPOSURES,
+        default=plan.exposure,
+        help="of pictures; auto: locked to the lamps, as a node's camera does it; default: %(default)s",
+    )
     parser.add_argument("--imu", action="store_true", help="with raw inertial samples")
     parser.add_argument(
         "--inertial",
@@ -55,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument(
         "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
     )
+    faults.add_argument("--pwm-hz", type=float, default=0.0, metavar="HZ", help="lights dimmed by pulses")
+    faults.add_argument("--strobe-s", type=float, default=0.0, metavar="S", help="a strobe flashes so often")
     faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
 
 
@@ -89,8 +97,17 @@ def run(args: argparse.Namespace) -> int:
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
         inertial=args.inertial,
         dead_lamps=tuple(args.dead_lamp),
+        pwm_hz=args.pwm_hz,
+        strobe_s=args.strobe_s,
     )
-    plan = DivePlan(seconds=args.seconds, rate_hz=args.rate, images=args.images, imu=args.imu, lost_share=args.lost)
+    plan = DivePlan(
+        seconds=args.seconds,
+        rate_hz=args.rate,
+        images=args.images,
+        exposure=args.exposure,
+        imu=args.imu,
+        lost_share=args.lost,
+    )
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
     with (
         new_dive_log(args.output, metadata) as writer,

@@ -1,7 +1,8 @@
-"""A Raspberry Pi camera through picamera2 (0.3.25 or later): free-running, fixed settings, one frame a trigger.
+"""A Raspberry Pi camera through picamera2 (0.3.25 or later): free-running, one frame a trigger.
 
-The camera is never started or stopped for a picture. Exposure, gain and white balance are fixed, so that a light
-looks the same in all frames. Only the frame duration is changed, to lock the phase.
+The camera is never started or stopped for a picture, and its own automatics are off. The frame duration is changed to
+lock the phase; exposure time and gain follow the node's plan, where they are not fixed. Such a change rides on the next
+request and shows about buffers + 3 frames later: each frame's metadata tell what it had.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
+from buddyline.node.capture.exposure import Exposure, ExposureRange, inverse_tone_curve, srgb_to_linear
+from buddyline.node.capture.planned import PlannedExposures
 from buddyline.node.config import CameraConfig, NodeConfig
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.health import DeviceHealth
@@ -35,6 +38,9 @@ log = logging.getLogger(__name__)
 BUFFERS: Final = 6
 COLOUR_GAINS: Final = (2.0, 1.7)  # white light near 5500 K; the brightness that counts hardly depends on it
 FOCUS_DIOPTRES: Final = 0.5  # two metres: sharp from one to infinity
+
+EXPOSED_SHARE: Final = 0.95
+"""Longest exposure, as a share of a frame's duration."""
 
 POLL_S: Final = 0.2
 SILENCE_NS: Final = 2 * S_NS
@@ -71,6 +77,7 @@ class Picamera2Camera:
         self._boottime = boottime
         self._health = DeviceHealth("camera")
         self._camera: Any = None
+        self.exposure_control: PlannedExposures | None = None
         self._open()
 
     @property
@@ -124,6 +131,7 @@ class Picamera2Camera:
                 f"camera: needs {error.name}: apt install python3-picamera2, then make install EXTRAS=pi"
             ) from error
         self._mapped_array: Any = MappedArray
+        self._picamera2: Any = Picamera2
         if not Picamera2.global_camera_info():
             raise AbsentError("camera: none found: check its cable, and rpicam-hello --list-cameras")
         try:
@@ -163,20 +171,60 @@ class Picamera2Camera:
         self._lock = PhaseLock(self._trigger_period_ns, self._frames, shortest_us * 1000, self._timer.line_ns)
         self._chooser = FrameChooser(self._trigger_period_ns, self._frame_period_ns)
         self._follower = FollowerWatch(self._trigger_period_ns)
-        if self._frame_period_ns < shortest_us * 1000 or self._frame_period_ns <= config.exposure_us * 1000:
+        exposure_us = config.exposure_us or 0
+        if self._frame_period_ns < shortest_us * 1000 or self._frame_period_ns <= exposure_us * 1000:
             raise DeviceError(
                 f"camera: a frame each {self._frame_period_ns / 1e6:.1f} ms cannot be had (mode: "
-                f"{shortest_us / 1e3:.1f} ms, exposure {config.exposure_us / 1e3:.1f} ms): lower rate_hz or exposure_us"
+                f"{shortest_us / 1e3:.1f} ms, exposure {exposure_us / 1e3:.1f} ms): lower rate_hz or exposure_us"
             )
-        camera.set_controls(self._controls(camera.camera_controls))
+        camera.set_controls(self._controls(camera.camera_controls, model))
 
-    def _controls(self, known: dict[str, tuple[Any, Any, Any]]) -> dict[str, Any]:
-        """Return all controls, fixed. Enumerations are libcamera's numbers."""
+    def _first_exposure(self, known: dict[str, tuple[Any, Any, Any]], model: str) -> Exposure:
+        """Return the exposure to start with, and make what changes it, unless it is fixed."""
+        if self._config.exposure_us is not None:
+            return Exposure(self._config.exposure_us * 1000, self._config.gain)
+        exposures = self._exposure_range(known, model)
+        if self.exposure_control is None:
+            self.exposure_control = PlannedExposures(
+                exposures, self._trigger_period_ns, self._frame_period_ns, self._config.sync != "off"
+            )
+        self.exposure_control.restart()
+        return self.exposure_control.first
+
+    def _exposure_range(self, known: dict[str, tuple[Any, Any, Any]], model: str) -> ExposureRange:
+        shortest_us, longest_us, _ = known["ExposureTime"]
+        gain_min, gain_max, _ = known["AnalogueGain"]
+        # Some lines of each frame cannot be exposed; the frame duration must not be stretched.
+        longest_ns = min(round(longest_us * 1000), round(EXPOSED_SHARE * self._frame_period_ns))
+        return ExposureRange(
+            max(round(shortest_us * 1000), 1), longest_ns, gain_max, self._timer.line_ns, gain_min, self._linear(model)
+        )
+
+    def _linear(self, model: str) -> NDArray[np.float64]:
+        """Return the light of each grey level: the inverse of the tuning file's tone curve, else of sRGB's."""
+        try:
+            tuning = self._picamera2.load_tuning_file(f"{model}.json")
+            return inverse_tone_curve(self._picamera2.find_tuning_algo(tuning, "rpi.contrast")["gamma_curve"])
+        except (*CAMERA_ERRORS, StopIteration, TypeError) as error:
+            log.info("camera: tone curve not known (%s: %s); taken for sRGB's", type(error).__name__, error)
+            return srgb_to_linear()
+
+    def _exposure_controls(self, exposure: Exposure) -> dict[str, Any]:
+        line_ns = self._timer.line_ns
+        # A whole number of lines, whether the camera truncates or rounds.
+        lines = max(round(exposure.time_ns / line_ns), 1)
+        free = self.exposure_control is None
+        return {
+            "ExposureTime": exposure.time_ns // 1000 if free else round((lines + 0.25) * line_ns / 1000),
+            "AnalogueGain": exposure.gain,
+        }
+
+    def _controls(self, known: dict[str, tuple[Any, Any, Any]], model: str) -> dict[str, Any]:
+        """Return all controls to start with. Enumerations are libcamera's numbers."""
         config = self._config
         controls: dict[str, Any] = {
             "AeEnable": False,
-            "ExposureTime": config.exposure_us,
-            "AnalogueGain": config.gain,
+            **self._exposure_controls(self._first_exposure(known, model)),
             "FrameDurationLimits": _limits(self._lock.duration_ns),
         }
         wanted = {
@@ -219,16 +267,20 @@ class Picamera2Camera:
             readout = self._readout(tuple(metadata.get("ScalerCrop", self._mode_crop)))
             stamp_ns = readout.middle_ns(metadata["SensorTimestamp"], metadata["ExposureTime"])
             stamp_ns += wall_offset_ns(self._boottime, self._clock.now_ns)
-            self._keep_phase(stamp_ns)
-            if not self._chooser.is_nearest(stamp_ns):
+            exposure = exposure_of(metadata)
+            steady_ns = self._ask_exposure(stamp_ns, exposure)
+            self._keep_phase(steady_ns)
+            if not self._chooser.is_nearest(steady_ns):
                 self.skipped["not_nearest"] += 1
                 return None
             image = self._copy(request)
         finally:
             # Controls given to set_controls ride on the request that is released next.
             request.release()
-        self._health.update(self._follow(stamp_ns))
-        return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])))
+        self._health.update(self._follow(steady_ns))
+        control = self.exposure_control
+        context = None if control is None else control.plan.is_context(exposure)
+        return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])), exposure, context)
 
     def _wait_request(self, stop: threading.Event) -> Any:
         camera, asked_ns = self._camera, self._boottime()
@@ -265,6 +317,17 @@ class Picamera2Camera:
         if self._timer.measured:
             log.info("camera: a line takes %.3f us", self._timer.line_ns / 1000)
 
+    def _ask_exposure(self, stamp_ns: int, exposure: Exposure) -> int:
+        """Ask for the exposure of a frame to come; return the time of this frame that the phase's lock is to see."""
+        control = self.exposure_control
+        if control is None:
+            return stamp_ns
+        steady_ns = control.steady_ns(stamp_ns, exposure)
+        wanted = control.next(steady_ns, exposure)
+        if wanted is not None:
+            self._camera.set_controls(self._exposure_controls(wanted))
+        return steady_ns
+
     def _keep_phase(self, stamp_ns: int) -> None:
         if self._config.sync == "client":
             return  # libcamera moves this camera's frames to the server's
@@ -294,6 +357,12 @@ def choose_mode(modes: list[dict[str, Any]], size: tuple[int, int]) -> dict[str,
     if not enough:
         raise DeviceError(f"camera: no mode has {size[0]}x{size[1]} pixels")
     return max(enough, key=lambda m: (m["crop_limits"][2] * m["crop_limits"][3], -m["size"][0], m["bit_depth"]))
+
+
+def exposure_of(metadata: dict[str, Any]) -> Exposure:
+    """Return what a frame had, by its metadata."""
+    gain = float(metadata.get("AnalogueGain", 1.0)) * float(metadata.get("DigitalGain", 1.0))
+    return Exposure(int(metadata["ExposureTime"]) * 1000, gain)
 
 
 def _limits(duration_ns: int) -> tuple[int, int]:

@@ -80,6 +80,7 @@ class FolderCamera:
 
     row_time_ns = 0
     problem = ""
+    exposure_control = None
 
     def __init__(self, files: list[Path], trigger_period_ns: int, clock: Clock) -> None:
         self.skipped: Counter[str] = Counter()
@@ -147,6 +148,7 @@ class DiveCamera:
     """The pictures of one node in a dive log, with the log's own calibration and times."""
 
     row_time_ns = 0  # the log's NodeInfo has it
+    exposure_control = None
     problem = ""
 
     def __init__(self, path: Path, node: str, clock: Clock) -> None:

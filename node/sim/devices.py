@@ -7,11 +7,13 @@ from collections import Counter
 from collections.abc import Callable
 from typing import cast
 
-from buddyline.node.config import NodeConfig, SimulationConfig
+from buddyline.node.capture.exposure import Exposure
+from buddyline.node.config import CameraConfig, NodeConfig, SimulationConfig
 from buddyline.node.devices import Frame
 from buddyline.node.sim.scenario import ENVIRONMENTS, Environment, Scenario
+from buddyline.node.sim.sensor import DelayedControls
 from buddyline.node.sim.world import World
-from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.clock import S_NS, Clock, trigger_index
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.messages import Message, NodeInfo
 
@@ -35,6 +37,11 @@ def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> 
     )
 
 
+def fixed_exposure(camera: CameraConfig) -> Exposure | None:
+    """Return the exposure that a configuration fixes, None where it is to follow the lamps."""
+    return None if camera.exposure_us is None else Exposure(camera.exposure_us * 1000, camera.gain)
+
+
 def next_instant_ns(after_ns: int, period_ns: int) -> int:
     """Return the first multiple of period_ns later than after_ns."""
     return (after_ns // period_ns + 1) * period_ns
@@ -47,6 +54,8 @@ class SimulatedCamera:
     problem = ""
 
     def __init__(self, config: NodeConfig, clock: Clock) -> None:
+        self._fixed = fixed_exposure(config.camera)
+        self.exposure_control = None if self._fixed else DelayedControls()
         camera = config.camera
         self._world = World(scenario_of(config.simulation, camera.width_px, camera.height_px))
         self._node = config.node
@@ -66,7 +75,11 @@ class SimulatedCamera:
         if self._clock.wait_until_ns(instant_ns, stop):
             return None
         self._last_ns = instant_ns
-        return Frame(self._world.render(self._node, instant_ns), instant_ns)
+        exposure, context = self._fixed, None
+        if self.exposure_control is not None:
+            exposure, context = self.exposure_control.take(trigger_index(instant_ns, self._period_ns))
+        picture = self._world.render(self._node, instant_ns, exposure)
+        return Frame(picture, instant_ns, exposure=exposure, context=context)
 
     def close(self) -> None:
         """Nothing to free."""

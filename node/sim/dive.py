@@ -8,12 +8,19 @@ from collections.abc import Callable, Iterator
 from typing import Final, TypeAlias
 
 import cv2
+import numpy as np
+from buddyline.node.capture.loop import ExposureLoop
+from buddyline.node.config import ExposureConfig
+from buddyline.node.detect import make_detector
+from buddyline.node.devices import Frame
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import DivePlan
+from buddyline.node.sim.sensor import DelayedControls
 from buddyline.node.sim.world import World
 from buddyline.protocol import topics
 from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
+from numpy.typing import NDArray
 
 BOOT: Final = "simulated"
 NET: Final = "main"
@@ -69,6 +76,7 @@ def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
 def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[Entry]:
     """Yield each frame that is not lost, as a picture or as candidates, and its LightTruth."""
     index, seq = world.scenario.index(node), 0
+    eye = _Eye(world, node) if plan.images and plan.exposure == "auto" else None
     light_truth = topics.LIGHT_TRUTH.key(node)
     for instant in _triggers(world, plan, end_ns):
         rng = generator(world.scenario.seed, "exposures", index, instant)
@@ -79,16 +87,36 @@ def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[En
         stamp_ns = instant * plan.period_ns + round(stray * plan.exposure_sigma_ns)
         trigger = trigger_index(stamp_ns, plan.period_ns)
         if plan.images:
-            yield stamp_ns, topics.IMAGE.key(node), _picture(world, node, stamp_ns)
+            picture = world.render(node, stamp_ns) if eye is None else eye.take(stamp_ns, trigger)
+            yield stamp_ns, topics.IMAGE.key(node), _message(picture, node, stamp_ns)
         else:
             yield stamp_ns, topics.CANDIDATES.key(node), world.candidates(node, stamp_ns, trigger, seq, BOOT)
         seq += 1
         yield stamp_ns, light_truth, world.light_truth(node, stamp_ns, trigger)
 
 
-def _picture(world: World, node: str, stamp_ns: int) -> CompressedImage:
+class _Eye:
+    """A node's camera with its exposure loop, which needs the detector."""
+
+    def __init__(self, world: World, node: str) -> None:
+        self._world, self._node = world, node
+        self._controls = DelayedControls()
+        self._loop = ExposureLoop(ExposureConfig(), self._controls.range)
+        self._detector = make_detector()
+
+    def take(self, stamp_ns: int, trigger: int) -> NDArray[np.uint8]:
+        """Return the picture of a trigger."""
+        exposure, context = self._controls.take(trigger)
+        picture = self._world.render(self._node, stamp_ns, exposure)
+        blobs = [detection.blob for detection in self._detector.detect(picture)]
+        frame = Frame(picture, stamp_ns, exposure=exposure, context=context)
+        self._controls.follow(self._loop.update(frame, blobs))
+        return picture
+
+
+def _message(picture: NDArray[np.uint8], node: str, stamp_ns: int) -> CompressedImage:
     """Return the picture as JPEG."""
-    _, data = cv2.imencode(".jpg", world.render(node, stamp_ns), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     seconds, rest_ns = divmod(stamp_ns, S_NS)
     return CompressedImage(
         timestamp=FoxgloveTime(sec=seconds, nsec=rest_ns),

@@ -142,8 +142,8 @@ class GlowRenderer:
         table += (glare[:, None] * flux_px(lamp, self._water, self._f_px)).astype(np.float32)[:, None, :]
         return table
 
-    def add_wide(self, coarse: Image, lamp: Lamp, table: Image) -> None:
-        """Add a lamp's light beyond NEAR_PX to the coarse picture."""
+    def add_wide(self, coarse: Image, lamp: Lamp, table: Image, rows: Image | None = None) -> None:
+        """Add a lamp's light beyond NEAR_PX to the coarse picture. rows: (H,), the share of it that each row gets."""
         du = np.broadcast_to(self._coarse_u - np.float32(lamp.pixel[0]), self.coarse_shape)
         dv = np.broadcast_to(self._coarse_v[:, None] - np.float32(lamp.pixel[1]), self.coarse_shape)
         radiance, rho = self._look_up(table, du, dv)
@@ -155,10 +155,12 @@ class GlowRenderer:
             slice(max(column - reach, 0), max(column + reach + 1, 0)),
         )
         radiance[box] *= (1.0 - self._window(rho[box]))[..., None]
+        if rows is not None:
+            radiance *= np.interp(self._coarse_v, np.arange(len(rows)), rows).astype(np.float32)[:, None, None]
         coarse += radiance
 
-    def add_near(self, full: Image, lamp: Lamp, table: Image) -> None:
-        """Add a lamp's disc and its light within FAR_PX to the full picture."""
+    def add_near(self, full: Image, lamp: Lamp, table: Image, rows: Image | None = None) -> None:
+        """Add a lamp's disc and its light within FAR_PX to the full picture. rows: as in add_wide."""
         reach = math.ceil(FAR_PX * self._scale) + 1
         u, v = float(lamp.pixel[0]), float(lamp.pixel[1])
         width_px, height_px = self._size_px
@@ -177,6 +179,8 @@ class GlowRenderer:
         near = rho < size_px + 14 * edge_px
         disc = 1.0 / (1.0 + np.exp((rho[near] - size_px) / edge_px))
         radiance[near] += disc[:, None] * (flux_px(lamp, self._water, self._f_px) / area_px).astype(np.float32)
+        if rows is not None:
+            radiance *= rows[v0:v1, None, None]
         full[v0:v1, u0:u1] += radiance
 
     def _look_up(self, table: Image, du: Image, dv: Image) -> tuple[Image, Image]:

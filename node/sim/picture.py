@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from buddyline.node.capture.exposure import Exposure
 from buddyline.node.sim import tags
+from buddyline.node.sim.flicker import Flicker
 from buddyline.node.sim.glow import GlowRenderer
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.scene import Lamp, Passer, Scene, SceneView
 from buddyline.node.sim.scenery import Scenery
+from buddyline.node.sim.sensor import scene_exposure, shot_noise
 from buddyline.node.sim.snow import Snow
 from numpy.typing import NDArray
 
@@ -18,10 +21,10 @@ NOISE_MARGIN_PX = 64
 
 
 class Painter:
-    """Renders the pictures of one node, in linear light. The camera's tone curve is a square root.
+    """Renders the pictures of one node, in linear light, with the scene's exposure or the one asked for.
 
-    After a square root, shot noise has the same size at every brightness. So all frames use one tile of noise,
-    shifted at random. Not safe for several threads: the buffers are reused.
+    The camera's tone curve is a square root. After a square root, shot noise has the same size at every brightness.
+    So all frames use one tile of noise, shifted at random. Not safe for several threads: the buffers are reused.
     """
 
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
@@ -32,30 +35,48 @@ class Painter:
         self._scenery = Scenery(scenario, camera)
         self._snow = Snow(scenario, camera, index)
         self._noise = _noise_tile(scenario, index)
+        self._noise_sd = water.noise
+        self._scene_exposure = scene_exposure(water)
+        self._flicker = Flicker(scenario) if scenario.pwm_hz > 0 else None
         self._full: Image = np.empty((scenario.height_px, scenario.width_px, 3), np.float32)
 
-    def paint(self, view: SceneView, t_s: float, frame: int) -> NDArray[np.uint8]:
-        """Return the picture, (H, W, 3) uint8, blue green red. frame: seeds the frame's noise."""
+    def paint(self, view: SceneView, t_s: float, frame: int, exposure: Exposure | None = None) -> NDArray[np.uint8]:
+        """Return the picture, (H, W, 3) uint8, blue green red.
+
+        frame: seeds the frame's noise. exposure: None for the scene's own.
+        """
         rng = generator(self._seed, "frame", self._index, frame)
         lamps = [lamp for lamp in (*view.lights, *view.others) if self._matters(lamp)]
         tables = [self._glow.table(lamp) for lamp in lamps]
         full = self._full
+        rows = [self._rows(lamp, view, t_s, exposure) for lamp in lamps]
         coarse = np.zeros((*self._glow.coarse_shape, 3), np.float32)
-        for lamp, table in zip(lamps, tables, strict=True):
-            self._glow.add_wide(coarse, lamp, table)
+        for lamp, table, lit in zip(lamps, tables, rows, strict=True):
+            self._glow.add_wide(coarse, lamp, table, lit)
         self._scenery.paint(view, t_s, coarse, full)
         for tag in view.tags:
             tags.paint(full, tag)
-        for lamp, table in zip(lamps, tables, strict=True):
-            self._glow.add_near(full, lamp, table)
+        for lamp, table, lit in zip(lamps, tables, rows, strict=True):
+            self._glow.add_near(full, lamp, table, lit)
         for passer in view.passers:
             _darken(full, passer, self._scenery.passer_radiance)
         self._snow.add(full, view, t_s)
+        noisier = 1.0
+        if exposure is not None:
+            full *= np.float32(exposure.amount / self._scene_exposure.amount)
+            noisier = shot_noise(exposure.gain) / self._noise_sd
         cv2.sqrt(full, dst=full)
         left, top = rng.integers(0, NOISE_MARGIN_PX, 2)
         width_px, height_px = self._size_px
         noise = self._noise[top : top + height_px, left : left + width_px]
-        return np.asarray(cv2.addWeighted(full, 255.0, noise, 1.0, 0.0, dtype=cv2.CV_8U), np.uint8)
+        return np.asarray(cv2.addWeighted(full, 255.0, noise, noisier, 0.0, dtype=cv2.CV_8U), np.uint8)
+
+    def _rows(self, lamp: Lamp, view: SceneView, t_s: float, exposure: Exposure | None) -> Image | None:
+        """Return the share of a lamp's light that each row gets, (H,); None for a steady lamp."""
+        side = next((i for i, light in enumerate(view.lights) if light is lamp), None)
+        if self._flicker is None or side is None:
+            return None
+        return self._flicker.rows(side, t_s, exposure or self._scene_exposure)
 
     def _matters(self, lamp: Lamp) -> bool:
         """Return whether a lamp is in the picture, or near enough to light the water in it."""

@@ -13,9 +13,11 @@ from buddyline.protocol.topics import check_node_id
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
 Trajectory: TypeAlias = Literal["circles", "rest"]
 InertialGrade: TypeAlias = Literal["good", "poor"]
+PictureExposure: TypeAlias = Literal["fixed", "auto"]
 ENVIRONMENTS: Final[tuple[str, ...]] = get_args(Environment)
 TRAJECTORIES: Final[tuple[str, ...]] = get_args(Trajectory)
 INERTIAL_GRADES: Final[tuple[str, ...]] = get_args(InertialGrade)
+EXPOSURES: Final[tuple[str, ...]] = get_args(PictureExposure)
 
 Bgr: TypeAlias = tuple[float, float, float]
 
@@ -81,6 +83,9 @@ class Scenario:
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
     magnetometer_off_rad: constant error of B's heading that its sigma does not include. inertial: quality of the
     inertial units. dead_lamps: lights that are dark for the whole dive, such as "b.left".
+    pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
+    in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
+    strobe_s: time between the flashes of a third diver's strobe between the nodes; 0: none.
     """
 
     environment: Environment = "cavern"
@@ -111,6 +116,9 @@ class Scenario:
     magnetometer_off_rad: float = 0.0
     inertial: InertialGrade = "good"
     dead_lamps: tuple[str, ...] = ()
+    pwm_hz: float = 0.0
+    pwm_depth: float = 0.5
+    strobe_s: float = 0.0
 
     def __post_init__(self) -> None:
         """Raise BuddylineError, naming the field, for what cannot be simulated."""
@@ -132,7 +140,7 @@ class Scenario:
         for name, lowest in _LOWEST.items():
             if not getattr(self, name) >= lowest:
                 raise BuddylineError(f"{name}: {getattr(self, name)} is below {lowest}")
-        for name in ("gross_share", "miss_share"):
+        for name in ("gross_share", "miss_share", "pwm_depth"):
             if getattr(self, name) > 1:
                 raise BuddylineError(f"{name}: {getattr(self, name)} is above 1")
         if self.far_m < self.range_min_m:
@@ -186,6 +194,9 @@ _LOWEST: Final = {
     "miss_share": 0.0,
     "false_lights": 0,
     "other_lamps": 0,
+    "pwm_hz": 0.0,
+    "pwm_depth": 0.0,
+    "strobe_s": 0.0,
 }
 
 
@@ -193,12 +204,14 @@ _LOWEST: Final = {
 class DivePlan:
     """Which messages of a dive are logged. images: pictures in place of synthetic candidates. imu: inertial samples.
 
+    exposure: of pictures: `fixed` for the scene's own, `auto` for what the node's loop makes of its detector's finds.
     exposure_sigma_ns: distance of exposures from their trigger instants, 1 sd. lost_share: share of lost frames.
     """
 
     seconds: float = 60.0
     rate_hz: float = 10.0
     images: bool = False
+    exposure: PictureExposure = "fixed"
     imu: bool = False
     exposure_sigma_ns: int = MS_NS
     lost_share: float = 0.03
@@ -209,6 +222,8 @@ class DivePlan:
             raise BuddylineError(f"seconds: {self.seconds} is not above 0 and below 1e6")
         if not 0 < self.rate_hz <= 200:
             raise BuddylineError(f"rate_hz: {self.rate_hz} is not above 0 and at most 200")
+        if self.exposure not in EXPOSURES:
+            raise BuddylineError(f"exposure: {self.exposure!r} is none of {', '.join(EXPOSURES)}")
         if not 0 <= self.lost_share <= 1:
             raise BuddylineError(f"lost_share: {self.lost_share} is not between 0 and 1")
 

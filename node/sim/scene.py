@@ -19,6 +19,8 @@ from buddyline.node.sim.trajectory import PairMotion, Placement
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0
 PASSING_SHARE = 0.6
+STROBE_SHOWS_S = 0.02
+STROBE_INTENSITY = 40.0
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,8 @@ class Scene:
         sources = [diver.source(other_a_b, t_s) for diver in self._divers]
         if self.scenario.water.surface > 0:
             sources += [self._reflection(1 - index, side, t_s) for side in (LEFT, RIGHT)]
+        if self.scenario.strobe_s > 0 and t_s % self.scenario.strobe_s < STROBE_SHOWS_S:
+            sources.append(self._strobe(other_a_b))
         others = tuple(self._seen(index, placement, source) for source in sources)
         seen_tags = self._tags(index, placement, t_s) if self.scenario.tags else ()
         return SceneView(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights), seen_tags)
@@ -158,6 +162,12 @@ class Scene:
             intensity=0.25 * source.intensity,
             stretch=3.0,
         )
+
+    @staticmethod
+    def _strobe(nodes: tuple[Placement, Placement]) -> LightSource:
+        """Return a flash a little above the middle between the nodes, which lights all directions."""
+        position_m = (nodes[0].position_ned_m + nodes[1].position_ned_m) / 2 - np.array([0.0, 0.0, 0.2])
+        return LightSource(position_m, np.array([0.0, 0.0, 1.0]), STROBE_INTENSITY, 2.0)
 
     def _seen(self, index: int, placement: Placement, source: LightSource) -> Lamp:
         """Return a lamp as A (0) or B (1) sees it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Literal, TypeAlias
 
 import numpy as np
+from buddyline.node.capture.exposure import Exposure
 from buddyline.node.sim import candidates, rotation, tags
 from buddyline.node.sim.glow import core_px
 from buddyline.node.sim.inertial import STEP_S
@@ -130,11 +131,11 @@ class World:
         ]
         return LightTruth(node=node, stamp_ns=stamp_ns, trigger=trigger, lights=lights)
 
-    def render(self, node: str, stamp_ns: int) -> NDArray[np.uint8]:
-        """Return the picture taken at stamp_ns, (H, W, 3) uint8, blue green red."""
+    def render(self, node: str, stamp_ns: int, exposure: Exposure | None = None) -> NDArray[np.uint8]:
+        """Return the picture taken at stamp_ns, (H, W, 3) uint8, blue green red. exposure: None for the scene's own."""
         index = self.scenario.index(node)
         t_s = self._seconds(index, stamp_ns)
-        return self._painter(index).paint(self._scene.view(index, t_s), t_s, stamp_ns)
+        return self._painter(index).paint(self._scene.view(index, t_s), t_s, stamp_ns, exposure)
 
     def tags(self, node: str) -> tuple[Tag, ...]:
         """Return the AR tags that a node carries; empty where the scenario has no tags."""

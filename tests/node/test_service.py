@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from buddyline.node.config import (
     CameraConfig,
@@ -22,8 +23,9 @@ from buddyline.node.config import (
     SensorsConfig,
     load_node_config,
 )
+from buddyline.node.devices import Frame
 from buddyline.node.drivers.samples import AbsentError
-from buddyline.node.images import RateLimiter
+from buddyline.node.images import Images, RateLimiter
 from buddyline.node.service import NodeService
 from buddyline.protocol.clock import MS_NS, S_NS, SystemClock
 from buddyline.protocol.codec import decode
@@ -236,6 +238,31 @@ def test_pictures_keep_their_rate_when_the_clock_is_set(step_ns):
     assert len(taken) in (8, 9)
 
 
+class Outlet:
+    """Takes what would be recorded and what would be shown."""
+
+    def __init__(self):
+        self.recorded, self.shown = [], []
+
+    def send(self, image, publish=True, record=True):
+        (self.recorded if record else self.shown).append(round(image.stamp_ns / S_NS, 1))
+
+
+@pytest.mark.parametrize(
+    ("every", "recorded", "shown"),
+    [(20, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 2.0, 4.0]), (None, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [0, 1, 2, 3, 4, 5]),
+     (1000, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 2.6, 3.6, 4.6, 5.6])],
+)  # fmt: skip
+def test_pictures_of_the_scene_are_recorded_and_shown_before_those_of_the_lamps(every, recorded, shown):
+    outlet = Outlet()
+    images = Images(NodeConfig(node="a"), outlet)
+    for i in range(60):
+        context = None if every is None else i % every == 0
+        images.send(Frame(np.zeros((9, 12, 3), np.uint8), i * 100 * MS_NS, context=context))
+    assert outlet.recorded == recorded
+    assert outlet.shown == shown
+
+
 class Silent:
     """A sensor that gives nothing."""
 
@@ -258,7 +285,7 @@ def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, mo
 class NewCamera:
     """A camera that gives nothing, as the driver makes it once the cable is in."""
 
-    problem, row_time_ns = "", 37_000
+    problem, row_time_ns, exposure_control = "", 37_000, None
 
     def __init__(self):
         self.skipped = Counter()

@@ -46,6 +46,7 @@ class RepeatingCamera(SimulatedCamera):
     def __init__(self, config: NodeConfig, clock: Clock) -> None:
         super().__init__(config, clock)
         self._world = RenderedBefore(config)
+        self.exposure_control = None  # its pictures are exposed already
 
 
 def open_camera(config: NodeConfig, clock: Clock) -> RepeatingCamera:

@@ -107,6 +107,7 @@ class PreparedCamera:
     """Returns prepared pictures at the trigger instants, each a copy. taken_s: start time of each copy, by stamp."""
 
     row_time_ns = 0
+    exposure_control = None
     problem = ""
 
     def __init__(self, pictures: NDArray[np.uint8], period_ns: int) -> None:

@@ -42,9 +42,14 @@ class Sensor:
             "AeEnable", "ExposureTime", "AnalogueGain", "FrameDurationLimits", "AwbEnable", "ColourGains",
             "NoiseReductionMode", "Sharpness", "ScalerCrop",
         }  # fmt: skip
+        # The beginning of a curve like that of the sensor's own tuning.
+        self.tunings = {"imx219.json": {"gamma_curve": [0, 0, 1024, 5040, 16384, 40642, 32768, 54979, 65535, 65535]}}
         self.ppm = 0.0
         self.padding = 64
+        self.pipeline_frames = 3  # behind the buffers, until a control shows
         self.picture: Callable[[int], int] = lambda number: number % 256
+        # What is seen with an exposure (ms, times gain); in place of `picture` where set.
+        self.view: Callable[[float], np.ndarray] | None = None
         self.lost: set[int] = set()
         self.silent_from: int | None = None
         self.job_error: Exception | None = None
@@ -109,6 +114,16 @@ class Picamera2:
     def global_camera_info() -> list[dict[str, Any]]:
         return Picamera2.sensor.cameras
 
+    @staticmethod
+    def load_tuning_file(tuning_file: str, dir: str | None = None) -> dict[str, Any]:
+        if tuning_file not in Picamera2.sensor.tunings:
+            raise RuntimeError("Tuning file not found")
+        return {"version": 2.0, "algorithms": [{"rpi.contrast": Picamera2.sensor.tunings[tuning_file]}]}
+
+    @staticmethod
+    def find_tuning_algo(tuning: dict[str, Any], name: str) -> dict[str, Any]:
+        return next(algorithm for algorithm in tuning["algorithms"] if name in algorithm)[name]
+
     def __init__(self, camera_num: int = 0) -> None:
         sensor = Picamera2.sensor
         if sensor.open_error is not None:
@@ -136,6 +151,8 @@ class Picamera2:
         height = self._config["sensor"]["output_size"][1] if self._config else 2464
         shortest_us = int((height + self._sensor.blanking) * self._sensor.line_ns / 1000)
         known["FrameDurationLimits"] = (shortest_us, 11_767_556, 33_333)
+        known["ExposureTime"] = (75, 11_766_829, 20_000)
+        known["AnalogueGain"] = (1.0, 10.666667, 1.0)
         return known
 
     def create_preview_configuration(
@@ -182,7 +199,9 @@ class Picamera2:
         self._started = True
         self._active = self._pending
         self._pending = {}
-        self._queued: deque[dict[str, Any]] = deque({} for _ in range(self._config["buffer_count"] + 3))
+        self._queued: deque[dict[str, Any]] = deque(
+            {} for _ in range(self._config["buffer_count"] + self._sensor.pipeline_frames)
+        )
         self._readout_ns = self._sensor.boottime_ns() + 137_531_000
 
     def capture_request(self, wait: bool | None = None, signal_function: Any = None, flush: Any = None) -> Job:
@@ -245,15 +264,19 @@ class Picamera2:
         if number in sensor.lost:
             self._queued.append({})
             return None
+        exposure_us = int(self._active.get("ExposureTime", 20_000) * 1000 // sensor.line_ns * sensor.line_ns / 1000)
+        # The sensor's gain comes in steps; the rest is made up for digitally.
+        gain = 256 / round(256 / self._active.get("AnalogueGain", 1.0))
         buffer = self._free.popleft()
-        height = self._config["main"]["size"][1]
-        buffer[:height] = sensor.picture(number)
+        width, height = self._config["main"]["size"]
+        seen = sensor.picture(number) if sensor.view is None else sensor.view(exposure_us / 1000 * gain)
+        buffer[:height, :width] = seen
         buffer[:, self._config["main"]["size"][0] :] = 255  # padding is no picture
         metadata = {
             "SensorTimestamp": readout_ns,
-            "ExposureTime": int(
-                self._active.get("ExposureTime", 20_000) * 1000 // sensor.line_ns * sensor.line_ns / 1000
-            ),
+            "ExposureTime": exposure_us,
+            "AnalogueGain": gain,
+            "DigitalGain": 1.0003,
             "FrameDuration": int(lines * sensor.line_ns / 1000),
             "ScalerCrop": next(
                 m["crop_limits"] for m in sensor.modes if m.get("size") == self._config["sensor"]["output_size"]

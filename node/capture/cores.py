@@ -1,0 +1,91 @@
+"""What a picture says of its exposure: the light of the lamps' cores, and of the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.messages import Blob
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+LIKELY: Final = 0.5
+LAMPS: Final = 2
+CLIPPED: Final = 250
+CORE_SHARE: Final = 0.5
+CORE_PX: Final = (1.5, 24.0)
+BRIGHTEST: Final = 0.9
+"""A core's light is this quantile of its pixels: a hot pixel or a glint is not a core."""
+SPARSE: Final = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Core:
+    """The core of one lamp. light: of its brightest channel, as a share of what clips; a lower bound where clipped."""
+
+    u_px: float
+    v_px: float
+    light: float
+    clipped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SceneLight:
+    """A whole picture. mean: of its light, as a share of what clips. clipped: share of its pixels that are clipped."""
+
+    mean: float
+    clipped: float
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedLamp:
+    """Where one of the other node's lamps is expected, with a radius that it is hardly ever outside of."""
+
+    u_px: float
+    v_px: float
+    radius_px: float
+
+
+def choose_lamps(blobs: Sequence[Blob], expected: Sequence[ExpectedLamp] = ()) -> list[Blob]:
+    """Return the candidates that are taken for the other node's lamps: one at each expected place, else the likeliest.
+
+    Where nothing is expected, or nothing is found there, they are at most LAMPS of a score of LIKELY or more.
+    """
+    found = []
+    for place in expected:
+        near = [b for b in blobs if math.hypot(b.u_px - place.u_px, b.v_px - place.v_px) <= place.radius_px]
+        found += [blob for blob in near[:1] if blob not in found]
+    likely = [blob for blob in blobs if blob.score is UNSET or blob.score >= LIKELY]
+    return found or likely[:LAMPS]
+
+
+def measure_cores(image: NDArray[np.uint8], lamps: Sequence[Blob], linear: NDArray[np.float64]) -> list[Core]:
+    """Measure the lamps' cores in a BGR (H, W, 3) or grey (H, W) picture. linear: (256,), light of each grey level."""
+    height, width = image.shape[:2]
+    cores = []
+    for lamp in lamps:
+        radius_px = min(max(CORE_SHARE * math.sqrt(lamp.area_px / math.pi), CORE_PX[0]), CORE_PX[1])
+        u0, u1 = max(math.ceil(lamp.u_px - radius_px), 0), min(math.floor(lamp.u_px + radius_px) + 1, width)
+        v0, v1 = max(math.ceil(lamp.v_px - radius_px), 0), min(math.floor(lamp.v_px + radius_px) + 1, height)
+        patch = image[v0:v1, u0:u1]
+        if patch.size == 0:
+            continue
+        level = _brightest(patch if patch.ndim == 2 else patch.max(axis=2))
+        cores.append(Core(lamp.u_px, lamp.v_px, float(linear[level]), level >= CLIPPED))
+    return cores
+
+
+def _brightest(levels: NDArray[np.uint8]) -> int:
+    flat = levels.ravel()
+    k = int(BRIGHTEST * (flat.size - 1))
+    return int(np.partition(flat, k)[k])
+
+
+def measure_scene(image: NDArray[np.uint8], linear: NDArray[np.float64]) -> SceneLight:
+    """Measure a picture as a whole, by every SPARSE-th pixel of every SPARSE-th row."""
+    some = image[::SPARSE, ::SPARSE]
+    levels = some if some.ndim == 2 else some.max(axis=2)
+    return SceneLight(float(linear[levels].mean()), float((levels >= CLIPPED).mean()))
