@@ -46,14 +46,11 @@ def view_of(frame: Candidates) -> View:
             blob.sigma_px,
             math.nan if blob.score is UNSET else blob.score,
             blob.area_px,
-            blob.peak,
             1e-9 * blob.dt_ns,
         )
         for blob in frame.blobs
     ]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    _, _, sigma_px, score, area_px, peak, dt_s = table.T
-    return View(table[:, :2], sigma_px, score, area_px, peak, dt_s, frame.stamp_ns)
+    return View(np.array(rows, dtype=np.float64).reshape(-1, 6), frame.stamp_ns)
 
 
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:

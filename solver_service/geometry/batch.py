@@ -26,7 +26,7 @@ class Batch:
     def of(observations: Sequence[Observation], rigs: tuple[Rig, Rig], settings: Settings) -> Batch:
         """Bring all into the bar frames."""
         pair = pair_of(*rigs)
-        candidates, sensors = find_candidates(observations, pair), find_sensors(observations, pair)
+        candidates, sensors = find_candidates(observations, pair), find_sensors(observations, pair, settings.checks)
         return Batch(pair, settings, candidates, find_pairs(candidates, pair, sensors.down, settings), sensors)
 
     @property

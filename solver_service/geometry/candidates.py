@@ -20,6 +20,8 @@ _MIN_SIGMA_PX: Final = 0.05
 # A score is a detector's opinion: its log odds count half, and at most 3 either way.
 _SCORE_WEIGHT: Final = 0.5
 _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
+# The instant of the pose is the mean of both stamps: half their difference before the one, and after the other.
+_LATER: Final[Floats] = np.array([[1.0], [-1.0]])
 
 
 @dataclass(eq=False, slots=True)
@@ -28,9 +30,9 @@ class CandidateBearings:
 
     triggers: T. counts: (T, 2) how many in A's and in B's picture.
     image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
-    picture's candidates begin. index: (N,) into the view. bearing: (3, N), bar frame. frames: (N, 3, 3) bearing and
-    both tangents, px per rad over sigma_px, bar frame. place: (2, N) over the picture's width and height. variance:
-    (N,) of the bearing, rad^2 per axis. disc2: (N,) square of the radius of a disc of its area, rad^2. sigma_px (N,).
+    picture's candidates begin. index: (N,) into the view. table: (7, N) the bearing in the bar frame, the place over
+    the picture's width and height, the bearing's variance, rad^2 per axis, and the square of the radius of a disc of
+    its area, rad^2. frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, camera frame. sigma_px (N,).
     dt_s: (N,) after the instant that the pose is for, the mean of both stamps. log_score, log_area: (N,).
     """
 
@@ -39,15 +41,23 @@ class CandidateBearings:
     image: Indices
     starts: Indices
     index: Indices
-    bearing: Floats
+    table: Floats
     frames: Floats
-    place: Floats
-    variance: Floats
-    disc2: Floats
     sigma_px: Floats
     dt_s: Floats
     log_score: Floats
     log_area: Floats
+
+    @property
+    def bearing(self) -> Floats:
+        """Unit vectors (3, N), each in the bar frame of the node that sees it."""
+        return self.table[:3]
+
+    @property
+    def variance(self) -> Floats:
+        """Of each bearing (N,), rad^2 per axis."""
+        variance: Floats = self.table[5]
+        return variance
 
 
 def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> CandidateBearings:
@@ -56,40 +66,39 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
     Left out are candidates whose position or noise is not finite, and pixels that the camera model does not reach.
     """
     views = [view for seen in observations for view in (seen.view_a, seen.view_b)]
-    counts = np.array([min(len(view.pixels), _MAX_CANDIDATES) for view in views])
-    image, index = places(counts)
-    node = image & 1
-
-    def joined(name: str) -> Floats:
-        return np.concatenate([getattr(view, name)[:_MAX_CANDIDATES] for view in views], dtype=np.float64)
-
-    pixels = joined("pixels")
-    sigma_px = np.maximum(joined("sigma_px"), _MIN_SIGMA_PX)
-    area_px = np.fmax(joined("area_px"), 1.0)
-    apart_s = [0.5e-9 * (seen.view_a.stamp_ns - seen.view_b.stamp_ns) for seen in observations]
-    dt_s = joined("dt_s") + np.outer(apart_s, (1.0, -1.0)).ravel()[image]
-    in_camera, px2_per_sr = _frames(pixels, node, rigs)
-    frames = in_camera @ rigs.R_bar_camera.swapaxes(1, 2)[node]
-    frames[:, 1:] /= sigma_px[:, None, None]
-    variance = sigma_px * sigma_px / px2_per_sr
-    usable = np.isfinite(frames[:, 0].sum(1) + pixels.sum(1) + variance + area_px + dt_s)
-    image = image[usable]
-    frames, pixels, area_px = frames[usable], pixels[usable], area_px[usable]
+    seen = np.concatenate([view.table[:_MAX_CANDIDATES] for view in views])
+    image, index = places(np.array([min(len(view.table), _MAX_CANDIDATES) for view in views]))
+    # A score that is not known is no evidence.
+    seen[:, 3] = np.where(np.isfinite(seen[:, 3]), seen[:, 3], 0.5)
+    seen[:, 2] = np.maximum(seen[:, 2], _MIN_SIGMA_PX)
+    seen[:, 4] = np.fmax(seen[:, 4], 1.0)
+    frames, px2_per_sr = _frames(seen[:, :2], image & 1, rigs)
+    variance = seen[:, 2] ** 2 / px2_per_sr
+    usable = np.isfinite(np.add.reduce(seen, 1) + variance)
+    if not usable.all():
+        seen, frames, image, index = seen[usable], frames[usable], image[usable], index[usable]
+        variance, px2_per_sr = variance[usable], px2_per_sr[usable]
+    node, sigma_px, area_px = image & 1, seen[:, 2], seen[:, 4]
+    half_apart_s = [0.5e-9 * (each.view_a.stamp_ns - each.view_b.stamp_ns) for each in observations]
+    later_s = np.array([half_apart_s, half_apart_s]) * _LATER
     counts = np.bincount(image, minlength=len(views))
+    table = np.empty((7, len(image)))
+    table[:3] = (rigs.R_bar_camera[node] @ frames[:, 0, :, None])[:, :, 0].T
+    table[3:5] = (seen[:, :2] / rigs.size_px[node]).T
+    table[5] = variance
+    table[6] = area_px / (math.pi * px2_per_sr)
+    frames[:, 1:] /= sigma_px[:, None, None]
     return CandidateBearings(
         triggers=len(observations),
         counts=counts.reshape(-1, 2),
         image=image,
         starts=starts_of(counts),
-        index=index[usable],
-        bearing=np.ascontiguousarray(frames[:, 0].T),
+        index=index,
+        table=table,
         frames=frames,
-        place=(pixels / rigs.size_px[node[usable]]).T,
-        variance=variance[usable],
-        disc2=area_px / (math.pi * px2_per_sr[usable]),
-        sigma_px=sigma_px[usable],
-        dt_s=dt_s[usable],
-        log_score=_log_score(joined("score")[usable], image, counts),
+        sigma_px=sigma_px,
+        dt_s=seen[:, 5] + later_s.T.ravel()[image],
+        log_score=_log_score(seen[:, 3], image, counts),
         log_area=np.log(area_px),
     )
 
@@ -97,7 +106,7 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
 def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Floats]:
     """Give bearing and tangents (N, 3, 3), camera frames, and px^2 per sr (N,)."""
     camera_a, camera_b = (rig.camera for rig in rigs.rigs)
-    if camera_a.same_as(camera_b):
+    if rigs.one_lens:
         return camera_a.frames(pixels)
     frames, px2_per_sr = np.empty((len(pixels), 3, 3)), np.empty(len(pixels))
     for camera, own in ((camera_a, node == 0), (camera_b, node == 1)):
@@ -106,8 +115,10 @@ def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Float
 
 
 def _log_score(score: Floats, image: Indices, counts: Indices) -> Floats:
-    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score is no evidence."""
-    odds = np.clip(np.where(np.isfinite(score), score, 0.5), _LEAST_SCORE, 1.0 - _LEAST_SCORE)
+    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score, 0.5, is no evidence."""
+    if (score == 0.5).all():
+        return np.zeros(len(score))
+    odds = np.minimum(np.maximum(score, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
     weight = _SCORE_WEIGHT * np.log(odds / (1.0 - odds))
     total = np.bincount(image, np.exp(weight), minlength=len(counts))
     balanced: Floats = weight - np.log(total / np.maximum(counts, 1))[image]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -39,6 +40,7 @@ class Bars:
     centred: bool
 
     @staticmethod
+    @lru_cache(maxsize=16)
     def of(pair: RigPair) -> Bars:
         """Take the bars of two rigs."""
         return Bars(pair.middle_m[:, :, None], pair.length_m[:, None], pair.offset_m == 0.0)
@@ -89,7 +91,7 @@ def wrap(angle_rad: Floats) -> Floats:
 
 def dot(a: Floats, b: Floats) -> Floats:
     """Scalar product over the axis before the last."""
-    total: Floats = np.einsum("...ik,...ik->...k", a, b)
+    total: Floats = np.add.reduce(a * b, -2)
     return total
 
 
@@ -195,18 +197,21 @@ def _pose(
     # The paper uses one of the two twists only.
     mean = twist[0] - 0.5 * twist_gap if mean_twist else twist[0]
     # One's own bar across the line of sight is (1 - ux^2, -ux uy, -ux uz) / cos beta; its perpendicular:
-    side = np.stack((np.zeros(ux.shape), uz / cos_beta, -uy / cos_beta), axis=1)
-    own = u * (-ux / cos_beta)[:, None]
+    slope = u / cos_beta[:, None]
+    side = np.zeros(u.shape)
+    side[:, 1], side[:, 2] = slope[:, 2], -slope[:, 1]
+    own = -ux[:, None] * slope
     own[:, 0] = cos_beta
     cosine, sine = np.cos(mean), np.sin(mean)
-    y = own[0] * cosine + side[0] * sine
-    z = side[0] * cosine - own[0] * sine
-    # B's frame about the same line of sight: -u_B, its bar across it, and their cross product.
-    R = y[:, None] * own[1] - u[0][:, None] * u[1] - z[:, None] * side[1]
-    t = u[0] * (0.5 * (range_m[0] + range_m[1]))
+    # What B's frame about the same line of sight is in A's: B's bar across it, u_B, and their cross product.
+    in_a = np.array((own[0] * cosine + side[0] * sine, -u[0], own[0] * sine - side[0] * cosine))
+    in_b = np.array((own[1], u[1], side[1]))
+    R = in_a.transpose(2, 1, 0) @ in_b.transpose(2, 0, 1)
+    t = (u[0] * (0.5 * (range_m[0] + range_m[1]))).T
     if not bars.centred:
-        t = t + bars.middle_m[0] - bars.middle_m[1, :, 0] @ R
-    return ClosedForm(u, range_m, twist, twist_gap, SE3(R.transpose(2, 0, 1), t.T))
+        middle_a_m, middle_b_m = bars.middle_m[:, :, 0]
+        t = t + middle_a_m - R @ middle_b_m
+    return ClosedForm(u, range_m, twist, twist_gap, SE3(R, t))
 
 
 def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, Floats], bars: Bars) -> Floats:

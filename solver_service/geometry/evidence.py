@@ -25,10 +25,9 @@ from buddyline.solver_service.geometry.sensors import Sensors, off_rad, turn_of
 # One light in ten quadruples stands off by a gross error, five times its noise.
 GROSS_PROBABILITY: Final = 0.1
 GROSS_SCALE: Final = 5.0
-# A sensor that contradicts the pictures is broken this often, a heading more often: steel stands beside it.
-_TILT_BROKEN: Final = 1e-5
-_HEADING_BROKEN: Final = 0.15
-_DEPTH_BROKEN: Final = 0.02
+# Log densities of no, one and two gaps at zero: of their noise, and of gross errors.
+_LOG_USUAL: Final = math.log(1.0 - GROSS_PROBABILITY)
+_LOG_GROSS: Final = [math.log(GROSS_PROBABILITY / GROSS_SCALE**gaps) for gaps in range(3)]
 # How often one light is missing, to being seen, and the other where one is; and chance alone, to all four being seen.
 MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
@@ -38,6 +37,14 @@ _PREDICTED_VARIANCE: Final = 4.0
 PITCH_SPREAD: Final = 1.1
 HEADING_SPREAD: Final = 1.5
 DEPTH_SPREAD_M: Final = 6.0
+# Of tilt, heading and depth: a sensor that contradicts the pictures is broken this often, a heading more often, as
+# steel stands beside it. It then says anything: what it may say (rad^2, rad, m) is as wide as this.
+_BROKEN: Final = np.array([[1e-5], [0.15], [0.02]])
+_ANYTHING: Final = np.array([[2.0], [2.0 * math.pi], [DEPTH_SPREAD_M]])
+# The density of a right one at chi^2 of 0, times its sds, and of a broken one; both over chance's.
+_OVER_CHANCE: Final = np.array([[PITCH_SPREAD / (2.0 * math.pi)], [HEADING_SPREAD], [DEPTH_SPREAD_M]])
+_RIGHT: Final = _OVER_CHANCE * (1.0 - _BROKEN) / np.sqrt([[1.0], [2.0 * math.pi], [2.0 * math.pi]])
+_WRONG: Final = _OVER_CHANCE * _BROKEN / _ANYTHING
 # Odds of a false candidate among four lights from which on three are tried.
 POOR_FIT: Final = 2e-3
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
@@ -48,22 +55,20 @@ AGREES: Final = 20.0
 class Support:
     """What the sensors say of K poses.
 
-    log_ratio: (K,) of all together. turn: (3, K) against both headings, log_heading (K,) what it counts for.
-    tilt_chi2, depth_chi2: (K,).
+    log_ratio: (K,) of all together. turn: (3, K) against both headings. log_each, chi2: (3, K) of tilt, of heading and
+    of depth; 0 where one may not speak.
     """
 
     log_ratio: Floats
     turn: Floats
-    log_heading: Floats
-    tilt_chi2: Floats
-    depth_chi2: Floats
+    log_each: Floats
+    chi2: Floats
 
 
 def log_gaps(chi2: Floats, gaps: int) -> Floats:
     """Give the log density of the gaps over their sds and (2 pi)^(1/2): Gaussian, with a share of gross errors."""
-    usual = math.log(1.0 - GROSS_PROBABILITY) - 0.5 * chi2
-    gross = math.log(GROSS_PROBABILITY) - gaps * math.log(GROSS_SCALE) - 0.5 * chi2 / GROSS_SCALE**2
-    density: Floats = np.logaddexp(usual, gross)
+    half = 0.5 * chi2
+    density: Floats = np.logaddexp(_LOG_USUAL - half, _LOG_GROSS[gaps] - half / GROSS_SCALE**2)
     return density
 
 
@@ -80,57 +85,45 @@ def false_light_odds(chi2: Floats, clutter: Floats) -> Floats:
 
 def log_chance(rigs: RigPair, counts: Indices, settings: Settings) -> Floats:
     """Give the part of the log ratio that all quads of a trigger share (T,); counts: (T, 2) candidates."""
-    in_a, in_b = np.maximum(counts, 2).T
+    in_order = np.maximum(counts * (counts - 1), 2)
     # A gap that nobody looks at says what chance says: about one turn, or an e-fold of range.
     spread = math.log(settings.range_max_m / settings.range_min_m) * (2.0 * math.pi) ** (2 - settings.gaps)
-    chance: Floats = np.log(rigs.views_sr2 / (in_a * (in_a - 1) * in_b * (in_b - 1) * spread))
+    chance: Floats = np.log(rigs.views_sr2 / spread / (in_order[:, 0] * in_order[:, 1]))
     return chance
 
 
-def weigh(
-    T_a_b: SE3, trigger: Indices, variance: Floats, rigs: RigPair, sensors: Sensors, checks: frozenset[str]
-) -> Support:
-    """Weigh K poses between the bar frames by attitude and depth.
+def weigh(T_a_b: SE3, trigger: Indices, variance: Floats, rigs: RigPair, sensors: Sensors) -> Support:
+    """Weigh K poses between the cameras' frames by attitude and depth.
 
     trigger: (K,). variance: (K,) of the gaps of ln range and of twist.
     """
-    R_ned_a, R_ned_b = sensors.R_ned_bar[trigger].swapaxes(0, 1)
+    R_ned_a, R_ned_b = sensors.R_ned_camera[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
-    log_heading = np.zeros(len(variance))
-    if "attitude" in checks:
-        # The picture's own noise turns B about the line of sight by half the twist gap's.
-        spread2 = sensors.tilt_variance.sum(1)[trigger] + 0.125 * variance
-        tilt_chi2 = 2.0 * (1.0 - turn[0]) / spread2
-        right = (1.0 - _TILT_BROKEN) * np.exp(-0.5 * tilt_chi2) / spread2
-        log_ratio = np.log(PITCH_SPREAD / (2.0 * math.pi) * (right + 0.5 * _TILT_BROKEN))
-        log_heading = weigh_heading(off_rad(turn), sensors.heading_variance[trigger] + 0.25 * variance)
-        log_ratio += np.where(sensors.both[trigger], log_heading, 0.0)
-    else:
-        # The reading is upright; of half a turn nothing is known.
-        tilt_chi2 = np.zeros(len(variance))
-        log_ratio = np.full(len(variance), -math.log(math.pi))
-    depth_chi2 = np.zeros(len(variance))
-    measured = np.isfinite(sensors.depth_m)[trigger]
-    if "depth" in checks and measured.any():
-        below = T_a_b @ rigs.port_m[1] - rigs.port_m[0]
-        down_a, down_b = R_ned_a[:, 2], R_ned_b[:, 2]
-        known_a = sensors.known[trigger, 0]
-        down = np.where(known_a[:, None], down_a, (T_a_b.R @ down_b[:, :, None])[:, :, 0])
-        fall = inner(down, below)
-        fall2 = fall * fall
-        tilt_variance = np.where(known_a, *sensors.tilt_variance[trigger].T)
-        spread2 = sensors.depth_variance[trigger] + tilt_variance * (inner(below, below) - fall2)
-        spread2 += 0.25 * variance * fall2
-        depth_chi2 = np.where(measured, (fall - sensors.depth_m[trigger]) ** 2 / spread2, 0.0)
-        density = DEPTH_SPREAD_M * np.exp(-0.5 * depth_chi2) / np.sqrt(2.0 * math.pi * spread2)
-        log_ratio += np.where(measured, np.log((1.0 - _DEPTH_BROKEN) * density + _DEPTH_BROKEN), 0.0)
-    return Support(log_ratio, turn, log_heading, tilt_chi2, depth_chi2)
+    angle_rad = off_rad(turn)
+    # How far B's port lies below A's by the pose and the attitude of A, or where that is unknown, of B.
+    down, known_a = R_ned_a[:, 2], sensors.known[trigger, 0]
+    if not known_a.all():
+        down = np.where(known_a[:, None], down, (T_a_b.R @ R_ned_b[:, 2, :, None])[:, :, 0])
+    port_a_m, port_b_m = rigs.port_in_camera_m
+    below = T_a_b.t_m + T_a_b.R @ port_b_m - port_a_m
+    fall_m = inner(down, below)
+    fall2 = fall_m * fall_m
+    # The picture's own noise turns B about the line of sight by half the twist gap's.
+    tilt2 = sensors.tilts_variance[trigger] + 0.125 * variance
+    heading2 = sensors.heading_variance[trigger] + 0.25 * variance
+    depth2 = sensors.fall_variance[trigger] * (inner(below, below) - fall2) + 0.25 * variance * fall2
+    depth2 += sensors.depth_variance[trigger]
+    off_m = fall_m - sensors.depth_m[trigger]
+    chi2 = np.array((2.0 * (1.0 - turn[0]) / tilt2, angle_rad * angle_rad / heading2, off_m * off_m / depth2))
+    speaks = sensors.speaks[:, trigger]
+    # Tilt has two axes.
+    density = np.exp(-0.5 * chi2) / np.sqrt((tilt2 * tilt2, heading2, depth2))
+    log_each = np.where(speaks, np.log(_RIGHT * density + _WRONG), 0.0)
+    return Support(np.add.reduce(log_each, 0), turn, log_each, np.where(speaks, chi2, 0.0))
 
 
 def weigh_heading(angle_rad: Floats, variance: Floats) -> Floats:
     """Weigh turns (K,) about the vertical between poses and attitudes; variance: (K,) of both headings' difference."""
-    right = (
-        (1.0 - _HEADING_BROKEN) * np.exp(-0.5 * angle_rad * angle_rad / variance) / np.sqrt(2.0 * math.pi * variance)
-    )
-    log_ratio: Floats = np.log(HEADING_SPREAD * (right + _HEADING_BROKEN / (2.0 * math.pi)))
+    density = np.exp(-0.5 * angle_rad * angle_rad / variance) / np.sqrt(variance)
+    log_ratio: Floats = np.log(_RIGHT[1] * density + _WRONG[1])
     return log_ratio

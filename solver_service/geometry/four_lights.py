@@ -24,7 +24,7 @@ from buddyline.solver_service.geometry.ragged import largest, rank, starts_of
 from buddyline.solver_service.geometry.readings import Poses, Read, Readings
 from buddyline.solver_service.geometry.refinement import Refined, light_rows, refine
 from buddyline.solver_service.geometry.rig import RigPair
-from buddyline.solver_service.geometry.rotation import Floats, Indices, inner
+from buddyline.solver_service.geometry.rotation import Floats, Index, Indices, inner
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
@@ -42,24 +42,24 @@ _SMALL_OFFSET: Final = 0.02
 class FourLights:
     """The quads of T triggers, of which the best are read.
 
-    why: where a trigger has no quad. chi2: of the readings. by_method: their poses by the closed form that is to be
+    why: where a trigger has no quad. by_method: their poses by the closed form that is to be
     published, None where the refined ones are.
     """
 
     read: Read
     why: list[tuple[Reason, str] | None]
-    chi2: Floats
     by_method: ClosedForm | None
 
     def doubtful(self, batch: Batch) -> NDArray[np.bool_]:
         """Tell in which triggers (T,) no reading is likely enough by pictures and sensors alone, or fits poorly."""
         settings, triggers, readings = batch.settings, batch.triggers, self.read.readings
         trigger = np.arange(triggers).repeat(self.read.starts[1:] - self.read.starts[:-1])
-        log_ratio = readings.log_ratio + log_gaps(self.chi2, settings.gaps)
-        log_ratio[~readings.sound] = -np.inf
+        chi2 = readings.refined.solved.chi2
+        log_ratio = readings.log_ratio + log_gaps(chi2, settings.gaps)
+        log_ratio[~readings.refined.sound] = -np.inf
         best = largest(trigger, log_ratio, triggers, -np.inf)
         total = np.bincount(trigger, np.exp(log_ratio), minlength=triggers)
-        poor = (log_ratio == best[trigger]) & (false_light_odds(self.chi2, readings.clutter) > POOR_FIT)
+        poor = (log_ratio == best[trigger]) & (false_light_odds(chi2, readings.clutter) > POOR_FIT)
         unlikely = ~(np.exp(best) > settings.min_probability * (CHANCE_ODDS + total))
         return unlikely | (np.bincount(trigger[poor], minlength=triggers) > 0)
 
@@ -72,11 +72,15 @@ def read_four_lights(batch: Batch) -> FourLights:
     solved = solve_exact(
         quads.spans, Bars.of(rigs), split_rounds=_SPLIT_ROUNDS, offset_rounds=1 if _centred(rigs) else 4
     )
-    support = weigh(solved.T_a_b, quads.trigger, quads.variance, rigs, batch.sensors, settings.checks)
+    T_a_b = rigs.between_cameras(solved.T_a_b)
+    support = weigh(T_a_b, quads.trigger, quads.variance, rigs, batch.sensors)
     base = support.log_ratio + quads.log_weight + log_chance(rigs, batch.candidates.counts, settings)[quads.trigger]
+    if "attitude" not in settings.checks:
+        # The reading is upright; of half a turn nothing is known.
+        base -= math.log(math.pi)
     base -= 0.5 * settings.gaps * np.log(2.0 * math.pi * quads.variance)
     gap_chi2 = _gap_chi2(batch, solved, quads.variance)
-    range2 = inner(solved.T_a_b.t_m, solved.T_a_b.t_m)
+    range2 = inner(T_a_b.t_m, T_a_b.t_m)
     log_ratio = base + log_gaps(gap_chi2, settings.gaps)
     inside = (range2 >= settings.range_min_m**2) & (range2 <= settings.range_max_m**2) & np.isfinite(log_ratio)
     log_ratio[~inside] = -np.inf
@@ -84,20 +88,21 @@ def read_four_lights(batch: Batch) -> FourLights:
     trigger, ranked = quads.trigger[order], log_ratio[order]
     likeliest = largest(trigger, ranked, batch.triggers, -np.inf)
     best = order[(place < _REFINED) & (ranked > likeliest[trigger] - _NEGLIGIBLE)]
-    refined = refine_lights(solved.T_a_b[best], batch.candidates.frames[quads.lights[:, best].T], rigs.lights_m)
+    frames = batch.candidates.frames[quads.lights[:, best].T]
+    refined = refine_lights(T_a_b[best], frames, rigs.lights_in_camera_m)
     readings = _readings(batch, quads, solved, support, base, gap_chi2, best, refined)
     return FourLights(
         read=Read(
-            pose_starts=starts_of(np.bincount(trigger, minlength=batch.triggers)),
-            poses=_poses(batch, solved.T_a_b, log_ratio, support, quads)[order],
+            pose_starts=starts_of(np.bincount(quads.trigger, minlength=batch.triggers)),
+            poses=Poses(T_a_b, log_ratio, support.turn, support.log_each[1], 0.25 * quads.variance),
             starts=starts_of(np.bincount(quads.trigger[best], minlength=batch.triggers)),
+            pose=best,
             readings=readings,
         ),
         why=[
             _why_none(batch, i, bool(near[i]), range2[quads.trigger == i]) if likeliest[i] == -np.inf else None
             for i in range(batch.triggers)
         ],
-        chi2=refined.solved.chi2,
         by_method=_by_method(batch, quads.lights[:, best]),
     )
 
@@ -122,22 +127,11 @@ def _gap_chi2(batch: Batch, solved: ClosedForm, variance: Floats) -> Floats:
     """Give chi^2 (K,) of the gaps that may speak."""
     total = np.zeros(len(variance))
     if "range" in batch.settings.checks:
-        total = total + np.log(solved.range_m[0] / solved.range_m[1]) ** 2
+        total += np.log(solved.range_m[0] / solved.range_m[1]) ** 2
     if "twist" in batch.settings.checks:
-        total = total + solved.twist_gap_rad**2
+        total += solved.twist_gap_rad**2
     chi2: Floats = total / variance
     return chi2
-
-
-def _poses(batch: Batch, T_a_b: SE3, log_ratio: Floats, support: Support, quads: Quads) -> Poses:
-    """Bring the quads' poses from the bar frames into the cameras'."""
-    return Poses(
-        T_a_b=batch.rigs.between_cameras(T_a_b),
-        log_ratio=log_ratio,
-        turn=support.turn,
-        log_heading=support.log_heading,
-        turn_variance=0.25 * quads.variance,
-    )
 
 
 def _readings(
@@ -157,13 +151,11 @@ def _readings(
     clutter = inner(seen.sigma_px[lights] ** 2, counts / rigs.area_px2.repeat(2))
     return Readings(
         lights=seen.index[lights],
-        T_a_b=rigs.between_cameras(refined.T_a_b),
-        rows=rigs.by_camera_step(refined.rows),
+        refined=refined,
         dt_s=seen.dt_s[lights].repeat(2, 1),
-        sound=refined.sound,
         log_ratio=base[best],
-        tilt_chi2=support.tilt_chi2[best],
-        depth_chi2=support.depth_chi2[best],
+        tilt_chi2=support.chi2[0, best],
+        depth_chi2=support.chi2[2, best],
         gap_chi2=gap_chi2[best],
         range_m=solved.range_m[:, best].T,
         twist_gap_rad=solved.twist_gap_rad[best],
@@ -185,20 +177,22 @@ def _by_method(batch: Batch, lights: Indices) -> ClosedForm | None:
 def refine_lights(T_a_b: SE3, frames: Floats, lights_m: Floats) -> Refined:
     """Refine K poses by their lights alone; frames, lights_m: as `light_rows` takes them."""
 
-    def rows_at(T_a_b: SE3, chosen: Indices) -> tuple[Floats, Floats]:
+    def rows_at(T_a_b: SE3, chosen: Index) -> tuple[Floats, Floats]:
         return light_rows(T_a_b, frames[chosen], lights_m)
 
     return refine(T_a_b, rows_at)
 
 
 def _motion_variance(batch: Batch) -> Floats:
-    """Give what relative motion between the exposures may add to ln range and twist of each pair, rad^2."""
+    """Give what relative motion between the exposures may add to ln range and twist, rad^2: (P,), for pairs of A's."""
     seen, settings, pairs = batch.candidates, batch.settings, batch.pairs
+    if settings.skew_sigma_s == 0.0 and not seen.dt_s.any():
+        return np.zeros(len(pairs.chord))
     total_s = np.bincount(seen.image, seen.dt_s, minlength=2 * batch.triggers).reshape(-1, 2)
     mean_s = total_s / np.maximum(seen.counts, 1)
     square_s2 = (mean_s[:, 0] - mean_s[:, 1]) ** 2 + settings.skew_sigma_s**2
-    per_range = pairs.chord / batch.rigs.length_m[1 - (pairs.image & 1)]
-    variance: Floats = square_s2[pairs.trigger] * ((settings.speed_mps * per_range) ** 2 + settings.turn_radps**2)
+    speed_per_chord_mps = settings.speed_mps / float(batch.rigs.length_m[1])
+    variance: Floats = square_s2[pairs.trigger] * ((speed_per_chord_mps * pairs.chord) ** 2 + settings.turn_radps**2)
     return variance
 
 

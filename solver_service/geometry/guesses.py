@@ -90,7 +90,7 @@ def guess(batch: Batch, wanted: NDArray[np.bool_]) -> Guesses:
     bar = R[:, 0] - sight[0] * dot(sight[0], R[:, 0])
     about = dot(sight[0], cross(bar, w)) / np.sqrt(dot(bar, bar))
     fall = dot(down[0], t - port[0] + dot(R, port[1]))
-    variance, tilt_variance = pairs.variance[tried.pair], sensors.tilt_variance.sum(1)[tried.trigger]
+    variance, tilt_variance = pairs.variance[tried.pair], sensors.tilts_variance[tried.trigger]
     depth_variance = sensors.depth_variance[tried.trigger] + 0.5 * tilt_variance * (dot(t, t) - fall * fall)
     depth_variance += variance * fall * fall
     off_m = np.where(tried.full == 0, fall, -fall) - sensors.depth_m[tried.trigger]
@@ -129,7 +129,7 @@ def _combinations(batch: Batch, wanted: NDArray[np.bool_]) -> _Combinations:
     seen, pairs, rigs, sensors = batch.candidates, batch.pairs, batch.rigs, batch.sensors
     counts = pairs.counts * seen.counts[:, ::-1]
     wanted = wanted & (2 * counts.sum(1) <= _MAX_COMBINATIONS)
-    chosen = np.flatnonzero(wanted[pairs.trigger])
+    chosen = np.flatnonzero(wanted[pairs.trigger] & pairs.usable)
     opposite = pairs.image[chosen] ^ 1
     owner, place = places(seen.counts.ravel()[opposite])
     pair, single = chosen[owner], seen.starts[opposite][owner] + place
@@ -140,7 +140,7 @@ def _combinations(batch: Batch, wanted: NDArray[np.bool_]) -> _Combinations:
     node = pairs.image & 1
     ratio = rigs.length_m[node] / rigs.length_m[1 - node]
     share = 0.75 * ratio * (np.abs(down[pairs.image, 0]) + _BAR_RISE) + _SPLIT_SHARE
-    slack = share * pairs.chord + np.sqrt(_GATE_CHI2 * sensors.tilt_variance.sum(1))[pairs.trigger]
+    slack = share * pairs.chord + np.sqrt(_GATE_CHI2 * sensors.tilts_variance)[pairs.trigger]
     near = np.abs(rise[pair] - fall[single]) < slack[pair]
     pair, single = pair[near].repeat(2), single[near].repeat(2)
     side = np.arange(len(pair)) & 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, TypeAlias
 
+import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
 
@@ -29,17 +30,41 @@ CHECKS: Final = frozenset({"range", "twist", "attitude", "depth"})
 class View:
     """What one node saw at one trigger: N candidates.
 
-    pixels: (N, 2), distorted. sigma_px, score (0-1, NaN unknown), area_px, peak: (N,). dt_s: (N,) exposure of
-    the candidate's row after stamp_ns.
+    table: (N, 6), one row a candidate, with the columns that the properties name. stamp_ns: of the frame.
     """
 
-    pixels: Floats
-    sigma_px: Floats
-    score: Floats
-    area_px: Floats
-    peak: Floats
-    dt_s: Floats
+    table: Floats
     stamp_ns: int
+
+    @staticmethod
+    def of(pixels: Floats, sigma_px: Floats, score: Floats, area_px: Floats, dt_s: Floats, stamp_ns: int) -> View:
+        """Put the columns together: pixels (N, 2), all others (N,)."""
+        return View(np.column_stack((pixels, sigma_px, score, area_px, dt_s)), stamp_ns)
+
+    @property
+    def pixels(self) -> Floats:
+        """Distorted picture coordinates u and v (N, 2), px."""
+        return self.table[:, :2]
+
+    @property
+    def sigma_px(self) -> Floats:
+        """Noise of each coordinate (N,), 1 sd."""
+        return self.table[:, 2]
+
+    @property
+    def score(self) -> Floats:
+        """How much each looks like a light (N,), 0 to 1; NaN: unknown."""
+        return self.table[:, 3]
+
+    @property
+    def area_px(self) -> Floats:
+        """Area of each in the picture (N,), px^2."""
+        return self.table[:, 4]
+
+    @property
+    def dt_s(self) -> Floats:
+        """Exposure of each one's row after stamp_ns (N,), s."""
+        return self.table[:, 5]
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,7 +93,8 @@ class Past:
 
     prediction: Prediction | None
     heading: Heading | None
-    motion: Motion
+    prior: Prior | None
+    settings: Settings
 
     @staticmethod
     def of(
@@ -101,7 +102,12 @@ class Past:
     ) -> Past:
         """Take a sound prediction, None where there is none, and what is learned of the headings."""
         prediction = None if prior is None else Prediction.of(prior, bearing_variance, rigs, settings)
-        return Past(prediction, heading, Motion.of(prior, settings))
+        return Past(prediction, heading, prior, settings)
+
+    @property
+    def motion(self) -> Motion:
+        """How the pose moves."""
+        return Motion.of(self.prior, self.settings)
 
     def weigh(self, T_a_b: SE3) -> Floats:
         """Weigh K poses between the cameras' frames by the prediction."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, Index, Indices
+from buddyline.solver_service.geometry.refinement import Refined
+from buddyline.solver_service.geometry.rotation import Floats, Indices
 from buddyline.solver_service.geometry.se3 import SE3
-from numpy.typing import NDArray
 
 
 @dataclass(eq=False, slots=True)
@@ -23,24 +22,14 @@ class Poses:
     log_heading: Floats
     turn_variance: Floats
 
-    def __getitem__(self, index: Index) -> Poses:
-        """Choose some."""
-        return Poses(
-            self.T_a_b[index],
-            self.log_ratio[index],
-            self.turn[:, index],
-            self.log_heading[index],
-            self.turn_variance[index],
-        )
-
 
 @dataclass(eq=False, slots=True)
 class Readings:
     """M readings, ready to be solved for what is known of the motion; poses between the cameras' frames.
 
     lights: (M, 4) places in the views of B's left and right in A's picture, A's left and right in B's; -1: not seen.
-    T_a_b: M poses where they are linearized, with rows (M, n, 7) of residuals as in `Refined`, and dt_s (M, n) after
-    the instant that the pose is for. sound: (M,) whether a pose follows. log_ratio: (M,) against chance, without what
+    refined: their poses, without the motion. dt_s: (M, n) of each residual after the instant that the pose is for.
+    log_ratio: (M,) against chance, without what
     the residuals and the past say. tilt_chi2, depth_chi2: (M,) of the sensors. gap_chi2: (M,) of the gaps that may
     speak, by the closed form. range_m: (M, 2) by A's bar and by B's, twist_gap_rad (M,); both by the closed form.
     clutter: (M,) candidates that chance puts in the place of one of the lights, per variance of its position, 0 where
@@ -49,10 +38,8 @@ class Readings:
     """
 
     lights: Indices
-    T_a_b: SE3
-    rows: Floats
+    refined: Refined
     dt_s: Floats
-    sound: NDArray[np.bool_]
     log_ratio: Floats
     tilt_chi2: Floats
     depth_chi2: Floats
@@ -65,14 +52,16 @@ class Readings:
 
 @dataclass(eq=False, slots=True)
 class Read:
-    """The readings of T triggers, and all poses that were weighed, the likeliest of each trigger first.
+    """The readings of T triggers, the likeliest of each first, and all poses that were weighed.
 
-    Trigger i has the poses from pose_starts[i] on, and the first of them are read: its readings from starts[i] on.
+    Trigger i has the poses from pose_starts[i] on, and its readings from starts[i] on. pose: (M,) the place of each
+    reading's pose.
     """
 
     pose_starts: Indices
     poses: Poses
     starts: Indices
+    pose: Indices
     readings: Readings
 
     def poses_of(self, trigger: int) -> slice:

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.past import Motion
-from buddyline.solver_service.geometry.rotation import Floats, Indices, inner, skew
+from buddyline.solver_service.geometry.rotation import Floats, Index, inner, skew
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
@@ -19,8 +19,10 @@ _SMALL: Final = 5e-4
 _LEFT: Final = 0.01
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
-_DAMPING: Final = 1e-13 * np.eye(6)
-_IDENTITY: Final = np.eye(3)
+# The normal matrix times this, element by element, can always be inverted.
+_DAMPED: Final = 1.0 + 1e-13 * np.eye(6)
+# How the vectors to B's two lights and back to A's two change with a step dt, in A's axes (4, 3, 3).
+_BY_POSITION: Final = np.array((1.0, 1.0, -1.0, -1.0))[:, None, None] * np.eye(3)
 # Eight picture coordinates and three of the sensors.
 _UNIT_NOISE: Final = np.eye(11)
 
@@ -39,6 +41,10 @@ class Solved:
     lost: Floats
     open: Floats
 
+    def __getitem__(self, index: Index) -> Solved:
+        """Choose some."""
+        return Solved(self.step[index], self.covariance[index], self.chi2[index], self.lost[index], self.open[index])
+
 
 @dataclass(eq=False, slots=True)
 class Refined:
@@ -54,18 +60,18 @@ class Refined:
     sound: NDArray[np.bool_]
 
 
-def refine(
-    T_a_b: SE3, rows_at: Callable[[SE3, Indices], tuple[Floats, Floats]], max_steps: int = _MAX_STEPS
-) -> Refined:
+def refine(T_a_b: SE3, rows_at: Callable[[SE3, Index], tuple[Floats, Floats]], max_steps: int = _MAX_STEPS) -> Refined:
     """Refine K poses, each until the last step leaves little of the noise.
 
     rows_at: gives rows (K, n, 7), and the distances of the lights along their bearings (K, 4), at the poses chosen by
     an index.
     """
-    R, t = T_a_b.R.copy(), T_a_b.t_m.copy()
-    rows, depth = rows_at(T_a_b, np.arange(len(t)))
+    rows, depth = rows_at(T_a_b, slice(None))
     solved = least_squares(rows)
-    left = np.flatnonzero(_is_large(solved, t))
+    (left,) = _is_large(solved, T_a_b.t_m).nonzero()
+    if len(left):
+        T_a_b = SE3(T_a_b.R.copy(), T_a_b.t_m.copy())
+    R, t = T_a_b.R, T_a_b.t_m
     for _ in range(max_steps - 1):
         if not len(left):
             break
@@ -77,8 +83,12 @@ def refine(
         solved.open[left] = part.open
         left = left[_is_large(part, moved.t_m)]
     # A step that is not finite makes chi^2 not finite either.
-    sound = (solved.open.max(1) < _UNDETERMINED) & (depth > 0.0).all(1) & np.isfinite(solved.chi2)
-    return Refined(SE3(R, t), rows, solved, sound)
+    sound = (
+        (np.maximum.reduce(solved.open, 1) < _UNDETERMINED)
+        & (np.minimum.reduce(depth, 1) > 0.0)
+        & np.isfinite(solved.chi2)
+    )
+    return Refined(T_a_b, rows, solved, sound)
 
 
 def least_squares(rows: Floats, covariance: Floats | None = None) -> Solved:
@@ -86,21 +96,18 @@ def least_squares(rows: Floats, covariance: Floats | None = None) -> Solved:
     weighted = rows if covariance is None else np.asarray(np.linalg.solve(covariance, rows))
     normal = rows.swapaxes(1, 2) @ weighted
     H, g = normal[:, :6, :6], normal[:, :6, 6:]
-    # Positions and rotations have their own units: scaled to a unit diagonal before solving.
-    unit = 1.0 / np.sqrt(H.diagonal(0, 1, 2))
-    scale = unit[:, :, None] * unit[:, None]
-    inverse = np.linalg.inv(H * scale + _DAMPING)
-    of_step = inverse * scale
-    step = -(of_step @ g)
-    lost = -(step.swapaxes(1, 2) @ g)[:, 0, 0]
+    of_step = np.asarray(np.linalg.inv(H * _DAMPED), dtype=np.float64)
+    back = of_step @ g
+    lost = (back.swapaxes(1, 2) @ g)[:, 0, 0]
     chi2 = np.maximum(normal[:, 6, 6] - lost, 0.0)
-    return Solved(step[:, :, 0], of_step, chi2, lost, np.array(inverse.diagonal(0, 1, 2)))
+    return Solved(-back[:, :, 0], of_step, chi2, lost, of_step.diagonal(0, 1, 2) * H.diagonal(0, 1, 2))
 
 
 def _is_large(solved: Solved, t: Floats) -> NDArray[np.bool_]:
     """Tell which steps leave what matters; t: (K, 3) before them."""
     moved = np.abs(solved.step)
-    size = np.maximum(moved[:, :3].max(1) / np.sqrt(inner(t, t)), moved[:, 3:].max(1))
+    moved[:, :3] /= np.sqrt(inner(t, t))[:, None]
+    size = np.maximum.reduce(moved, 1)
     # The geometry changes by about this share over the step, and so the step: in sd, the root of what chi^2 loses.
     large: NDArray[np.bool_] = (size > _SMALL) & (size * size * solved.lost > _LEFT**2 * solved.chi2)
     return large
@@ -110,7 +117,8 @@ def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> tuple[Floats, Fl
     """Linearize the eight coordinates at K poses: give rows (K, 8, 7) and the lights' distances (K, 4).
 
     frames: (K, 4, 3, 3) of B's left and right light in A's picture, A's left and right in B's: bearing, then both
-    tangents in pixels per radian over sigma_px. lights_m: (2, 2, 3) A's and B's left and right light.
+    tangents in pixels per radian over sigma_px, in the frame of the camera that sees it. lights_m: (2, 2, 3) A's and
+    B's left and right light. T_a_b is between the frames of both.
 
     From a camera to a light, in A's axes, q = R l_b + t, and back from B to A's lights, q = R^T (l_a - t). A step moves
     the first by dt + dw x R l_b, the second by R^T (-dt - dw x (l_a - t)).
@@ -121,13 +129,11 @@ def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> tuple[Floats, Fl
     to_a = lights_m[0] - t[:, None]
     # (K, 4, 3, 7): derivatives by dt and dw, then q itself, in A's axes.
     q = np.empty((len(t), 4, 3, 7))
-    q[:, :2, :, :3], q[:, 2:, :, :3] = _IDENTITY, -_IDENTITY
-    q[:, :2, :, 3:6], q[:, 2:, :, 3:6] = -skew(about_b), skew(to_a)
+    q[..., :3] = _BY_POSITION
+    q[..., 3:6] = skew(np.concatenate((-about_b, to_a), axis=1))
     q[:, :2, :, 6], q[:, 2:, :, 6] = about_b + t[:, None], to_a
-    frames = frames.copy()
-    frames[:, 2:] = frames[:, 2:] @ back[:, None]
     # How q and its derivatives extend along the bearing and along both tangents.
-    extent = frames @ q
+    extent = np.concatenate((frames[:, :2], frames[:, 2:] @ back[:, None]), axis=1) @ q
     along, across = extent[:, :, :1], extent[:, :, 1:]
     depth = along[..., 6:]
     r = across[..., 6:] / depth

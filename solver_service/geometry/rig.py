@@ -81,18 +81,21 @@ class Rig:
 class RigPair:
     """What follows from two rigs together; arrays hold A's value first.
 
-    rigs: as given. in_bar_frames: the same. R_bar_camera (2, 3, 3). lights_m (2, 2, 3), middle_m (2, 3),
-    port_m (2, 3): bar frames. length_m (2,): of the bars. size_px (2, 2): width and height of the pictures.
-    solid_angle_sr (2,): of the pictures. offset_m: of both bars' middles from their cameras, together.
-    gap_per_bearing_m2: half the sum of the bars' lengths^-2, the variance of a gap over that of a bearing and range^2.
+    rigs: as given. in_bar_frames: the same. R_bar_camera (2, 3, 3). lights_m (2, 2, 3), middle_m (2, 3): bar frames.
+    port_m (2, 3): bar frames. lights_in_camera_m, port_in_camera_m: camera frames. length_m (2,): of the bars. size_px
+    (2, 2): width and height of the pictures. solid_angle_sr (2,): of the pictures. offset_m: of both bars' middles from
+    their cameras, together. gap_per_bearing_m2: half the sum of the bars' lengths^-2, the variance of a gap over that
+    of a bearing and range^2.
     """
 
     rigs: tuple[Rig, Rig]
     in_bar_frames: tuple[Rig, Rig]
     R_bar_camera: Floats
     lights_m: Floats
+    lights_in_camera_m: Floats
     middle_m: Floats
     port_m: Floats
+    port_in_camera_m: Floats
     length_m: Floats
     size_px: Floats
     solid_angle_sr: Floats
@@ -111,31 +114,30 @@ class RigPair:
         return float(self.solid_angle_sr.prod())
 
     @cached_property
-    def R_body_bar(self) -> Floats:
-        """From the bar frames to the bodies (2, 3, 3)."""
-        return np.array([rig.R_body_camera for rig in self.in_bar_frames])
+    def one_lens(self) -> bool:
+        """Whether both cameras turn pixels into the same bearings."""
+        return self.rigs[0].camera.same_as(self.rigs[1].camera)
+
+    @cached_property
+    def R_body_camera(self) -> Floats:
+        """From the cameras' frames to the bodies (2, 3, 3)."""
+        return np.array([rig.R_body_camera for rig in self.rigs])
+
+    @cached_property
+    def R_ned_upright(self) -> Floats:
+        """From the cameras' frames to NED (2, 3, 3) where the attitude is unknown: the bar level, looking north."""
+        upright: Floats = NOMINAL_R_BODY_CAMERA @ self.R_bar_camera
+        return upright
 
     @cached_property
     def R_magnetic_ned(self) -> Floats:
         """From the north that each node's headings are given from to the magnetic one (2, 3, 3)."""
         return rotation_exp(np.array([(0.0, 0.0, -rig.declination_rad) for rig in self.rigs]))
 
-    @cached_property
-    def _camera_step(self) -> Floats:
-        """From a step in A's bar frame, with a residual, to one in its camera's (7, 7)."""
-        turn = np.eye(7)
-        turn[:3, :3] = turn[3:6, 3:6] = self.R_bar_camera[0]
-        return turn
-
     def between_cameras(self, T_a_b: SE3) -> SE3:
         """Bring poses from the bar frames into the cameras'."""
         turn_a, turn_b = self.R_bar_camera
         return SE3(turn_a.T @ T_a_b.R @ turn_b, T_a_b.t_m @ turn_a)
-
-    def by_camera_step(self, rows: Floats) -> Floats:
-        """Turn rows (..., 7), derivatives by a step in A's bar frame, into those by a step in its camera's."""
-        by_step: Floats = rows @ self._camera_step
-        return by_step
 
 
 @lru_cache(maxsize=16)
@@ -148,8 +150,10 @@ def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
         in_bar_frames=in_bar_frames,
         R_bar_camera=np.array([rig.R_bar_camera for rig in rigs]),
         lights_m=np.array([rig.lights_m for rig in in_bar_frames]),
+        lights_in_camera_m=np.array([rig.lights_m for rig in rigs]),
         middle_m=np.array([rig.middle_m for rig in in_bar_frames]),
         port_m=np.array([rig.depth_port_m for rig in in_bar_frames]),
+        port_in_camera_m=np.array([rig.depth_port_m for rig in rigs]),
         length_m=np.array([rig.length_m for rig in rigs]),
         size_px=np.array([(rig.camera.width_px, rig.camera.height_px) for rig in rigs], dtype=np.float64),
         solid_angle_sr=np.array([rig.camera.solid_angle_sr for rig in rigs]),

@@ -18,6 +18,13 @@ for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
     _CROSS[_axis, 3 * _row + _column] = 1.0
     _CROSS[_axis, 3 * _column + _row] = -1.0
 _IDENTITY: Final[Floats] = np.eye(3)
+# The products (16,) of a quaternion's components, row by row, times this: the matrix (9,), times the quaternion's
+# square length: (w^2 - |v|^2) I + 2 v v^T + 2 w [v x].
+_MATRIX_OF_PRODUCTS: Final[Floats] = np.zeros((4, 4, 9))
+_MATRIX_OF_PRODUCTS[:3, :3] = 2.0 * np.eye(9).reshape(3, 3, 9)
+_MATRIX_OF_PRODUCTS[range(4), range(4)] += np.outer((-1.0, -1.0, -1.0, 1.0), _IDENTITY.ravel())
+_MATRIX_OF_PRODUCTS[3, :3] = 2.0 * _CROSS
+_MATRIX_OF_PRODUCTS.shape = (16, 9)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
 # Up to so many rotations, Python's numbers are faster than arrays.
@@ -27,7 +34,7 @@ _FEWER: Final = 4
 
 def inner(a: Floats, b: Floats) -> Floats:
     """Give the scalar products (...,) of vectors (..., n)."""
-    product: Floats = np.einsum("...i,...i->...", a, b)
+    product: Floats = np.add.reduce(a * b, -1)
     return product
 
 
@@ -38,10 +45,10 @@ def skew(v: Floats) -> Floats:
 
 def quat_to_matrix(q_xyzw: Floats) -> Floats:
     """Turn quaternions (..., 4), of any length but zero, into matrices (..., 3, 3)."""
-    K = skew(q_xyzw[..., :3])
-    length2 = inner(q_xyzw, q_xyzw)[..., None, None]
-    R: Floats = _IDENTITY + (2.0 * q_xyzw[..., 3, None, None] * K + 2.0 * K @ K) / length2
-    return R
+    products = q_xyzw[..., :, None] * q_xyzw[..., None, :]
+    length2 = inner(q_xyzw, q_xyzw)[..., None]
+    R: Floats = products.reshape(*q_xyzw.shape[:-1], 16) @ _MATRIX_OF_PRODUCTS / length2
+    return R.reshape(*q_xyzw.shape[:-1], 3, 3)
 
 
 def matrix_to_quat(R: Floats) -> Floats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from buddyline.solver_service.geometry.guesses import Guesses, guess
 from buddyline.solver_service.geometry.ragged import places, starts_of
 from buddyline.solver_service.geometry.readings import Poses, Read, Readings
 from buddyline.solver_service.geometry.refinement import Refined, Solved, light_rows, refine
-from buddyline.solver_service.geometry.rotation import Floats, Indices, inner, skew
+from buddyline.solver_service.geometry.rotation import Floats, Index, Indices, inner, skew
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.sensors import off_rad, turn_of
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ def three_lights_tell(batch: Batch) -> NDArray[np.bool_]:
 def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     """Give the best readings of three lights of the triggers wanted (T,), of those in which three lights can tell."""
     guesses = guess(batch, wanted)
-    seen, rigs, settings = batch.candidates, batch.rigs, batch.settings
+    seen, settings = batch.candidates, batch.settings
     trigger, lights = guesses.trigger, guesses.lights
     refined = _refined(batch, guesses)
     T_a_b = refined.T_a_b.retract(refined.solved.step)
@@ -58,19 +59,18 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     return Read(
         pose_starts=starts,
         poses=Poses(
-            T_a_b=rigs.between_cameras(T_a_b),
+            T_a_b=T_a_b,
             log_ratio=np.where(sound, log_ratio + log_fit(refined.solved), -np.inf),
             turn=turn,
             log_heading=log_heading,
             turn_variance=turn_variance,
         ),
         starts=starts,
+        pose=np.arange(len(trigger)),
         readings=Readings(
             lights=np.where(lights < 0, -1, seen.index[lights]),
-            T_a_b=rigs.between_cameras(refined.T_a_b),
-            rows=rigs.by_camera_step(refined.rows),
+            refined=replace(refined, sound=sound),
             dt_s=np.column_stack(((seen.dt_s[lights] * (lights >= 0)).repeat(2, 1), none, none, none)),
-            sound=sound,
             log_ratio=log_ratio,
             tilt_chi2=none,
             depth_chi2=none,
@@ -92,20 +92,21 @@ def log_fit(solved: Solved) -> Floats:
 def _refined(batch: Batch, guesses: Guesses) -> Refined:
     """Fit the three lights with tilt and depth."""
     seen, rigs = batch.candidates, batch.rigs
-    lights, T_a_b = guesses.lights, guesses.T_a_b
+    lights, T_a_b = guesses.lights, rigs.between_cameras(guesses.T_a_b)
     absent = lights < 0
     # The missing light has no weight; its bearing only keeps the arithmetic finite.
-    in_a = rigs.lights_m[1] @ T_a_b.R.swapaxes(1, 2) + T_a_b.t_m[:, None]
-    in_b = (rigs.lights_m[0] - T_a_b.t_m[:, None]) @ T_a_b.R
+    lights_m = rigs.lights_in_camera_m
+    in_a = lights_m[1] @ T_a_b.R.swapaxes(1, 2) + T_a_b.t_m[:, None]
+    in_b = (lights_m[0] - T_a_b.t_m[:, None]) @ T_a_b.R
     q = np.concatenate((in_a, in_b), axis=1)
     frames = seen.frames[lights]
     frames[absent] = 0.0
     frames[absent, 0] = (q / np.sqrt(inner(q, q))[..., None])[absent]
 
-    across = _across(batch.sensors.down[guesses.trigger, 0])
+    across = _across(batch.sensors.R_ned_camera[guesses.trigger, 0, 2])
 
-    def rows_at(T_a_b: SE3, chosen: Indices) -> tuple[Floats, Floats]:
-        of_lights, depth = light_rows(T_a_b, frames[chosen], rigs.lights_m)
+    def rows_at(T_a_b: SE3, chosen: Index) -> tuple[Floats, Floats]:
+        of_lights, depth = light_rows(T_a_b, frames[chosen], lights_m)
         of_sensors, _ = _sensor_rows(batch, guesses.trigger[chosen], across[chosen], T_a_b)
         return np.concatenate((of_lights, of_sensors), axis=1), depth
 
@@ -117,14 +118,14 @@ def _sensor_rows(batch: Batch, trigger: Indices, across: Floats, T_a_b: SE3) -> 
 
     across: (K, 2, 3) unit vectors across A's down.
     """
-    sensors, (port_a, port_b) = batch.sensors, batch.rigs.port_m
-    down_a, of_b = sensors.down[trigger].swapaxes(0, 1)
+    sensors, (port_a, port_b) = batch.sensors, batch.rigs.port_in_camera_m
+    down_a, of_b = sensors.R_ned_camera[trigger, :, 2].swapaxes(0, 1)
     down_b, port_b = (T_a_b.R @ of_b[:, :, None])[:, :, 0], T_a_b.R @ port_b
     below = T_a_b.t_m - port_a + port_b
     down = down_a + down_b
     down /= np.sqrt(inner(down, down))[:, None]
     fall = inner(down, below)
-    tilt_variance = sensors.tilt_variance.sum(1)[trigger]
+    tilt_variance = sensors.tilts_variance[trigger]
     sigma_m = np.sqrt(sensors.depth_variance[trigger] + 0.25 * tilt_variance * (inner(below, below) - fall * fall))
     across = across / np.sqrt(tilt_variance)[:, None, None]
     down /= sigma_m[:, None]
@@ -166,20 +167,20 @@ def _log_ratio(
         both_seen, np.log(np.maximum(counts - 1, 1) / rigs.area_px2), 0.0
     )
     sigma_px = np.where(lights < 0, 1.0, seen.sigma_px[lights])
-    across = _across(sensors.down[trigger, 0])
+    across = _across(sensors.R_ned_camera[trigger, 0, 2])
     _, sigma = _sensor_rows(batch, trigger, across, refined.T_a_b)
     total = prior - chance.sum(1) - 2.0 * np.log(sigma_px).sum(1) - np.log(sigma)
     # Nine residuals and six unknowns leave three factors of a normal density.
     total += math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS) - 1.5 * math.log(2.0 * math.pi)
     total += np.where(lights < 0, 0.0, seen.log_score[lights]).sum(1)
-    R_ned_a, R_ned_b = sensors.R_ned_bar[trigger].swapaxes(0, 1)
+    R_ned_a, R_ned_b = sensors.R_ned_camera[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
     u = T_a_b.t_m / range_m[:, None]
     turn_variance = inner((refined.solved.covariance[:, 3:, 3:] @ u[:, :, None])[:, :, 0], u)
     heading = weigh_heading(off_rad(turn), sensors.heading_variance[trigger] + turn_variance)
     # The pair and the attitudes predict where the lone light stands: across by the tilts, along by the headings.
     rise = inner((T_a_b.R @ R_ned_b[:, 2, :, None])[:, :, 0] - R_ned_a[:, 2], u)
-    tilt_variance = sensors.tilt_variance.sum(1)[trigger]
+    tilt_variance = sensors.tilts_variance[trigger]
     density = np.exp(heading - 0.5 * rise * rise / tilt_variance)
     density /= HEADING_SPREAD * np.sqrt(2.0 * math.pi * tilt_variance)
     lone_odds = MISSING_ODDS * _others_per_sr(batch, guesses) / density

@@ -157,7 +157,7 @@ class _Batched:
         read = self.three
         if read is None or not self.tried[trigger]:
             read = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
-        if not read.readings.sound[read.places_of(trigger)].any():
+        if not read.readings.refined.sound[read.places_of(trigger)].any():
             return found
         three = weigh_readings(read, trigger, past, settings, three=True)
         return self._choose(trigger, three if four is None else four.joined(three), heading)
@@ -227,7 +227,7 @@ class _Batched:
         sensors = self.batch.sensors
         if not self.oriented[trigger] or "attitude" not in self.batch.settings.checks:
             return None
-        R_ned_a, R_ned_b = sensors.R_ned_bar[trigger] @ self.batch.rigs.R_bar_camera
+        R_ned_a, R_ned_b = sensors.R_ned_camera[trigger]
         gap_rad, variance = heading_offset(weighed.T_a_b[k], covariance, R_ned_a, R_ned_b)
         follows = bool(weighed.log_prior[k] > 0.0)
         return compare_headings(gap_rad, variance, float(sensors.heading_variance[trigger]), learned, follows=follows)

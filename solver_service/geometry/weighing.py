@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.evidence import log_gaps
 from buddyline.solver_service.geometry.observation import Settings
-from buddyline.solver_service.geometry.past import Motion, Past
+from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.readings import Read, Readings
-from buddyline.solver_service.geometry.refinement import Solved, at_one_instant, least_squares
+from buddyline.solver_service.geometry.refinement import Solved, at_one_instant
 from buddyline.solver_service.geometry.rotation import Floats, Indices
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.three_lights import UNCHECKED, log_fit
@@ -71,15 +71,17 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         turned = poses.turn[:, of_trigger], poses.log_heading[of_trigger], poses.turn_variance[of_trigger]
         log_past = log_prior + past.weigh_heading(*turned)
     so_far = poses.log_ratio[of_trigger] + log_past
-    chosen = _likeliest(so_far, places.stop - places.start)
+    read_at = read.pose[places] - of_trigger.start
+    chosen = _likeliest(so_far, read_at)
+    pose, place = read_at[chosen], places.start + chosen
     others = 0.0
-    if not three and len(chosen) < len(so_far):
+    if not three and len(pose) < len(so_far):
         ratios = np.exp(so_far)
-        ratios[chosen] = 0.0
+        ratios[pose] = 0.0
         others = float(ratios.sum())
-    log_prior, log_past, place = log_prior[chosen], log_past[chosen], places.start + chosen
+    log_prior, log_past = log_prior[pose], log_past[pose]
     readings = read.readings
-    solved = _solve(readings, place, past.motion)
+    solved = _solve(readings, place, past)
     chi2, covariance = solved.chi2, solved.covariance
     if three:
         fit = log_fit(solved)
@@ -89,9 +91,9 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2[place]
         fit = log_gaps(chi2, settings.gaps)
     log_ratio = readings.log_ratio[place] + fit + log_past
-    log_ratio[~(readings.sound[place] & np.isfinite(log_ratio))] = -np.inf
+    log_ratio[~(readings.refined.sound[place] & np.isfinite(log_ratio))] = -np.inf
     return Weighed(
-        T_a_b=readings.T_a_b[place].retract(solved.step),
+        T_a_b=readings.refined.T_a_b[place].retract(solved.step),
         covariance=covariance,
         chi2=chi2,
         log_ratio=log_ratio,
@@ -102,20 +104,24 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
     )
 
 
-def _likeliest(log_ratio: Floats, count: int) -> Indices:
-    """Give the places of those of the first `count` that are worth solving for the motion, the likeliest first."""
-    if count == 1:
+def _likeliest(log_ratio: Floats, read_at: Indices) -> Indices:
+    """Give those of the readings that are worth solving for the motion, the likeliest first.
+
+    log_ratio: (K,) of all poses. read_at: (M,) the readings' poses among them.
+    """
+    if len(read_at) == 1:
         return np.zeros(1, dtype=np.intp)
-    order = (-log_ratio[:count]).argsort(kind="stable")[:_CHOSEN]
-    likely = log_ratio[order] > log_ratio.max() - _NEGLIGIBLE
+    order = (-log_ratio[read_at]).argsort(kind="stable")[:_CHOSEN]
+    likely = log_ratio[read_at[order]] > log_ratio.max() - _NEGLIGIBLE
     likely[0] = True
     chosen: Indices = order[likely]
     return chosen
 
 
-def _solve(readings: Readings, place: Indices, motion: Motion) -> Solved:
+def _solve(readings: Readings, place: Indices, past: Past) -> Solved:
     """Take the last step, for what is known of the motion."""
-    rows, dt_s = readings.rows[place], readings.dt_s[place]
-    if motion.skew_sigma_s == 0.0 and not dt_s.any():
-        return least_squares(rows)
-    return at_one_instant(rows, dt_s, _SKEW_SIGN[: rows.shape[1]], motion)
+    dt_s = readings.dt_s[place]
+    if past.settings.skew_sigma_s == 0.0 and not dt_s.any():
+        return readings.refined.solved[place]
+    rows = readings.refined.rows[place]
+    return at_one_instant(rows, dt_s, _SKEW_SIGN[: rows.shape[1]], past.motion)

@@ -121,12 +121,11 @@ class Scene:
 def view(pixels, sigma_px=1.0, dt_s=0.0, stamp_ns=0, score=math.nan):
     """A view of bare pixels."""
     n = len(pixels)
-    return View(
+    return View.of(
         pixels=np.asarray(pixels, dtype=float).reshape(-1, 2),
         sigma_px=np.full(n, float(sigma_px)),
         score=np.full(n, score),
         area_px=np.full(n, 100.0),
-        peak=np.full(n, 255.0),
         dt_s=np.full(n, dt_s),
         stamp_ns=stamp_ns,
     )

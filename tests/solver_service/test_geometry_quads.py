@@ -1,7 +1,5 @@
 """The search: it leaves out nothing that passes both gaps."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.batch import Batch
@@ -51,7 +49,8 @@ def test_two_candidates_within_one_glow_are_no_rarity():
 
     def log_weights(area_px):
         pixels = np.array([[800.0, 600.0], [820.0, 600.0], [1100.0, 600.0]])
-        seen = replace(view(pixels, 1.0), area_px=np.full(3, area_px))
+        seen = view(pixels, 1.0)
+        seen.area_px[:] = area_px
         pairs = Batch.of([Observation(seen, seen)], (IDEAL, IDEAL), Settings()).pairs
         weights = dict(zip(zip(*pairs.ends.tolist(), strict=True), pairs.log_weight.tolist(), strict=True))
         return weights[0, 1], weights[0, 2]

@@ -79,7 +79,8 @@ def test_each_candidates_own_noise_counts():
     rng = np.random.default_rng(5)
     scene = random_scene(rng, 5.0)
     (a, _), (b, _) = scene.views(rng, 0.0)
-    worse = replace(a, sigma_px=np.array([5.0, 1.0]))
+    worse = replace(a, table=a.table.copy())
+    worse.sigma_px[0] = 5.0
     assert np.trace(solve(scene, (worse, b)).covariance) > 1.5 * np.trace(solve(scene, (a, b)).covariance)
 
 
@@ -353,7 +354,7 @@ def test_scores_are_weak_evidence():
             score = np.full(len(v.pixels), 0.2)
             score[list(pair)] = 0.9
             views.append(v)
-            scored.append(View(v.pixels, v.sigma_px, score, v.area_px, v.peak, v.dt_s, v.stamp_ns))
+            scored.append(View.of(v.pixels, v.sigma_px, score, v.area_px, v.dt_s, v.stamp_ns))
         without += isinstance(solve(scene, views), Fix)
         with_scores += isinstance(solve(scene, scored), Fix)
     assert with_scores > without
@@ -365,7 +366,8 @@ def test_lights_that_do_not_fit_each_other_give_no_pose(shift_px, reason):
     scene = facing()
     (a, _), (b, _) = scene.views(np.random.default_rng(1), 1.0)
     assert isinstance(solve(scene, (a, b)), Fix)
-    off = replace(a, pixels=a.pixels + np.array([shift_px, (0.0, 0.0)]))
+    off = replace(a, table=a.table.copy())
+    off.pixels[0] += shift_px
     for sensed in (None, scene.sensed()):
         found = solve(scene, (off, b)) if sensed is None else solve(scene, (off, b), sensed)
         assert isinstance(found, NoFix)

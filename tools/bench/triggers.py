@@ -83,7 +83,7 @@ def simulate(rng: np.random.Generator, range_m: tuple[float, float], false: int 
         places = np.argsort(order)
         pairs.append((int(places[0]), int(places[1])))
         one = np.ones(len(pixels))
-        views.append(View(pixels[order], sigma_px * one, np.nan * one, 100.0 * one, 255.0 * one, 0.0 * one, 0))
+        views.append(View.of(pixels[order], sigma_px * one, np.nan * one, 100.0 * one, 0.0 * one, 0))
     sigma_rad = np.array((TILT_SIGMA_RAD, TILT_SIGMA_RAD, HEADING_SIGMA_RAD))
     depths_m = 10.0, 10.0 + float((R_ned_a @ t)[2])
     sensed = [
