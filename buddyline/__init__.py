@@ -129,7 +129,7 @@ def __dir__() -> list[str]:
 def open_dive(*logs: str | Path) -> DiveColumns:
     """Open a stored dive: its log, or each node's own, with poses or without.
 
-    Poses, attitudes, depths, candidates and truth are then numpy columns. Of damaged logs what can be read is used;
+    Poses, attitudes, depths, candidates and truth are then numpy columns. What can be read of damaged logs is used;
     `losses` says what is missing.
     """
     from buddyline.tools.columns import DiveColumns
@@ -181,7 +181,7 @@ def solve_messages(
 ) -> SolvedDive:
     """Solve messages that a program made itself: NodeInfo and Candidates of both nodes, Imu, Attitude, Depth if any.
 
-    They are taken in the order given, which is that of their stamps but for a second at most. track: as of solve.
+    The order must be that of their stamps, within a second. track: as of solve.
     """
     from buddyline.tools.offline import solve_messages as solve_in_memory
 

@@ -111,7 +111,7 @@ def attitudes(samples: Iterable[Imu], estimator: AttitudeEstimator) -> Iterator[
     """Yield one node's attitudes from its inertial samples, in order of time, live or from a log.
 
     Imu.mag_t is the uncalibrated reading, so that a log gives better attitudes with a later calibration. With the
-    calibration of the dive they are the recorded ones, except after full scale, which a log does not tell.
+    dive's own calibration they equal the recorded ones, except after a saturation, which a log does not contain.
     """
     for message in samples:
         mag_t = None if message.mag_t is UNSET else np.array(message.mag_t)

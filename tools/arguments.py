@@ -237,7 +237,7 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--what",
         choices=("poses", "track"),
-        help="default: the track where the log has one (of several modes the best), else the poses",
+        help="default: the track if the log has one (the best of its modes), else the poses",
     )
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses instead of the solved ones (tum)")

@@ -86,7 +86,7 @@ class TagSolver:
     def _message(
         self, trigger: int, stamps_ns: dict[str, int], solved: TagPose, attitudes_a: PoseHistory
     ) -> RelativePose:
-        # Where one node's picture is missing, the other's stamp stands for both.
+        # If one node's picture is missing, the other's stamp is used for both.
         stamp_a_ns = stamps_ns.get(self.node_a, stamps_ns.get(self.node_b, 0))
         stamp_b_ns = stamps_ns.get(self.node_b, stamp_a_ns)
         t_ned_m = None
@@ -121,7 +121,7 @@ class TagSolver:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find the tags of a dive's pictures; return 0, or 1 where no picture shows one."""
+    """Find the tags of a dive's pictures; return 0, or 1 if no picture shows one."""
     cv2.setNumThreads(1)
     with Dive(args.dives) as dive:
         nodes = pair_of(dive, args.nodes)
@@ -167,7 +167,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def layouts(name: str, infos: dict[str, NodeInfo], nodes: tuple[str, str], given: list[str]) -> dict[str, Layout]:
-    """Return the tags of both nodes: of `--tags NODE=FILE`, else of NodeInfo; raise where there are none."""
+    """Return the tags of both nodes: of `--tags NODE=FILE`, else of NodeInfo; raise if there are none."""
     chosen: dict[str, Layout] = {}
     for text in given:
         node, equals, path = text.partition("=")

@@ -45,7 +45,7 @@ class Authority:
         except OSError as error:
             raise BuddylineError(f"{directory}: cannot be made: {error.strerror}") from error
         key = ec.generate_private_key(ec.SECP256R1())
-        # Two authorities differ by name, so that a foreign certificate is told from a forged one.
+        # Every authority has its own name, so that errors distinguish a foreign certificate from a forged one.
         name = _name(f"buddyline authority {secrets.token_hex(4)}")
         identifier = x509.SubjectKeyIdentifier.from_public_key(key.public_key())
         certificate = _builder(name, name, key.public_key(), days, identifier, signs=True).sign(key, hashes.SHA256())

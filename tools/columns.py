@@ -198,7 +198,7 @@ class DiveColumns:
 
     nodes, pairs: those in the logs. infos: each node's calibration. losses: what could not be read of damaged
     logs so far, a line each with file and byte; everything else was used.
-    Raises BuddylineError naming the file where one is missing or is no dive log.
+    Raises BuddylineError naming the file if one is missing or is no dive log.
     """
 
     def __init__(self, *logs: str | Path) -> None:
@@ -213,23 +213,23 @@ class DiveColumns:
             self._note(dive)
 
     def poses(self, pair: Pair | None = None) -> PoseColumns:
-        """Return the solved poses; pair: may be left out where there is one."""
+        """Return the solved poses; pair: needed if there are several."""
         return pose_columns(self._of_pair(POSE, RelativePose, pair))
 
     def track(self, pair: Pair | None = None, mode: TrackMode | None = None) -> TrackColumns:
-        """Return the fused estimate; pair: may be left out where there is one.
+        """Return the fused estimate; pair: needed if there are several.
 
-        mode: default: of the modes in the logs the best: smooth, lag, filter.
+        mode: default: the best that the logs have of smooth, lag, filter.
         """
         found = self._of_pair(TRACK, Track, pair) + self._of_pair(TRACK_LAG, Track, pair)
         return track_columns(in_order(of_mode(found, mode)))
 
     def truth(self, pair: Pair | None = None) -> TruthColumns:
-        """Return the true poses; pair: may be left out where there is one."""
+        """Return the true poses; pair: needed if there are several."""
         return columns_of(TruthColumns, self._of_pair(TRUTH, Truth, pair))
 
     def rejections(self, pair: Pair | None = None) -> RejectionColumns:
-        """Return the triggers without a pose; pair: may be left out where there is one."""
+        """Return the triggers without a pose; pair: needed if there are several."""
         return rejection_columns(self._of_pair(REJECTED, Rejected, pair))
 
     def attitudes(self, node: str) -> AttitudeColumns:

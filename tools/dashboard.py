@@ -128,7 +128,7 @@ class Dashboard:
             self._track_truths.append(self._world.truth(track.stamp_ns, 0))
 
     def _shown(self) -> Estimate | None:
-        """Return the track, or where it is missing or stale the newest pose."""
+        """Return the track, or the newest pose if the track is missing or stale."""
         stale_s = stale_after_s(TRACK, self._period_s)
         if self._track is not None and self._now_s() - self._track_came_s < stale_s:
             return self._track

@@ -79,7 +79,7 @@ class Dive:
 
     @cached_property
     def start_ns(self) -> int:
-        """Log time of the first message; raises where no log has any."""
+        """Log time of the first message; raises if no log has any."""
         starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
         if not starts:
             raise BuddylineError(f"{self.name}: no message can be read")

@@ -48,7 +48,7 @@ LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
 
 
 class FoxgloveTranslation:
-    """Turns a dive's messages into Foxglove's, one by one. tracked: pairs whose track, not poses, says where B is."""
+    """Translates a dive's messages into Foxglove's, one by one. tracked: pairs whose track, not poses, places B."""
 
     def __init__(self, schemas: Any, tracked: Collection[tuple[str, ...]] = ()) -> None:
         self._fox = schemas
@@ -168,13 +168,13 @@ class FoxgloveTranslation:
             piece[:] = [track]
 
     def paths(self) -> Iterator[tuple[str, int, Any]]:
-        """Yield what is left of the paths at the end of the dive."""
+        """Yield the unfinished pieces of the paths, at the end of the dive."""
         for piece in self._paths.values():
             if len(piece) > 1:
                 yield self._path(piece)
 
     def _path(self, piece: list[Track]) -> tuple[str, int, Any]:
-        """Return a piece of B's path: in the world where A's attitude is known, else in A's camera frame."""
+        """Return a piece of B's path: in the world if A's attitude is known, else in A's camera frame."""
         fox, first = self._fox, piece[0]
         known = [one.t_ned_m for one in piece if one.t_ned_m is not UNSET]
         if len(known) == len(piece):
@@ -245,7 +245,7 @@ class FoxgloveTranslation:
 def export_foxglove(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write a dive as Foxglove messages into output, which must not exist; return how many there are.
 
-    what: "poses" leaves the track out, "track" asks for one; None: with the track where there is one.
+    what: "poses" leaves the track out, "track" asks for one; None: with the track if there is one.
     """
     try:
         from foxglove import messages as fox

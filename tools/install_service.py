@@ -163,7 +163,7 @@ def _source(args: argparse.Namespace) -> UnitSource:
 
 
 def _program() -> Path:
-    """Return this program as it is installed; raise BuddylineError if it is not installed."""
+    """Return the path of the installed program; raise BuddylineError if it is not installed."""
     program = Path(sys.executable).parent / "buddyline"
     if not program.is_file():
         raise BuddylineError(f"{program}: not there; install the program first: make install")

@@ -75,7 +75,7 @@ class LiveStream(Generic[M]):
         self._bus.close()
 
     def __iter__(self) -> Iterator[M]:
-        """Yield each message as it comes; raise where a thread of the bus has died."""
+        """Yield each message as it comes; raise if a thread of the bus has died."""
         while (message := self._next()) is not None:
             yield message
 

@@ -219,7 +219,7 @@ class MinImu9V3(ChipImu):
 
     @classmethod
     def find(cls, name: str, bus: I2cBus, R_body_chip: NDArray[np.float64], clock: Clock) -> Self | None:
-        """Return the unit where both chips answer, else None."""
+        """Return the unit if both chips answer, else None."""
         lsm303d, l3gd20h = Lsm303d.find(bus), L3gd20h.find(bus)
         if lsm303d is None or l3gd20h is None:
             return None

@@ -33,7 +33,7 @@ TRANSFERS_NS: Final = 1_500_000
 
 Model = Literal["30ba", "02ba"]
 
-# Word 0 does not tell the ranges apart: 30BA parts with the 02BA01's type 0 are sold. Their sensitivity at
+# Word 0 does not distinguish the ranges: 30BA parts with the 02BA01's type 0 are sold. Their sensitivity at
 # 20 degC (C1) does (production figures given by TE in ArduPilot pull request 29122).
 TYPES: Final[dict[int, Model]] = {0x1A: "30ba", 0x15: "02ba"}
 SENSITIVITY: Final[dict[Model, range]] = {"30ba": range(26_000, 37_001), "02ba": range(37_001, 49_001)}

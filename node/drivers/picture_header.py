@@ -10,7 +10,7 @@ Size: TypeAlias = tuple[int, int]
 
 
 def stated_size(data: bytes) -> Size | None:
-    """Return (width_px, height_px) of a picture file's bytes; None where no header says it."""
+    """Return (width_px, height_px) of a picture file's bytes; None if no header gives it."""
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:

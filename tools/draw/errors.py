@@ -35,7 +35,7 @@ class ErrorCurve:
 
 
 def by_verdict(errors: PoseErrors) -> list[ErrorCurve]:
-    """Return the poses that hold and, where there are any, those that are wrong."""
+    """Return the curve of the right poses and, if there are any, that of the wrong ones."""
     curves = [ErrorCurve("poses", errors.select(~errors.wrong))]
     return (
         [*curves, ErrorCurve("wrong poses", errors.select(errors.wrong), "tab:red")] if errors.wrong.any() else curves

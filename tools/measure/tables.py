@@ -41,12 +41,12 @@ def markdown_table(head: Sequence[object], rows: Sequence[Sequence[object]]) -> 
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Return a figure, or a dash where there is none."""
+    """Return a figure, or a dash if there is none."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def percent(value: float | None) -> str:
-    """Return a share in percent, or a dash where there is none."""
+    """Return a share in percent, or a dash if there is none."""
     return "-" if value is None else f"{100 * value:.1f} %"
 
 

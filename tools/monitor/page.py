@@ -145,7 +145,7 @@ class Page:
         self._headline = gui.add_html(panel.block("Starting."))
         self.scene = SceneDrawing(server)
         gui.add_button("Show both nodes").on_click(lambda _: self.scene.fit_all())
-        with gui.add_folder("What is going on"):
+        with gui.add_folder("What is happening"):
             self._health = gui.add_html("")
         with gui.add_folder("Cameras"):
             self._cameras: list[viser.GuiHtmlHandle] = [gui.add_html("", visible=False) for _ in range(2)]

@@ -102,7 +102,7 @@ QUANTITIES: Final = (
 
 
 def columns(points: Iterable[Point], zero_ns: int) -> dict[str, Column]:
-    """Return, by title, each quantity where it is known, over the time from zero_ns.
+    """Return each quantity, by title, as far as it is known, over the time since zero_ns.
 
     Azimuths are continued past 360 deg, so that no line jumps where north is crossed. A quantity that is never known
     is left out.

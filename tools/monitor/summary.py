@@ -140,7 +140,7 @@ def _keep(summary: Summary, points: list[Point], estimate: Estimate, at_ns: int)
 
 
 def _shots(dive: Dive, pair: Pair | None) -> dict[str, JudgedPicture]:
-    """Return a picture of each node near the middle of the dive, where there are pictures."""
+    """Return a picture of each node near the middle of the dive, if there are pictures."""
     middle_ns = (dive.start_ns + dive.end_ns) // 2
     picture = PairPicture(pair)
     shots: dict[str, JudgedPicture] = {}

@@ -19,7 +19,7 @@ KINDS: Final = get_args(MarkKind)
 
 
 def time_of(text: str) -> datetime | float:
-    """Return `2026-05-01T10:20:30Z` as a time (UTC where no zone is given), or a number of seconds; else ValueError."""
+    """Return `2026-05-01T10:20:30Z` as a time (UTC if no zone is given), or a number of seconds; else ValueError."""
     try:
         return float(text)
     except ValueError:
