@@ -1,4 +1,4 @@
-"""Options of the tests, and hypothesis without a deadline: on a loaded machine an example takes as long as it takes."""
+"""Options of the tests, and hypothesis without a deadline: a loaded machine may need long for an example."""
 
 from hypothesis import settings
 

@@ -1,4 +1,4 @@
-"""What the project's modules import, out of their syntax: everywhere in a module, for types alone as well."""
+"""The imports of the project's modules, read from their syntax: at any place in a module, also for types only."""
 
 import ast
 from pathlib import Path

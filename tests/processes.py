@@ -11,7 +11,7 @@ import threading
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-# How long an event may take on the slowest and most loaded machine. Whoever waits for one goes on as soon as it comes.
+# Time limit for an event on the slowest and most loaded machine. A wait ends as soon as its event comes.
 PATIENCE_S = 180.0
 
 

@@ -29,7 +29,7 @@ COMMAND = {command.name: command for command in COMMANDS}
 
 
 def said(text: str) -> Iterator[str]:
-    """Give what a document shows as something to type: lines of code blocks, and code within sentences."""
+    """Yield the code of a document: lines of code blocks, and code within sentences."""
     fenced = False
     prose: list[str] = []
     for line in text.splitlines():
@@ -56,7 +56,7 @@ def unknown(words: list[str], parser: argparse.ArgumentParser) -> list[str]:
 
 
 def wrong(text: str) -> list[str]:
-    """Return what a document names that is not there, a line of complaint each."""
+    """Return the missing things that a document names, a line each."""
     found = []
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     targets = set(re.findall(r"^([a-z]+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE))

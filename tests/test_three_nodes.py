@@ -32,7 +32,7 @@ def log_of(path):
 
 @pytest.fixture(scope="module")
 def three_logs(tmp_path_factory):
-    """A sees b and c, which stand in one place: pairs a, b and a, c have poses."""
+    """A sees b and c, which are at one place: pairs a, b and a, c have poses."""
     folder = tmp_path_factory.mktemp("three")
     messages, _ = dive_messages(seconds=4.0, seed=7, miss_share=0.05)
     messages += [replace(message, node="c") for message in messages if message.node == "b"]

@@ -1,4 +1,4 @@
-"""Inject faults into the real system and print what became of every frame and every trigger.
+"""Inject faults into the real system and count what happened to every frame and every trigger.
 
 python -m tests.faults --times 20 [hub frozen_hub node solver viewer stopped link orders]
 """
@@ -47,7 +47,7 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=20)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    # So that whoever ends this early ends what it has started, too.
+    # A SIGTERM also ends the processes that were started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     reports = []
     if not args.json:

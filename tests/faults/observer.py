@@ -1,4 +1,4 @@
-"""What a viewer on the bus has seen, and what can be said of it."""
+"""Record the frames and outcomes that a viewer on the bus receives, and compare them with the nodes' logs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from buddyline.protocol.topics import CANDIDATES, POSE, REJECTED
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import follow, open_bus_within
 
-# What a node exposed in the last moment before it was stopped may not have left it.
+# Frames exposed in the last moment before a node was stopped may not have been sent.
 END_NS = S_NS
 CONNECT_S = 20.0
 
@@ -72,7 +72,7 @@ class Observer:
             self._changed.notify_all()
 
     def wait_for_match(self, since_ns: int, timeout_s: float) -> int:
-        """Wait for an outcome out of both nodes' frames of since_ns or later; return when it came, ns."""
+        """Wait for an outcome from frames of both nodes exposed at since_ns or later; return its receive time, ns."""
 
         def found() -> int | None:
             return next(

@@ -1,4 +1,4 @@
-"""The faults, each repeated; every scenario yields how long the system took to be whole again."""
+"""The faults, each repeated; every scenario yields the time that the system took to recover."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FREEZE_S = 5.0
 
 @dataclass
 class Report:
-    """One row of the table. recover_s: from the path's return to the first trigger matched anew."""
+    """One row of the table. recover_s: from the end of the fault to the first trigger matched again."""
 
     fault: str
     tally: Tally = field(default_factory=Tally)
@@ -76,7 +76,7 @@ def hub(times: int) -> Report:
 
 
 def freeze_and_return(name: str, seconds: float, report: Report, times: int) -> Report:
-    """A process stands still, and goes on as if nothing had been."""
+    """A process is stopped, and then continued."""
     with running() as system:
         for _ in range(times):
             time.sleep(1.0)
@@ -89,7 +89,7 @@ def freeze_and_return(name: str, seconds: float, report: Report, times: int) -> 
 
 
 def frozen_hub(times: int) -> Report:
-    """The hub stands still for longer than its clients' patience."""
+    """The hub is stopped for longer than its clients' time-out."""
     return freeze_and_return("hub", FREEZE_S, Report(f"hub stopped for {FREEZE_S:g} s"), times)
 
 
@@ -102,7 +102,7 @@ def solver(times: int) -> Report:
 
 
 def frozen_viewer(times: int) -> Report:
-    """A recorder of everything is stopped for 5 s; nobody else may notice, and it misses nothing."""
+    """A recorder of everything is stopped for 5 s; the others are not affected, and it misses nothing."""
     report = Report(f"viewer frozen for {FREEZE_S:g} s")
     with running() as system:
         assert system.observer is not None

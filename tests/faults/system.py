@@ -92,7 +92,7 @@ class System:
         return self.observer
 
     def kill(self, name: str) -> None:
-        """Kill without a chance to say anything."""
+        """Kill a process with SIGKILL."""
         process = self.processes.pop(name)
         process.send(signal.SIGKILL)
         process.wait()
@@ -103,7 +103,7 @@ class System:
         self.processes[name].send(signal.SIGSTOP)
 
     def thaw(self, name: str) -> None:
-        """Let it go on."""
+        """Continue a stopped process."""
         self.processes[name].send(signal.SIGCONT)
 
     def finish(self) -> Tally:

@@ -1,1 +1,1 @@
-"""Broken and hostile input: whatever comes, it is refused or taken, and nothing else happens."""
+"""Broken and hostile input: all of it is accepted or refused with a known error; anything else is a failure."""

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from tests.fuzz.targets import TARGETS
 
 BATCH = 200
-# To shrink a failing case takes longer than to find it; its seed finds it again.
+# Shrinking a failing case takes longer than finding it; its seed finds it again.
 PHASES = (Phase.generate,)
 
 
@@ -40,7 +40,7 @@ def fuzz(name: str, seconds: float, first_seed: int) -> tuple[int, set[str]]:
         number += 1
         try:
             run()
-        except Exception as error:  # whatever comes out is what is looked for
+        except Exception as error:  # any other error is what the fuzzer looks for
             place = traceback.extract_tb(error.__traceback__)[-1]
             where = f"{type(error).__name__} at {place.filename}:{place.lineno}"
             if where not in failures:

@@ -1,4 +1,4 @@
-"""A sound message of every kind, which the fuzzer spoils."""
+"""A valid message of every type, which the fuzzer corrupts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is fuzzed: each target takes hypothesis's data, and fails where anything but a known error comes out."""
+"""The fuzzed functions: each target takes hypothesis's data, and fails if anything but a known error is raised."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def _dive() -> tuple[Message, ...]:
 
 @st.composite
 def hostile_streams(draw: st.DrawFn) -> list[tuple[str, bytes]]:
-    """A short dive on the nodes' keys, some of it twice, late, an hour ahead, or in numbers of no world there is."""
+    """A short dive on the nodes' keys; some messages are doubled, late, an hour ahead, or have absurd numbers."""
     stream = [(key_of(message), encode(message)) for message in _dive()]
     big = [i for i, message in enumerate(_dive()) if isinstance(message, Candidates | NodeInfo)]
     for _ in range(draw(st.integers(1, 6))):
@@ -286,10 +286,10 @@ class Capture:
         return self
 
     def subscribe(self, *_: object, **__: object) -> None:
-        """Nothing comes by itself."""
+        """Subscribe to nothing: the test passes messages itself."""
 
     def newest(self, _: Topic) -> list[Received]:
-        """Nobody was here before."""
+        """Return no retained message."""
         return []
 
     def put(self, message: Message) -> bool:
@@ -304,7 +304,7 @@ def fuzz_solver(data: st.DataObject) -> None:
     bus = Capture()
     service.attach(bus)
     sent = set()
-    # A person sees numpy's warnings of such numbers on stderr; here they would be errors.
+    # numpy warns of such numbers; in the tests warnings would be errors.
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         for key, payload in data.draw(hostile_streams()):

@@ -1,4 +1,4 @@
-"""Makes the golden dives anew: `python -m tests.golden.make FOLDER`.
+"""Make the golden dives again: `python -m tests.golden.make FOLDER`.
 
 The dives in tests/data/golden are the reference, not this program: another OpenCV compresses pictures differently, and
 the simulator may change. Run it to add a dive, and commit that dive alone.

@@ -1,4 +1,4 @@
-"""Each stage over the golden dives against its reference, so that a commit shows what it did to results."""
+"""Each stage over the golden dives against its reference, so that a commit shows how it changed results."""
 
 import pytest
 

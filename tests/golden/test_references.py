@@ -1,4 +1,4 @@
-"""The comparison itself: it sees what it is there to see."""
+"""The comparison with references finds each kind of difference."""
 
 import copy
 

@@ -1,6 +1,6 @@
 """The program, with a camera and sensors that stop for as long as a file is there: STALL_IN/camera, STALL_IN/imu.
 
-Everything is quicker than in earnest, so that a test need not wait for seconds.
+All time limits are shorter than in the program, so that a test need not wait for seconds.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""What an inertial unit feels on a diver's rig in swell, with truth: laid out beforehand, at every sample."""
+"""The samples of an inertial unit on a diver's rig in swell, with the true attitude at each sample."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ SOUND = MagnetometerCalibration(np.full(3, 1e-12), np.eye(3))  # calibrated, and
 
 @dataclass(frozen=True)
 class Run:
-    """What came out against truth; errors in NED, rad, (n, 3); sigmas (n, 3)."""
+    """Estimates compared with truth: errors in NED, rad, (n, 3); sigmas (n, 3)."""
 
     times_s: np.ndarray
     errors_rad: np.ndarray

@@ -8,7 +8,7 @@ LOOK_NS = 200 * MS_NS
 
 
 class Clocks:
-    """The one that nobody sets, and the wall clock."""
+    """CLOCK_BOOTTIME, which is never set, and the wall clock."""
 
     def __init__(self):
         self.boot_ns = 5 * S_NS

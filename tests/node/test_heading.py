@@ -35,7 +35,7 @@ class Node:
     def run(
         self, seconds: float, delta_rad: float, rig_t: float = 0.0, drift_radps: float = 0.0, **field: float
     ) -> float:
-        """Go on; rig_t: a field fixed to the rig, forward. Return delta at the end."""
+        """Simulate further; rig_t: a field fixed to the rig, forward. Return delta at the end."""
         for _ in range(round(seconds / DT_S)):
             self.t_s += DT_S
             delta_rad += drift_radps * DT_S

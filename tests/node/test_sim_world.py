@@ -239,7 +239,7 @@ def test_the_inertial_sensor_measures_the_motion():
         rate = (np.array(sample.gyro_radps) + after.gyro_radps) / 2
         R = R @ cv2.Rodrigues(rate * dt_s)[0]
     assert np.linalg.norm(rotation.to_vector(R.T @ R_ned_body[-1])) < 0.01 * n * dt_s
-    # Specific force in NED adds up to the change of velocity, but for gravity; the field stands still.
+    # The integral of specific force in NED plus gravity is the change of velocity; the field is constant in NED.
     force = np.mean([R @ s.accel_mps2 for R, s in zip(R_ned_body, imu, strict=True)], axis=0)
     field = np.mean([R @ s.mag_t for R, s in zip(R_ned_body, imu, strict=True)], axis=0)
     grade = GRADES["good"]

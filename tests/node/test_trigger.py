@@ -74,7 +74,7 @@ def test_the_phase_locks_within_two_seconds_and_stays(ppm, line_ns, seed):
 
 @pytest.mark.parametrize(("rate_hz", "frames"), [(7, 2), (3, 4), (30, 1), (10, 2)])
 def test_the_phase_locks_at_any_rate_and_number_of_frames(rate_hz, frames):
-    """A seventh of a second is no whole number of ns: the grid must not slide away with the years."""
+    """A seventh of a second is no whole number of ns: the rounding must not accumulate since 1970."""
     period_ns = round(1e9 / rate_hz)
     camera = FreeCamera(ppm=30.0)
     times_s, off_ns = camera.run(lock_for(camera, period_ns, frames), 20.0, period_ns, frames=frames)
@@ -89,7 +89,7 @@ def test_a_shorter_latency_than_assumed_does_no_harm(latency):
 
 
 def test_without_the_lock_a_drift_of_forty_ppm_accumulates():
-    """The simulation is no easy one: the same camera left alone."""
+    """Without the lock the simulated camera drifts away: the other tests are not trivial."""
     camera = FreeCamera(ppm=40.0)
     lock = lock_for(camera)
     lock.update = lambda stamp_ns: None  # type: ignore[method-assign]

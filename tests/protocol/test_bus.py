@@ -26,7 +26,7 @@ Connect = Callable[[], Bus]
 
 
 class Inbox:
-    """A handler that keeps what it gets; wait_for blocks until enough has come."""
+    """A handler that keeps its messages; wait_for blocks until there are enough."""
 
     def __init__(self) -> None:
         self.received: list[Received] = []
@@ -48,7 +48,7 @@ class Inbox:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for what no event announces."""
+    """Wait for a condition that no event announces."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline_s
@@ -204,7 +204,7 @@ def test_the_newest_message_is_known_after_its_publisher_is_gone(client: Connect
 
     assert known() == []
     publishers = [solver.publisher(topics.REJECTED, "gone", end) for end in "hi"]
-    # The first of a publisher may pass the hub unheard; it is recovered, but not by what only remembers the newest.
+    # The hub may miss a publisher's first message; subscribers recover it, but the hub's retained copy does not.
     triggers = iter(range(10_000))
 
     def all_known() -> bool:

@@ -1,4 +1,4 @@
-"""The parts that both buses are made of."""
+"""The parts that both buses share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> Non
     assert begun.wait(PATIENCE_S)
     for item in ("a", "b", "c"):
         queue.offer(item, 60)
-    # One alone may be bigger than the bound, or it could never be had.
+    # A single item may exceed the bound, or it could never be delivered.
     queue.offer("huge", 1000)
     assert queue.dropped == 3
     go_on.set()

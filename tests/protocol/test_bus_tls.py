@@ -70,7 +70,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
         inbox, alive = Inbox(), Inbox()
         watcher.subscribe(topics.EVERYTHING, inbox)
         watcher.watch_alive(lambda name, here: alive(Received(f"{name} {here}", b"", 0, "")))
-        # Denied first, allowed last, of one session and one priority: what is denied would come before.
+        # The denied message is sent first, in one session with one priority: if it passed, it would arrive first.
         for bus, denied, allowed in (
             (a, [(topics.DEPTH, "b"), (topics.TRUTH, "a", "b"), (topics.EXPECT, "a")], (topics.DEPTH, "a")),
             (b, [(topics.CANDIDATES, "a"), (topics.POSE, "a", "b")], (topics.CANDIDATES, "b")),
@@ -100,7 +100,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
         said += ["buddyline/node/c/candidates", "buddyline/pair/a/b/pose", "buddyline/pair/a/b/truth"]
         for key in said:
             inbox.wait_for(key)
-        # What was denied never got into anybody's history either, and what was allowed did.
+        # Denied messages are not in any history either; allowed ones are.
         late = Inbox()
         with join(endpoint, tls(keys, "viewer")) as latecomer:
             latecomer.subscribe(topics.EVERYTHING, late)
@@ -109,7 +109,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
         assert sorted(inbox.keys) == said
         assert sorted(late.keys) == said
         assert sorted(set(alive.keys)) == [f"{n} True" for n in ("node/a", "node/b", "solver/a_b", "viewer/v")]
-        # Nor is it what the hub remembers.
+        # Nor does the hub retain them.
         poses, denied_poses = (bus.publisher(topics.POSE, "a", "b") for bus in (solver, viewer))
         remembered: list[Received] = []
         while not remembered:

@@ -90,7 +90,7 @@ def numbers(received: list[Received]) -> list[int]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for what no event announces."""
+    """Wait for a condition that no event announces."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline_s
@@ -221,7 +221,7 @@ def test_the_hub_retains_a_bounded_number_of_messages(monkeypatch: pytest.Monkey
 
 
 def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
-    """What is published meanwhile too, and what a publisher sends that nobody has heard of yet."""
+    """Also messages published meanwhile, and those of a publisher that was not known before."""
     endpoint, known, unheard = free_endpoint(), Inbox(), Inbox()
     changes: list[tuple[str, bool]] = []
     with hub_process(endpoint) as hub:

@@ -130,7 +130,7 @@ def test_chunks_are_cut_by_the_second_of_log_time(tmp_path):
         chunks = sorted(reader._contents.chunks)
         assert len(chunks) == 20
         whole = (tmp_path / "a.mcap").read_bytes()
-        # Whatever bit is flipped in a chunk: a second is lost, and said.
+        # Any flipped bit in a chunk loses that second, and the loss is reported.
         for _, _, offset, _ in chunks:
             data = bytearray(whole)
             data[offset + 80] ^= 1

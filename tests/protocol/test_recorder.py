@@ -30,7 +30,7 @@ def quick(monkeypatch):
 
 
 def until(condition):
-    """Wait until what another thread does has come."""
+    """Wait for a condition that another thread fulfils."""
     deadline, pause = time.monotonic() + PATIENCE_S, threading.Event()
     while not condition():
         assert time.monotonic() < deadline

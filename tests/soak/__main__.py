@@ -67,7 +67,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="default: 60")
     parser.add_argument("--every", type=float, default=60.0, metavar="S", help="between two lines; default: 60")
     args = parser.parse_args()
-    # So that whoever ends this early ends what it has started, too.
+    # A SIGTERM also ends the processes that were started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory() as directory:
         result = soak(Path(directory), 60 * args.minutes, args.every, show)

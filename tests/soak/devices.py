@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 ATTITUDE_HZ = 100
 PICTURES = 30
-# The dive goes forward for so long, and back again.
+# The dive is played forward for this time, and then backward.
 STRETCH_NS = 1 * S_NS
 
 

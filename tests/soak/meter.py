@@ -1,4 +1,4 @@
-"""What comes over the bus and what the processes take, counted as it goes, in bounded memory but for the triggers."""
+"""Count the messages of the bus and the load of the processes, in memory that is bounded except for the triggers."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from tests.soak.meter import Stream, Streams, Viewer, stamps_of, streams_of
 RATE_HZ = 30.0
 # The first frames wait for those of the node that starts last.
 START_S = 3.0
-# What is exposed in the last moment may not have left its node, or be answered.
+# Frames of the last moment may not have been sent or solved.
 END_NS = 2 * S_NS
 
 # Once the publishers' caches, which hold a minute or more, and the solver's memory of the clocks' offset are full. What
@@ -61,7 +61,7 @@ class Row:
 
 @dataclass
 class Result:
-    """All that was measured, and what of it is beyond the bounds."""
+    """All measurements, and the bounds that were exceeded."""
 
     minutes: list[Minute] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
@@ -70,7 +70,7 @@ class Result:
 
 
 def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute], None] = lambda _: None) -> Result:
-    """Run the system for so long; measure every so many seconds, and at the end compare with the nodes' logs."""
+    """Run the system for `seconds`; measure every `every_s`, and at the end compare with the nodes' logs."""
     result, repeating = Result(), {"devices": "repeating", "width_px": 205, "preview_hz": 1.0}
     with System(directory, RATE_HZ, **repeating, node_module="tests.soak.node") as system, ExitStack() as stack:
         system.start("hub")
@@ -81,7 +81,7 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
         pace = stack.enter_context(Process(module="buddyline.tools.measure.pace"))
         _measure(result, processes, viewer, pace, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("a", "b")}
-        # The solver takes a pause of 2.5 s for the end, and looks once a second; the recorder hears its last words.
+        # The solver takes a pause of 2.5 s for the end of a dive; the recorder then needs a second for its messages.
         _settle(viewer)
         statuses["solver"] = processes["solver"].end()
         time.sleep(1.0)

@@ -1,4 +1,4 @@
-"""Keys for tests: an authority with every identity, made once; others made wrong on purpose."""
+"""Keys for tests: an authority with every identity, made once, and invalid identities."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def measure(campaign, seed, directory, figures):
     lost = len(course.legs) - len(legs)
     figures["legs lost"].append(lost)
     if lost:
-        # It is said, and on the leg after it; what becomes of its stations is a person's to mark.
+        # The alarm is on this leg and on the next one; a person has to mark the stations.
         figures["lost and not said"].append(not any("NO LEG" in problem.text for problem in derived.problems))
         return
     _legs(legs, at, figures)

@@ -86,7 +86,7 @@ def loop(rng, legs):
     depth = 12 + rng.normal(0, 0.9, legs)
     places = np.column_stack([radii * np.cos(angles), radii * np.sin(angles), depth])
     steps = [(k, (k + 1) % legs, k % 2) for k in range(legs)]
-    # Who closes the loop stands where it began: the front node of the last leg.
+    # The front node of the last leg closes the loop: it is at the first station.
     return Course(places, steps, [str(k) for k in range(legs)], {(legs - 1, 1 - (legs - 1) % 2): "0"})
 
 
@@ -135,7 +135,7 @@ class _Node:
         )
 
     def arrive(self, disturbance):
-        """Be held anew, at what may be a bad place for a compass (degrees, None: by chance)."""
+        """Be held again, at a place whose iron turns the compass by so many degrees (None: at random)."""
         self.disturbance = disturbance or 0.0
         if disturbance is None and self.rng.random() < self.flaws.disturbed_share:
             self.disturbance = float(self.rng.choice([-1, 1]) * self.rng.uniform(6, 20))

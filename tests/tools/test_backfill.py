@@ -94,7 +94,7 @@ def test_a_backfilled_log_solves_like_the_nodes_own_logs(dive, tmp_path):
     assert main(["solve", str(directory / "out.mcap"), "-o", str(tmp_path / "filled.mcap")]) == 0
 
     def results(path):
-        # The solver's own: what the live one said is in the topside recording alone, and is not solved again.
+        # The live solver's outcomes are only in the topside recording, and are not solved again.
         return [record.payload for record in read(path) if record.key.startswith("buddyline/pair/")]
 
     assert results(tmp_path / "own.mcap")

@@ -105,7 +105,7 @@ def test_a_board_hardly_tilted_is_refused(tilt_rad):
 
 
 def test_another_board_than_the_print_is_refused():
-    """Rows and columns mixed up: the corners' numbers mean other places."""
+    """Rows and columns swapped: the corners' numbers mean other places."""
     with pytest.raises(PoorCalibration):
         camera.calibrate(views(8), boards.SIZE, Board(columns=6, rows=9))
 

@@ -87,9 +87,9 @@ def test_sigmas_cover_the_errors_without_excess():
         drifts.append((found.drift - 5e-6) / found.drift_sigma)
         assert abs(error_s) < found.bound_s + 5 * found.scatter_s
     assert 0.5 < np.std(offsets) < 1.5
-    # On the safe side: how late the quickest itself was is guessed, not known.
+    # The sigma is on the safe side, because the delay of the quickest exchange is estimated.
     assert 0.3 < np.std(drifts) < 1.3
-    assert max(errors_s) > 1e-4  # ways that differ cannot be seen: the bound is what says so
+    assert max(errors_s) > 1e-4  # unequal one-way times cannot be observed, so only the bound covers them
 
 
 def test_the_quickest_exchanges_count_most():

@@ -1,4 +1,4 @@
-"""The program as a person meets it: help, exit status, and errors of one line that say what to do."""
+"""The command line: help, exit status, and one-line errors that say what to do."""
 
 import argparse
 import json
@@ -205,7 +205,7 @@ print(*sorted(sys.modules))
 
 
 def test_help_of_every_command_is_quick_because_it_imports_nothing_heavy():
-    # What is imported tells more than a clock on a shared machine.
+    # The list of imports is a better measure than a time on a shared machine.
     out = subprocess.run([sys.executable, "-c", EVERY_HELP], capture_output=True, text=True, check=True).stdout
     assert {"numpy", "cv2", "zenoh", "mcap", "matplotlib", "viser"}.isdisjoint(out.split())
     assert "buddyline.tools.arguments" in out

@@ -67,7 +67,7 @@ COMMANDS = {
     "calibrate clock": ["calibrate", "clock", "IN"],
     "calibrate camera": ["calibrate", "camera", "PICTURES", "--node", "a"],
 }
-# A few seconds in which nobody rests do not suffice for these: they say what they lack, and what was lost.
+# A few seconds without a rest are too short for these commands: they name what is missing, and the losses.
 NOT_ENOUGH = (
     "align",
     "survey legs",

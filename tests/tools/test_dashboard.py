@@ -1,4 +1,4 @@
-"""What the demo says of a running pair: the track between fixes, its age, and both against the truth."""
+"""The demo's text about a running pair: the track between fixes, its age, and errors against the truth."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def test_rerun_reads_pictures_cameras_and_transforms_without_set_up(tmp_path: Pa
         messages.append(pose(k))
     output = str(tmp_path / "foxglove.mcap")
     assert main(["export", write_log(tmp_path / "dive.mcap", *messages), "--format", "foxglove", "-o", output]) == 0
-    # It asks nobody, and writes nowhere but here.
+    # rerun sends no usage data, and writes only to this folder.
     env = {**os.environ, "HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path), "RERUN_ANALYTICS": "0"}
 
     def said(*words: str) -> str:

@@ -1,4 +1,4 @@
-"""Commands on the bus end in good order, whether a hub answers or not; the demo tells at once what died."""
+"""Commands on the bus end properly, with or without a hub; the demo names a dead process at once."""
 
 import json
 import os

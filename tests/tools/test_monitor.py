@@ -1,4 +1,4 @@
-"""The state of a pair, what is said of it in plain words, and how it is put on the page."""
+"""The state of a pair, its findings in words, and their place on the page."""
 
 from __future__ import annotations
 

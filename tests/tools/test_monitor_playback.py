@@ -107,7 +107,7 @@ class TestReadingFromATime:
             assert summary is not None
             file.seek(summary.chunk_indexes[4].chunk_start_offset + 100)
             file.write(bytes(16))
-        # Whoever reads the broken chunk says so.
+        # The reader of the broken chunk reports it.
         for wanted, since_ns, expected, damaged in (
             (None, None, 91, True),
             (lambda key: key.endswith("/info"), None, 1, False),

@@ -98,7 +98,7 @@ def test_the_dashboard_refuses_a_status_on_another_nodes_key():
 
 @pytest.fixture
 def misplaced(tmp_path):
-    """A solved dive in which a says on b's keys what it is not to say."""
+    """A solved dive in which a publishes on b's keys."""
     with DiveLogWriter(tmp_path / "o.mcap") as writer:
         for message in (*INFOS.values(), depth("a", 1.0), frame("a", 0), frame("b", 0), pose(0), pose(1)):
             writer.write_message(message)

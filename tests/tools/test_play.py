@@ -110,7 +110,7 @@ class LateSolver:
             self._seen.add(frame.trigger)
             return
         if self.wait_s:
-            # What the link took comes now, and all at once.
+            # The messages that the link held back come now, all at once.
             time.sleep(self.wait_s)
             self.wait_s = 0.0
         self.answered_ns = frame.stamp_ns
@@ -129,7 +129,7 @@ def test_fast_playback_never_outruns_what_a_solver_waits_for(tmp_path):
         solver = LateSolver(listener, wait_s=1.5)
         player = Player(bus, dive.nodes("candidates"), 0.0, ManualClock(5), threading.Event())
         player.declare(dive.keys)
-        # Until it is told that a solver is alive, playback waits for nobody.
+        # Playback does not wait before it knows that a solver is alive.
         while not player._follower._solvers:
             time.sleep(0.01)
         for envelope in dive.messages():

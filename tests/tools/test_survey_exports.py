@@ -93,7 +93,7 @@ def test_cavern_accepts_all_legs_in_one_style(tmp_path, style):
     assert not said
     assert h == pytest.approx(adjusted.loops[0].horizontal_ratio, rel=0.1)
     assert v == pytest.approx(adjusted.loops[0].vertical_ratio, rel=0.1, abs=0.05)
-    # That diving style is no good here is Survex's fault; where it is none any more, `auto` has had its day.
+    # Diving style fails here because of a fault of Survex; once that is mended, `auto` is no longer needed.
     assert (max(differences(adjusted, found)) <= SAME_M) == (style == "normal")
 
 

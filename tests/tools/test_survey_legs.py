@@ -296,7 +296,7 @@ def test_sigma_of_slow_readings_is_the_error_of_their_mean(share):
         values = math.sqrt(share) * rng.normal() + math.sqrt(1 - share) * rng.normal(size=40)
         mean = mean_of_slow(stamps, values, 1.0, 0.0)
         chi.append(mean.value / mean.sigma)
-    # Never too sure; where all noise is new the sample's own variance still leaves something unseen.
+    # Never too certain; if all noise is new, the sample's own variance underestimates it slightly.
     assert 0.3 < np.std(chi) < 1.1
     if share == 1.0:
         assert np.std(chi) > 0.9

@@ -1,4 +1,4 @@
-"""The network: exact where readings are, honest where they are not, and it names who is wrong."""
+"""The network: exact with exact readings, true covariances with noisy ones, and it names the wrong leg."""
 
 import math
 from datetime import date

@@ -1,4 +1,4 @@
-"""The project file and the commands: what people write stays, what dives give is made anew."""
+"""The project file and the commands: hand-written text stays, the derived part is written again."""
 
 import argparse
 import csv

@@ -288,7 +288,7 @@ class Picamera2:
         return Request(self, buffer, metadata)
 
     def _recycle(self, buffer: np.ndarray) -> None:
-        buffer[:] = 99  # whoever still looks at it, sees the next frame in the making
+        buffer[:] = 99  # a reader that still uses the buffer sees the next frame
         self._free.append(buffer)
         self._queued.append(self._pending)
         self._pending = {}

@@ -63,7 +63,7 @@ def test_a_start_under_water_takes_standard_pressure_with_its_uncertainty():
 
 @pytest.mark.parametrize(("pressure_pa", "surface_pa"), [(104_000.0, 101_000.0), (101_500.0, 101_500.0)])
 def test_the_days_zero_survives_a_restart(pressure_pa, surface_pa):
-    """At 30 cm a restart must not make that the surface; weather since the morning may."""
+    """A restart at 30 cm must not take that depth as the surface; a change of the weather may move the zero."""
     zero = SurfaceZero(remembered_pa=101_000.0)
     feed(zero, [pressure_pa] * ZERO_SAMPLES)
     assert zero.surface_pa == surface_pa

@@ -63,7 +63,7 @@ def config(tmp_path) -> NodeConfig:
 
 
 def collect(source, clock: ManualClock, seconds: float) -> list:
-    """Run a source until the clock has gone on by so much."""
+    """Run a source until the clock has advanced by this time."""
     end_ns = clock.now_ns() + int(seconds * S_NS)
     messages: list = []
     while clock.now_ns() < end_ns:

@@ -71,7 +71,7 @@ def test_a_crop_starts_later_and_is_shorter():
 
 
 class Ticking:
-    """Two clocks read in turn; reading takes as long as it is told to."""
+    """Two clocks read in turn; each reading takes the given time."""
 
     def __init__(self, costs_ns: list[int]) -> None:
         self.now_ns = 1_000_000
