@@ -53,11 +53,15 @@ class ExposureConfig(Config, frozen=True, kw_only=True):
 
 
 class DetectorConfig(Config, frozen=True, kw_only=True):
-    """[detector]: method, environment, and single values that override a preset."""
+    """[detector]: method, environment, and single values that override a preset.
+
+    guided: look first where the solver, or the last pictures, expect the lights.
+    """
 
     method: str = "source"
     environment: str = "auto"
     overrides: dict[str, float] = field(default_factory=dict)
+    guided: bool = True
 
 
 class SensorsConfig(Config, frozen=True, kw_only=True):

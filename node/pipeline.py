@@ -6,11 +6,12 @@ import statistics
 from collections import deque
 
 import msgspec
-from buddyline.node.detect import Detection, Detector
+from buddyline.node.detect import Detection, Detector, GuidedDetector
 from buddyline.node.devices import Frame
+from buddyline.node.guide import Guide, expected_first
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.messages import MAX_BLOBS, Blob, Candidates
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 __all__ = ["Pipeline", "blobs_of"]
 
@@ -28,9 +29,14 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
 
 
 class Pipeline:
-    """Detects the candidates of one camera's frames, and numbers the messages."""
+    """Detects the candidates of one camera's frames, and numbers the messages.
 
-    def __init__(self, node: str, boot: str, trigger_period_ns: int, detector: Detector) -> None:
+    guide: plans where to look in each frame; None to search all of each.
+    """
+
+    def __init__(
+        self, node: str, boot: str, trigger_period_ns: int, detector: Detector, guide: Guide | None = None
+    ) -> None:
         self.node = node
         self.boot = boot
         self.trigger_period_ns = trigger_period_ns
@@ -38,6 +44,7 @@ class Pipeline:
         self.repeated = 0
         self.detections: list[Detection] = []  # of the last frame, for drawings
         self._detector = detector
+        self._guide = guide
         self._seq = 0
         self._last_trigger = -1
 
@@ -49,7 +56,7 @@ class Pipeline:
             return None
         self._last_trigger = trigger
         self.residuals_s.append((frame.stamp_ns - trigger * self.trigger_period_ns) / 1e9)
-        self.detections = self._detector.detect(frame.image)
+        self.detections, elsewhere = self._search(frame)
         blobs, truncated = blobs_of(self.detections, frame)
         height, width = frame.image.shape[:2]
         message = Candidates(
@@ -65,9 +72,31 @@ class Pipeline:
             exposure_ns=UNSET if frame.exposure is None else frame.exposure.time_ns,
             gain=UNSET if frame.exposure is None else frame.exposure.gain,
             context=UNSET if frame.context is None else frame.context,
+            elsewhere=elsewhere,
         )
         self._seq += 1
         return message
+
+    def _search(self, frame: Frame) -> tuple[list[Detection], int | UnsetType]:
+        """Return a frame's detections, and how many were elsewhere where only parts of it were searched."""
+        guide, image, stamp_ns = self._guide, frame.image, frame.stamp_ns
+        if guide is None or not isinstance(self._detector, GuidedDetector):
+            return self._detector.detect(image), UNSET
+        height, width = image.shape[:2]
+        # A frame exposed for the scene shows what the others do not, and the lamps in another size.
+        lamps = not frame.context
+        plan = guide.plan(stamp_ns, width, height, whole=not lamps)
+        found = None
+        if plan.regions:
+            found = self._detector.detect_near(image, plan.regions)
+            if found is not None and plan.is_lost(found):
+                found = None
+        whole = found is None
+        if found is None:
+            found = self._detector.detect(image)
+        guide.learn(stamp_ns, found, width, whole=whole, sized=lamps)
+        elsewhere = UNSET if whole else guide.elsewhere(len(found))
+        return expected_first(found, plan.foretold), elsewhere
 
     @property
     def residual_s(self) -> float | None:

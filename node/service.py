@@ -24,6 +24,7 @@ from buddyline.node.config import NodeConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.drivers.samples import AbsentError
+from buddyline.node.guide import Guide
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
@@ -36,7 +37,7 @@ from buddyline.protocol.recorder import Recorder, RecordError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS
+from buddyline.protocol.topics import CANDIDATES, EXPECT, IMU, TOPICS
 from msgspec import UNSET
 
 if TYPE_CHECKING:
@@ -89,6 +90,7 @@ class NodeService(Service):
         self._status_s = self._started_s
         self._clock_watch = ClockWatch(self.clock.now_ns)
         self._clock_sync = ClockSync(config.node, self.boot, self.clock)
+        self._guide = Guide(config.node) if config.detector.guided else None
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError for what waiting cannot mend. An absent camera is awaited."""
@@ -105,6 +107,7 @@ class NodeService(Service):
                 self.config.detector.overrides,
                 info.camera.fx_px,
             ),
+            self._guide,
         )
         path, metadata = self._log_path(), self._log_metadata()
         min_free_bytes = self.config.record.min_free_mb * 1_000_000
@@ -273,6 +276,10 @@ class NodeService(Service):
             bus.declare_alive(f"node/{self.config.node}")
             self.outlet.connect(bus)
             log.info("%s: connected to %s", self.name, self.config.connect)
+            if self._guide is not None:
+                # Without history: an old expectation says nothing of the next picture.
+                bus.subscribe(EXPECT.key(self.config.node), self._guide.hear, history=False)
+                bus.watch_alive(self._guide.saw_process)
             self._clock_sync.exchange(bus, self.outlet, self.stop)
             self.outlet.disconnect()
 

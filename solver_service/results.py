@@ -50,7 +50,8 @@ def view_of(frame: Candidates) -> View:
         )
         for blob in frame.blobs
     ]
-    return View(np.array(rows, dtype=np.float64).reshape(-1, 6), frame.stamp_ns)
+    elsewhere = 0 if frame.elsewhere is UNSET else frame.elsewhere
+    return View(np.array(rows, dtype=np.float64).reshape(-1, 6), frame.stamp_ns, elsewhere)
 
 
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:

@@ -316,7 +316,7 @@ def _same_rig(info: NodeInfo, other: NodeInfo) -> bool:
 
 def _frame_of(view: View) -> FrameSeen:
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
-    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score)
+    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score, view.elsewhere)
 
 
 def _fix_of(pose: RelativePose) -> FixSeen:

@@ -10,13 +10,23 @@ from typing import Final
 
 from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.node.detect import paper, source
-from buddyline.node.detect.detection import Detection, Detector, ImageError
+from buddyline.node.detect.detection import Detection, Detector, GuidedDetector, ImageError, Region
 from buddyline.protocol.errors import BuddylineError
 
 METHODS: Final = DETECTORS
 ENVIRONMENTS: Final = PRESETS
 
-__all__ = ["ENVIRONMENTS", "METHODS", "Detection", "Detector", "ImageError", "make_detector", "presets"]
+__all__ = [
+    "ENVIRONMENTS",
+    "METHODS",
+    "Detection",
+    "Detector",
+    "GuidedDetector",
+    "ImageError",
+    "Region",
+    "make_detector",
+    "presets",
+]
 
 
 def presets(method: str) -> Mapping[str, Mapping[str, float]]:

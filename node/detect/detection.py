@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
@@ -25,6 +26,15 @@ class Detection:
     why: str
 
 
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A disc of the picture where a light is looked for. centre_px: (u, v). light_px: radius of the light itself."""
+
+    centre_px: tuple[float, float]
+    radius_px: float
+    light_px: float
+
+
 class Detector(Protocol):
     """Finds light candidates. Each camera has its own instance, used from one thread.
 
@@ -42,6 +52,18 @@ class Detector(Protocol):
 def focal_of(width_px: int) -> float:
     """Return the focal length, px, of a camera of unknown calibration: 49 degrees across, as of the default rig."""
     return 904.0 / 820.0 * width_px
+
+
+@runtime_checkable
+class GuidedDetector(Detector, Protocol):
+    """A detector that can search parts of a picture."""
+
+    def detect_near(self, image: NDArray[np.uint8], regions: Sequence[Region]) -> list[Detection] | None:
+        """Find the candidates within some regions, also fainter ones than in a whole picture, the likeliest first.
+
+        None where the whole picture has to be searched: the first one, or one whose regions cost as much.
+        """
+        ...
 
 
 class ImageError(BuddylineError):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
@@ -35,6 +36,10 @@ _ROW, _COLUMN = np.divmod(np.arange(_WINDOW**2), _WINDOW)
 _MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.float32)
 
 
+Keep: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float32]], NDArray[np.bool_]]
+"""Which places count: of their centres (N, 2), px of the whole picture, and their octaves' steps (N,), px."""
+
+
 @dataclass(slots=True, eq=False)
 class Proposals:
     """Places where a light may be, the most outstanding first; arrays of length N.
@@ -46,6 +51,15 @@ class Proposals:
     centre_px: NDArray[np.float32]
     radius_px: NDArray[np.float32]
     outstanding: NDArray[np.float32]
+
+    @staticmethod
+    def joined(parts: Sequence[Proposals]) -> Proposals:
+        """Return the places of all parts, in order."""
+        outstanding = np.concatenate([part.outstanding for part in parts])
+        order = np.argsort(-outstanding, kind="stable")
+        centre_px = np.concatenate([part.centre_px for part in parts])
+        radius_px = np.concatenate([part.radius_px for part in parts])
+        return Proposals(centre_px[order], radius_px[order], outstanding[order])
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +96,14 @@ class ProposalFinder:
     contrast of its neighbourhood, the clutter.
     """
 
-    def __init__(self, focal_px: float | None = None) -> None:
-        """focal_px: of the pictures; None to take each picture's from its width (see focal_of)."""
+    def __init__(self, focal_px: float | None = None, octaves: int = _OCTAVES, at_least: int = _ALWAYS) -> None:
+        """focal_px: of the pictures; None to take each picture's from its width (see focal_of).
+
+        octaves: of the pyramid. at_least: how many places are found, where there are so many.
+        """
         self._focal_px = focal_px
+        self._most_octaves = octaves
+        self._at_least = at_least
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
         self._halves: list[NDArray[np.uint8]] = []
@@ -98,6 +117,11 @@ class ProposalFinder:
         self._level = np.zeros(0, np.uint8)
         self._steps_px = np.zeros(0, np.float32)
         self._base_step_px = 1.0
+
+    @property
+    def base_step_px(self) -> int:
+        """Side of a pixel of the pyramid's base, px of the loaded picture."""
+        return round(self._base_step_px)
 
     def load(self, image: NDArray[np.uint8]) -> None:
         """Build the pyramid of a (H, W, 3) BGR or (H, W) grey picture."""
@@ -119,11 +143,18 @@ class ProposalFinder:
         lower = steps[: len(steps) // 2 + 1]
         return float(cv2.mean(lower)[0]) / _MEAN_OF_LOWER_HALF
 
-    def find(self, contrast_min: float, clutter_gain: float) -> Proposals:
-        """Find the 16 most outstanding places of the loaded picture, or up to 64 where that many clearly stand out.
+    def find(
+        self,
+        contrast_min: float,
+        clutter_gain: float,
+        keep: Keep | None = None,
+        origin_px: tuple[int, int] = (0, 0),
+    ) -> Proposals:
+        """Find the most outstanding places of the loaded picture, 16 by default, or up to 64 that clearly stand out.
 
         A place needs a contrast of contrast_min grey levels plus clutter_gain times the mean contrast of its
-        neighbourhood.
+        neighbourhood. keep: which places count; None for all. origin_px: (u, v) of the loaded picture's first pixel in
+        the whole picture.
         """
         below: NDArray[np.uint8] | None = None
         for octave in reversed(self._octaves):
@@ -144,8 +175,12 @@ class ProposalFinder:
         clutter = self._clutter[self._cell_of[places]].astype(np.float32)
         outstanding = contrast / (_NOISE + clutter)
         outstanding[contrast < contrast_min + clutter_gain * clutter] = 0.0
+        if keep is not None:
+            clear_of = np.flatnonzero(outstanding)
+            clear_of = clear_of[keep(*self._whereabouts(places[clear_of], origin_px))]
+            places, contrast, outstanding = places[clear_of], contrast[clear_of], outstanding[clear_of]
         clear = int(np.count_nonzero(outstanding >= CLEAR))
-        order = np.argsort(-outstanding, kind="stable")[: min(max(clear, _ALWAYS), _AT_MOST)]
+        order = np.argsort(-outstanding, kind="stable")[: min(max(clear, self._at_least), _AT_MOST)]
         order = order[outstanding[order] > 0.0]
         places = places[order]
         which = np.searchsorted(self._starts, places, side="right") - 1
@@ -156,8 +191,17 @@ class ProposalFinder:
         across = _ACROSS + (corner[:, 0] * size[:, 1] + corner[:, 1] + start)[:, None]
         level = self._level.take((across[:, None] + (_ACROSS * size[:, 1:])[:, :, None]).reshape(-1, _WINDOW**2))
         middle, radius = _settle(level.astype(np.float32), self._level[places].astype(np.float32), contrast[order])
-        centre_px = (corner[:, ::-1] + middle + 0.5) * step[:, None] - 0.5
+        centre_px = (corner[:, ::-1] + middle + 0.5) * step[:, None] - 0.5 + origin_px
         return Proposals(centre_px.astype(np.float32), radius * step, outstanding[order])
+
+    def _whereabouts(
+        self, places: NDArray[np.intp], origin_px: tuple[int, int]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Return the centres (N, 2) of pixels of the pyramid in the whole picture, and their steps (N,), px."""
+        which = np.searchsorted(self._starts, places, side="right") - 1
+        step = self._steps_px[which]
+        row, column = np.divmod(places - self._starts[which], self._sizes[which, 1])
+        return (np.stack((column, row), axis=1) + 0.5) * step[:, None] - 0.5 + origin_px, step
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
         self._shape = shape
@@ -170,7 +214,7 @@ class ProposalFinder:
             self._base_step_px *= 2.0
             self._halves.append(np.empty((height, width), np.uint8))
         sizes: list[tuple[int, int]] = []
-        while min(height, width) >= _WINDOW and len(sizes) < _OCTAVES:
+        while min(height, width) >= _WINDOW and len(sizes) < self._most_octaves:
             sizes.append((height, width))
             height, width = height // 2, width // 2
         cells = [(h // _CLUTTER_CELL, w // _CLUTTER_CELL) for h, w in sizes]

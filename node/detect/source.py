@@ -6,15 +6,16 @@ each is a lamp and not a caustic, a particle or texture, and locates the source 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 from buddyline.node.detect.centre import Centres, locate_sources
-from buddyline.node.detect.detection import Detection, check_image, focal_of
+from buddyline.node.detect.detection import Detection, Region, check_image, focal_of
 from buddyline.node.detect.lights import Lights, distinct, measure_lights
-from buddyline.node.detect.proposals import ProposalFinder
+from buddyline.node.detect.proposals import ProposalFinder, Proposals
+from buddyline.node.detect.regions import RegionFinder
 from buddyline.node.detect.rings import RAY_UV, Floats
 from buddyline.protocol.messages import Blob
 from numpy.typing import NDArray
@@ -31,8 +32,12 @@ _CLUTTER_GAIN: Final = 2.0
 _CONTRAST_MIN: Final = (4.0, 16.0)
 _CONTRAST_TO_NOISE: Final = 2.0
 _MEMORY: Final = 0.8
+_FAINTER: Final = 0.5
+"""Share of the thresholds on contrast that holds where a light is expected."""
 _KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.5))
 """(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.5 or more."""
+_KEPT_NEAR: Final = ((2, 0.0), *_KEPT[1:])
+"""Where only regions are searched: nearly all that is faint in them is no lamp."""
 
 _SCORE_AT_ZERO: Final = -5.2
 _SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
@@ -49,25 +54,52 @@ class SourceDetector:
         """focal_px: of the pictures; None to take each picture's from its width."""
         self._focal_px = focal_px
         self._values = {**PRESETS.get(environment, {}), **overrides}
+        self._clutter_gain = self._values.get("clutter_gain", _CLUTTER_GAIN)
         self._finder = ProposalFinder(focal_px)
         self._noise: float | None = None
+        # Of the last whole picture.
+        self._contrast_min = _CONTRAST_MIN[0]
+        self._shape: tuple[int, ...] = ()
+        self._near: RegionFinder | None = None
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Find the candidates of one picture, the most likely first."""
         check_image(image)
         self._finder.load(image)
         contrast_min = self._values.get("contrast_min")
-        if contrast_min is None:
-            contrast_min = self._adapt()
-        proposals = self._finder.find(contrast_min, self._values.get("clutter_gain", _CLUTTER_GAIN))
+        self._contrast_min = self._adapt() if contrast_min is None else contrast_min
+        if image.shape != self._shape:
+            focal_px = self._focal_px or focal_of(image.shape[1])
+            self._shape, self._near = image.shape, RegionFinder(focal_px, self._finder.base_step_px)
+        return self._measured(image, self._finder.find(self._contrast_min, self._clutter_gain))
+
+    def detect_near(self, image: NDArray[np.uint8], regions: Sequence[Region]) -> list[Detection] | None:
+        """Find the candidates within some regions, also fainter ones than in a whole picture.
+
+        A lamp that stands out enough for the whole picture's search is found at the same place as there, because it is
+        proposed and measured from the same pixels. Its score may differ a little: the clutter of the coarser octaves
+        is that of the tile around the region, not of a wider neighbourhood. The noise is that of the last whole
+        picture.
+        """
+        check_image(image)
+        if self._near is None or image.shape != self._shape:
+            return None
+        thresholds = self._contrast_min * _FAINTER, self._clutter_gain * _FAINTER
+        proposals = self._near.find(image, regions, *thresholds)
+        return None if proposals is None else self._measured(image, proposals, _KEPT_NEAR)
+
+    def _measured(
+        self, image: NDArray[np.uint8], proposals: Proposals, table: Sequence[tuple[int, float]] = _KEPT
+    ) -> list[Detection]:
+        """Measure, score and locate the proposed places, and keep the likeliest."""
         if len(proposals.radius_px) == 0:
             return []
         lights = measure_lights(image, proposals)
         score = _score(lights)
         order = np.argsort(-score, kind="stable")
-        order = order[distinct(lights.centre_px[order], lights.core_px[order], _KEPT[-1][0])]
+        order = order[distinct(lights.centre_px[order], lights.core_px[order], table[-1][0])]
         ranked = score[order].tolist()
-        chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in _KEPT)]
+        chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in table)]
         likely = lights.at(chosen)
         focal_px = self._focal_px or focal_of(image.shape[1])
         return _detections(likely, locate_sources(image, likely, focal_px), score[chosen], image.shape)

@@ -28,7 +28,8 @@ _LATER: Final[Floats] = np.array([[1.0], [-1.0]])
 class CandidateBearings:
     """The usable candidates of T triggers, N in all: by trigger, A's picture before B's.
 
-    triggers: T. counts: (T, 2) how many in A's and in B's picture.
+    triggers: T. counts: (T, 2) how many in A's and in B's picture. in_whole: (T, 2) the same with those elsewhere in
+    pictures of which only parts were searched: as many as chance has to choose from.
     image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
     picture's candidates begin. index: (N,) into the view. table: (7, N) the bearing in the bar frame, the place over
     the picture's width and height, the bearing's variance, rad^2 per axis, and the square of the radius of a disc of
@@ -38,6 +39,7 @@ class CandidateBearings:
 
     triggers: int
     counts: Indices
+    in_whole: Indices
     image: Indices
     starts: Indices
     index: Indices
@@ -88,9 +90,11 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
     table[5] = variance
     table[6] = area_px / (math.pi * px2_per_sr)
     frames[:, 1:] /= sigma_px[:, None, None]
+    elsewhere = np.array([view.elsewhere for view in views])
     return CandidateBearings(
         triggers=len(observations),
         counts=counts.reshape(-1, 2),
+        in_whole=(counts + elsewhere).reshape(-1, 2),
         image=image,
         starts=starts_of(counts),
         index=index,
@@ -98,7 +102,7 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
         frames=frames,
         sigma_px=sigma_px,
         dt_s=seen[:, 5] + later_s.T.ravel()[image],
-        log_score=_log_score(seen[:, 3], image, counts),
+        log_score=_log_score(seen[:, 3], image, counts, elsewhere),
         log_area=np.log(area_px),
     )
 
@@ -114,12 +118,15 @@ def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Float
     return frames, px2_per_sr
 
 
-def _log_score(score: Floats, image: Indices, counts: Indices) -> Floats:
-    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score, 0.5, is no evidence."""
+def _log_score(score: Floats, image: Indices, counts: Indices, elsewhere: Indices) -> Floats:
+    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score, 0.5, is no evidence.
+
+    Those elsewhere in a picture count as the least likely: likely ones are in the parts that were searched.
+    """
     if (score == 0.5).all():
         return np.zeros(len(score))
     odds = np.minimum(np.maximum(score, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
     weight = _SCORE_WEIGHT * np.log(odds / (1.0 - odds))
-    total = np.bincount(image, np.exp(weight), minlength=len(counts))
-    balanced: Floats = weight - np.log(total / np.maximum(counts, 1))[image]
+    total = np.bincount(image, np.exp(weight), minlength=len(counts)) + elsewhere * math.exp(-3.0 * _SCORE_WEIGHT)
+    balanced: Floats = weight - np.log(total / np.maximum(counts + elsewhere, 1))[image]
     return balanced

@@ -74,7 +74,7 @@ def read_four_lights(batch: Batch) -> FourLights:
     )
     T_a_b = rigs.between_cameras(solved.T_a_b)
     support = weigh(T_a_b, quads.trigger, quads.variance, rigs, batch.sensors)
-    base = support.log_ratio + quads.log_weight + log_chance(rigs, batch.candidates.counts, settings)[quads.trigger]
+    base = support.log_ratio + quads.log_weight + log_chance(rigs, batch.candidates.in_whole, settings)[quads.trigger]
     if "attitude" not in settings.checks:
         # The reading is upright; of half a turn nothing is known.
         base -= math.log(math.pi)
@@ -147,7 +147,7 @@ def _readings(
     """Put together what is known of the best quads (M,)."""
     seen, rigs = batch.candidates, batch.rigs
     lights = quads.lights[:, best].T
-    counts = seen.counts[quads.trigger[best]].repeat(2, 1)
+    counts = seen.in_whole[quads.trigger[best]].repeat(2, 1)
     clutter = inner(seen.sigma_px[lights] ** 2, counts / rigs.area_px2.repeat(2))
     return Readings(
         lights=seen.index[lights],

@@ -30,11 +30,13 @@ CHECKS: Final = frozenset({"range", "twist", "attitude", "depth"})
 class View:
     """What one node saw at one trigger: N candidates.
 
-    table: (N, 6), one row a candidate, with the columns that the properties name. stamp_ns: of the frame.
+    table: (N, 6), one row a candidate, with the columns that the properties name. stamp_ns: of the frame. elsewhere:
+    how many more the whole picture held, where only parts were searched.
     """
 
     table: Floats
     stamp_ns: int
+    elsewhere: int = 0
 
     @staticmethod
     def of(pixels: Floats, sigma_px: Floats, score: Floats, area_px: Floats, dt_s: Floats, stamp_ns: int) -> View:

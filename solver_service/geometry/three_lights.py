@@ -161,7 +161,7 @@ def _log_ratio(
     # The prior of a pose, per m^3 and rad^3; its turn about the line of sight stands with the tilt.
     prior = -3.0 * np.log(range_m) - math.log(rigs.views_sr2 * math.log(settings.range_max_m / settings.range_min_m))
     # Chance puts candidates evenly on the pictures, per px^2.
-    counts = seen.counts[trigger]
+    counts = seen.in_whole[trigger]
     both_seen = (lights.reshape(-1, 2, 2) >= 0).all(2)
     chance = np.log(counts / rigs.area_px2) + np.where(
         both_seen, np.log(np.maximum(counts - 1, 1) / rigs.area_px2), 0.0

@@ -31,7 +31,7 @@ class FrameSeen:
     """The light candidates of one picture.
 
     pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns; score (K,): how likely each
-    is a light, NaN where unknown.
+    is a light, NaN where unknown. elsewhere: how many more the whole picture held, where only parts were searched.
     """
 
     stamp_ns: int
@@ -39,6 +39,7 @@ class FrameSeen:
     sigma_px: Floats
     dt_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
     score: Floats = field(default_factory=lambda: np.zeros(0))
+    elsewhere: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -83,7 +83,9 @@ class TrackIntake:
         dt_s = np.zeros(len(frame.pixels))
         if len(frame.dt_ns):
             dt_s += frame.dt_ns * 1e-9
-        sight = sight_of(self.nodes[node].rig, node, frame.stamp_ns, t_s, frame.pixels, frame.sigma_px, dt_s)
+        sight = sight_of(
+            self.nodes[node].rig, node, frame.stamp_ns, t_s, frame.pixels, frame.sigma_px, dt_s, frame.elsewhere
+        )
         self._push(t_s, 1 + node, sight)
 
     def add_fix(self, fix: FixSeen) -> None:

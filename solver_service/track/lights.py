@@ -131,7 +131,7 @@ def pixel_of(camera: Camera, X: Floats) -> Floats | None:
 class Sight:
     """One picture as the track uses it: bearings and tangents of its sound candidates.
 
-    index (K,): their places in the frame. t_s: on A's clock as believed; dt_s (K,).
+    index (K,): their places in the frame. t_s: on A's clock as believed; dt_s (K,). elsewhere: as in FrameSeen.
     """
 
     stamp_ns: int
@@ -142,12 +142,28 @@ class Sight:
     tangents: Floats
     sigma_px: Floats
     dt_s: Floats
+    elsewhere: int = 0
+
+    @property
+    def clutter(self) -> float:
+        """How many candidates chance may have put into the whole picture: all but one, and never none."""
+        return max(len(self.index) + self.elsewhere - 1.0, 1.0)
 
 
-def sight_of(rig: Rig, node: int, stamp_ns: int, t_s: float, pixels: Floats, sigma_px: Floats, dt_s: Floats) -> Sight:
+def sight_of(
+    rig: Rig,
+    node: int,
+    stamp_ns: int,
+    t_s: float,
+    pixels: Floats,
+    sigma_px: Floats,
+    dt_s: Floats,
+    elsewhere: int = 0,
+) -> Sight:
     """Prepare a picture's candidates; those that the camera model does not reach are left out."""
     with np.errstate(all="ignore"):
         bearings, tangents = rig.camera.rays(pixels.reshape(-1, 2))
     sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
     keep = np.flatnonzero(sound)
-    return Sight(stamp_ns, t_s, node, keep, bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep])
+    seen = bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep]
+    return Sight(stamp_ns, t_s, node, keep, *seen, elsewhere)

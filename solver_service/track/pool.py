@@ -161,7 +161,7 @@ class TrackPool(TrackSteps):
         offset_s = sight.dt_s + (t_s - base.t_s)
         X, D = light_positions(base.state, sight.node, lights_m, base.rates_radps, offset_s)
         y, H = residuals(sight.bearings, sight.tangents, X, D)
-        log_clutter = math.log(max(len(y) - 1.0, 1.0) / self.nodes[sight.node].rig.camera.area_px2)
+        log_clutter = math.log(sight.clutter / self.nodes[sight.node].rig.camera.area_px2)
         for k in range(len(y)):
             for light in (0, 1):
                 if not np.isfinite(y[k, light]).all():

@@ -172,7 +172,7 @@ class TrackSteps(TrackIntake):
             at = X[0] if len(X) else self._expected(estimate, observer)
             inside = [in_picture(camera, at[light]) for light in (0, 1)]
             detection = detection * np.where(inside, 1.0, 0.02)
-        clutter = max(len(sight.index) - 1.0, 1.0) / camera.area_px2
+        clutter = sight.clutter / camera.area_px2
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         guide = self.guides.get((observer, sight.stamp_ns))
         given = estimate.given.get((observer, sight.stamp_ns))
