@@ -62,7 +62,7 @@ class LocalNetwork:
         """Return a new client."""
         return LocalBus(self)
 
-    def tell(self, name: str, alive: bool) -> None:
+    def notify(self, name: str, alive: bool) -> None:
         """Tell all watches of a change."""
         for watch in self.watches:
             watch.offer(name, alive)
@@ -197,7 +197,7 @@ class LocalBus(Bus):
             known = any(name == other for other, _ in self._network.alive)
             self._network.alive.append((name, self))
             if not known:
-                self._network.tell(name, True)
+                self._network.notify(name, True)
 
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
         """Call handle(name, alive) for every name that is alive now, and at every change."""
@@ -221,4 +221,4 @@ class LocalBus(Bus):
             own = {name for name, bus in self._network.alive if bus is self}
             self._network.alive = [entry for entry in self._network.alive if entry[1] is not self]
             for name in own - {name for name, _ in self._network.alive}:
-                self._network.tell(name, False)
+                self._network.notify(name, False)

@@ -43,7 +43,7 @@ class TagSolver:
     _seen: dict[int, dict[str, tuple[int, dict[int, list[Floats]]]]] = field(default_factory=dict)
     _finders: dict[str, TagFinder] = field(default_factory=dict)
 
-    def look(self, node: str, image: CompressedImage) -> None:
+    def take(self, node: str, image: CompressedImage) -> None:
         """Take one picture; raise PictureError if it cannot be used."""
         info = self.infos[node]
         picture = decode_picture(image.data, f"picture of node {node} at {image.stamp_ns}")
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
                     continue
                 if isinstance(message, CompressedImage):
                     try:
-                        solver.look(envelope.node, message)
+                        solver.take(envelope.node, message)
                     except PictureError as error:
                         skipped += 1
                         losses.report([str(error)])

@@ -7,7 +7,7 @@ import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
-from buddyline.tools.survey.chain import Stop, stand
+from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.derive import Derived, ranges
 from buddyline.tools.survey.live import LiveAlarms
 from buddyline.tools.survey.network import adjust
@@ -253,23 +253,23 @@ def stop(line, a=10.0, b=10.0):
 
 def test_depths_show_which_node_has_moved():
     stops = [stop((5, 0, 0)), stop((4, 2, 0), b=12.0), stop((-4, 1, 0), a=14.0, b=12.0), stop((3, 3, 1), a=9, b=9)]
-    standings = stand(stops, "leapfrog", "a")
+    standings = find_standings(stops, "leapfrog", "a")
     assert [s.station["a"] + s.station["b"] for s in standings] == ["01", "02", "32", "54"]
     assert [bool(s.problem) for s in standings] == [False, False, False, True]
 
 
 def test_without_other_evidence_the_procedure_decides():
     level = [stop((5, 0, 0)), stop((-5, 0, 0)), stop((5, 1, 0))]
-    assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "a")] == ["01", "21", "23"]
-    assert [s.station["a"] + s.station["b"] for s in stand(level, "leapfrog", "b")] == ["10", "12", "32"]
-    assert [s.station["a"] + s.station["b"] for s in stand(level, "stay", "a")] == ["01", "02", "03"]
+    assert [s.station["a"] + s.station["b"] for s in find_standings(level, "leapfrog", "a")] == ["01", "21", "23"]
+    assert [s.station["a"] + s.station["b"] for s in find_standings(level, "leapfrog", "b")] == ["10", "12", "32"]
+    assert [s.station["a"] + s.station["b"] for s in find_standings(level, "stay", "a")] == ["01", "02", "03"]
     again = [stop((5, 0, 0)), stop((5.02, 0, 0))]
-    assert [s.station["a"] + s.station["b"] for s in stand(again, "leapfrog", "a")] == ["01", "01"]
+    assert [s.station["a"] + s.station["b"] for s in find_standings(again, "leapfrog", "a")] == ["01", "01"]
 
 
 def test_marks_take_precedence_over_depths():
     moved = Stop(np.array([-4.0, 0.0, 0.0]), {"a": 13.0, "b": 10.0}, {"b": "X"})
-    standing = stand([stop((5, 0, 0)), moved], "leapfrog", "a")[1]
+    standing = find_standings([stop((5, 0, 0)), moved], "leapfrog", "a")[1]
     assert standing.station == {"a": "2", "b": "X"}
 
 

@@ -33,7 +33,7 @@ class Standing:
     problem: str = ""
 
 
-def stand(stops: list[Stop], procedure: Procedure, first: str, taken: Iterable[str] = ()) -> list[Standing]:
+def find_standings(stops: list[Stop], procedure: Procedure, first: str, taken: Iterable[str] = ()) -> list[Standing]:
     """Return the stations of both nodes at each stop.
 
     Stations without a mark get the free numbers in order; a later mark by such a number means that station.

@@ -120,9 +120,11 @@ def _legs(args: argparse.Namespace) -> int:
     stations = derived.stations()
     gauges = adjust_gauges(derived.legs, project.alarms)
     for text in gauges.alarms:
-        derived.say(text)
+        derived.add_problem(text)
     for dive, rate in gauges.tides_m_per_h.items():
-        derived.say(f"water level in dive {dive}: {rate:+.2f} m an hour, by the gauges' own readings; taken off")
+        derived.add_problem(
+            f"water level in dive {dive}: {rate:+.2f} m an hour, by the gauges' own readings; taken off"
+        )
     write_derived(
         path, {"problem": derived.problems, "station": stations, "leg": derived.legs, "point": derived.points}
     )

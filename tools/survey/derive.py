@@ -15,7 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.averages import Mean
-from buddyline.tools.survey.chain import Stop, stand
+from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.gauges import adjust_gauges
 from buddyline.tools.survey.magnetism import usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
@@ -77,18 +77,20 @@ class Derived:
             if mark.node not in nodes and mark.kind != "note":
                 self.faults += 1
                 known = ", ".join(sorted(nodes))
-                self.say(f"mark {mark.name} at {at}: node {mark.node} is in no pair of dive {dive}; known: {known}")
+                self.add_problem(
+                    f"mark {mark.name} at {at}: node {mark.node} is in no pair of dive {dive}; known: {known}"
+                )
             elif mark.kind == "note" and mark.note:
-                self.say(f"note at {at}: {mark.note}")
+                self.add_problem(f"note at {at}: {mark.note}")
             elif mark.kind == "station" and mark.node in nodes:
                 if not STATION_NAME.match(mark.name):
-                    self.say(f"mark at {at}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -")
+                    self.add_problem(f"mark at {at}: {mark.name!r} is no station's name: 1-12 of A-Z a-z 0-9 _ -")
                     continue
                 if mark.note and mark.note not in self.notes[mark.name]:
                     self.notes[mark.name].append(mark.note)
                 if id(mark) not in placed and not points:
                     self.faults += 1
-                    self.say(f"mark {mark.name} at {at}: no rest near it")
+                    self.add_problem(f"mark {mark.name} at {at}: no rest near it")
         for mark in points:
             name = mark.name or f"p{len(self.points) + 1}"
             # Of several nodes that saw the point, the first with enough fixes.
@@ -97,9 +99,9 @@ class Derived:
             if shot is not None:
                 self.points.append(shot)
             else:
-                self.say(f"point {name}: {found[0]}")
+                self.add_problem(f"point {name}: {found[0]}")
 
-    def say(self, text: str) -> None:
+    def add_problem(self, text: str) -> None:
         """Add a problem."""
         self.problems.append(Problem(text=text))
 
@@ -156,13 +158,13 @@ class _Chain:
         least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
         for rest in every:
             if rest.too_short:
-                out.say(f"NO LEG: rest at {_time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
+                out.add_problem(f"NO LEG: rest at {_time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
         # After a rest without a leg, it is a guess who has moved.
         doubtful = {id(rest) for before, rest in pairwise(every) if before.too_short}
         self.found = [rest for rest in every if not rest.too_short]
         if not self.found:
             pair = f", nodes {' and '.join(readings.nodes)}"
-            out.say(f"dive {dive}{pair}: no rest of {least}")
+            out.add_problem(f"dive {dive}{pair}: no rest of {least}")
         shots = [shoot(readings, self.seen, rest.chosen, settings, rest.unused) for rest in self.found]
         self.usual = {
             node: usual_field([shot.ends[i].field for shot in shots]) for i, node in enumerate(readings.nodes)
@@ -174,7 +176,7 @@ class _Chain:
         ]
         first = settings.first if settings.first in readings.nodes else readings.nodes[0]
         taken = {name for leg in out.legs for name in (leg.from_, leg.to)}
-        self.standings = stand(stops, settings.procedure, first, taken)
+        self.standings = find_standings(stops, settings.procedure, first, taken)
         legs = []
         for rest, shot, standing, stations in zip(self.found, shots, self.standings, self.named, strict=True):
             leg = self._leg(shot, standing.station, standing.rear)
@@ -206,7 +208,7 @@ class _Chain:
                 earlier = out.numbered.get(mark.name, self.dive)
                 if earlier != self.dive and mark.name not in joined:
                     joined.add(mark.name)
-                    out.say(
+                    out.add_problem(
                         f"mark {mark.name} in dive {self.dive}: taken for station {mark.name} of dive {earlier}, which "
                         f"got that number because no mark named it; is it the same place?"
                     )
