@@ -80,7 +80,7 @@ class FrameWindow:
 
     def received_since(self, receive_ns: int | None) -> list[Candidates]:
         """Return the frames received at receive_ns or later, and those whose receive time is unknown; None: all."""
-        return [frame for frame, came_ns in self._frames if receive_ns is None or (came_ns or receive_ns) >= receive_ns]
+        return [frame for frame, at_ns in self._frames if receive_ns is None or (at_ns or receive_ns) >= receive_ns]
 
     def clear(self) -> None:
         """Drop all frames."""

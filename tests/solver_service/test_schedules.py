@@ -234,8 +234,8 @@ class Schedules(RuleBasedStateMachine):
     def what_is_matched_came_together(self):
         for solver in getattr(self, "solvers", {}).values():
             for matched in solver.given:
-                came_ns = [self.arrivals[f.node, f.boot, f.seq] for f in (matched.frame_a, matched.frame_b)]
-                assert abs(came_ns[0] - came_ns[1]) <= OUTCOME_WITHIN_NS
+                received_ns = [self.arrivals[f.node, f.boot, f.seq] for f in (matched.frame_a, matched.frame_b)]
+                assert abs(received_ns[0] - received_ns[1]) <= OUTCOME_WITHIN_NS
                 assert matched.frame_a.trigger == matched.frame_b.trigger == matched.trigger
             solver.given.clear()
 
