@@ -32,9 +32,9 @@ LEAST_POINT_FIXES: Final = 3
 
 
 class Derived:
-    """What dives give: legs, points, problems; notes on stations by name.
+    """The result of all dives: legs, points, problems; notes on stations by name.
 
-    numbered: stations that no mark has named, and the dive that numbered them. faults: how many marks were of no use.
+    numbered: stations that no mark has named, and the dive that numbered them. faults: number of unusable marks.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Derived:
     ) -> None:
         """Add one dive's legs and points; each pair of nodes is a chain of its own.
 
-        by_hand: marks beside the logs', which count before these: with them a person corrects what was mistyped.
+        by_hand: marks besides the logs'. They take precedence, so that a person can correct mistyped marks.
         """
         corrections = list(by_hand)
         marks = sorted([*pairs[0].marks, *corrections], key=lambda mark: mark.stamp_ns)
@@ -106,7 +106,7 @@ class Derived:
         self.problems.append(Problem(text=text))
 
     def equate(self, stations: list[str]) -> None:
-        """Give stations that are one place the first one's name; raise BuddylineError for one that there is not."""
+        """Give stations that are the same place the first one's name; raise BuddylineError for an unknown station."""
         known = {name for leg in self.legs + self.points for name in (leg.from_, leg.to)}
         for name in stations:
             if name not in known:

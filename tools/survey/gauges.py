@@ -14,16 +14,16 @@ from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.settings import AlarmSettings
 from msgspec import UNSET
 
-# A gauge's zero may change by its own slow error in so long (MS5837-30BA data sheet: long-term stability; measured
+# Time in which a gauge's zero may change by its slow error (MS5837-30BA data sheet: long-term stability; measured
 # zeros of a rig that warms up change within the first hour).
 DRIFT_S: Final = 3600.0
 # The water level of another dive, 1 sd: tide, flood, or the air pressure at which the zero was taken.
 LEVEL_M: Final = 0.5
-# A tide is taken in where the readings show it: 1 sd of the level's rate, and chi^2 of one degree of freedom that
+# A tide is estimated if the readings show one: 1 sd of the level's rate, and the chi^2 of one degree of freedom that
 # one dive in a thousand exceeds by chance.
 TIDE_M_PER_S: Final = 0.5 / 3600.0
 SHOWN_CHI2: Final = 10.83
-# A tide is shown by stations visited again after so long; one alone may as well have been misread or misnamed.
+# Stations visited again after this time show a tide; a single one may have been misread or misnamed.
 APART_S: Final = 600.0
 LEAST_STATIONS: Final = 2
 LEAST_NOISE_M: Final = 0.002
@@ -40,7 +40,7 @@ class StationDepth:
 
 @dataclass(frozen=True)
 class Gauges:
-    """What all readings give together.
+    """The result of all readings.
 
     depths: by station. corrected_m: by leg's index, its two depths with zeros, drifts and levels taken off.
     tides_m_per_h: by dive, where the readings show one; the level rises with positive values. alarms: in words.
@@ -96,7 +96,7 @@ def _readings(legs: Sequence[Leg]) -> _Readings:
 
 
 class _Unknowns:
-    """Columns (n, k) of what readings share, with the standard deviation (k,) of each before any reading."""
+    """Design columns (n, k) of the shared unknowns, with their prior standard deviations (k,)."""
 
     def __init__(self, readings: _Readings, tides: Sequence[int]) -> None:
         columns: list[Floats] = []
@@ -125,7 +125,7 @@ class _Unknowns:
 
 
 def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> Gauges:
-    """Return what the gauges of all legs say together.
+    """Adjust the gauges' readings of all legs together.
 
     A reading = the station's depth + the gauge's zero + its drift * time + the dive's level + its tide * time + noise.
     Zero and drift have the gauge's stated slow error, so that stations visited by both gauges, twice, or in two dives
@@ -188,7 +188,7 @@ class _Fit:
         self.sigma_m = np.sqrt(1 / total + np.einsum("sk,kl,sl->s", A_mean, covariance, A_mean))
         self.off_m = self.corrected_m - self.depth_m[at]
         own = np.einsum("nk,kl,nl->n", A_own, covariance, A_own)
-        # A reading's residual has the noise less what the fit has followed of it.
+        # The variance of a residual is the noise's, minus the part that the fit has followed.
         self.off_sigma_m = np.sqrt(np.maximum(1 / weight - 1 / total[at] - own, 0.0))
         self.chi2 = float((weight * self.off_m**2).sum() + ((self.shared / unknowns.sigmas) ** 2).sum())
 
@@ -197,7 +197,7 @@ def _alarms(readings: _Readings, fit: _Fit, limits: AlarmSettings) -> list[str]:
     said = []
     for number, name in enumerate(readings.names):
         here = np.flatnonzero(readings.station == number)
-        # Where nothing checks a reading, its residual and its sigma are both zero.
+        # If nothing checks a reading, its residual and its sigma are both zero.
         checked = fit.off_sigma_m[here] > 0.1 * readings.noise_m[here]
         away = np.abs(fit.off_m[here]) > limits.depth_sigmas * fit.off_sigma_m[here]
         if (checked & away).any() and np.ptp(fit.corrected_m[here]) > limits.depth_m:

@@ -1,4 +1,4 @@
-"""Places: latitude and longitude, the projection of a map grid, its convergence, the declination there and then."""
+"""Places: latitude and longitude, the projection of a map grid, its convergence, the declination of place and date."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SEMI_MAJOR_M: Final = 6378137.0
 FLATTENING: Final = 1 / 298.257223563
 _E2: Final = FLATTENING * (2 - FLATTENING)
-# The World Magnetic Model is worked out for places rounded to this: a kilometre, where it changes by 0.01 degrees.
+# Places are rounded to this for the World Magnetic Model: to a kilometre, in which it changes by 0.01 degrees.
 MODEL_DIGITS: Final = 2
 
 
@@ -116,7 +116,7 @@ def _model_declination_rad(latitude_deg: float, longitude_deg: float, when: date
 
 @dataclass(frozen=True)
 class Declination:
-    """Of magnetic north, east of true north positive. source: where it comes from, for the exports.
+    """The declination of magnetic north, east of true north positive. source: its origin, for the exports.
 
     stated_rad: the same everywhere, by the project. None: the World Magnetic Model's, for each leg's date and place.
     """

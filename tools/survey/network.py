@@ -145,7 +145,7 @@ def fixed_points(project: Project, grid: Grid) -> Fixed:
 def adjust(project: Project) -> Adjusted:
     """Adjust the whole network; raise BuddylineError if there is nothing to adjust.
 
-    Declination and convergence are each leg's own, so on a map grid a first adjustment tells where the legs are.
+    Declination and convergence are each leg's own, so on a map grid a first adjustment gives the places of the legs.
     """
     grid = grid_of(project)
     first = _adjust(project, grid, {})
@@ -355,7 +355,7 @@ def loops(lines: list[Line], fixed: Fixed) -> list[Loop]:
             for end, sign in ((out[-1], 1.0), (back[-1], -1.0)):
                 vector = vector + sign * fixed[end][0]
                 covariance = covariance + np.diag(fixed[end][1] ** 2)
-        # Held depths close by construction: how well depths repeat is in what each leg read.
+        # Held depths close by construction, so V is computed from each leg's own readings.
         read_m = sum(sign * (one.read_rise_m - one.rise_m) for one, sign in signed)
         read_var = sum(one.read_rise_sigma_m**2 - one.rise_sigma_m**2 for one, _ in signed)
         vector = vector + np.array([0.0, 0.0, read_m])

@@ -1,4 +1,4 @@
-"""Questions to the surveyor: stations that may be one and the same place, which no mark has said."""
+"""Questions to the surveyor: stations without a common mark that may be the same place."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Final
 import numpy as np
 from buddyline.tools.survey.averages import Bools, Floats, Ints
 
-# Stations as far apart as this many legs are not neighbours, which may well stand close.
+# Stations fewer legs apart than this are neighbours, which may be close to each other.
 LEAST_LEGS_APART: Final = 3
 # Chi^2 of two degrees of freedom that three sd of each allow; and of one.
 NEAR_CHI2: Final = 11.83
 NEAR_SIGMAS: Final = 3.0
-# Two nodes are held at one tie-off within this, 1 sd, by two divers on two days.
+# 1 sd between two nodes that two divers hold at the same tie-off on two days.
 HELD_M: Final = 0.05
-# Two places closer than this share of the legs about them are seldom two stations of a survey.
+# Two different stations are seldom closer to each other than this share of the legs around them.
 LEG_SHARE: Final = 0.5
 
 
@@ -32,7 +32,7 @@ class Proposal:
 
     @property
     def text(self) -> str:
-        """What to say, and what to do if it is so."""
+        """The question, and what to do if the answer is yes."""
         return (
             f"station {self.station} may be {self.other}: {self.apart_m:.2f} m away, {self.sigmas:.1f} sd; the loop "
             f'would close with H {self.ratio:.1f}. If it is: [[equate]] stations = ["{self.other}", "{self.station}"]'
@@ -75,7 +75,7 @@ def proposals(
 
 
 def _near(count: int, ends: tuple[Ints, Ints]) -> Bools:
-    """Tell which stations (n, n) are fewer than LEAST_LEGS_APART legs apart."""
+    """Return which stations (n, n) are fewer than LEAST_LEGS_APART legs apart."""
     beside = np.eye(count, dtype=bool)
     beside[ends] = beside[ends[::-1]] = True
     reached = beside
