@@ -5,6 +5,7 @@ protocol.zenoh_bus connects processes; protocol.local_bus works within one proce
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import threading
@@ -25,6 +26,8 @@ CACHE_S: Final = 60.0
 MAX_TRIGGER_HZ: Final = 30.0
 
 KeyExprs: TypeAlias = str | tuple[str, ...]
+
+log = logging.getLogger(__name__)
 
 _ALIVE_NAME = re.compile(r"[a-z0-9_]{1,64}(/[a-z0-9_]{1,64})*\Z")
 
@@ -51,15 +54,21 @@ class Publisher(ABC):
         self.key = key
         self._cap = cap
         self._closed = False
+        self._too_large = 0
 
     def put(self, message: Message) -> bool:
-        """Encode and send a message; return False if the rate cap or a closed bus prevents it. Raises MessageError."""
+        """Encode and send a message; return False as put_bytes does. Raises MessageError."""
         if not isinstance(message, self.topic.schema):
             raise TypeError(f"topic {self.topic.name} carries {self.topic.schema.__name__}")
         return self.put_bytes(encode(message))
 
     def put_bytes(self, payload: bytes) -> bool:
-        """Send an encoded message; return False if the rate cap or a closed bus prevents it."""
+        """Send an encoded message; return False if its size, the rate cap or a closed bus prevents it."""
+        if len(payload) > self.topic.max_bytes:
+            if not self._too_large:
+                log.warning("%s: %d bytes, at most %d: not sent", self.key, len(payload), self.topic.max_bytes)
+            self._too_large += 1
+            return False
         return not self._closed and self._cap.passes() and self._send(payload)
 
     @abstractmethod

@@ -7,32 +7,59 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
-MAX_PUBLISHERS: Final = 4096
+# Limits by the first chunks of a key, which the hub's access rules give to one client: whoever invents publishers with
+# gaps makes others forget nothing. MAX_HELD_BYTES: samples of one owner that wait for a gap to close.
+MAX_OWNERS: Final = 256
+MAX_PUBLISHERS: Final = 256
 MAX_HELD: Final = 8192
+MAX_HELD_BYTES: Final = 16 * 1024 * 1024
+OWNER_CHUNKS: Final = 3
 
 S = TypeVar("S")
-Source = tuple[str, int]
+
+
+class Source(NamedTuple):
+    """One publisher: its key, and what it says of itself.
+
+    A client may say any zid and eid; the key is what the hub lets it publish. So both together name a publisher, and
+    what one client says on its own keys changes nothing on another's.
+    """
+
+    key: str
+    zid: str
+    eid: int
+
+    @property
+    def owner(self) -> str:
+        """The first chunks of the key, such as "buddyline/node/a"; a namespace counts as one more."""
+        chunks = self.key.split("/")
+        start = chunks.index("buddyline") if "buddyline" in chunks else 0
+        return "/".join(chunks[: start + OWNER_CHUNKS])
 
 
 @dataclass(frozen=True)
 class Gap:
-    """The missing numbers before a sample that has arrived. known: earlier samples of the publisher have arrived."""
+    """The missing numbers of a publisher. known: earlier samples of the publisher have arrived."""
 
     source: Source
-    key: str
     missing: range
     known: bool
 
 
 @dataclass
 class _Sender(Generic[S]):
-    """The next expected number of a publisher, and its samples that arrived after a gap that is still open."""
+    """The next expected number of a publisher, and its samples that arrived after a gap that is still open.
+
+    told: the last number that its heartbeat has told of.
+    """
 
     due: int
     known: bool
-    held: list[tuple[int, S]] = field(default_factory=list)
+    open: bool = False
+    told: int = -1
+    held: list[tuple[int, S, int]] = field(default_factory=list)
 
 
 class Sequence(Generic[S]):
@@ -44,27 +71,33 @@ class Sequence(Generic[S]):
     def __init__(self, deliver: Callable[[S], None]) -> None:
         self.missed = 0
         self._deliver = deliver
-        # Sorted by last sample: the publisher that has been silent longest is first.
-        self._publishers: dict[Source, _Sender[S]] = {}
+        # By owner; sorted by last sample: the publisher that has been silent longest is first.
+        self._publishers: dict[str, dict[Source, _Sender[S]]] = {}
+        self._held_bytes: dict[str, int] = {}
 
     def begin(self, source: Source, number: int) -> None:
         """Take `number` as the first of a publisher: earlier samples can no longer be fetched."""
-        self._publishers.setdefault(source, _Sender(number, known=True))
+        self._sender(source, _Sender(number, known=True))
 
     def accept(
-        self, source: Source, number: int, key: str, sample: S, *, recover: bool = True, newest_only: bool = False
+        self,
+        source: Source,
+        number: int,
+        sample: S,
+        *,
+        size_bytes: int = 0,
+        recover: bool = True,
+        newest_only: bool = False,
     ) -> Gap | None:
         """Deliver or hold a sample; return the gap that it opens, if any, for the caller to close.
 
-        recover=False: missing numbers are skipped and counted. newest_only: they are skipped and not counted.
+        size_bytes: of the sample. recover=False: missing numbers are skipped and counted. newest_only: they are skipped
+        and not counted.
         """
-        publisher = self._publishers.pop(source, None) or _Sender[S](0, known=False)
-        self._publishers[source] = publisher
-        if len(self._publishers) > MAX_PUBLISHERS:
-            del self._publishers[next(iter(self._publishers))]
-        if publisher.held:
-            if number > publisher.held[-1][0] and len(publisher.held) < MAX_HELD:
-                publisher.held.append((number, sample))
+        publisher = self._sender(source, _Sender(0, known=False))
+        if publisher.open:
+            if number > (publisher.held[-1][0] if publisher.held else publisher.due - 1):
+                self._hold(source, publisher, number, sample, size_bytes)
             return None
         if number < publisher.due:
             return None
@@ -72,30 +105,79 @@ class Sequence(Generic[S]):
             publisher.due = number
         missing = range(publisher.due, number)
         if missing and recover:
-            publisher.held.append((number, sample))
-            return Gap(source, key, missing, publisher.known)
+            publisher.open = True
+            self._hold(source, publisher, number, sample, size_bytes)
+            return Gap(source, missing, publisher.known)
         self._pass(publisher, number, sample)
         return None
 
+    def told(self, source: Source, last: int, *, newest_only: bool = False) -> Gap | None:
+        """Take a heartbeat: the publisher's last number so far. Return the gap up to it, if any.
+
+        A sample may be on its way still, so it counts as missing only when the heartbeat before told of it, too.
+        """
+        publisher = self._sender(source, _Sender(0, known=False))
+        before, publisher.told = publisher.told, last
+        if publisher.open or before < publisher.due:
+            return None
+        if newest_only:
+            publisher.due = before
+        publisher.open = True
+        return Gap(source, range(publisher.due, before + 1), publisher.known)
+
     def close(self, gap: Gap, found: Iterable[tuple[int, S]]) -> Gap | None:
         """Deliver the found samples of a gap, count the others as missed, and continue; return the next gap or None."""
-        publisher = self._publishers.get(gap.source)
-        if publisher is None or not publisher.held:
+        publisher = self._publishers.get(gap.source.owner, {}).get(gap.source)
+        if publisher is None or not publisher.open:
             return None
-        for number, sample in sorted(found, key=lambda item: item[0]):
-            if number in gap.missing and number >= publisher.due:
-                self._pass(publisher, number, sample)
         held, publisher.held = publisher.held, []
-        for position, (number, sample) in enumerate(held):
-            if position and number > publisher.due:
-                publisher.held = held[position:]
-                return Gap(gap.source, gap.key, range(publisher.due, number), known=True)
-            self._pass(publisher, number, sample)
+        self._held_bytes[gap.source.owner] = self._held_bytes.get(gap.source.owner, 0) - sum(one[2] for one in held)
+        end = gap.missing[-1]
+        fetched = [(number, sample, 0) for number, sample in found if number in gap.missing]
+        waiting = sorted([*fetched, *held], key=lambda one: one[0])
+        for position, (number, sample, _) in enumerate(waiting):
+            if number > end:
+                self._skip(publisher, end + 1)
+                if number > publisher.due:
+                    for later in waiting[position:]:
+                        self._hold(gap.source, publisher, *later)
+                    return Gap(gap.source, range(publisher.due, number), known=True)
+            if number >= publisher.due:
+                self._pass(publisher, number, sample)
+        self._skip(publisher, end + 1)
+        publisher.open = False
         return None
 
+    def _sender(self, source: Source, new: _Sender[S]) -> _Sender[S]:
+        """Return what is known of a publisher, which has just been heard."""
+        others = self._publishers.pop(source.owner, {})
+        self._publishers[source.owner] = others
+        if len(self._publishers) > MAX_OWNERS:
+            owner = next(iter(self._publishers))
+            del self._publishers[owner]
+            self._held_bytes.pop(owner, None)
+        sender = others.pop(source, None) or new
+        others[source] = sender
+        if len(others) > MAX_PUBLISHERS:
+            gone = others.pop(next(iter(others)))
+            self._held_bytes[source.owner] = self._held_bytes.get(source.owner, 0) - sum(one[2] for one in gone.held)
+        return sender
+
+    def _hold(self, source: Source, publisher: _Sender[S], number: int, sample: S, size_bytes: int) -> None:
+        held_bytes = self._held_bytes.setdefault(source.owner, 0)
+        if len(publisher.held) >= MAX_HELD or (publisher.held and held_bytes + size_bytes > MAX_HELD_BYTES):
+            return
+        publisher.held.append((number, sample, size_bytes))
+        self._held_bytes[source.owner] = held_bytes + size_bytes
+
     def _pass(self, publisher: _Sender[S], number: int, sample: S) -> None:
-        if publisher.known:
-            self.missed += number - publisher.due
+        self._skip(publisher, number)
         publisher.known = True
         publisher.due = number + 1
         self._deliver(sample)
+
+    def _skip(self, publisher: _Sender[S], due: int) -> None:
+        """Give up what is missing before `due`."""
+        if due > publisher.due:
+            self.missed += (due - publisher.due) if publisher.known else 0
+            publisher.due = due

@@ -25,7 +25,7 @@ class Topic:
     for messages sent on change. latest_only: a late subscriber gets only the newest message (of other topics, what it
     missed). express: sent at once, not in batches. stale_s: age from which it is stale (0: never). retained: the hub
     keeps the newest message of each key, also after its sender is gone. solved: a result of the solver, which `solve`
-    computes again from a stored dive.
+    computes again from a stored dive. max_bytes: of a payload; a larger one is not sent, and no hub passes it on.
     """
 
     name: str
@@ -38,6 +38,7 @@ class Topic:
     stale_s: float = 0.0
     retained: bool = False
     solved: bool = False
+    max_bytes: int = 64 * 1024
 
     def key(self, *ids: str) -> str:
         """Return the Zenoh key, which is also the MCAP topic. ids: a node's, a pair's two, or a net's and a node's."""
@@ -98,7 +99,16 @@ ATTITUDE: Final = Topic(
 DEPTH: Final = Topic(
     "depth", "buddyline/node/{node}/depth", messages.Depth, 20.0, "data_high", express=True, stale_s=2.0
 )
-IMAGE: Final = Topic("image", "buddyline/node/{node}/image", messages.CompressedImage, 1.0, "background", stale_s=3.0)
+# A full picture of a stored dive, in base64; a live preview is a twentieth of it.
+IMAGE: Final = Topic(
+    "image",
+    "buddyline/node/{node}/image",
+    messages.CompressedImage,
+    1.0,
+    "background",
+    stale_s=3.0,
+    max_bytes=4 * 1024 * 1024,
+)
 NODE_STATUS: Final = Topic(
     "node_status", "buddyline/node/{node}/status", messages.NodeStatus, 1.0, "data_low", latest_only=True, stale_s=3.0
 )

@@ -27,11 +27,15 @@ class Health:
         """Note a node's trigger period."""
         self._period_s[node] = trigger_period_ns / S_NS
 
-    def saw_process(self, name: str, alive: bool) -> None:
-        """Note that a process has started or ended; name: as declared alive on the bus."""
+    def saw_process(self, name: str, alive: bool) -> bool:
+        """Note that a process has started or ended; name: as declared alive on the bus. Return whether that is news."""
         node = name.removeprefix("node/")
-        if name != node and (node in self._alive or len(self._alive) < MAX_PROCESSES):
-            self._alive[node] = alive
+        if name == node or self._alive.get(node) == alive:
+            return False
+        if node not in self._alive and len(self._alive) >= MAX_PROCESSES:
+            return False
+        self._alive[node] = alive
+        return True
 
     def problems(self, nodes: tuple[str, str], now_ns: int) -> list[str]:
         """Return the problems of a pair of nodes, one phrase each."""

@@ -46,6 +46,7 @@ class SolverService(Service):
         self._publishers: dict[str, Publisher] = {}
         self._declared: set[PairId] = set()
         self._refused = ""
+        self._news = False
         self._answered = Answered()
         self._joined_ns: int | None = None
 
@@ -75,13 +76,18 @@ class SolverService(Service):
             ticks = 0
             while not self.stop.wait(TICK_S):
                 ticks += 1
-                with self._lock:
-                    self._publish(self.core.advance(self.clock.now_ns()))
+                self.tick(ticks % TICKS_A_STATUS == 0)
                 if ticks % TICKS_A_STATUS == 0:
-                    self.report()
                     self.heartbeat()
             with self._lock:
                 self._publish(self.core.flush())
+
+    def tick(self, status_due: bool) -> None:
+        """Resolve triggers whose time has come; report where a status is due, or a node has started or ended."""
+        with self._lock:
+            self._publish(self.core.advance(self.clock.now_ns()))
+        if self._news or status_due:
+            self.report()
 
     def attach(self, bus: Bus) -> None:
         """Subscribe to the nodes on this bus, and publish on it from now on."""
@@ -109,16 +115,16 @@ class SolverService(Service):
                 self._handle(message)
 
     def watch(self, name: str, alive: bool) -> None:
-        """Report at once that a process has started or ended."""
+        """Note that a node has started or ended; of however many, the next tick reports once."""
         with self._lock:
-            self.core.health.saw_process(name, alive)
-        self.report()
+            self._news |= self.core.health.saw_process(name, alive)
 
     def report(self) -> None:
         """Publish each pair's status."""
         with self._lock:
             now_ns = self.clock.now_ns()
             refused, self._refused = self._refused, ""
+            self._news = False
             statuses = self.core.report(now_ns, now_ns, self.refusals.count, [refused] if refused else [])
             if not statuses:
                 return

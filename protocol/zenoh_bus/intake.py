@@ -7,14 +7,11 @@ from collections.abc import Callable
 from typing import Final, TypeAlias
 
 import zenoh
-import zenoh.ext
 from buddyline.protocol.delivery import CLOSE_S, FailureLatch
 
 INTAKE: Final = 8192
 
-AnySubscriber: TypeAlias = (
-    zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]
-)
+RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
 
 
 class Intake:
@@ -26,7 +23,7 @@ class Intake:
     def __init__(
         self,
         name: str,
-        subscriber: AnySubscriber,
+        subscriber: RingSubscriber,
         accept: Callable[[zenoh.Sample], None],
         failures: FailureLatch,
     ) -> None:

@@ -8,6 +8,7 @@ from buddyline.protocol.codec import MAX_MESSAGE_BYTES
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import Tls
+from buddyline.protocol.topics import TOPICS
 
 # lease, ms: a link that is silent for this time counts as dead. open_timeout, ms: how long a client waits for a hub
 # that accepts the connection but does not answer; Zenoh's default is ten seconds.
@@ -30,8 +31,30 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
         "connect/endpoints": [],
         **_COMMON,
         **_tls_settings(tls, "listen"),
+        "low_pass_filter": size_limits(),
     }
     return settings if access is None else {**settings, "access_control": access}
+
+
+def size_limits() -> list[dict[str, object]]:
+    """Return Zenoh's `low_pass_filter` for a hub: payloads above their topic's limit go no further.
+
+    Each client's caches and heartbeats are under `@adv`, which `**` does not match.
+    """
+    keys: dict[int, list[str]] = {}
+    for topic in TOPICS:
+        # Clients may have a namespace, which comes before the key; the hub itself has none.
+        keys.setdefault(topic.max_bytes, []).append(f"**/{topic.key_any()}")
+    return [
+        {
+            "id": f"at most {max_bytes} bytes",
+            "flows": ["ingress"],
+            "messages": ["put", "delete", "query", "reply"],
+            "key_exprs": [*of_size, *(f"{key}/@adv/**" for key in of_size)],
+            "size_limit": max_bytes,
+        }
+        for max_bytes, of_size in keys.items()
+    ]
 
 
 def client_settings(endpoint: str, namespace: str | None, tls: Tls | None = None) -> dict[str, object]:

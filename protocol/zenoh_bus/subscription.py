@@ -7,26 +7,28 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import zenoh
-import zenoh.ext
 from buddyline.protocol.bus import Received, held_order
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
 from buddyline.protocol.sequence import Gap, Source
 from buddyline.protocol.sequence import Sequence as Numbers
 from buddyline.protocol.topics import parse_key
-from buddyline.protocol.zenoh_bus.intake import INTAKE, AnySubscriber, Intake
+from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
 from buddyline.protocol.zenoh_bus.session import RETRY_S
 
 QUERY_S: Final = 2.0
-MAX_FETCHING: Final = 16
+# Threads that fetch, of one owner of keys and of all.
+MAX_FETCHING: Final = 8
+MOST_FETCHING: Final = 64
 FETCHES: Final = 16
 
 
 class ZenohSubscription:
     """A Subscription over Zenoh: samples in order, each once; missing ones are fetched if their publisher has them.
 
-    Zenoh's own recovery does most of this. It does not cover a publisher whose first samples were missed, or a gap
-    whose query was lost with the link, for example when the hub was frozen for longer than the lease.
+    A gap shows by a later sample, or by the publisher's heartbeat, which tells its last number. Zenoh's own advanced
+    subscriber is not used: it knows a publisher by the id that a sample states, which any client may state, and it does
+    not cover a publisher whose first samples were missed, or a gap whose query was lost with the link.
     """
 
     def __init__(
@@ -46,26 +48,23 @@ class ZenohSubscription:
         self._failures = failures
         self._lock = threading.Lock()
         self._sequence = Numbers(self._deliver)
-        self._fetching: set[threading.Thread] = set()
+        self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
-        subscribers = [self._declare(key_expr) for key_expr in key_exprs]
+        subscribers = [(key_expr, self._accept, self._declare(key_expr)) for key_expr in key_exprs]
+        if history:
+            beats = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
+            subscribers += [(beat, self._heed, self._declare(beat)) for beat in beats]
         if history:
             held = [sample for key_expr in key_exprs for sample in self._query(f"{key_expr}/@adv/pub/**")]
             for sample in sorted(held, key=_number):
                 self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
-        self._intakes = [
-            Intake(key_expr, subscriber, self._accept, failures)
-            for key_expr, subscriber in zip(key_exprs, subscribers, strict=True)
-        ]
+        self._intakes = [Intake(key_expr, subscriber, accept, failures) for key_expr, accept, subscriber in subscribers]
 
-    def _declare(self, key_expr: str) -> AnySubscriber:
+    def _declare(self, key_expr: str) -> RingSubscriber:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
-        if not self._history:
-            return self._session.declare_subscriber(key_expr, ring)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-        return zenoh.ext.declare_advanced_subscriber(self._session, key_expr, ring, recovery=recovery)
+        return self._session.declare_subscriber(key_expr, ring)
 
     @property
     def dropped(self) -> int:
@@ -95,20 +94,41 @@ class ZenohSubscription:
         if sample.source_info is None:
             self._deliver(sample)
             return
-        key = str(sample.key_expr)
-        parsed = parse_key(key)
-        newest_only = parsed is None or parsed[0].latest_only
+        source = _source(sample)
         with self._lock:
             gap = self._sequence.accept(
-                _source(sample), _number(sample), key, sample, recover=self._history, newest_only=newest_only
+                source,
+                _number(sample),
+                sample,
+                size_bytes=len(sample.payload),
+                recover=self._history,
+                newest_only=_newest_only(source.key),
             )
-            # Limited, so that a client that invents publishers with gaps does not cost a thread for each.
-            while gap is not None and len(self._fetching) >= MAX_FETCHING:
-                gap = self._sequence.close(gap, [])
-            if gap is not None:
-                thread = threading.Thread(target=self._fill, args=(gap,), name=f"bus fetch {key}", daemon=True)
-                self._fetching.add(thread)
-                thread.start()
+            self._start_filling(gap)
+
+    def _heed(self, sample: zenoh.Sample) -> None:
+        """Take a publisher's heartbeat: on its key and `@adv/pub/ZID/EID/_`, its last number as four bytes."""
+        key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
+        chunks, payload = rest.split("/"), sample.payload.to_bytes()
+        if sample.kind != zenoh.SampleKind.PUT or len(payload) != 4 or len(chunks) < 2 or not chunks[1].isdecimal():
+            return
+        source = Source(key, chunks[0], int(chunks[1]))
+        with self._lock:
+            last = int.from_bytes(payload, "little")
+            self._start_filling(self._sequence.told(source, last, newest_only=_newest_only(key)))
+
+    def _start_filling(self, gap: Gap | None) -> None:
+        """Fetch a gap in a thread of its own; the lock is held."""
+        # Limited by owner: a client that invents publishers with gaps takes no thread from another's.
+        while gap is not None and (
+            list(self._fetching.values()).count(gap.source.owner) >= MAX_FETCHING
+            or len(self._fetching) >= MOST_FETCHING
+        ):
+            gap = self._sequence.close(gap, [])
+        if gap is not None:
+            thread = threading.Thread(target=self._fill, args=(gap,), name=f"bus fetch {gap.source.key}", daemon=True)
+            self._fetching[thread] = gap.source.owner
+            thread.start()
 
     def _fill(self, gap: Gap) -> None:
         """Fetch the missing samples and continue; runs in its own thread, so that other publishers do not wait."""
@@ -120,21 +140,22 @@ class ZenohSubscription:
                     due = self._sequence.close(due, found)
         except Exception as error:
             if not self._stop.is_set():
-                self._failures.report(f"bus fetch {gap.key}", error)
+                self._failures.report(f"bus fetch {gap.source.key}", error)
         finally:
             with self._lock:
-                self._fetching.discard(threading.current_thread())
+                self._fetching.pop(threading.current_thread(), None)
 
     def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
         """Return the samples of a gap that its publisher still holds; ask again for some time if it does not answer."""
-        zid, eid = gap.source
-        # The sample after the gap has arrived, so the publisher has it: an answer that contains it is complete.
-        after = gap.missing[-1] + 1
-        selector = f"{gap.key}/@adv/pub/{zid}/{eid}/**?_sn={gap.missing[0]}..{after}"
+        # The gap's last sample, or the one after it, has been heard of: an answer that contains one is complete.
+        last = gap.missing[-1]
+        source = gap.source
+        selector = f"{source.key}/@adv/pub/{source.zid}/{source.eid}/**?_sn={gap.missing[0]}..{last + 1}"
         found: dict[int, zenoh.Sample] = {}
         for _ in range(FETCHES):
-            found.update((_number(sample), sample) for sample in self._query(selector))
-            if after in found or self._stop.wait(RETRY_S):
+            # An answer may come from anybody who may answer on this key, and say any source.
+            found.update((_number(sample), sample) for sample in self._query(selector) if _source(sample) == source)
+            if last in found or last + 1 in found or self._stop.wait(RETRY_S):
                 break
         return list(found.items())
 
@@ -160,8 +181,14 @@ class ZenohSubscription:
 
 
 def _source(sample: zenoh.Sample) -> Source:
-    info = sample.source_info
-    return ("", 0) if info is None else (str(info.source_id.zid), info.source_id.eid)
+    key, info = str(sample.key_expr), sample.source_info
+    return Source(key, "", 0) if info is None else Source(key, str(info.source_id.zid), info.source_id.eid)
+
+
+def _newest_only(key: str) -> bool:
+    """Tell whether of a key only the newest message counts."""
+    parsed = parse_key(key)
+    return parsed is None or parsed[0].latest_only
 
 
 def _number(sample: zenoh.Sample) -> int:

@@ -442,3 +442,16 @@ def test_a_handler_can_publish(client: Connect) -> None:
 )
 def test_key_expressions_match_chunks(key_expr: str, key: str, matches: bool) -> None:
     assert key_matches(key_expr, key) is matches
+
+
+def test_a_payload_above_its_topics_limit_is_not_sent_and_said_once(
+    client: Connect, caplog: pytest.LogCaptureFixture
+) -> None:
+    inbox, sender, receiver = Inbox(), client(), client()
+    receiver.subscribe(topics.DEPTH.key_any(), inbox)
+    publisher = sender.publisher(topics.DEPTH, "a")
+    assert not publisher.put_bytes(bytes(topics.DEPTH.max_bytes + 1))
+    assert not publisher.put_bytes(bytes(topics.DEPTH.max_bytes + 1))
+    assert publisher.put_bytes(bytes(topics.DEPTH.max_bytes))
+    assert [len(received.payload) for received in inbox.wait_for(1)] == [topics.DEPTH.max_bytes]
+    assert len([record for record in caplog.records if "not sent" in record.message]) == 1

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from buddyline.protocol import sequence
-from buddyline.protocol.sequence import Gap, Sequence
+from buddyline.protocol.sequence import Gap, Sequence, Source
 from hypothesis import given
 from hypothesis import strategies as st
 
-A, B = ("a", 1), ("b", 1)
+A, B = Source("buddyline/node/a/depth", "z", 1), Source("buddyline/node/b/depth", "z", 1)
+
+
+def name_of(source: Source) -> str:
+    return source.key.split("/")[2]
 
 
 class Listener:
@@ -18,14 +24,14 @@ class Listener:
         self.got: list[tuple[str, int]] = []
         self.sequence = Sequence(self.got.append)
 
-    def accept(self, source: tuple[str, int], number: int, **more: bool) -> Gap | None:
-        return self.sequence.accept(source, number, "key", (source[0], number), **more)
+    def accept(self, source: Source, number: int, **more: Any) -> Gap | None:
+        return self.sequence.accept(source, number, (name_of(source), number), **more)
 
     def close(self, gap: Gap, found: list[int]) -> Gap | None:
-        return self.sequence.close(gap, [(number, (gap.source[0], number)) for number in found])
+        return self.sequence.close(gap, [(number, (name_of(gap.source), number)) for number in found])
 
-    def numbers(self, source: tuple[str, int] = A) -> list[int]:
-        return [number for name, number in self.got if name == source[0]]
+    def numbers(self, source: Source = A) -> list[int]:
+        return [number for name, number in self.got if name == name_of(source)]
 
 
 @given(
@@ -33,11 +39,11 @@ class Listener:
     st.lists(st.integers(0, 5), max_size=60),
 )
 def test_all_available_samples_come_in_order_and_once(
-    samples: list[tuple[tuple[str, int], bool, bool]], delays: list[int]
+    samples: list[tuple[Source, bool, bool]], delays: list[int]
 ) -> None:
     """Some samples are lost on their way, some of those are still held; fetching takes a while."""
     listener, sent, held_by, open_gaps = Listener(), {A: 0, B: 0}, {A: [], B: []}, []
-    expected: dict[tuple[str, int], list[int]] = {A: [], B: []}
+    expected: dict[Source, list[int]] = {A: [], B: []}
     delay = iter(delays)
 
     def fetch(gap: Gap) -> Gap | None:
@@ -74,7 +80,7 @@ def test_samples_after_a_gap_wait_and_other_publishers_do_not() -> None:
     listener = Listener()
     listener.accept(A, 0)
     gap = listener.accept(A, 3)
-    assert gap == Gap(A, "key", range(1, 3), known=True)
+    assert gap == Gap(A, range(1, 3), known=True)
     assert listener.accept(A, 4) is None
     listener.accept(B, 0)
     assert listener.got == [("a", 0), ("b", 0)]
@@ -89,7 +95,7 @@ def test_a_second_gap_is_closed_after_the_first() -> None:
     first = listener.accept(A, 2)
     assert listener.accept(A, 5) is None
     second = listener.close(first, [1])
-    assert second == Gap(A, "key", range(3, 5), known=True)
+    assert second == Gap(A, range(3, 5), known=True)
     assert listener.numbers() == [0, 1, 2]
     assert listener.close(second, []) is None
     assert listener.numbers() == [0, 1, 2, 5]
@@ -99,7 +105,7 @@ def test_a_second_gap_is_closed_after_the_first() -> None:
 def test_samples_before_a_publishers_first_are_fetched_and_not_counted_as_missed() -> None:
     listener = Listener()
     gap = listener.accept(A, 5)
-    assert gap == Gap(A, "key", range(5), known=False)
+    assert gap == Gap(A, range(5), known=False)
     assert listener.close(gap, [3, 4]) is None
     assert listener.numbers() == [3, 4, 5]
     assert listener.sequence.missed == 0
@@ -144,8 +150,82 @@ def test_memory_for_publishers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
         listener.accept(A, number)
     assert listener.close(gap, [1]) is None
     assert listener.numbers() == [0, 1, 2, 3, 4]
-    assert listener.accept(A, 10) == Gap(A, "key", range(5, 10), known=True)
-    for name in ("x", "y"):
-        listener.accept((name, 1), 0)
-    assert listener.close(Gap(A, "key", range(5, 10), known=True), []) is None
-    assert listener.numbers() == [0, 1, 2, 3, 4]
+    assert listener.accept(A, 10) == Gap(A, range(5, 10), known=True)
+    for eid in (2, 3):
+        listener.accept(A._replace(eid=eid), 0)
+    # It was silent longest, so it is forgotten.
+    assert listener.close(Gap(A, range(5, 10), known=True), []) is None
+    assert listener.numbers() == [0, 1, 2, 3, 4, 0, 0]
+
+
+def test_samples_that_wait_are_bounded_in_bytes_by_owner(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sequence, "MAX_HELD_BYTES", 100)
+    listener = Listener()
+    for source in (A, B):
+        listener.accept(source, 0)
+        gap = listener.accept(source, 2, size_bytes=60)
+        for number in range(3, 10):
+            listener.accept(source, number, size_bytes=20)
+        # One more publisher of this owner finds no more room than for a single sample.
+        other = source._replace(eid=2)
+        listener.accept(other, 1, size_bytes=20)
+        listener.accept(other, 2, size_bytes=20)
+        assert listener.close(gap, [1]) is None
+        assert listener.numbers(source) == [0, 1, 2, 3, 4]
+
+
+def test_a_publisher_is_known_by_its_key_and_not_by_what_it_says_of_itself_alone() -> None:
+    listener = Listener()
+    for number in range(3):
+        listener.accept(B, number)
+    forged = Source(A.key, B.zid, B.eid)
+    assert listener.accept(forged, 10**6) == Gap(forged, range(10**6), known=False)
+    assert listener.accept(B, 3) is None
+    assert listener.numbers(B) == [0, 1, 2, 3]
+
+
+def test_whoever_invents_publishers_makes_others_forget_nothing() -> None:
+    listener = Listener()
+    listener.accept(B, 0)
+    for eid in range(2 * sequence.MAX_PUBLISHERS):
+        listener.accept(A._replace(eid=eid), 5)
+    assert listener.accept(B, 1) is None
+    assert listener.numbers(B) == [0, 1]
+
+
+def test_a_heartbeat_tells_of_the_last_sample_and_the_next_one_that_it_is_lost() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    assert listener.sequence.told(A, 0) is None
+    assert listener.sequence.told(A, 2) is None
+    gap = listener.sequence.told(A, 3)
+    assert gap == Gap(A, range(1, 3), known=True)
+    assert listener.sequence.told(A, 3) is None
+    # What comes meanwhile waits; what was late and is fetched as well comes once.
+    assert listener.accept(A, 2) is None
+    assert listener.accept(A, 3) is None
+    assert listener.close(gap, [1, 2]) is None
+    assert listener.numbers() == [0, 1, 2, 3]
+    assert listener.sequence.missed == 0
+
+
+def test_what_a_heartbeat_tells_of_and_nobody_has_is_missed_once() -> None:
+    listener = Listener()
+    listener.accept(A, 0)
+    listener.sequence.told(A, 4)
+    gap = listener.sequence.told(A, 4)
+    assert listener.close(gap, [2]) is None
+    assert listener.sequence.told(A, 4) is None
+    assert listener.accept(A, 5) is None
+    assert listener.numbers() == [0, 2, 5]
+    assert listener.sequence.missed == 3
+
+
+def test_of_a_state_the_newest_alone_is_fetched() -> None:
+    listener = Listener()
+    listener.sequence.told(A, 7, newest_only=True)
+    gap = listener.sequence.told(A, 7, newest_only=True)
+    assert gap == Gap(A, range(7, 8), known=False)
+    assert listener.close(gap, [7]) is None
+    assert listener.numbers() == [7]
+    assert listener.sequence.missed == 0

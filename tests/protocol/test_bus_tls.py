@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import queue
 import socket
 import struct
 import threading
@@ -12,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import zenoh
 from buddyline.protocol import topics
 from buddyline.protocol.access import access_rules
 from buddyline.protocol.bus import Received
@@ -20,6 +22,8 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
 from buddyline.protocol.security import RefusedError, Tls, refusal
 from buddyline.protocol.zenoh_bus import ZenohBus, connect, open_hub
+from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S, Process, buddyline, free_endpoint
 from tests.tools.identities import copy_of, expired, make_keys, tls
@@ -43,16 +47,25 @@ def join(endpoint: str, identity: Tls | None) -> ZenohBus:
 class Inbox:
     def __init__(self) -> None:
         self.keys: list[str] = []
+        self.received: list[Received] = []
         self._changed = threading.Condition()
 
     def __call__(self, received: Received) -> None:
         with self._changed:
             self.keys.append(received.key)
+            self.received.append(received)
             self._changed.notify_all()
 
     def wait_for(self, key: str) -> None:
         with self._changed:
             assert self._changed.wait_for(lambda: key in self.keys, PATIENCE_S), self.keys
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        with self._changed:
+            assert self._changed.wait_for(condition, PATIENCE_S), self.received[-20:]
+
+    def payloads(self, key: str) -> list[bytes]:
+        return [received.payload for received in self.received if received.key == key]
 
 
 def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
@@ -165,6 +178,68 @@ def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> No
             publisher.put_bytes(b'{"stamp_ns":%d}' % k)
         assert done.wait(PATIENCE_S), len(received)
         assert received == [b'{"stamp_ns":%d}' % k for k in range(60)]
+
+
+def raw(endpoint: str, identity: Tls) -> zenoh.Session:
+    """A client that says what it likes, with a certificate of its own."""
+    return zenoh.open(config_of(client_settings(endpoint, None, identity)))
+
+
+def source_of(session: zenoh.Session, key_expr: str, happen: Callable[[], object]) -> zenoh.SourceInfo:
+    """Return what a publisher says of itself in a sample that `happen` makes it send."""
+    heard: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    subscriber = session.declare_subscriber(key_expr, heard.put)
+    happen()
+    info = heard.get(timeout=PATIENCE_S).source_info
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert info is not None
+    return info
+
+
+@pytest.mark.parametrize(
+    ("role", "own"),
+    [("node-a", "node/a/candidates"), ("node-a", "node/a/depth"), ("surveyor", "node/b/mark")],
+)
+def test_nobody_can_mute_another_by_stating_its_source(keys: Path, role: str, own: str) -> None:
+    """The forger has heard b; on keys of its own it goes on in b's name, by puts, heartbeats and recovery answers."""
+    endpoint = tls_endpoint()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
+        join(endpoint, tls(keys, "node-b")) as b,
+        join(endpoint, tls(keys, "solver")) as solver,
+        join(endpoint, tls(keys, "viewer")) as recorder,
+    ):
+        forger = raw(endpoint, tls(keys, role))
+        everything, candidates = Inbox(), Inbox()
+        recorder.subscribe(topics.EVERYTHING, everything)
+        solver.subscribe(topics.CANDIDATES.key_any(), candidates)
+        publisher = b.publisher(topics.CANDIDATES, "b")
+        info = source_of(forger, "buddyline/node/b/candidates", lambda: publisher.put_bytes(b'{"stamp_ns":0}'))
+        identity = info.source_id
+        beside = f"@adv/pub/{identity.zid}/{identity.eid}/_"
+
+        def answer(query: zenoh.Query) -> None:
+            for key in ("buddyline/node/b/candidates", f"buddyline/{own}"):
+                query.reply(key, b'{"stamp_ns":-1}')
+
+        for key in (f"buddyline/{own}/{beside}", f"buddyline/node/b/candidates/{beside}", "buddyline/**/@adv/**"):
+            forger.declare_queryable(key, answer)
+        for key in (f"buddyline/{own}", "buddyline/node/b/candidates"):
+            for number in (1, 2, 50, 10**6, 2**31):
+                forger.put(key, b'{"stamp_ns":-1}', source_info=zenoh.SourceInfo(identity, number))
+            for number in (60, 10**6):
+                forger.put(f"{key}/{beside}", number.to_bytes(4, "little"))
+            forger.delete(key, source_info=zenoh.SourceInfo(identity, 70))
+        # The forger's words have arrived when a last one without a number has.
+        forger.put(f"buddyline/{own}", b'{"stamp_ns":-2}')
+        everything.wait_for(f"buddyline/{own}")
+        for k in range(1, 100):
+            publisher.put_bytes(b'{"stamp_ns":%d}' % k)
+        expected = [b'{"stamp_ns":%d}' % k for k in range(100)]
+        for inbox in (everything, candidates):
+            inbox.wait_until(lambda: expected[-1] in inbox.payloads("buddyline/node/b/candidates"))  # noqa: B023
+            assert inbox.payloads("buddyline/node/b/candidates") == expected
+        forger.close()  # type: ignore[no-untyped-call]
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
 from buddyline.protocol.zenoh_bus import hub as hub_module
 from buddyline.protocol.zenoh_bus import subscription as subscription_module
+from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S
 
@@ -111,6 +113,10 @@ class Inbox:
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S), numbers(self.received)
             return numbers(self.received)
+
+    def wait_for_sizes(self, count: int) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S)
 
 
 @contextmanager
@@ -388,3 +394,22 @@ def test_lost_samples_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
             foreign.put("buddyline/node/a/depth", "8")
             assert inbox.wait_for(6)[-1] == 8
         assert subscription.missed == 3
+
+
+@pytest.mark.parametrize("namespace", [None, "tether/two"])
+def test_the_hub_passes_on_no_payload_above_its_topics_limit(namespace: str | None) -> None:
+    """Whatever a client sends that is not ours: images may be larger than all else."""
+    endpoint = free_endpoint()
+    with open_hub(endpoint), run_client(endpoint, namespace=namespace) as receiver:
+        inbox = Inbox()
+        receiver.subscribe(topics.EVERYTHING, inbox)
+        sender = zenoh.open(config_of(client_settings(endpoint, namespace)))
+        image, depth = topics.IMAGE.max_bytes, topics.DEPTH.max_bytes
+        sizes = {"image": [image, image + 1, 1], "depth": [depth, depth + 1, 2]}
+        for name, all_sizes in sizes.items():
+            for size in all_sizes:
+                sender.put(f"buddyline/node/a/{name}", b"1" * size)
+                sender.put(f"buddyline/node/a/{name}/@adv/pub/1/1/_", b"1" * (size + 1))
+        inbox.wait_for_sizes(4)
+        assert sorted(len(received.payload) for received in inbox.received) == [1, 2, depth, image]
+        sender.close()  # type: ignore[no-untyped-call]
