@@ -12,13 +12,14 @@ from typing import Final, TypeVar
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.earlier import EARLIER_S, EarlierFilter
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
-from buddyline.solver_service.track.start import CLOCK_S, constants_of
-from buddyline.solver_service.track.state import CLOCK, NAV, PHI, R_, State
+from buddyline.solver_service.track.start import CLOCK_S, broad_start
+from buddyline.solver_service.track.state import CLOCK, NAV, State
 from buddyline.solver_service.track.stepping import Guide
 from buddyline.solver_service.track.trail import Trail
 
@@ -27,12 +28,11 @@ UNTOLD_CLOCK_S: Final = 0.1
 CLOCK_LEFT_S: Final = 0.003
 CLOCK_WITHOUT_S: Final = 0.003
 FAR_CLOCK_S: Final = 0.06
+# A track whose start is so near to the dive's is left as it is.
+LEAST_EARLIER_S: Final = 0.15
 CLOCK_ROUNDS: Final = 3
 # Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
-# A later pass starts as if nothing were known but roughly where: its lights tell the rest.
-BROAD_R_M: Final = 0.5
-BROAD_TURN_RAD: Final = 0.15
 # A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
 PIECE_NS: Final = 10 * S_NS
 MARGIN_NS: Final = S_NS
@@ -187,15 +187,40 @@ def smooth(
         second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
     # A track that has just begun has not yet learned how much its units shake.
     strain = max(part.strain for part in parts)
+    since_s = -math.inf
     for part in parts:
         path = smoothed(part.steps)
         guide_by(second, path)
+        earlier = _path_before(records, clock_ns, path, since_s)
+        if earlier is not None:
+            guide_by(second, earlier)
+            path = earlier
         state = replace(path.state(0), clock_s=0.0)
-        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *broad_start(second, state), strain)
+        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest)
+        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, strain)
+        since_s = part.end_s
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
-    del first, parts, part, learned, path
+    del first, parts, part, learned, path, earlier
     pass_over(second, records, ())
     return _smoothed(second, parts_of(second), outputs_ns)
+
+
+def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Path, since_s: float) -> Path | None:
+    """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
+    track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=UNTOLD_CLOCK_S)
+    track.clock_ns = clock_ns
+    first_ns = min(frame.stamp_ns for record in records for frame in record.frames[:1])
+    track.seconds(0, first_ns)
+    start_s = float(path.t_s[0])
+    begin_s = max(since_s, track.seconds(0, first_ns) + 0.1, start_s - EARLIER_S)
+    if start_s - begin_s < LEAST_EARLIER_S:
+        return None
+    before_ns, after_ns = (round((start_s - at_s) * 1e9) for at_s in (begin_s - 1.0, start_s + 1.0))
+    start_ns = track.stamp_ns(start_s)
+    for node, record in enumerate(records):
+        shift_ns = clock_ns if node else 0
+        feed(track, node, record.between(start_ns - before_ns + shift_ns, start_ns - after_ns + shift_ns))
+    return track.path_before(path, begin_s)
 
 
 def _in_order(record: NodeRecord) -> NodeRecord:
@@ -225,17 +250,6 @@ def parts_of(track: TrackFilter) -> list[Estimate]:
     if track.main is not None and track.main.confirmed and track.main.steps:
         parts.append(track.main)
     return parts
-
-
-def broad_start(track: TrackFilter, state: State) -> tuple[State, Floats]:
-    """Give a state to start again from, with a covariance that holds nothing of the lights yet."""
-    _, variances = constants_of(track.nodes, state.R, state.r_m, track.clock_sigma_s)
-    P = np.diag(variances)
-    P[R_, R_] = BROAD_R_M**2 * np.eye(3)
-    level = 0.15**2 * np.eye(3)
-    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
-    P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
-    return state, P
 
 
 def guide_by(track: TrackFilter, path: Path) -> None:

@@ -47,6 +47,10 @@ class TrackIntake:
             self.epoch_ns = stamp_ns - stamp_ns % 86_400_000_000_000
         return (stamp_ns - (self.clock_ns if node else 0) - self.epoch_ns) * 1e-9
 
+    def stamp_ns(self, t_s: float) -> int:
+        """Give the stamp of A's clock at a time since the epoch."""
+        return (self.epoch_ns or 0) + round(t_s * 1e9)
+
     def between(self, stamp_ns: int) -> float:
         """Give a stamp between both clocks, as those of fixes and rows are, as `seconds` does."""
         return self.seconds(0, stamp_ns - self.clock_ns // 2)

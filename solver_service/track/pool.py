@@ -71,7 +71,9 @@ class TrackPool(TrackSteps):
             state = self._rewound(estimate, estimate.start_s)
             learned = REPLAY_SIGMAS * np.sqrt(np.diag(estimate.covariance))
             range_m = float(np.linalg.norm(state.r_m))
-            _, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
+            untold, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
+            # What was learned of the constants is learned anew: the same lights must not count twice.
+            state = untold.moved(state.r_m, state.v_mps, state.R)
             P = np.diag(variances)
             P[R_, R_] = np.diag(np.maximum(learned[R_], REPLAY_SHARE * range_m) ** 2)
             level = REPLAY_RAD**2 * np.eye(3)

@@ -10,7 +10,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow, rows_of
-from buddyline.solver_service.track.state import NAV, ROW, State
+from buddyline.solver_service.track.state import NAV, ROW, SIZE, State
 from buddyline.solver_service.track.strapdown import predicted
 from buddyline.solver_service.track.trail import Look, Trail
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ class Path:
     """Smoothed steps as columns, in order of time.
 
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
-    covariance of COLUMNS, its upper half.
+    covariance of COLUMNS, its upper half. oldest (SIZE, SIZE): the whole covariance at the first step.
     """
 
     t_s: Floats
@@ -37,6 +37,7 @@ class Path:
     states: Floats
     halves: Floats
     looks: Sequence[tuple[Look, ...]]
+    oldest: Floats
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -70,6 +71,7 @@ def smoothed(steps: Trail) -> Path:
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
         looks=looks,
+        oldest=np.empty((SIZE, SIZE)),
     )
     later = None
     for k, step in zip(range(count - 1, -1, -1), steps.backward(), strict=True):
@@ -88,6 +90,8 @@ def smoothed(steps: Trail) -> Path:
         path.rates_radps[k], path.states[k], path.halves[k] = step.rates_radps, state.to_row(), P[_BLOCK_UPPER]
         looks[k] = step.looks
         later = step
+    if count:
+        path.oldest[:] = P
     return path
 
 

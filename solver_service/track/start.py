@@ -17,6 +17,7 @@ from buddyline.solver_service.track.state import (
     GYRO_BIAS,
     LEVER,
     MOUNT,
+    NAV,
     PHI,
     R_,
     SIZE,
@@ -35,6 +36,11 @@ DELAY_TOLD_S: Final = 0.001
 DELAY_UNTOLD_S: Final = 0.004
 CLOCK_S: Final = 0.05
 DEPTH_OFFSET_M: Final = 0.2
+# A later pass starts as if nothing were known but roughly where: its lights tell the rest.
+BROAD_R_M: Final = 0.5
+BROAD_TURN_RAD: Final = 0.15
+BROAD_SIGMAS: Final = 4.0
+LEAST_BROAD: Final = 0.005
 
 
 def constants_of(
@@ -65,6 +71,28 @@ def constants_of(
     sigma[CLOCK] = clock_sigma_s
     sigma[DEPTH_OFFSET] = DEPTH_OFFSET_M
     return state, sigma**2
+
+
+def broad_start(
+    nodes: tuple[TrackNode, TrackNode], state: State, clock_sigma_s: float = CLOCK_S, known: Floats | None = None
+) -> tuple[State, Floats]:
+    """Give a state to start again from, with a covariance that holds next to nothing of the lights yet.
+
+    known (SIZE, SIZE): its covariance by an earlier pass, of which BROAD_SIGMAS are kept: from a broader start the
+    first updates would be far from linear.
+    """
+    _, variances = constants_of(nodes, state.R, state.r_m, clock_sigma_s)
+    P = np.diag(variances)
+    P[R_, R_] = BROAD_R_M**2 * np.eye(3)
+    level = BROAD_TURN_RAD**2 * np.eye(3)
+    P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
+    P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
+    if known is not None:
+        least = np.diag([LEAST_BROAD**2] * NAV)
+        narrow = BROAD_SIGMAS**2 * known[:NAV, :NAV] + least
+        P[:NAV, :NAV] = P[:NAV, :NAV] @ np.linalg.solve(P[:NAV, :NAV] + narrow, narrow)
+        P = 0.5 * (P + P.T)
+    return state, P
 
 
 def tilt_of(force_mps2: Floats) -> Floats | None:
