@@ -66,8 +66,8 @@ class Lights(NamedTuple):
         return Lights._make(values[index] for values in self)
 
 
-def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
-    """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture."""
+def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float) -> Lights:
+    """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture. water: its water_level."""
     kept = distinct(proposals.centre_px, proposals.radius_px, _MAX_MEASURED)
     kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR)))]
     centre, radius_px, outstanding = proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept]
@@ -80,7 +80,6 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals) -> Lights:
         level[1] = weakest_channel(rings.pixels)
     peak = np.minimum(level[:, :, :_CORE_RINGS].max(axis=(2, 3)), _CLIPPED)
     ground = _low(level[:, :, -4:], 0.2)
-    water = _water_level(image)
     if colour:
         np.minimum(ground[1], water, out=ground[1])
     height = peak - ground
@@ -189,7 +188,7 @@ def _at_most(step_px: Floats, length_px: Floats) -> Floats:
     return np.asarray(step_px * np.minimum(length_px / own_px, 1.0)[:, None], np.float32)
 
 
-def _water_level(image: NDArray[np.uint8]) -> float:
+def water_level(image: NDArray[np.uint8]) -> float:
     """Return the 20 % quantile of a picture's weakest channel, in grey levels."""
     # Few rows, but many pixels of each: the pixels of one row are adjacent in memory.
     some = image[::32, ::16]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
@@ -36,8 +36,10 @@ _ROW, _COLUMN = np.divmod(np.arange(_WINDOW**2), _WINDOW)
 _MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.float32)
 
 
-Keep: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float32]], NDArray[np.bool_]]
-"""Which places count: of their centres (N, 2), px of the whole picture, and their octaves' steps (N,), px."""
+Layout: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float32]], tuple[NDArray[np.bool_], NDArray[np.float64]]]
+"""Which places of a loaded picture count, and where the part that each is in begins in the whole picture, (N, 2) px.
+
+Its arguments: the places' centres (N, 2), px of the loaded picture, and their octaves' steps (N,), px."""
 
 
 @dataclass(slots=True, eq=False)
@@ -51,15 +53,6 @@ class Proposals:
     centre_px: NDArray[np.float32]
     radius_px: NDArray[np.float32]
     outstanding: NDArray[np.float32]
-
-    @staticmethod
-    def joined(parts: Sequence[Proposals]) -> Proposals:
-        """Return the places of all parts, in order."""
-        outstanding = np.concatenate([part.outstanding for part in parts])
-        order = np.argsort(-outstanding, kind="stable")
-        centre_px = np.concatenate([part.centre_px for part in parts])
-        radius_px = np.concatenate([part.radius_px for part in parts])
-        return Proposals(centre_px[order], radius_px[order], outstanding[order])
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,18 +140,19 @@ class ProposalFinder:
         self,
         contrast_min: float,
         clutter_gain: float,
-        keep: Keep | None = None,
-        origin_px: tuple[int, int] = (0, 0),
+        layout: Layout | None = None,
     ) -> Proposals:
         """Find the most outstanding places of the loaded picture, 16 by default, or up to 64 that clearly stand out.
 
         A place needs a contrast of contrast_min grey levels plus clutter_gain times the mean contrast of its
-        neighbourhood. keep: which places count; None for all. origin_px: (u, v) of the loaded picture's first pixel in
-        the whole picture.
+        neighbourhood. layout: of a picture that is made of parts of another; None for a whole one. A finder is for
+        the one or for the other.
         """
         below: NDArray[np.uint8] | None = None
-        for octave in reversed(self._octaves):
-            octave.measure(below)
+        for i, octave in reversed(list(enumerate(self._octaves))):
+            # Of parts of a picture the last octave is only the surround of the one before: it has no places.
+            if layout is None or i < len(self._octaves) - 1:
+                octave.measure(below)
             below = octave.level
         if self._octaves:
             # One long row for OpenCV, which compares it many times faster than numpy does.
@@ -173,35 +167,28 @@ class ProposalFinder:
         places = places[self._marks[places] != 0]
         contrast = self._contrast[places].astype(np.float32)
         clutter = self._clutter[self._cell_of[places]].astype(np.float32)
-        outstanding = contrast / (_NOISE + clutter)
-        outstanding[contrast < contrast_min + clutter_gain * clutter] = 0.0
-        if keep is not None:
-            clear_of = np.flatnonzero(outstanding)
-            clear_of = clear_of[keep(*self._whereabouts(places[clear_of], origin_px))]
-            places, contrast, outstanding = places[clear_of], contrast[clear_of], outstanding[clear_of]
+        kept = np.flatnonzero(contrast >= np.maximum(contrast_min + clutter_gain * clutter, np.float32(1e-3)))
+        places, contrast = places[kept], contrast[kept]
+        outstanding = contrast / (_NOISE + clutter[kept])
+        which = np.searchsorted(self._starts, places, side="right") - 1
+        start, step, size = self._starts[which], self._steps_px[which], self._sizes[which]
+        at = np.stack(np.divmod(places - start, size[:, 1]), axis=1)
+        origin_px = np.zeros((1, 2))
+        if layout is not None:
+            inside, origin_px = layout((at[:, ::-1] + 0.5) * step[:, None] - 0.5, step)
+            outstanding = np.where(inside, outstanding, np.float32(0.0))
         clear = int(np.count_nonzero(outstanding >= CLEAR))
         order = np.argsort(-outstanding, kind="stable")[: min(max(clear, self._at_least), _AT_MOST)]
         order = order[outstanding[order] > 0.0]
-        places = places[order]
-        which = np.searchsorted(self._starts, places, side="right") - 1
-        start, step = self._starts[which], self._steps_px[which]
-        size = self._sizes[which]
-        at = np.array(np.divmod(places - start, size[:, 1])).T
+        places, start, step, size, at = places[order], start[order], step[order], size[order], at[order]
         corner = np.minimum(np.maximum(at - _WINDOW // 2, 0), size - _WINDOW)
         across = _ACROSS + (corner[:, 0] * size[:, 1] + corner[:, 1] + start)[:, None]
         level = self._level.take((across[:, None] + (_ACROSS * size[:, 1:])[:, :, None]).reshape(-1, _WINDOW**2))
         middle, radius = _settle(level.astype(np.float32), self._level[places].astype(np.float32), contrast[order])
-        centre_px = (corner[:, ::-1] + middle + 0.5) * step[:, None] - 0.5 + origin_px
+        # The sum in float64: the same place comes out the same to the last bit, in a part and in the whole picture.
+        centre_px = (corner[:, ::-1] + middle + 0.5) * step[:, None] - 0.5
+        centre_px += origin_px if layout is None else origin_px[order]
         return Proposals(centre_px.astype(np.float32), radius * step, outstanding[order])
-
-    def _whereabouts(
-        self, places: NDArray[np.intp], origin_px: tuple[int, int]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """Return the centres (N, 2) of pixels of the pyramid in the whole picture, and their steps (N,), px."""
-        which = np.searchsorted(self._starts, places, side="right") - 1
-        step = self._steps_px[which]
-        row, column = np.divmod(places - self._starts[which], self._sizes[which, 1])
-        return (np.stack((column, row), axis=1) + 0.5) * step[:, None] - 0.5 + origin_px, step
 
     def _allocate(self, shape: tuple[int, ...]) -> None:
         self._shape = shape

@@ -20,31 +20,22 @@ MARGIN: Final = 8
 LARGEST_OCTAVE: Final = 3
 # By so much the octaves' limits are lower than a light's radius.
 REACH: Final = 1.2
-# Each tile costs some time whatever its size: as much as so many px of the base.
-TILE_COSTS_PX2: Final = 15_000
-# Tiles that cost more than this share of the whole picture save too little.
-MOST_COST: Final = 0.6
-# Places that are found in a tile.
-AT_LEAST: Final = 6
+# Tiles that cover more than this share of the picture save too little.
+MOST_COVERED: Final = 0.5
+# Places that are found for each region.
+AT_LEAST: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """A square of the picture around some regions.
+    """A square of the picture around a region. origin_px: (u, v) of its first pixel.
 
-    origin_px: (u, v) of its first pixel. side: px of the pyramid's base. octaves: of its pyramid, with one that only
-    serves as the surround of the last but one.
+    cut: whether what the region's places depend on goes on beyond the picture's upper or lower edge.
     """
 
-    regions: tuple[Region, ...]
+    region: Region
     origin_px: tuple[int, int]
-    side: int
-    octaves: int
-
-    @property
-    def cost_px2(self) -> int:
-        """What its search costs, px of the base."""
-        return self.side * self.side + TILE_COSTS_PX2
+    cut: bool
 
 
 class RegionFinder:
@@ -54,12 +45,9 @@ class RegionFinder:
     """
 
     def __init__(self, focal_px: float, step_px: int) -> None:
+        self._focal_px = focal_px
         self._step_px = step_px
-        self._finders = {
-            (side, octaves): ProposalFinder(focal_px, octaves, AT_LEAST)
-            for side in SIDES
-            for octaves in range(2, LARGEST_OCTAVE + 3)
-        }
+        self._mosaics: dict[tuple[int, int, int], _Mosaic] = {}
 
     def find(
         self, image: NDArray[np.uint8], regions: Sequence[Region], contrast_min: float, clutter_gain: float
@@ -68,60 +56,36 @@ class RegionFinder:
 
         contrast_min, clutter_gain: as in ProposalFinder.find.
         """
-        tiles = self._tiles(image.shape, regions)
-        if tiles is None:
-            return None
-        found = []
-        for tile in tiles:
-            (u_px, v_px), side_px = tile.origin_px, tile.side * self._step_px
-            finder = self._finders[tile.side, tile.octaves]
-            finder.load(image[v_px : v_px + side_px, u_px : u_px + side_px])
-            keep = _InRegions(tile.regions, self._step_px << (tile.octaves - 2))
-            found.append(finder.find(contrast_min, clutter_gain, keep, tile.origin_px))
-        return Proposals.joined(found)
-
-    def _tiles(self, shape: tuple[int, ...], regions: Sequence[Region]) -> list[_Tile] | None:
-        """Return tiles for the regions, one for several where that costs less; None where they cost too much."""
-        tiles: list[_Tile] = []
-        for region in regions:
-            alone = self._tile(shape, (region,))
-            if alone is None:
-                return None
-            best, saved = None, 0
-            for i, tile in enumerate(tiles):
-                joined = self._tile(shape, (*tile.regions, region))
-                if joined is not None and tile.cost_px2 + alone.cost_px2 - joined.cost_px2 > saved:
-                    best, saved = (i, joined), tile.cost_px2 + alone.cost_px2 - joined.cost_px2
-            if best is None:
-                tiles.append(alone)
-            else:
-                tiles[best[0]] = best[1]
-        cost_px2 = sum(tile.cost_px2 for tile in tiles) * self._step_px**2
-        return tiles if cost_px2 <= MOST_COST * shape[0] * shape[1] else None
-
-    def _tile(self, shape: tuple[int, ...], regions: tuple[Region, ...]) -> _Tile | None:
-        """Return the smallest tile that holds these regions, with what their places depend on; None for none."""
-        reach_px = [self._reach_px(region) for region in regions]
-        spans = []
-        for axis in (0, 1):
-            low = min(region.centre_px[axis] - reach for region, reach in zip(regions, reach_px, strict=True))
-            high = max(region.centre_px[axis] + reach for region, reach in zip(regions, reach_px, strict=True))
-            spans.append((low, high))
         octaves = max(map(self._octave, regions)) + 2
         # A tile begins where a pixel of its last octave does, so that its pixels are those of the whole picture.
         aligned_px = self._step_px << (octaves - 1)
-        wanted = (max(high - low for low, high in spans) + aligned_px) / self._step_px
-        side = next((side for side in SIDES if side >= wanted), None)
-        if side is None:
+        wanted_px = 2.0 * max(map(self._reach_px, regions)) + aligned_px
+        side_px = next((side * self._step_px for side in SIDES if side * self._step_px >= wanted_px), None)
+        height, width = image.shape[:2]
+        if side_px is None or side_px > min(height, width):
             return None
+        if len(regions) * side_px * side_px > MOST_COVERED * height * width:
+            return None
+        tiles = [self._tile(region, side_px, aligned_px, width, height) for region in regions]
+        # In a mosaic one tile's edge is another's, and not the picture's.
+        mosaics = [[tile] for tile in tiles] if any(tile.cut for tile in tiles) else [tiles]
+        found = []
+        for group in mosaics:
+            mosaic = self._mosaics.get((len(group), side_px, octaves))
+            if mosaic is None:
+                finder = ProposalFinder(self._focal_px, octaves, AT_LEAST * len(group))
+                mosaic = self._mosaics[len(group), side_px, octaves] = _Mosaic(finder, side_px)
+            found.append(mosaic.find(image, group, self._step_px << (octaves - 2), contrast_min, clutter_gain))
+        return found[0] if len(found) == 1 else _joined(found)
+
+    def _tile(self, region: Region, side_px: int, aligned_px: int, width: int, height: int) -> _Tile:
         origin = []
-        for (low, high), size_px in zip(spans, (shape[1], shape[0]), strict=True):
-            last_px = size_px - side * self._step_px
-            if last_px < 0:
-                return None
-            begin_px = round((0.5 * (low + high) - 0.5 * side * self._step_px) / aligned_px) * aligned_px
-            origin.append(max(min(begin_px, last_px // aligned_px * aligned_px), 0))
-        return _Tile(regions, (origin[0], origin[1]), side, octaves)
+        for centre_px, size_px in zip(region.centre_px, (width, height), strict=True):
+            begin_px = round((centre_px - 0.5 * side_px) / aligned_px) * aligned_px
+            origin.append(max(min(begin_px, (size_px - side_px) // aligned_px * aligned_px), 0))
+        reach_px = self._reach_px(region)
+        cut = not reach_px <= region.centre_px[1] <= height - reach_px
+        return _Tile(region, (origin[0], origin[1]), cut)
 
     def _reach_px(self, region: Region) -> float:
         """Return how far around a region's centre the pixels count."""
@@ -136,16 +100,52 @@ class RegionFinder:
         return min(int(math.log2(max(REACH * region.light_px / self._step_px, 1.0))), LARGEST_OCTAVE)
 
 
-class _InRegions:
-    """Keeps the places within some regions, of octaves with pixels of at most coarsest_px."""
+class _Mosaic:
+    """Tiles of a picture, one below the other, searched as one picture: each search costs much, whatever its size."""
 
-    def __init__(self, regions: Sequence[Region], coarsest_px: int) -> None:
-        self._coarsest_px = coarsest_px
-        self._centre_px = np.array([region.centre_px for region in regions])
-        self._radius_px = np.array([region.radius_px for region in regions])
+    def __init__(self, finder: ProposalFinder, side_px: int) -> None:
+        self._finder = finder
+        self._side_px = side_px
+        self._pixels = np.zeros((0, 0), np.uint8)
 
-    def __call__(self, centre_px: NDArray[np.float64], step_px: NDArray[np.float32]) -> NDArray[np.bool_]:
-        away = centre_px[:, None] - self._centre_px
-        near = np.hypot(away[..., 0], away[..., 1]) <= self._radius_px + step_px[:, None]
-        kept: NDArray[np.bool_] = near.any(1) & (step_px <= self._coarsest_px)
-        return kept
+    def find(
+        self,
+        image: NDArray[np.uint8],
+        tiles: Sequence[_Tile],
+        coarsest_px: int,
+        contrast_min: float,
+        clutter_gain: float,
+    ) -> Proposals:
+        """Find the places within the tiles' regions, of octaves with pixels of at most coarsest_px."""
+        side_px = self._side_px
+        shape = (len(tiles) * side_px, side_px, *image.shape[2:])
+        if self._pixels.shape != shape:
+            self._pixels = np.empty(shape, np.uint8)
+        for i, tile in enumerate(tiles):
+            u, v = tile.origin_px
+            self._pixels[i * side_px : (i + 1) * side_px] = image[v : v + side_px, u : u + side_px]
+        # Where each tile begins, less where it begins in the mosaic.
+        origin = np.array([tile.origin_px for tile in tiles], np.float64)
+        origin[:, 1] -= np.arange(len(tiles)) * side_px
+        centre = np.array([tile.region.centre_px for tile in tiles]) - origin
+        radius = np.array([tile.region.radius_px for tile in tiles])
+
+        def layout(
+            centre_px: NDArray[np.float64], step_px: NDArray[np.float32]
+        ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+            of = (centre_px[:, 1] // side_px).astype(np.intp)
+            away = centre_px - centre[of]
+            near = (away * away).sum(1) <= (radius[of] + step_px) ** 2
+            return near & (step_px <= coarsest_px), origin[of]
+
+        self._finder.load(self._pixels)
+        return self._finder.find(contrast_min, clutter_gain, layout)
+
+
+def _joined(parts: Sequence[Proposals]) -> Proposals:
+    """Return the places of all parts, the most outstanding first."""
+    outstanding = np.concatenate([part.outstanding for part in parts])
+    order = np.argsort(-outstanding, kind="stable")
+    centre_px = np.concatenate([part.centre_px for part in parts])
+    radius_px = np.concatenate([part.radius_px for part in parts])
+    return Proposals(centre_px[order], radius_px[order], outstanding[order])

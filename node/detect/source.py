@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from buddyline.node.detect.centre import Centres, locate_sources
 from buddyline.node.detect.detection import Detection, Region, check_image, focal_of
-from buddyline.node.detect.lights import Lights, distinct, measure_lights
+from buddyline.node.detect.lights import Lights, distinct, measure_lights, water_level
 from buddyline.node.detect.proposals import ProposalFinder, Proposals
 from buddyline.node.detect.regions import RegionFinder
 from buddyline.node.detect.rings import RAY_UV, Floats
@@ -59,6 +59,7 @@ class SourceDetector:
         self._noise: float | None = None
         # Of the last whole picture.
         self._contrast_min = _CONTRAST_MIN[0]
+        self._water = 0.0
         self._shape: tuple[int, ...] = ()
         self._near: RegionFinder | None = None
 
@@ -71,6 +72,7 @@ class SourceDetector:
         if image.shape != self._shape:
             focal_px = self._focal_px or focal_of(image.shape[1])
             self._shape, self._near = image.shape, RegionFinder(focal_px, self._finder.base_step_px)
+        self._water = water_level(image)
         return self._measured(image, self._finder.find(self._contrast_min, self._clutter_gain))
 
     def detect_near(self, image: NDArray[np.uint8], regions: Sequence[Region]) -> list[Detection] | None:
@@ -78,8 +80,8 @@ class SourceDetector:
 
         A lamp that stands out enough for the whole picture's search is found at the same place as there, because it is
         proposed and measured from the same pixels. Its score may differ a little: the clutter of the coarser octaves
-        is that of the tile around the region, not of a wider neighbourhood. The noise is that of the last whole
-        picture.
+        is that of the tile around the region, not of a wider neighbourhood. The noise and
+        the water's brightness are those of the last whole picture.
         """
         check_image(image)
         if self._near is None or image.shape != self._shape:
@@ -94,7 +96,7 @@ class SourceDetector:
         """Measure, score and locate the proposed places, and keep the likeliest."""
         if len(proposals.radius_px) == 0:
             return []
-        lights = measure_lights(image, proposals)
+        lights = measure_lights(image, proposals, self._water)
         score = _score(lights)
         order = np.argsort(-score, kind="stable")
         order = order[distinct(lights.centre_px[order], lights.core_px[order], table[-1][0])]
