@@ -96,6 +96,12 @@ def detect(parser: argparse.ArgumentParser) -> None:
     _json(parser, "JSON lines on stdout (the default without -o)")
 
 
+def after(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `after`."""
+    parser.add_argument("folders", nargs="+", metavar="FOLDER|LOG.mcap", help="what each node recorded")
+    parser.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder for poses, track and report")
+
+
 def tune(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `tune`."""
     parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")

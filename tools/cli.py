@@ -112,6 +112,11 @@ COMMANDS: Final = (
         ("solve a.mcap b.mcap -o poses.mcap", "solve dive.mcap -o p.mcap --checks range"),
     ),
     Command(
+        "after",
+        "after a dive: from the nodes' folders to poses, track and report at once",
+        ("after a/ b/ -o dive/",),
+    ),
+    Command(
         "align",
         "find the offset between two nodes' clocks from a dive in which they moved",
         ("align a.mcap b.mcap",),

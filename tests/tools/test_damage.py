@@ -46,6 +46,7 @@ DAMAGES = {
 COMMANDS = {
     "solve": ["solve", "IN", "-o", "OUT.mcap"],
     "solve, pictures": ["solve", "PICTURES", "-o", "OUT.mcap"],
+    "after": ["after", "IN", "-o", "OUT"],
     "align": ["align", "IN"],
     "evaluate": ["evaluate", "IN", "--json"],
     "evaluate, truth": ["evaluate", "WHOLE", "--truth", "IN", "--json"],

@@ -1,0 +1,167 @@
+"""`buddyline after`: from the nodes' folders to a solved dive and its report, in one command.
+
+For two nodes that never heard each other during the dive: everything that is done by hand otherwise, in the same order.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import logging
+from collections.abc import Iterable
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.topics import parse_key
+from buddyline.tools.losses import collected
+from buddyline.tools.losses import report as report_losses
+
+log = logging.getLogger(__name__)
+
+# Logs that overlap, or are this close, are of one dive: a node may have been started again.
+SAME_DIVE_S: Final = 120.0
+# A smaller offset of the clocks moves a light by less than its noise, whatever its sigma.
+LEAST_OFFSET_S: Final = 0.001
+
+
+@dataclass
+class Outing:
+    """The logs of all nodes between one start and one end. nodes: which nodes recorded them."""
+
+    start_ns: int
+    end_ns: int
+    logs: list[Path] = field(default_factory=list)
+    nodes: set[str] = field(default_factory=set)
+
+    @property
+    def words(self) -> str:
+        """When it was and who recorded it."""
+        began = datetime.fromtimestamp(self.start_ns / S_NS, UTC)
+        minutes = (self.end_ns - self.start_ns) / 60 / S_NS
+        return f"{began:%Y-%m-%d %H:%M} UTC, {minutes:.1f} min, {', '.join(sorted(self.nodes))}"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve every dive of the folders; return 1 where one could not be solved, or a log was damaged."""
+    folder = Path(args.output)
+    if folder.exists():
+        raise BuddylineError(f"{folder}: exists already; name a new folder with -o")
+    found = outings(logs_in(Path(path) for path in args.folders))
+    dives = [one for one in found if len(one.nodes) > 1]
+    for one in found:
+        if one not in dives:
+            log.warning("%s: only one node: left out (%s)", one.words, ", ".join(path.name for path in one.logs))
+    if not dives:
+        raise BuddylineError(
+            f"{', '.join(args.folders)}: no dive that two nodes recorded at the same time; if they did, their clocks "
+            f"are more than {SAME_DIVE_S:g} s apart"
+        )
+    folder.mkdir(parents=True)
+    status = 0
+    for number, one in enumerate(dives, 1):
+        where = folder if len(dives) == 1 else folder / f"dive-{number}"
+        where.mkdir(exist_ok=True)
+        log.info("dive %d of %d: %s", number, len(dives), one.words)
+        status |= _solve(one, where)
+    return status
+
+
+def logs_in(folders: Iterable[Path]) -> list[Path]:
+    """Return the logs in these folders, and those that are named themselves; pictures lie beside their log."""
+    found: list[Path] = []
+    for folder in folders:
+        if not folder.exists():
+            raise BuddylineError(f"{folder}: does not exist")
+        inside = [path for path in sorted(folder.rglob("*.mcap")) if path.parent.suffix != ".pictures"]
+        if folder.is_dir() and not inside:
+            raise BuddylineError(f"{folder}: holds no log (*.mcap)")
+        found += inside if folder.is_dir() else [folder]
+    return found
+
+
+def outings(logs: list[Path]) -> list[Outing]:
+    """Return the dives that these logs are of, in order of time; damaged logs count as far as they can be read."""
+    spans: list[tuple[int, int, Path, set[str]]] = []
+    for path in logs:
+        if path.stat().st_size == 0:
+            report_losses([f"{path}: is empty: the node ended before it wrote anything"])
+            continue
+        try:
+            reader = DiveLogReader(path)
+        except BuddylineError as error:
+            report_losses([str(error)])
+            continue
+        with reader:
+            keys = [parse_key(key) for key in reader.keys]
+            nodes = {ids[0] for topic, ids in filter(None, keys) if topic.name in ("candidates", "image")}
+            if reader.start_ns is not None and reader.end_ns is not None and nodes:
+                spans.append((reader.start_ns, reader.end_ns, path, nodes))
+    found: list[Outing] = []
+    for start_ns, end_ns, path, nodes in sorted(spans, key=lambda span: span[0]):
+        if not found or start_ns > found[-1].end_ns + SAME_DIVE_S * S_NS:
+            found.append(Outing(start_ns, end_ns))
+        found[-1].end_ns = max(found[-1].end_ns, end_ns)
+        found[-1].logs.append(path)
+        found[-1].nodes |= nodes
+    return found
+
+
+def _solve(outing: Outing, folder: Path) -> int:
+    logs, solved = [str(path) for path in outing.logs], folder / "solved.mcap"
+    words = ["solve", *logs, "-o", str(solved)]
+    if len(outing.nodes) == 2:
+        offset_s = _clock_offset_s(logs)
+        if offset_s is not None and abs(offset_s) > LEAST_OFFSET_S:
+            words += ["--clock-offset", f"{offset_s:.5f}"]
+    status = _command(words)
+    if not solved.exists():
+        return 1
+    for kind, name in (("tum", "track.tum"), ("csv", "track.csv")):
+        status |= _command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
+    try:
+        status |= _command(["report", str(solved), "-o", str(folder / "report.html")])
+    except BuddylineError as error:
+        # The report draws; without the extra for it everything else is there.
+        log.warning("no report: %s", error)
+    print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    return status
+
+
+def _clock_offset_s(logs: list[str]) -> float | None:
+    """Return B's clock minus A's by the nodes' beacons, or else by how they moved; None where neither tells."""
+    for words in (["calibrate", "clock", *logs, "--json"], ["align", *logs, "--json"]):
+        said = io.StringIO()
+        try:
+            with redirect_stdout(said):
+                _command(words)
+            found = json.loads(said.getvalue())
+        except (BuddylineError, json.JSONDecodeError) as error:
+            log.info("clocks: `%s` does not tell: %s", words[0], error)
+            continue
+        # Beacons of before and after the dive: the middle is what the whole dive is off by.
+        offsets = found.get("offsets") or [one for pair in found.get("pairs", []) for one in pair["offsets"]] or [found]
+        known = [one["offset_s"] for one in offsets if "offset_s" in one]
+        if known:
+            offset_s = float(sum(known) / len(known))
+            log.info("clocks: B's is %+.2f ms from A's, by `%s`", 1e3 * offset_s, " ".join(words[:2]))
+            return offset_s
+    log.warning("clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set")
+    return None
+
+
+def _command(words: list[str]) -> int:
+    """Run one command of this program; what it could not read is reported with all other losses."""
+    from buddyline.tools.cli import COMMANDS
+
+    command = next(command for command in COMMANDS if command.name == words[0])
+    with collected() as lost:
+        status = command.run(words[1:])
+    report_losses(lost.lines())
+    return status
