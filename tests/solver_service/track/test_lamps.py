@@ -1,5 +1,7 @@
 """A lamp that is dark for a dive is named in the solver's status; working lamps never are."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from buddyline.node.sim.dive import messages
@@ -17,13 +19,19 @@ START_NS = 1_764_000_000_000_000_000
 SLOW = pytest.mark.slow
 
 
+@cache
+def simulated(seed, seconds, dead_lamps):
+    scenario = Scenario(ENVIRONMENTS[seed % 5], seed=300 + seed, start_ns=START_NS, dead_lamps=dead_lamps)
+    plan = DivePlan(seconds=seconds, imu=True)
+    found = [message for _, _, message in messages(World(scenario), plan)]
+    return [message for message in found if not isinstance(message, Truth | LightTruth | NodePose)]
+
+
 def status_problem(seed, seconds, *dead_lamps, mode="filter"):
     """What the status says at the end of a simulated dive."""
-    scenario = Scenario(ENVIRONMENTS[seed % 5], seed=300 + seed, start_ns=START_NS, dead_lamps=dead_lamps)
     core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset((mode,))))
-    for _, _, message in messages(World(scenario), DivePlan(seconds=seconds, imu=True)):
-        if not isinstance(message, Truth | LightTruth | NodePose):
-            core.handle(message)
+    for message in simulated(seed, seconds, dead_lamps):
+        core.handle(message)
     if mode == "smooth":
         core.flush()
     return core.report(0, 0, 0, [])[0].problem
