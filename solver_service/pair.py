@@ -20,6 +20,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.trigger import TriggerReadings, read_triggers
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
+from buddyline.solver_service.rarity import Rarity
 from buddyline.solver_service.results import view_of
 
 # Limits of one batch: its triggers, and their combinations of pairs of candidates. Larger arrays do not fit into the
@@ -71,6 +72,7 @@ class PairSolver:
         self.alignment = alignment
         self._prior = PosePrior()
         self._headings = HeadingOffset()
+        self._rarity = Rarity()
 
     def solve(self, matched: Sequence[Matched]) -> list[Fix | NoFix]:
         """Return one result for each trigger.
@@ -86,6 +88,7 @@ class PairSolver:
         """Forget all earlier fixes, after a clock was set or a value was out of numeric range."""
         self._prior.reset()
         self._headings.reset()
+        self._rarity.reset()
 
     def heading(self, stamp_ns: int) -> Heading | None:
         """Return the difference of the two headings' biases at stamp_ns; None without an estimate."""
@@ -110,7 +113,9 @@ class PairSolver:
     def _decide(self, matched: Matched, readings: TriggerReadings, place: int) -> Fix | NoFix:
         stamp_ns = matched.stamp_ns
         try:
-            found = readings.decide(place, self._prior.predict(stamp_ns), self._headings.predict(stamp_ns))
+            learned = self._prior.predict(stamp_ns), self._headings.predict(stamp_ns)
+            found = readings.decide(place, *learned, self._rarity.factor)
+            self._rarity.take(found)
             if isinstance(found, Fix):
                 self._remember(matched, found)
         except (ArithmeticError, ValueError) as error:

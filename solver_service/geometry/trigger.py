@@ -139,7 +139,7 @@ class _Batched:
         three = read_three_lights(batch, tried) if tried.any() else None
         return _Batched(batch, mean, four, three, tried, batch.sensors.both.tolist(), told.tolist())
 
-    def decide(self, trigger: int, prior: Prior | None, heading: Heading | None) -> Fix | NoFix:
+    def decide(self, trigger: int, prior: Prior | None, heading: Heading | None, rarity: float = 1.0) -> Fix | NoFix:
         """Apply the past to one trigger, and choose."""
         settings = self.batch.settings
         if not self.oriented[trigger]:
@@ -149,7 +149,7 @@ class _Batched:
         found: Fix | NoFix
         if why is None:
             four = weigh_readings(self.four.read, trigger, past, settings, three=False)
-            found = self._choose(trigger, four, heading)
+            found = self._choose(trigger, four, heading, rarity)
         else:
             found = NoFix(*why)
         if not self.three_told[trigger] or not _is_doubtful(found, four):
@@ -160,10 +160,13 @@ class _Batched:
         if not read.readings.refined.sound[read.places_of(trigger)].any():
             return found
         three = weigh_readings(read, trigger, past, settings, three=True)
-        return self._choose(trigger, three if four is None else four.joined(three), heading)
+        return self._choose(trigger, three if four is None else four.joined(three), heading, rarity)
 
-    def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None) -> Fix | NoFix:
-        """Publish the likeliest reading where it stands alone."""
+    def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None, rarity: float) -> Fix | NoFix:
+        """Publish the likeliest reading where it stands alone.
+
+        rarity: by how much chance is likelier against all four lights than usual.
+        """
         settings, others = self.batch.settings, weighed.others
         k = int(weighed.log_ratio.argmax())
         if weighed.log_ratio[k] == -np.inf:
@@ -192,7 +195,8 @@ class _Batched:
         # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
         if unsure or widened > 1.0:
             false_light = ratio * float(false_light_odds(weighed.chi2[k], readings.clutter[place]))
-        probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
+        chance = CHANCE_ODDS * (1.0 if short else rarity)
+        probability = agreeing / (chance + agreeing + others + false_light)
         required = settings.min_probability
         if short:
             required = max(required, _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY)
@@ -209,8 +213,8 @@ class _Batched:
             return NoFix("attitude", f"{what} is {math.sqrt(tilt_chi2):.1f} sigma off the attitudes")
         if depth_chi2 > AGREES:
             return NoFix("depth", f"{what} is {math.sqrt(depth_chi2):.1f} sigma off the depths")
-        why = "one light may be a false candidate" if false_light > CHANCE_ODDS else "chance may give it"
-        if widened > 1.0 and false_light > CHANCE_ODDS + others:
+        why = "one light may be a false candidate" if false_light > chance else "chance may give it"
+        if widened > 1.0 and false_light > chance + others:
             in_range = abs(math.log(float(readings.range_m[place, 0] / readings.range_m[place, 1])))
             reason: Reason = "range_gap" if in_range > abs(float(readings.twist_gap_rad[place])) else "twist_gap"
             return NoFix(reason, f"{what} does not fit its lights (chi2 {chi2:.1f}): {why}")
@@ -325,8 +329,8 @@ class TriggerReadings:
     readings: _Batched | None
     why: NoFix | None = None
 
-    def decide(self, trigger: int, prior: Prior | None, heading: Heading | None) -> Fix | NoFix:
-        """Solve one of the triggers with what earlier fixes tell of it, and of the headings."""
+    def decide(self, trigger: int, prior: Prior | None, heading: Heading | None, rarity: float = 1.0) -> Fix | NoFix:
+        """Solve one of the triggers with what earlier fixes tell of it, and how rare four lights are."""
         if self.readings is None:
             return self.why or NoFix("degenerate", "")
-        return self.readings.decide(trigger, prior, heading)
+        return self.readings.decide(trigger, prior, heading, rarity)

@@ -1,0 +1,45 @@
+"""How rarely all four lights are found: where they hardly ever are, what looks like all four is likely chance.
+
+A dead or hidden lamp leaves no trigger with four lights. Over a dive of thousands of triggers chance lights, another
+diver's lamp among them, then fit in some: each trigger for itself cannot tell.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from buddyline.solver_service.geometry.fix import Fix, NoFix
+
+# What was found so many triggers ago counts e times less.
+MEMORY: Final = 300.0
+# Before the first trigger: so many with four lights, and without.
+START: Final = 0.5
+# Other lamps come back in picture after picture, as even chance does not: the odds count with this power.
+PERSISTENCE: Final = 2.0
+# Triggers that say nothing of the lamps.
+SILENT: Final = ("too_few_candidates", "degenerate", "out_of_range")
+
+
+class Rarity:
+    """Counts the triggers of a pair with four lights, and those without."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all triggers."""
+        self._full, self._other = START, START
+
+    @property
+    def factor(self) -> float:
+        """By how much chance is likelier, against four lights, than where they are mostly found; 1 or more."""
+        return float(max(self._other / self._full, 1.0) ** PERSISTENCE)
+
+    def take(self, found: Fix | NoFix) -> None:
+        """Count a trigger's outcome."""
+        if isinstance(found, NoFix) and found.reason in SILENT:
+            return
+        kept = 1.0 - 1.0 / MEMORY
+        full = isinstance(found, Fix) and found.method != "three_lights"
+        self._full = START + kept * (self._full - START) + full
+        self._other = START + kept * (self._other - START) + (not full)
