@@ -11,6 +11,7 @@ import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -221,6 +222,15 @@ def expected_first(found: list[Detection], foretold: Sequence[Foretold]) -> list
     best = max(_score(d) for d in found)
     chosen = [replace(found[i], blob=msgspec.structs.replace(found[i].blob, score=best)) for i in sorted(first)]
     return chosen + [d for i, d in enumerate(found) if i not in first]
+
+
+def count_expected(found: Sequence[Detection], foretold: Sequence[Foretold]) -> int:
+    """Return how many of the first candidates, as `expected_first` orders them, are where a light is expected."""
+    lights = takewhile(
+        lambda d: any(_away(d, place.u_px, place.v_px) <= place.radius_px for place in foretold),
+        found[: len(foretold)],
+    )
+    return sum(1 for _ in lights)
 
 
 Planned = tuple[list[Region], list[float]]

@@ -8,7 +8,7 @@ from collections import deque
 import msgspec
 from buddyline.node.detect import Detection, Detector, GuidedDetector
 from buddyline.node.devices import Frame
-from buddyline.node.guide import Guide, expected_first
+from buddyline.node.guide import Guide, count_expected, expected_first
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.messages import MAX_BLOBS, Blob, Candidates
 from msgspec import UNSET, UnsetType
@@ -31,7 +31,8 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
 class Pipeline:
     """Detects the candidates of one camera's frames, and numbers the messages.
 
-    guide: plans where to look in each frame; None to search all of each.
+    guide: plans where to look in each frame; None to search all of each. expected: so many of the last frame's first
+    candidates are where the solver expects the other node's lights.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Pipeline:
         self.residuals_s: deque[float] = deque(maxlen=100)
         self.repeated = 0
         self.detections: list[Detection] = []  # of the last frame, for drawings
+        self.expected = 0
         self._detector = detector
         self._guide = guide
         self._seq = 0
@@ -96,7 +98,9 @@ class Pipeline:
             found = self._detector.detect(image)
         guide.learn(stamp_ns, found, width, whole=whole, sized=lamps)
         elsewhere = UNSET if whole else guide.elsewhere(len(found))
-        return expected_first(found, plan.foretold), elsewhere
+        found = expected_first(found, plan.foretold)
+        self.expected = count_expected(found, plan.foretold)
+        return found, elsewhere
 
     @property
     def residual_s(self) -> float | None:

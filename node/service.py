@@ -250,7 +250,7 @@ class NodeService(Service):
             return
         if self._exposure is None:
             self._exposure = ExposureLoop(self.config.exposure, control.range)
-        control.follow(self._exposure.update(frame, candidates.blobs))
+        control.follow(self._exposure.update(frame, candidates, self.pipeline.expected))
 
     def _read(self, source: Source) -> None:
         while not self.stop.is_set():

@@ -40,26 +40,17 @@ class SceneLight:
     clipped: float
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedLamp:
-    """Where one of the other node's lamps is expected, with a radius that it is hardly ever outside of."""
-
-    u_px: float
-    v_px: float
-    radius_px: float
+def is_likely(blob: Blob) -> bool:
+    """Return whether a candidate is likely a lamp; one without a score is."""
+    return blob.score is UNSET or blob.score >= LIKELY
 
 
-def choose_lamps(blobs: Sequence[Blob], expected: Sequence[ExpectedLamp] = ()) -> list[Blob]:
-    """Return the candidates that are taken for the other node's lamps: one at each expected place, else the likeliest.
+def choose_lamps(blobs: Sequence[Blob], expected: int = 0) -> list[Blob]:
+    """Return the candidates that are taken for the other node's lamps.
 
-    Where nothing is expected, or nothing is found there, they are at most LAMPS of a score of LIKELY or more.
+    expected: so many of the first are where the solver expects these lamps; then only those. Else the likeliest two.
     """
-    found = []
-    for place in expected:
-        near = [b for b in blobs if math.hypot(b.u_px - place.u_px, b.v_px - place.v_px) <= place.radius_px]
-        found += [blob for blob in near[:1] if blob not in found]
-    likely = [blob for blob in blobs if blob.score is UNSET or blob.score >= LIKELY]
-    return found or likely[:LAMPS]
+    return [blob for blob in blobs[: expected or LAMPS] if is_likely(blob)]
 
 
 def measure_cores(image: NDArray[np.uint8], lamps: Sequence[Blob], linear: NDArray[np.float64]) -> list[Core]:

@@ -34,15 +34,24 @@ SCENE_MEAN: Final = 0.15
 SCENE_CLIPPED: Final = (0.0015, 0.005)
 SCENE_STEP: Final = 1.4
 SCENE_DEAD_BAND: Final = 1.3
+STILL_HIDDEN: Final = 2
+"""So many context frames one after the other must show a lamp that the lamps' frames do not."""
+FLOOR_BELOW_SCENE: Final = 8.0
+FLOOR_TRIED: Final = 30
+"""A floor that hides nothing is given up after so many context frames: what was hidden may be gone."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metering:
-    """What one frame showed. exposure: by its own metadata. cores: of what is taken for the other node's lamps."""
+    """What one frame showed. exposure: by its own metadata. cores: of what is taken for the other node's lamps.
+
+    scene: of a context frame, else None. hidden: whether a context frame has a lamp that the lamps' frames do not show.
+    """
 
     exposure: Exposure
     cores: Sequence[Core]
-    scene: SceneLight
+    scene: SceneLight | None = None
+    hidden: bool = False
 
 
 class ExposureLock:
@@ -67,11 +76,15 @@ class ExposureLock:
         self._missed = 0
         self._bright = 0
         self._clipped_at = math.inf
+        self._floor = 0.0
+        self._contexts = self._hidden = 0
         self.plan = self._plan()
 
     def update(self, metering: Metering) -> ExposurePlan:
         """Take what a frame showed; return the plan from now on."""
-        self._follow_scene(metering)
+        if metering.scene is not None:
+            self._follow_scene(metering.exposure.amount, metering.scene)
+            self._keep_visible(metering.hidden)
         if not metering.cores:
             self._miss(metering)
         elif any(core.clipped for core in metering.cores):
@@ -113,6 +126,10 @@ class ExposureLock:
     def _take_bound(self, metering: Metering) -> None:
         """Take a frame with a clipped core: less is wanted than what it had."""
         amount = metering.exposure.amount
+        lowest = max(self._floor, self._range.least)
+        if amount <= NEAR * lowest:
+            self._settle(lowest)
+            return
         if self.state == "locked":
             # Frames with more than what is asked for are older, or the scene's.
             if amount > NEAR * self.plan.lamps.amount:
@@ -135,6 +152,12 @@ class ExposureLock:
         # A lamp is brighter than what it lights: what wants more than the scene does is no lamp.
         wanted = self._target * metering.exposure.amount / max(core.light for core in metering.cores)
         wanted = self._within(min(wanted, self._scene))
+        if wanted >= self._floor:
+            self._floor = 0.0
+        self._settle(max(wanted, self._floor))
+
+    def _settle(self, wanted: float) -> None:
+        """Go towards the amount that a frame wants."""
         self._missed = 0
         self._wanted.append(wanted)
         if self.state != "locked":
@@ -148,15 +171,30 @@ class ExposureLock:
             self._amount = min(goal, self._amount * RISE)
         self._good = self._amount
 
-    def _follow_scene(self, metering: Metering) -> None:
+    def _keep_visible(self, hidden: bool) -> None:
+        """Expose longer than the brightest lamp wants where that hides another one, which may be the other node's."""
+        if not hidden:
+            self._hidden = 0
+        if self.state != "locked":
+            self._floor = 0.0
+        elif hidden:
+            self._hidden += 1
+            if self._hidden < STILL_HIDDEN:
+                return
+            self._floor = min(RUNG * max(self._amount, self._floor), self._scene / FLOOR_BELOW_SCENE)
+            self._contexts = 0
+        elif self._floor > 0.0:
+            self._contexts += 1
+            if self._contexts >= FLOOR_TRIED:
+                self._floor = 0.0
+
+    def _follow_scene(self, amount: float, scene: SceneLight) -> None:
         """Bring the scene's exposure towards SCENE_MEAN, as long as hardly anything is clipped."""
-        if not self.plan.is_context(metering.exposure):
-            return
-        amount, few, many = metering.exposure.amount, *SCENE_CLIPPED
-        goal = amount * SCENE_MEAN / max(metering.scene.mean, 1e-6)
-        if metering.scene.clipped > many:
+        few, many = SCENE_CLIPPED
+        goal = amount * SCENE_MEAN / max(scene.mean, 1e-6)
+        if scene.clipped > many:
             goal = min(goal, amount / SCENE_STEP)
-        elif metering.scene.clipped > few:
+        elif scene.clipped > few:
             goal = min(goal, amount)
         if not 1 / SCENE_DEAD_BAND <= goal / self._scene <= SCENE_DEAD_BAND:
             self._scene = self._within(min(max(goal, self._scene / SCENE_STEP), self._scene * SCENE_STEP))

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from typing import Final
 
-from buddyline.node.capture.cores import ExpectedLamp, choose_lamps, measure_cores, measure_scene
+from buddyline.node.capture.cores import choose_lamps, is_likely, measure_cores, measure_scene
 from buddyline.node.capture.exposure import ExposurePlan, ExposureRange
 from buddyline.node.capture.flicker import FlickerWatch
 from buddyline.node.capture.lock import ExposureLock, Metering
 from buddyline.node.config import ExposureConfig
 from buddyline.node.devices import Frame
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Blob
+from buddyline.protocol.messages import Candidates
+from msgspec import UNSET
+
+APART: Final = 0.05
+"""A lamp of one frame is within this share of the picture's width in the next."""
 
 
 class ExposureLoop:
@@ -22,6 +27,7 @@ class ExposureLoop:
         self._flicker_ns = S_NS / config.flicker_hz if config.flicker_hz > 0 else 0.0
         self._lock = ExposureLock(self._range, config.context_every, self._flicker_ns, config.target)
         self._flicker = FlickerWatch()
+        self._seen_px: list[tuple[float, float]] = []
 
     @property
     def plan(self) -> ExposurePlan:
@@ -38,13 +44,29 @@ class ExposureLoop:
         """What is wrong with the lamps, "" where nothing is."""
         return self._flicker.problem
 
-    def update(self, frame: Frame, blobs: Sequence[Blob], expected: Sequence[ExpectedLamp] = ()) -> ExposurePlan:
-        """Take a frame and its candidates, the likeliest first; return the plan from now on.
+    def update(self, frame: Frame, candidates: Candidates, expected: int = 0) -> ExposurePlan:
+        """Take a frame and its candidates; return the plan from now on.
 
-        expected: where the solver expects the other node's lamps. A frame that does not say its exposure is ignored.
+        expected: so many of the first candidates are where the solver expects the other node's lamps. A frame that does
+        not say its exposure is ignored.
         """
         if frame.exposure is None:
             return self.plan
-        cores = measure_cores(frame.image, choose_lamps(blobs, expected), self._range.linear)
+        cores = measure_cores(frame.image, choose_lamps(candidates.blobs, expected), self._range.linear)
         self._flicker.update(frame.exposure, cores)
-        return self._lock.update(Metering(frame.exposure, cores, measure_scene(frame.image, self._range.linear)))
+        scene, hidden = None, False
+        if self.plan.is_context(frame.exposure):
+            scene = measure_scene(frame.image, self._range.linear)
+            hidden = expected == 0 and self._hides(frame, candidates)
+        elif candidates.elsewhere is UNSET:
+            self._seen_px = [(blob.u_px, blob.v_px) for blob in candidates.blobs]
+        return self._lock.update(Metering(frame.exposure, cores, scene, hidden))
+
+    def _hides(self, frame: Frame, candidates: Candidates) -> bool:
+        """Return whether a context frame has a lamp, clipped as lamps are in it, that the lamps' frames do not show."""
+        likely = [blob for blob in candidates.blobs if is_likely(blob)]
+        reach_px = APART * frame.image.shape[1]
+        return any(
+            core.clipped and all(math.hypot(core.u_px - u, core.v_px - v) > reach_px for u, v in self._seen_px)
+            for core in measure_cores(frame.image, likely, self._range.linear)
+        )

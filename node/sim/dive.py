@@ -13,6 +13,7 @@ from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.config import ExposureConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.devices import Frame
+from buddyline.node.pipeline import Pipeline
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import DivePlan
 from buddyline.node.sim.sensor import DelayedControls
@@ -76,7 +77,7 @@ def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
 def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[Entry]:
     """Yield each frame that is not lost, as a picture or as candidates, and its LightTruth."""
     index, seq = world.scenario.index(node), 0
-    eye = _Eye(world, node) if plan.images and plan.exposure == "auto" else None
+    eye = _Eye(world, node, plan.period_ns) if plan.images and plan.exposure == "auto" else None
     light_truth = topics.LIGHT_TRUTH.key(node)
     for instant in _triggers(world, plan, end_ns):
         rng = generator(world.scenario.seed, "exposures", index, instant)
@@ -98,19 +99,20 @@ def _frames(world: World, plan: DivePlan, node: str, end_ns: int) -> Iterator[En
 class _Eye:
     """A node's camera with its exposure loop, which needs the detector."""
 
-    def __init__(self, world: World, node: str) -> None:
+    def __init__(self, world: World, node: str, period_ns: int) -> None:
         self._world, self._node = world, node
         self._controls = DelayedControls()
         self._loop = ExposureLoop(ExposureConfig(), self._controls.range)
-        self._detector = make_detector()
+        self._pipeline = Pipeline(node, BOOT, period_ns, make_detector())
 
     def take(self, stamp_ns: int, trigger: int) -> NDArray[np.uint8]:
         """Return the picture of a trigger."""
         exposure, context = self._controls.take(trigger)
         picture = self._world.render(self._node, stamp_ns, exposure)
-        blobs = [detection.blob for detection in self._detector.detect(picture)]
         frame = Frame(picture, stamp_ns, exposure=exposure, context=context)
-        self._controls.follow(self._loop.update(frame, blobs))
+        candidates = self._pipeline.candidates(frame)
+        if candidates is not None:
+            self._controls.follow(self._loop.update(frame, candidates))
         return picture
 
 

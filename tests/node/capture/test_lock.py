@@ -45,7 +45,8 @@ class Eye:
         cores = []
         if seen and level >= SEEN_FROM:
             cores = [Core(100.0, 100.0, float(self.range.linear[level]), level >= CLIPPED)]
-        scene = SceneLight(min(self.scene_light * exposure.amount, 1.0), 0.0)
+        context = self.lock.plan.is_context(exposure)
+        scene = SceneLight(min(self.scene_light * exposure.amount, 1.0), 0.0) if context else None
         plan = self.lock.update(Metering(exposure, cores, scene))
         self.asked.append(plan)
         return level
@@ -185,7 +186,7 @@ def test_context_frames_are_those_of_the_same_triggers_in_all_nodes():
 def test_a_brighter_second_lamp_counts():
     lock = ExposureLock(RANGE, 0)
     cores = [Core(0, 0, 0.1, False), Core(50, 0, 0.3, False)]
-    lock.update(Metering(Exposure(1_000_000), cores, SceneLight(0.1, 0.0)))
+    lock.update(Metering(Exposure(1_000_000), cores))
     assert lock.plan.lamps.amount == pytest.approx(2.0, rel=0.02)
 
 
@@ -195,7 +196,34 @@ def test_pulsed_lamps_get_whole_periods():
         for _ in range(30):
             exposure = lock.plan.lamps
             level = min(light * exposure.amount, 1.0)
-            lock.update(Metering(exposure, [Core(0, 0, level, level >= 1.0)], SceneLight(0.1, 0.0)))
+            lock.update(Metering(exposure, [Core(0, 0, level, level >= 1.0)]))
         periods = lock.plan.lamps.time_ns / 1e6
         assert abs(periods - round(periods)) < 0.02
         assert round(periods) >= 1
+
+
+@pytest.mark.parametrize("delay", [0, 4, 10])
+def test_a_lamp_that_is_hidden_is_made_room_for_without_hunting(delay):
+    """Context frames show a second lamp that needs 500 times the light that the first one wants."""
+    eye = Eye(30.0, delay)
+    needed = 500 * 0.6 / 30.0 * 0.01
+    pipe = deque([eye.lock.plan] * delay)
+    amounts = []
+    for trigger in range(600):
+        pipe.append(eye.lock.plan)
+        exposure = pipe.popleft().at(trigger)
+        level = eye.level(exposure)
+        context = eye.lock.plan.is_context(exposure)
+        shown = amounts and amounts[-1] >= needed
+        eye.lock.update(
+            Metering(
+                exposure,
+                [Core(0.0, 0.0, float(SQUARE[level]), level >= CLIPPED)],
+                SceneLight(0.1, 0.0) if context else None,
+                context and not shown,
+            )
+        )
+        amounts.append(eye.lock.plan.lamps.amount)
+    late = amounts[200:]
+    assert np.mean(np.array(late) >= needed) > 0.8
+    assert sum(a != b for a, b in pairwise(late)) <= 12

@@ -5,15 +5,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from buddyline.node.capture.cores import ExpectedLamp, choose_lamps, measure_cores, measure_scene
+from buddyline.node.capture.cores import choose_lamps, measure_cores, measure_scene
 from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.config import ExposureConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.devices import Frame
+from buddyline.node.pipeline import Pipeline
 from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
 from buddyline.node.sim.sensor import DelayedControls
 from buddyline.node.sim.world import World
-from buddyline.protocol.messages import Blob
+from buddyline.protocol.messages import Blob, Candidates
 
 from tests.node.rendered import lamp_picture
 
@@ -30,7 +31,7 @@ class Node:
         self.world = World(Scenario(**SMALL | scenario))
         self.controls = DelayedControls(delay)
         self.loop = ExposureLoop(config or ExposureConfig(), self.controls.range)
-        self._detector = make_detector()
+        self._pipeline = Pipeline("a", "boot", STEP_NS, make_detector())
         self.trigger = 10
 
     def step(self):
@@ -39,9 +40,10 @@ class Node:
         stamp_ns = self.trigger * STEP_NS
         exposure, context = self.controls.take(self.trigger)
         image = self.world.render("a", stamp_ns, exposure)
-        blobs = [detection.blob for detection in self._detector.detect(image)]
         frame = Frame(image, stamp_ns, exposure=exposure, context=context)
-        self.controls.follow(self.loop.update(frame, blobs))
+        candidates = self._pipeline.candidates(frame)
+        self.controls.follow(self.loop.update(frame, candidates))
+        blobs = candidates.blobs
         found = np.array([(blob.u_px, blob.v_px) for blob in blobs[:3]]).reshape(-1, 2)
         lights = [x for x in self.world.light_truth("a", stamp_ns, 0).lights if x.visible and not x.merged]
         errors = [min(np.hypot(*(found - (x.u_px, x.v_px)).T), default=99.0) for x in lights]
@@ -124,7 +126,7 @@ def test_one_lamp_that_goes_out_leaves_the_other_well_exposed():
 
 def test_a_strobe_leaves_the_exposure_alone():
     scenario = {"environment": "cavern", "seed": 3, "trajectory": "rest", "other_lamps": 0}
-    node, quiet = Node(**scenario, strobe_s=1.0), Node(**scenario)
+    node, quiet = Node(**scenario, strobe_s=1.3), Node(**scenario)
     amounts = [[frame.exposure.amount for frame, _ in n.run(60)[30:] if not frame.context] for n in (node, quiet)]
     assert max(amounts[0]) <= 1.4 * max(amounts[1])
     assert min(amounts[0]) >= min(amounts[1]) / 1.4
@@ -147,7 +149,7 @@ def test_pulsed_lamps_are_noticed_and_whole_periods_mend_it():
 def test_a_frame_that_does_not_say_its_exposure_changes_nothing():
     node = Node(environment="cavern", seed=3)
     before = node.loop.plan
-    assert node.loop.update(Frame(np.full((308, 410, 3), 255, np.uint8), 0), []) is before
+    assert node.loop.update(Frame(np.full((308, 410, 3), 255, np.uint8), 0), message([])) is before
 
 
 def blob(u_px, v_px, score=0.9, area_px=30.0):
@@ -156,13 +158,49 @@ def blob(u_px, v_px, score=0.9, area_px=30.0):
     )  # fmt: skip
 
 
-def test_the_likeliest_two_are_taken_and_what_is_expected_first():
+def message(blobs, **more):
+    return Candidates(
+        node="a", stamp_ns=0, trigger=0, seq=0, boot="boot", width_px=410, height_px=308, blobs=blobs, **more
+    )
+
+
+def test_the_likeliest_two_are_taken_or_only_those_that_are_expected():
     blobs = [blob(10.0, 10.0), blob(50.0, 10.0), blob(90.0, 10.0, 0.6), blob(200.0, 10.0, 0.3)]
     assert choose_lamps(blobs) == blobs[:2]
     assert choose_lamps(blobs[2:]) == blobs[2:3]
-    expected = [ExpectedLamp(198.0, 11.0, 5.0), ExpectedLamp(88.0, 11.0, 5.0)]
-    assert choose_lamps(blobs, expected) == [blobs[3], blobs[2]]
-    assert choose_lamps(blobs, [ExpectedLamp(300.0, 300.0, 5.0)]) == blobs[:2]
+    assert choose_lamps(blobs, 1) == blobs[:1]
+
+
+def strangers(node_lamp, stranger):
+    """A picture of a lamp and a stranger's; light of each core."""
+    return np.clip(
+        np.maximum(
+            lamp_picture([(100.0, 80.0)], core=255.0 * np.sqrt(node_lamp), core_px=4.0, ground=0.0, noise=1.0),
+            lamp_picture([(300.0, 200.0)], core=255.0 * np.sqrt(stranger), core_px=4.0, ground=0.0, noise=1.0),
+        ),
+        0,
+        255,
+    )
+
+
+@pytest.mark.parametrize(("told", "guided"), [(0, False), (1, False), (0, True)])
+def test_a_strangers_bright_lamp_does_not_hide_the_other_nodes(told, guided):
+    """It is 10,000 times as bright. Context frames show the other, or the solver says which one it is."""
+    controls = DelayedControls(0)
+    loop = ExposureLoop(ExposureConfig(context_every=10), controls.range)
+    found = 0
+    for trigger in range(150):
+        exposure, context = controls.take(trigger)
+        image = strangers(0.5 * exposure.amount, 5000.0 * exposure.amount)
+        blobs = [blob(300.0, 200.0)] if image[200, 300, 1] > 20 else []
+        if image[80, 100, 1] > 20:
+            lamp = blob(100.0, 80.0)
+            blobs = [lamp, *blobs] if told else [*blobs, lamp]
+            found += trigger >= 75 and not context
+        more = {"elsewhere": 0} if guided and trigger % 10 != 5 else {}
+        frame = Frame(image, trigger, exposure=exposure, context=context)
+        controls.follow(loop.update(frame, message(blobs, **more), told if len(blobs) == 2 else 0))
+    assert found >= 60
 
 
 def test_cores_are_measured_in_linear_light():
