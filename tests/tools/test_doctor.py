@@ -7,6 +7,7 @@ import time
 import msgspec
 import numpy as np
 import pytest
+from buddyline.node.capture.exposure import Exposure
 from buddyline.node.chrony import decode_tracking
 from buddyline.node.config import NodeConfig, load_node_config
 from buddyline.node.detect import Detection
@@ -119,6 +120,26 @@ def test_a_calibration_of_this_camera_is_accepted():
 @pytest.mark.parametrize(("grey", "level"), [(0, "warning"), (30, "ok"), (255, "warning")])
 def test_picture(grey, level):
     assert judge_rig.picture(np.full((20, 30), grey, np.uint8)).level == level
+
+
+@pytest.mark.parametrize(
+    ("state", "had", "level", "word"),
+    [
+        ("locked", Exposure(80_000), "ok", "locked to the lamps: 0.08 ms, gain 1"),
+        ("search", Exposure(80_000), "skipped", "no lamp was seen"),
+        (None, Exposure(4_000_000, 2.0), "warning", "fixed: 4 ms, gain 2"),
+        (None, None, "ok", "fixed: not told"),
+    ],
+)
+def test_exposure(state, had, level, word):
+    found = judge_rig.exposure(state, had)
+    assert found.level == level
+    assert word in found.text
+
+
+def test_a_dark_or_bright_picture_is_no_reason_to_change_an_exposure_that_follows_the_lamps():
+    assert "exposure_us" not in judge_rig.picture(np.zeros((9, 9), np.uint8), fixed=False).advice
+    assert judge_rig.picture(np.full((9, 9), 255, np.uint8), fixed=False).level == "ok"
 
 
 def detection(score):
@@ -287,7 +308,12 @@ def test_a_simulated_rig_has_no_problem(name, monkeypatch):
     with monkeypatch.context() as patched:
         # The other node swims: at this instant it is in view.
         patched.setattr(rig, "SystemClock", lambda: ManualClock(1_764_000_002 * S_NS))
-        assert levels(rig.check_camera(config)) == {"camera": "ok", "calibration": "ok", "lights": "ok"}
+        assert levels(rig.check_camera(config)) == {
+            "camera": "ok",
+            "exposure": "ok",
+            "calibration": "ok",
+            "lights": "ok",
+        }
     assert levels(rig.check_sensors(config)) == {
         "attitude": "ok",
         "depth": "ok",
@@ -311,6 +337,7 @@ def test_on_a_pi_without_camera_and_sensors_each_is_a_problem(monkeypatch):
 def test_a_camera_without_frames_is_a_problem(monkeypatch):
     class Silent:
         problem = ""
+        exposure_control = None
 
         def info(self):
             return INFO_A

@@ -7,9 +7,11 @@ import threading
 import time
 from typing import Final
 
+from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.config import NodeConfig
-from buddyline.node.detect import make_detector
-from buddyline.node.devices import Frame, Source, open_camera, open_sensors
+from buddyline.node.detect import Detection, make_detector
+from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
+from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu, Message, NodeInfo
@@ -19,6 +21,8 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 FRAMES: Final = 3
+# An exposure that follows the lamps: enough frames for a camera whose controls show nine frames later.
+FRAMES_TO_LOCK: Final = 40
 FRAMES_WITHIN_S: Final = 5.0
 LISTEN_S: Final = 3.0
 # Longer than the search for the chips plus the two seconds of samples that the surface pressure needs.
@@ -36,16 +40,10 @@ def check_camera(config: NodeConfig) -> list[Finding]:
             "camera", "problem", str(error), "does a node run already? check the cable, then node/README.md"
         )
         return [problem, _calibration(config, None, None), unseen]
-    stop = threading.Event()
-    timer = threading.Timer(FRAMES_WITHIN_S, stop.set)
-    timer.start()
-    frames: list[Frame] = []
     try:
         info = camera.info()
-        while len(frames) < FRAMES and (frame := camera.next_frame(stop)) is not None:
-            frames.append(frame)
+        frames, found, loop = _take_frames(camera, config, info)
     finally:
-        timer.cancel()
         problem_text = camera.problem
         camera.close()
     if not frames:
@@ -55,6 +53,22 @@ def check_camera(config: NodeConfig) -> list[Finding]:
             _calibration(config, info, None),
             Finding("lights", "skipped", "no test frame"),
         ]
+    # The scene is judged, where there is a picture of it.
+    seen = next((frame for frame in reversed(frames) if frame.context is not False), frames[-1])
+    return [
+        judge.picture(seen.image, fixed=loop is None),
+        judge.exposure(loop.state if loop else None, frames[-1].exposure),
+        _calibration(config, info, frames[-1].image.shape),
+        judge.lights(found),
+    ]
+
+
+def _take_frames(
+    camera: CameraDevice, config: NodeConfig, info: NodeInfo | None
+) -> tuple[list[Frame], list[list[Detection]], ExposureLoop | None]:
+    """Take a few frames, and find lights in each; where the exposure follows the lamps, until it is locked to them."""
+    control = camera.exposure_control
+    loop = None if control is None else ExposureLoop(config.exposure, control.range)
     stated = config.calibration or info
     detector = make_detector(
         config.detector.method,
@@ -62,9 +76,27 @@ def check_camera(config: NodeConfig) -> list[Finding]:
         config.detector.overrides,
         stated.camera.fx_px if stated else None,
     )
-    found = [detector.detect(frame.image) for frame in frames]
-    seen = judge.picture(frames[-1].image)
-    return [seen, _calibration(config, info, frames[-1].image.shape), judge.lights(found)]
+    pipeline = Pipeline(config.node, "doctor", config.trigger_period_ns, detector)
+    stop = threading.Event()
+    timer = threading.Timer(FRAMES_WITHIN_S, stop.set)
+    timer.start()
+    frames: list[Frame] = []
+    found: list[list[Detection]] = []
+    locked = 0
+    try:
+        while len(frames) < (FRAMES_TO_LOCK if loop else FRAMES) and locked < FRAMES:
+            frame = camera.next_frame(stop)
+            if frame is None:
+                break
+            frames.append(frame)
+            candidates = pipeline.candidates(frame)
+            found.append(pipeline.detections)
+            if control is not None and loop is not None and candidates is not None:
+                control.follow(loop.update(frame, candidates))
+                locked = locked + 1 if loop.state == "locked" else 0
+    finally:
+        timer.cancel()
+    return frames, found, loop
 
 
 def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from buddyline.node.capture.exposure import Exposure
 from buddyline.node.config import CalibrationConfig
 from buddyline.node.detect import Detection
 from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2
+from buddyline.protocol.clock import MS_NS
 from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu, Message, NodeInfo
 from buddyline.tools.health.finding import Finding
 from msgspec import UNSET
@@ -56,16 +58,28 @@ def _odd(camera: CameraModel, size: tuple[int, int]) -> str:
     return ""
 
 
-def picture(image: NDArray[np.uint8]) -> Finding:
-    """Judge the exposure of a test frame; lamps in it do not count."""
+def picture(image: NDArray[np.uint8], *, fixed: bool = True) -> Finding:
+    """Judge the exposure of a test frame; lamps in it do not count. fixed: whether the configuration fixes it."""
     height, width = image.shape[:2]
     brightest, clipped = int(image.max()), float((image >= 250).mean())
     text = f"gives {width}x{height} pixels, median {np.median(image):.0f} of 255"
     if brightest < 10:
-        return Finding("camera", "warning", f"{text}: all black", "take the cap off; raise exposure_us or gain")
-    if clipped > 0.2:
+        advice = "take the cap off; raise exposure_us or gain" if fixed else "take the cap off"
+        return Finding("camera", "warning", f"{text}: all black", advice)
+    if clipped > 0.2 and fixed:
         return Finding("camera", "warning", f"{text}: {clipped:.0%} overexposed", "lower exposure_us or gain, or dive")
     return Finding("camera", "ok", text)
+
+
+def exposure(state: str | None, had: Exposure | None) -> Finding:
+    """Judge the exposure of the last test frame. state: of the loop that locks it to the lamps; None if it is fixed."""
+    text = "not told by the camera" if had is None else f"{had.time_ns / MS_NS:.3g} ms, gain {had.gain:.3g}"
+    if state is None:
+        advice = "leave camera.exposure_us out: lamps near the camera are overexposed at any fixed exposure"
+        return Finding("exposure", "ok" if had is None else "warning", f"fixed: {text}", "" if had is None else advice)
+    if state == "locked":
+        return Finding("exposure", "ok", f"locked to the lamps: {text}")
+    return Finding("exposure", "skipped", f"follows lamps, and no lamp was seen for long enough: {text}")
 
 
 def lights(frames: list[list[Detection]]) -> Finding:
