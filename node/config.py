@@ -55,13 +55,15 @@ class ExposureConfig(Config, frozen=True, kw_only=True):
 class DetectorConfig(Config, frozen=True, kw_only=True):
     """[detector]: method, environment, and single values that override a preset.
 
-    guided: look first where the solver, or the last pictures, expect the lights.
+    guided: look first where the solver, or the last pictures, expect the lights. masks: polygons of the picture that
+    are never searched; corners [u, v] as shares of its width and height, two for a rectangle.
     """
 
     method: str = "source"
     environment: str = "auto"
     overrides: dict[str, float] = field(default_factory=dict)
     guided: bool = True
+    masks: list[Annotated[list[tuple[Fraction, Fraction]], Meta(min_length=2)]] = field(default_factory=list)
 
 
 class SensorsConfig(Config, frozen=True, kw_only=True):

@@ -106,6 +106,7 @@ class NodeService(Service):
                 self.config.detector.environment,
                 self.config.detector.overrides,
                 info.camera.fx_px,
+                self.config.detector.masks,
             ),
             self._guide,
         )

@@ -93,6 +93,14 @@ def detect(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}; paper: the paper's"
     )
+    parser.add_argument(
+        "--mask",
+        action="append",
+        default=[],
+        metavar="U,V,U,V",
+        help="never search this rectangle (or polygon) of each picture, corners as shares of width and height; "
+        "may be repeated; default: the masks in a dive's logs",
+    )
     _json(parser, "JSON lines on stdout (the default without -o)")
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
+import msgspec
 from buddyline.node.detect import METHODS, Detection, make_detector
+from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.node.pipeline import Pipeline
@@ -41,6 +44,7 @@ class DiveDetector:
     method: str
     environment: str
     infos: dict[str, NodeInfo]
+    masks: Mapping[str, Sequence[Corners]] = field(default_factory=dict)
     skipped: int = 0
     pictures: int = 0
     _pipelines: dict[str, Pipeline] = field(default_factory=dict)
@@ -68,13 +72,50 @@ class DiveDetector:
         if pipeline is None:
             period_ns = info.trigger_period_ns if info else FOLDER_PERIOD_NS
             focal_px = info.camera.fx_px if info else None
-            detector = make_detector(self.method, self.environment, focal_px=focal_px)
+            detector = make_detector(self.method, self.environment, focal_px=focal_px, masks=self.masks.get(node, ()))
             pipeline = self._pipelines[node] = Pipeline(node, f"detect-{self.method}", period_ns, detector)
         self.pictures += 1
         frame = Frame(picture, image.stamp_ns, info.row_time_ns if info else 0)
         candidates = pipeline.candidates(frame)
         self.last = (frame, pipeline.detections)
         return envelope_of(candidates, envelope.time_ns) if candidates is not None else None
+
+
+def recorded_masks(dive: Dive) -> dict[str, list[list[tuple[float, float]]]]:
+    """Return the masks of each node, from the configurations that the nodes wrote into their logs."""
+    found = {}
+    for reader in dive.readers:
+        noted = reader.metadata()
+        try:
+            config = msgspec.json.decode(noted.get("config", "{}"), type=_RecordedConfig)
+        except msgspec.DecodeError as error:
+            losses.report([f"{reader.path}: its masks cannot be read from its configuration: {error}"])
+            continue
+        if config.detector.masks:
+            found[noted.get("node", "")] = config.detector.masks
+    return found
+
+
+class _RecordedDetector(msgspec.Struct):
+    masks: list[list[tuple[float, float]]] = msgspec.field(default_factory=list)
+
+
+class _RecordedConfig(msgspec.Struct):
+    detector: _RecordedDetector = msgspec.field(default_factory=_RecordedDetector)
+
+
+def _given_masks(words: Sequence[str]) -> list[list[tuple[float, float]]]:
+    """Return the masks of `--mask U,V,U,V ...`; raise BuddylineError."""
+    masks = []
+    for word in words:
+        try:
+            numbers = [float(number) for number in word.split(",")]
+        except ValueError as error:
+            raise BuddylineError(f"--mask {word}: not numbers with commas between them") from error
+        if len(numbers) % 2:
+            raise BuddylineError(f"--mask {word}: {len(numbers)} numbers; give u and v of each corner")
+        masks.append(list(zip(numbers[::2], numbers[1::2], strict=True)))
+    return masks
 
 
 def run(args: argparse.Namespace) -> int:
@@ -102,7 +143,7 @@ def _detect_pictures(args: argparse.Namespace) -> int:
         if not found:
             raise BuddylineError(f"{name}: holds no pictures")
         files += found
-    detector = make_detector(args.method, args.environment)
+    detector = make_detector(args.method, args.environment, masks=_given_masks(args.mask))
     skipped = 0
     with Progress("detect", len(files)) as progress:
         for i, file in enumerate(files):
@@ -153,7 +194,9 @@ def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:
         infos = dive.infos()
         if not dive.nodes("image"):
             raise BuddylineError(f"{dive.name}: holds no pictures; topics: {', '.join(dive.keys) or 'none'}")
-        detector = DiveDetector(args.method, args.environment, infos)
+        given = _given_masks(args.mask)
+        masks = {node: given for node in dive.nodes("image")} if given else recorded_masks(dive)
+        detector = DiveDetector(args.method, args.environment, infos, masks)
         with new_dive_log(args.output) if args.output else nullcontext() as writer:
             for envelope in dive.messages(*DERIVED_FROM, doing="detect"):
                 found = detector.candidates(envelope) if envelope.topic is IMAGE else envelope

@@ -118,9 +118,9 @@ def _messages(dive: Dive, environment: str, infos: dict[str, NodeInfo]) -> Itera
     raw = set(dive.nodes("image")) - set(dive.nodes("candidates"))
     detector = None
     if raw:
-        from buddyline.tools.detect import DEFAULT_METHOD, DiveDetector
+        from buddyline.tools.detect import DEFAULT_METHOD, DiveDetector, recorded_masks
 
-        detector = DiveDetector(DEFAULT_METHOD, environment, dive.infos() | infos)
+        detector = DiveDetector(DEFAULT_METHOD, environment, dive.infos() | infos, recorded_masks(dive))
     topics = ("info", "candidates", "imu", "attitude", "depth", *(("image",) if raw else ()))
     for envelope in dive.messages(*topics):
         message = envelope.message

@@ -131,9 +131,9 @@ def messages_of(
     raw = [node for node in nodes if node not in dive.nodes("candidates")]
     detector = None
     if raw:
-        from buddyline.tools.detect import DiveDetector
+        from buddyline.tools.detect import DiveDetector, recorded_masks
 
-        detector = DiveDetector(args.detector, args.environment, infos)
+        detector = DiveDetector(args.detector, args.environment, infos, recorded_masks(dive))
     topics = (*COPIED, "image") if raw else COPIED
     for envelope in dive.messages(*topics, doing=doing):
         if len(envelope.ids) == 1 and envelope.node not in nodes:

@@ -28,6 +28,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.newfile import new_folder, write_picture
 from buddyline.tools.progress import Progress
+from buddyline.tools.still import Rectangle, still_parts
 from numpy.typing import NDArray
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,8 @@ CLOSE_PX: Final = 2.0
 COST_OF_FALSE: Final = 0.01
 LIKELY: Final = 0.5
 ROUNDS: Final = 2
+MASK_BGR: Final = (255, 160, 60)
+BY_TRUTH: Final = "truth"
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,11 @@ def run(args: argparse.Namespace) -> int:
     lights = sum(len(picture.lights_px) for picture in pictures)
     if lights == 0:
         raise BuddylineError("no lights in these pictures to tune on; give pictures with the lamps on, or --truth")
+    masks = still_parts([picture.pixels for picture in pictures], _true_lights(pictures, by))
     present = dict(presets(args.method)[args.environment])
     folder = new_folder(args.draw)
     proposed, before, after = propose(args.method, args.environment, present, pictures)
-    _write(folder, args.method, args.environment, proposed, pictures)
+    _write(folder, args.method, args.environment, proposed, pictures, masks)
     report = {
         "method": args.method,
         "environment": args.environment,
@@ -97,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
         "lights": lights,
         "judged_by": by,
         "present": present | {"recall": before.recall, "false_a_picture": before.false},
+        "masks": masks,
         "proposed": proposed | {"recall": after.recall, "false_a_picture": after.false},
         "marked": str(folder),
     }
@@ -106,6 +111,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         sys.stdout.write(_text(report, proposed, before, after))
     return 0
+
+
+def _true_lights(pictures: Sequence[Picture], by: str) -> list[Points] | None:
+    return [picture.lights_px for picture in pictures] if by == BY_TRUTH else None
 
 
 def propose(
@@ -166,7 +175,7 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
     if not named:
         raise BuddylineError("no pictures " + ("with truth " if known else "") + f"in {', '.join(inputs)}")
     if known:
-        return [Picture(name, pixels, lights) for name, lights, pixels in named if lights is not None], "truth"
+        return [Picture(name, pixels, lights) for name, lights, pixels in named if lights is not None], BY_TRUTH
     detector = make_detector()
     pictures = []
     for name, _, pixels in named:
@@ -231,13 +240,24 @@ def _spread(items: list[Any], limit: int) -> list[Any]:
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, min(limit, len(items)))]
 
 
-def _write(folder: Path, method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> None:
+def _write(
+    folder: Path,
+    method: str,
+    environment: str,
+    values: Values,
+    pictures: Sequence[Picture],
+    masks: Sequence[Rectangle],
+) -> None:
     """Write every picture with the candidates found by the proposed values, and its lights as crosses."""
     detector = make_detector(method, environment, values)
     for picture in pictures:
         marked = mark_candidates(
             picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px]
         )
+        height, width = picture.pixels.shape[:2]
+        for (u0, v0), (u1, v1) in masks:
+            corners = (round(u0 * width), round(v0 * height)), (round(u1 * width), round(v1 * height))
+            cv2.rectangle(marked, *corners, MASK_BGR, 2)
         write_picture(folder, Path(picture.name).stem, marked)
 
 
@@ -255,4 +275,7 @@ def _text(report: Mapping[str, Any], proposed: Values, before: Judged, after: Ju
         f'environment = "{report["environment"]}"',
         "overrides = { " + ", ".join(f"{name} = {value:.1f}" for name, value in proposed.items()) + " }",
     ]
+    if report["masks"]:
+        corners = [f"[[{u0:g}, {v0:g}], [{u1:g}, {v1:g}]]" for (u0, v0), (u1, v1) in report["masks"]]
+        lines += [f"masks = [{', '.join(corners)}]  # what stays still; look at the marked pictures first"]
     return "\n".join(lines) + "\n"

@@ -89,13 +89,14 @@ class ProposalFinder:
     contrast of its neighbourhood, the clutter.
     """
 
-    def __init__(self, focal_px: float | None = None, octaves: int = _OCTAVES, at_least: int = _ALWAYS) -> None:
+    def __init__(self, focal_px: float | None = None, surround: int | None = None, at_least: int = _ALWAYS) -> None:
         """focal_px: of the pictures; None to take each picture's from its width (see focal_of).
 
-        octaves: of the pyramid. at_least: how many places are found, where there are so many.
+        surround: for parts of pictures, the octave that is only the surround of the one before, and has no places; None
+        for whole pictures. at_least: how many places are found, where there are so many.
         """
         self._focal_px = focal_px
-        self._most_octaves = octaves
+        self._surround = surround
         self._at_least = at_least
         self._shape: tuple[int, ...] = ()
         self._octaves: list[_Octave] = []
@@ -145,13 +146,11 @@ class ProposalFinder:
         """Find the most outstanding places of the loaded picture, 16 by default, or up to 64 that clearly stand out.
 
         A place needs a contrast of contrast_min grey levels plus clutter_gain times the mean contrast of its
-        neighbourhood. layout: of a picture that is made of parts of another; None for a whole one. A finder is for
-        the one or for the other.
+        neighbourhood. layout: which places count, and where they are; None for all of a whole picture.
         """
         below: NDArray[np.uint8] | None = None
         for i, octave in reversed(list(enumerate(self._octaves))):
-            # Of parts of a picture the last octave is only the surround of the one before: it has no places.
-            if layout is None or i < len(self._octaves) - 1:
+            if i != self._surround:
                 octave.measure(below)
             below = octave.level
         if self._octaves:
@@ -201,7 +200,9 @@ class ProposalFinder:
             self._base_step_px *= 2.0
             self._halves.append(np.empty((height, width), np.uint8))
         sizes: list[tuple[int, int]] = []
-        while min(height, width) >= _WINDOW and len(sizes) < self._most_octaves:
+        while min(height, width) >= _WINDOW and len(sizes) < (
+            _OCTAVES if self._surround is None else self._surround + 1
+        ):
             sizes.append((height, width))
             height, width = height // 2, width // 2
         cells = [(h // _CLUTTER_CELL, w // _CLUTTER_CELL) for h, w in sizes]

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.node.detect.detection import Region
+from buddyline.node.detect.masks import Masks
 from buddyline.node.detect.proposals import ProposalFinder, Proposals
 from numpy.typing import NDArray
 
@@ -41,10 +42,12 @@ class _Tile:
 class RegionFinder:
     """Finds the local maxima of contrast within regions.
 
-    focal_px: of the pictures. step_px: side of a pixel of the pyramid's base, px of the picture.
+    focal_px: of the pictures. step_px: side of a pixel of the pyramid's base, px of the picture. masks: where no
+    places are looked for.
     """
 
-    def __init__(self, focal_px: float, step_px: int) -> None:
+    def __init__(self, focal_px: float, step_px: int, masks: Masks | None = None) -> None:
+        self._masks = masks
         self._focal_px = focal_px
         self._step_px = step_px
         self._mosaics: dict[tuple[int, int, int], _Mosaic] = {}
@@ -73,8 +76,8 @@ class RegionFinder:
         for group in mosaics:
             mosaic = self._mosaics.get((len(group), side_px, octaves))
             if mosaic is None:
-                finder = ProposalFinder(self._focal_px, octaves, AT_LEAST * len(group))
-                mosaic = self._mosaics[len(group), side_px, octaves] = _Mosaic(finder, side_px)
+                finder = ProposalFinder(self._focal_px, octaves - 1, AT_LEAST * len(group))
+                mosaic = self._mosaics[len(group), side_px, octaves] = _Mosaic(finder, side_px, self._masks)
             found.append(mosaic.find(image, group, self._step_px << (octaves - 2), contrast_min, clutter_gain))
         return found[0] if len(found) == 1 else _joined(found)
 
@@ -103,8 +106,9 @@ class RegionFinder:
 class _Mosaic:
     """Tiles of a picture, one below the other, searched as one picture: each search costs much, whatever its size."""
 
-    def __init__(self, finder: ProposalFinder, side_px: int) -> None:
+    def __init__(self, finder: ProposalFinder, side_px: int, masks: Masks | None) -> None:
         self._finder = finder
+        self._masks = masks
         self._side_px = side_px
         self._pixels = np.zeros((0, 0), np.uint8)
 
@@ -136,7 +140,10 @@ class _Mosaic:
             of = (centre_px[:, 1] // side_px).astype(np.intp)
             away = centre_px - centre[of]
             near = (away * away).sum(1) <= (radius[of] + step_px) ** 2
-            return near & (step_px <= coarsest_px), origin[of]
+            kept = near & (step_px <= coarsest_px)
+            if self._masks is not None:
+                kept &= ~self._masks.hide(centre_px + origin[of], image.shape[1], image.shape[0])
+            return kept, origin[of]
 
         self._finder.load(self._pixels)
         return self._finder.find(contrast_min, clutter_gain, layout)

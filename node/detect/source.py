@@ -14,7 +14,8 @@ import numpy as np
 from buddyline.node.detect.centre import Centres, locate_sources
 from buddyline.node.detect.detection import Detection, Region, check_image, focal_of
 from buddyline.node.detect.lights import Lights, distinct, measure_lights, water_level
-from buddyline.node.detect.proposals import ProposalFinder, Proposals
+from buddyline.node.detect.masks import Masks, unmasked
+from buddyline.node.detect.proposals import Layout, ProposalFinder, Proposals
 from buddyline.node.detect.regions import RegionFinder
 from buddyline.node.detect.rings import RAY_UV, Floats
 from buddyline.protocol.messages import Blob
@@ -50,8 +51,15 @@ grey, and in real caustics."""
 class SourceDetector:
     """The default detector. With the environment `auto` it adapts to the noise of this picture and those before."""
 
-    def __init__(self, environment: str, overrides: Mapping[str, float], focal_px: float | None = None) -> None:
-        """focal_px: of the pictures; None to take each picture's from its width."""
+    def __init__(
+        self,
+        environment: str,
+        overrides: Mapping[str, float],
+        focal_px: float | None = None,
+        masks: Masks | None = None,
+    ) -> None:
+        """focal_px: of the pictures; None to take each picture's from its width. masks: what is never searched."""
+        self._masks = masks
         self._focal_px = focal_px
         self._values = {**PRESETS.get(environment, {}), **overrides}
         self._clutter_gain = self._values.get("clutter_gain", _CLUTTER_GAIN)
@@ -71,9 +79,17 @@ class SourceDetector:
         self._contrast_min = self._adapt() if contrast_min is None else contrast_min
         if image.shape != self._shape:
             focal_px = self._focal_px or focal_of(image.shape[1])
-            self._shape, self._near = image.shape, RegionFinder(focal_px, self._finder.base_step_px)
+            self._shape, self._near = image.shape, RegionFinder(focal_px, self._finder.base_step_px, self._masks)
         self._water = water_level(image)
-        return self._measured(image, self._finder.find(self._contrast_min, self._clutter_gain))
+        return self._measured(image, self._finder.find(self._contrast_min, self._clutter_gain, self._layout(image)))
+
+    def _layout(self, image: NDArray[np.uint8]) -> Layout | None:
+        """Return which places of a whole picture count; None for all."""
+        masks = self._masks
+        if masks is None:
+            return None
+        height, width = image.shape[:2]
+        return lambda centre_px, _: (~masks.hide(centre_px, width, height), np.zeros_like(centre_px))
 
     def detect_near(self, image: NDArray[np.uint8], regions: Sequence[Region]) -> list[Detection] | None:
         """Find the candidates within some regions, also fainter ones than in a whole picture.
@@ -104,7 +120,8 @@ class SourceDetector:
         chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in table)]
         likely = lights.at(chosen)
         focal_px = self._focal_px or focal_of(image.shape[1])
-        return _detections(likely, locate_sources(image, likely, focal_px), score[chosen], image.shape)
+        found = _detections(likely, locate_sources(image, likely, focal_px), score[chosen], image.shape)
+        return unmasked(found, self._masks, image.shape)
 
     def _adapt(self) -> float:
         """Return the least contrast of a place, in grey levels: from the noise of this picture and those before."""

@@ -75,6 +75,7 @@ def _take_frames(
         config.detector.environment,
         config.detector.overrides,
         stated.camera.fx_px if stated else None,
+        config.detector.masks,
     )
     pipeline = Pipeline(config.node, "doctor", config.trigger_period_ns, detector)
     stop = threading.Event()
