@@ -56,12 +56,12 @@ def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) 
     return np.array((shown_m - h,)), H
 
 
-def kalman(P: Floats, H: Floats, y: Floats, noise: Floats) -> tuple[Floats, Floats, float]:
-    """Give the error (SIZE,) to add, the covariance after, and chi^2 of the residual."""
+def kalman(P: Floats, H: Floats, y: Floats, noise: Floats) -> tuple[Floats, Floats, float, Floats]:
+    """Give the error (SIZE,) to add, the covariance after, chi^2 of the residual and its covariance's inverse."""
     across = P @ H.T
     S = H @ across + noise
-    inverse = np.linalg.inv(S)
+    inverse = np.asarray(np.linalg.inv(S), np.float64)
     gain = across @ inverse
     after = P - gain @ across.T
     after = 0.5 * (after + after.T)
-    return gain @ y, after, float(y @ inverse @ y)
+    return gain @ y, after, float(y @ inverse @ y), inverse

@@ -185,8 +185,6 @@ def smooth(
     told = sum(part.told for part in parts)
     if told > 100:
         second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
-    # A track that has just begun has not yet learned how much its units shake.
-    strain = max(part.strain for part in parts)
     since_s = -math.inf
     for part in parts:
         path = smoothed(part.steps)
@@ -196,8 +194,8 @@ def smooth(
             guide_by(second, earlier)
             path = earlier
         state = replace(path.state(0), clock_s=0.0)
-        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest)
-        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, strain)
+        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest, part.shaking)
+        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, part.shaking)
         since_s = part.end_s
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
     del first, parts, part, learned, path, earlier

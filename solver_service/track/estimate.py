@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
-from buddyline.solver_service.track.state import State
+from buddyline.solver_service.track.shaking import Shaking
+from buddyline.solver_service.track.state import MOVING, State
 from buddyline.solver_service.track.trail import Chosen, Trail
 
 CHALLENGE_S: Final = 4.0
@@ -18,7 +19,8 @@ CHALLENGE_S: Final = 4.0
 class Estimate:
     """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
 
-    strain: by how much the units' noise is greater than their samples show, learned from the lights' residuals.
+    shaking: how much the units are shaken in their mounts, as learned from the lights' residuals; shaken (3, MOVING,
+    MOVING): how much of the moving errors' covariance is of that.
     evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
 
     agreed_s: when a fix last agreed with it; inf where none ever bore on it. agreed: how many did.
@@ -47,7 +49,8 @@ class Estimate:
     depth_s: float = -np.inf
     steps: Trail = field(default_factory=Trail)
     confirmed: bool = False
-    strain: float = 1.0
+    shaking: Shaking = field(default_factory=Shaking)
+    shaken: Floats = field(default_factory=lambda: np.zeros((3, MOVING, MOVING)))
     surprise: float = 0.0
     fit: float = 0.0
     told: int = 0

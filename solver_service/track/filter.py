@@ -16,6 +16,7 @@ from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
+from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import State
 from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TOGETHER_S
@@ -193,10 +194,19 @@ class TrackFilter(TrackPool):
         noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
         return float(y @ np.linalg.solve(noise + H @ P @ H.T, y)) < CONTRADICTS
 
-    def begin(self, t_s: float, end_s: float, state: State, P: Floats, strain: float) -> None:
+    def begin(self, t_s: float, end_s: float, state: State, P: Floats, shaking: Shaking) -> None:
         """Start from a state that is known beforehand, confirmed; a later one takes over at its time."""
         estimate = Estimate(
-            t_s, state, P, t_s, confirmed=True, end_s=end_s, skip_s=0.0, evidence=CONFIRMED, light_s=t_s, strain=strain
+            t_s,
+            state,
+            P,
+            t_s,
+            confirmed=True,
+            end_s=end_s,
+            skip_s=0.0,
+            evidence=CONFIRMED,
+            light_s=t_s,
+            shaking=shaking,
         )
         self._open(estimate)
         self._waiting.append(estimate)

@@ -90,7 +90,7 @@ class TrackPool(TrackSteps):
                 t_s=again.t_s,
                 state=again.state,
                 covariance=again.covariance,
-                strain=again.strain,
+                shaking=again.shaking,
                 surprise=again.surprise,
                 told=again.told,
                 fit=again.fit,
@@ -117,7 +117,7 @@ class TrackPool(TrackSteps):
             v_mps = state.v_mps - (b.dv_mps - a.dv_mps)
             state = state.moved(state.r_m - v_mps * span_s - (b.dp_m - a.dp_m), v_mps, R)
             t_s = since_s
-        return state
+        return replace(state, shake_rad=np.zeros((2, 3)), shove_mps=np.zeros(3))
 
     def _search(self, t_s: float, sight: Sight) -> None:
         """Start from this picture alone, where nothing is confirmed, or what is explains one node's pictures only."""

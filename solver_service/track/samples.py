@@ -11,6 +11,8 @@ from buddyline.solver_service.track.strapdown import Bools, Noise
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
 STANDARD_GRAVITY: Final = 9.80665
+# Over so long shaking has no mean to speak of, and motion changes little.
+SLOW_S: Final = 0.4
 _NOISE_SPAN_S: Final = 2.0
 # Below these densities what the model leaves out rules: scale, cross-axis, interpolation, shake.
 GYRO_FLOOR: Final = 1e-4
@@ -102,6 +104,14 @@ class Samples:
         late = np.maximum(grid[1:] - t[last - 1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
         told = (after - before < GAP_S) & (late < 0.5 * GAP_S)
         return grid, at, told
+
+    def slow_rate(self, time_s: float, known_s: float) -> Floats | None:
+        """Give the mean turn rate (3,) of SLOW_S until known_s or shortly after time_s, None where there is none.
+
+        Shaking is gone from it, motion is SLOW_S / 2 late in it.
+        """
+        first, stop = np.searchsorted(self.times_s, (time_s - SLOW_S, min(time_s + 0.1 * SLOW_S, known_s)))
+        return np.asarray(self._values[first:stop, 3:].mean(axis=0)) if stop > first else None
 
     def near(self, time_s: float, known_s: float) -> bool:
         """Whether there is a sample within a second before time_s, nothing later than known_s looked at."""

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
 from buddyline.solver_service.track.lights import COLUMNS
 from buddyline.solver_service.track.output import TrackRow, rows_of
-from buddyline.solver_service.track.state import NAV, ROW, SIZE, State
+from buddyline.solver_service.track.shaking import SHAKEN_S
+from buddyline.solver_service.track.state import MOVING, NAV, PHI, R_, ROW, SHAKE, SHOVE, SIZE, V_, State
 from buddyline.solver_service.track.strapdown import predicted
 from buddyline.solver_service.track.trail import Look, Trail
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ _UPPER: Final = np.triu_indices(len(COLUMNS))
 _BLOCK_UPPER: Final = COLUMNS[_UPPER[0]], COLUMNS[_UPPER[1]]
 # So many rows are made at once.
 TOGETHER: Final = 256
+# Over so many steps a turn rate's swings are averaged.
+SWINGS: Final = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,9 @@ class Path:
     """Smoothed steps as columns, in order of time.
 
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
-    covariance of COLUMNS, its upper half. oldest (SIZE, SIZE): the whole covariance at the first step.
+    covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
+    attitude by shaking, of both by their samples, and of the velocity by shaking. oldest (SIZE, SIZE): the whole
+    covariance at the first step.
     """
 
     t_s: Floats
@@ -36,6 +41,7 @@ class Path:
     rates_radps: Floats
     states: Floats
     halves: Floats
+    drawn: Floats
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
 
@@ -46,6 +52,13 @@ class Path:
     def state(self, k: int) -> State:
         """Give the state at a step."""
         return State.of_row(self.states[k])
+
+    def swings(self) -> Floats:
+        """Give the variance of each node's turn rate, one axis, as its changes from step to step show it, (N, 2)."""
+        changes = np.zeros((len(self), 2))
+        changes[2:] = 0.5 * ((self.rates_radps[2:] - self.rates_radps[1:-1]) ** 2).mean(axis=2)
+        near = np.stack([np.convolve(changes[:, node], np.ones(SWINGS) / SWINGS, "full") for node in (0, 1)], axis=1)
+        return near[SWINGS // 2 : SWINGS // 2 + len(self)]
 
     def covariance(self, k: NDArray[np.intp] | int) -> Floats:
         """Give the covariance (..., C, C) of COLUMNS at steps."""
@@ -70,6 +83,7 @@ def smoothed(steps: Trail) -> Path:
         rates_radps=np.empty((count, 2, 3)),
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
+        drawn=np.empty((count, 5)),
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
     )
@@ -80,7 +94,7 @@ def smoothed(steps: Trail) -> Path:
         else:
             P_before = predicted(step.covariance, later.F, later.Q, later.walk)
             across = step.covariance.copy()
-            across[:, :NAV] = step.covariance @ later.F.T
+            across[:, :MOVING] = step.covariance @ later.F.T
             gain = np.linalg.solve(P_before, across.T).T
             error = gain @ state.minus(later.before)
             P = step.covariance + gain @ (P - P_before) @ gain.T
@@ -88,6 +102,7 @@ def smoothed(steps: Trail) -> Path:
             state = step.after.plus(error)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
         path.rates_radps[k], path.states[k], path.halves[k] = step.rates_radps, state.to_row(), P[_BLOCK_UPPER]
+        path.drawn[k] = _drawn(step.Q)
         looks[k] = step.looks
         later = step
     if count:
@@ -129,11 +144,44 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
     b = np.clip(a, 0.0, 1.0)
     b3 = b[:, None, None]
     near = np.where(b < 1.0, one, two)
+    between = before.moved(r, v, R)
     return rows_of(
         stamps_ns,
-        before.moved(r, v, R),
-        (1.0 - b3) * path.covariance(one) + b3 * path.covariance(two),
+        between,
+        (1.0 - b3) * path.covariance(one) + b3 * path.covariance(two) + _unseen(path, between, two, span, b),
         (1.0 - b3) * path.rates_radps[one] + b3 * path.rates_radps[two],
         path.lights[near],
         np.maximum(times_s - path.light_s[near], 0.0),
     )
+
+
+def _drawn(Q: Floats) -> Floats:
+    """Give a row of Path.drawn for a step's Q (MOVING, MOVING)."""
+    of = np.diag(Q)[[PHI[0].start, PHI[1].start, V_.start, SHAKE[0].start, SHAKE[1].start, SHOVE.start]]
+    # Without a unit its shaking is drawn, but moves nothing.
+    shaken = np.minimum(of[:3], of[3:])
+    return np.array((*shaken[:2], *(of[:2] - shaken[:2]), shaken[2]))
+
+
+def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, share: Floats) -> Floats:
+    """Give what states between two steps may be off by, whatever is known at both, (M, C, C) of COLUMNS.
+
+    share (M,): of the span that has passed since the first. Of what noise of density q does in a step h, white noise
+    leaves s (h - s) / h^2, shaking (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2. Shaking does no
+    more than what the interpolation takes from the rates at both ends, which are shaken too.
+    """
+    gone = [-np.expm1(-2.0 * passed * span_s / SHAKEN_S) for passed in (share, 1.0 - share, np.ones_like(share))]
+    shaken = path.drawn[two] * (gone[0] * gone[1] / gone[2] ** 2)[:, None]
+    white = path.drawn[two, 2:4] * (share * (1.0 - share))[:, None]
+    slopes = span_s**2 * ((share * (1.0 - share) ** 2) ** 2 + (share**2 * (1.0 - share)) ** 2)
+    most = slopes[:, None] * path.swings()[two]
+    variances = np.zeros((len(two), NAV))
+    variances[:, PHI[0]] = (np.minimum(shaken[:, 0], most[:, 0]) + white[:, 0])[:, None]
+    variances[:, PHI[1]] = (np.minimum(shaken[:, 1], most[:, 1]) + white[:, 1])[:, None]
+    variances[:, V_] = shaken[:, 4:5]
+    T = np.zeros((len(two), NAV, NAV))
+    T[:] = np.eye(NAV)
+    T[:, R_, PHI[0]], T[:, V_, PHI[0]] = skew(states.r_m), skew(states.v_mps)
+    out = np.zeros((len(two), len(COLUMNS), len(COLUMNS)))
+    out[:, :NAV, :NAV] = (T * variances[:, None, :]) @ np.swapaxes(T, -1, -2)
+    return out

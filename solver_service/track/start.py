@@ -9,6 +9,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.anchors import attitude_covariance
 from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
+from buddyline.solver_service.track.shaking import SHAKE_RAD, SHOVE_MPS, Shaking
 from buddyline.solver_service.track.state import (
     ACCEL_BIAS,
     CLOCK,
@@ -17,9 +18,12 @@ from buddyline.solver_service.track.state import (
     GYRO_BIAS,
     LEVER,
     MOUNT,
+    MOVING,
     NAV,
     PHI,
     R_,
+    SHAKE,
+    SHOVE,
     SIZE,
     V_,
     State,
@@ -52,6 +56,8 @@ def constants_of(
         r_m=r_m,
         v_mps=np.zeros(3),
         R=R,
+        shake_rad=np.zeros((2, 3)),
+        shove_mps=np.zeros(3),
         gyro_bias_radps=np.zeros((2, 3)),
         accel_bias_mps2=np.zeros((2, 3)),
         mount_rad=np.zeros((2, 3)),
@@ -62,7 +68,9 @@ def constants_of(
     )
     sigma = np.zeros(SIZE)
     sigma[V_] = SPEED_MPS
+    sigma[SHOVE] = SHOVE_MPS
     for i, node in enumerate(nodes):
+        sigma[SHAKE[i]] = SHAKE_RAD
         sigma[GYRO_BIAS[i]] = GYRO_BIAS_RADPS
         sigma[ACCEL_BIAS[i]] = ACCEL_BIAS_MPS2
         sigma[MOUNT[i]] = MOUNT_RAD
@@ -74,14 +82,20 @@ def constants_of(
 
 
 def broad_start(
-    nodes: tuple[TrackNode, TrackNode], state: State, clock_sigma_s: float = CLOCK_S, known: Floats | None = None
+    nodes: tuple[TrackNode, TrackNode],
+    state: State,
+    clock_sigma_s: float = CLOCK_S,
+    known: Floats | None = None,
+    shaking: Shaking | None = None,
 ) -> tuple[State, Floats]:
     """Give a state to start again from, with a covariance that holds next to nothing of the lights yet.
 
     known (SIZE, SIZE): its covariance by an earlier pass, of which BROAD_SIGMAS are kept: from a broader start the
-    first updates would be far from linear.
+    first updates would be far from linear. shaking: as it was learned.
     """
     _, variances = constants_of(nodes, state.R, state.r_m, clock_sigma_s)
+    if shaking is not None:
+        variances[NAV:MOVING] = np.repeat(shaking.variances, 3)
     P = np.diag(variances)
     P[R_, R_] = BROAD_R_M**2 * np.eye(3)
     level = BROAD_TURN_RAD**2 * np.eye(3)

@@ -13,19 +13,23 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rot
 R_: Final = slice(0, 3)
 V_: Final = slice(3, 6)
 PHI: Final = (slice(6, 9), slice(9, 12))
-GYRO_BIAS: Final = (slice(12, 15), slice(15, 18))
-ACCEL_BIAS: Final = (slice(18, 21), slice(21, 24))
-MOUNT: Final = (slice(24, 27), slice(27, 30))
-LEVER: Final = (slice(30, 33), slice(33, 36))
-DELAY: Final = (36, 37)
-CLOCK: Final = 38
-DEPTH_OFFSET: Final = 39
-SIZE: Final = 40
+SHAKE: Final = (slice(12, 15), slice(15, 18))
+SHOVE: Final = slice(18, 21)
+GYRO_BIAS: Final = (slice(21, 24), slice(24, 27))
+ACCEL_BIAS: Final = (slice(27, 30), slice(30, 33))
+MOUNT: Final = (slice(33, 36), slice(36, 39))
+LEVER: Final = (slice(39, 42), slice(42, 45))
+DELAY: Final = (45, 46)
+CLOCK: Final = 47
+DEPTH_OFFSET: Final = 48
+SIZE: Final = 49
 NAV: Final = 12
-"""The first errors, which move; the others are constants or walk slowly."""
+"""The first errors: of position, velocity and attitudes."""
+MOVING: Final = 21
+"""The first errors, which a step moves; the others are constants or walk slowly."""
 
 # The shapes of a state's fields, where each ends in a row, and how long a row is.
-_SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
+_SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (3,), (2, 3), (2, 3), (2, 3), (2, 3), (2,), (), ())
 _ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES])
 ROW: Final = int(_ENDS[-1])
 _THREE: Final = 3.0 * np.eye(3)
@@ -35,16 +39,19 @@ _THREE: Final = 3.0 * np.eye(3)
 class State:
     """Where both nodes are, in a level frame (z down; north-east-down where a compass says so), and their constants.
 
-    r_m, v_mps (3,): of B's camera from A's. R (2, 3, 3): each camera to level. gyro_bias_radps, accel_bias_mps2,
-    mount_rad, lever_m (2, 3): in camera axes; mount: the small turn that brings the unit's axes, as stated, to the
-    true ones. delay_s (2,): the unit's stamps minus true time. clock_s: B's clock minus A's. depth_offset_m: what
-    B's gauge shows too much against A's. As rows of numbers states are kept; several rows make a batch of states, each
-    array with leading axes.
+    r_m, v_mps (3,): of B's camera from A's. R (2, 3, 3): each camera to level. shake_rad (2, 3): how far each unit is
+    shaken out of its mount at this time, camera axes; shove_mps (3,): what the shaking adds to the velocity that the
+    units tell, level axes. gyro_bias_radps, accel_bias_mps2, mount_rad, lever_m (2, 3): in camera axes; mount: the
+    small turn that brings the unit's axes, as stated, to the true ones. delay_s (2,): the unit's stamps minus true
+    time. clock_s: B's clock minus A's. depth_offset_m: what B's gauge shows too much against A's. As rows of numbers
+    states are kept; several rows make a batch of states, each array with leading axes.
     """
 
     r_m: Floats
     v_mps: Floats
     R: Floats
+    shake_rad: Floats
+    shove_mps: Floats
     gyro_bias_radps: Floats
     accel_bias_mps2: Floats
     mount_rad: Floats
@@ -56,19 +63,21 @@ class State:
     def plus(self, error: Floats) -> State:
         """Return the state that is off this one by an error (SIZE,).
 
-        R_X = exp(phi_X) R_X; r = exp(phi_A) r + dr and v likewise: turning all about the vertical is then an error
-        in phi_A and phi_B alone, whatever r and v are (docs/track.md, consistency).
+        R_X = exp(phi_X) R_X; r = exp(phi_A) r + dr, v and shove likewise: turning all about the vertical is then an
+        error in phi_A and phi_B alone, whatever r and v are (docs/track.md, consistency).
         """
         turn = rotation_exp(np.stack((error[PHI[0]], error[PHI[1]])))
         return State(
             r_m=turn[0] @ self.r_m + error[R_],
             v_mps=turn[0] @ self.v_mps + error[V_],
             R=orthonormal(turn @ self.R),
-            gyro_bias_radps=self.gyro_bias_radps + error[12:18].reshape(2, 3),
-            accel_bias_mps2=self.accel_bias_mps2 + error[18:24].reshape(2, 3),
-            mount_rad=self.mount_rad + error[24:30].reshape(2, 3),
-            lever_m=self.lever_m + error[30:36].reshape(2, 3),
-            delay_s=self.delay_s + error[36:38],
+            shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
+            shove_mps=turn[0] @ self.shove_mps + error[SHOVE],
+            gyro_bias_radps=self.gyro_bias_radps + error[21:27].reshape(2, 3),
+            accel_bias_mps2=self.accel_bias_mps2 + error[27:33].reshape(2, 3),
+            mount_rad=self.mount_rad + error[33:39].reshape(2, 3),
+            lever_m=self.lever_m + error[39:45].reshape(2, 3),
+            delay_s=self.delay_s + error[45:47],
             clock_s=self.clock_s + float(error[CLOCK]),
             depth_offset_m=self.depth_offset_m + float(error[DEPTH_OFFSET]),
         )
@@ -81,11 +90,13 @@ class State:
         turn = rotation_exp(phi)
         error[R_] = self.r_m - turn @ other.r_m
         error[V_] = self.v_mps - turn @ other.v_mps
-        error[12:18] = (self.gyro_bias_radps - other.gyro_bias_radps).ravel()
-        error[18:24] = (self.accel_bias_mps2 - other.accel_bias_mps2).ravel()
-        error[24:30] = (self.mount_rad - other.mount_rad).ravel()
-        error[30:36] = (self.lever_m - other.lever_m).ravel()
-        error[36:38] = self.delay_s - other.delay_s
+        error[12:18] = (self.shake_rad - other.shake_rad).ravel()
+        error[SHOVE] = self.shove_mps - turn @ other.shove_mps
+        error[21:27] = (self.gyro_bias_radps - other.gyro_bias_radps).ravel()
+        error[27:33] = (self.accel_bias_mps2 - other.accel_bias_mps2).ravel()
+        error[33:39] = (self.mount_rad - other.mount_rad).ravel()
+        error[39:45] = (self.lever_m - other.lever_m).ravel()
+        error[45:47] = self.delay_s - other.delay_s
         error[CLOCK] = self.clock_s - other.clock_s
         error[DEPTH_OFFSET] = self.depth_offset_m - other.depth_offset_m
         return error
@@ -114,16 +125,14 @@ def orthonormal(R: Floats) -> Floats:
 
 
 def plain_of_invariant(state: State) -> Floats:
-    """Give T (NAV, NAV): errors with plain r_true - r and v_true - v, from the state's own."""
-    T = np.eye(NAV)
-    T[R_, PHI[0]] = -skew(state.r_m)
-    T[V_, PHI[0]] = -skew(state.v_mps)
+    """Give T (MOVING, MOVING): errors with plain r_true - r, v_true - v and shove likewise, from the state's own."""
+    T = np.eye(MOVING)
+    T[R_, PHI[0]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = -skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
     return T
 
 
 def invariant_of_plain(state: State) -> Floats:
     """Give the inverse of `plain_of_invariant`."""
-    T = np.eye(NAV)
-    T[R_, PHI[0]] = skew(state.r_m)
-    T[V_, PHI[0]] = skew(state.v_mps)
+    T = np.eye(MOVING)
+    T[R_, PHI[0]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
     return T

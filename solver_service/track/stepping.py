@@ -15,7 +15,7 @@ from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals
 from buddyline.solver_service.track.smoother import Path
-from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, NAV, SIZE, State
+from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
 from buddyline.solver_service.track.trail import Look, Step
 
@@ -33,14 +33,7 @@ WITHOUT_RAD: Final = 0.03
 # How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
 # 0.7 of its sigma in half a second.
 WANDER_PER_ROOT_S: Final = 1.0
-# How fast the strain of a track follows its residuals' chi^2, of which one residual counts at most MOST_CHI2: with
-# four lights ten times a second it settles within some seconds.
-STRAIN_GAIN: Final = 0.005
-MOST_CHI2: Final = 9.0
-MOST_STRAIN: Final = 50.0
-# Shaking lasts for some tenths of a second, and so moves a track farther than white noise of the same residuals: found
-# on simulated dives, so that the normalized errors of shaken units are near 1.
-COLOURED: Final = 2.0
+_STILL: Final = np.eye(MOVING)
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
@@ -78,16 +71,20 @@ class TrackSteps(TrackIntake):
             without = not told.any() and not self.samples[node].near(t_s + shift, t_s + HOLD_S)
             if without:
                 values = np.zeros_like(values)
-            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told)
+            slow = [
+                self.samples[node].slow_rate(each_s, t_s + HOLD_S) for each_s in (estimate.t_s + shift, t_s + shift)
+            ]
+            ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
+            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends))
             parts.append(replace(part, without=True) if without else part)
         return parts[0], parts[1]
 
-    def _noises(self, t_s: float, strain: float) -> tuple[Noise, Noise]:
-        a, b = (self._noise(node, t_s, 1.0 + COLOURED * (strain - 1.0)) for node in (0, 1))
+    def _noises(self, t_s: float) -> tuple[Noise, Noise]:
+        a, b = (self._noise(node, t_s) for node in (0, 1))
         return a, b
 
-    def _noise(self, node: int, t_s: float, strain: float) -> Noise:
-        noise = self.samples[node].noise(t_s).scaled(self.unrest, strain)
+    def _noise(self, node: int, t_s: float) -> Noise:
+        noise = self.samples[node].noise(t_s).scaled(self.unrest)
         stated = self._turning[node].stated(t_s)
         if stated is None:
             return noise
@@ -97,15 +94,16 @@ class TrackSteps(TrackIntake):
     def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
         span_s = t_s - estimate.t_s
         parts = self.increments(estimate, t_s)
-        noises = self._noises(t_s, estimate.strain)
         after, F = propagate(estimate.state, parts, span_s)
-        Q, walk = process_noise(after, parts, noises, span_s)
+        Q, walk, shaken = process_noise(after, parts, self._noises(t_s), estimate.shaking.variances, span_s)
+        onward = F[:, :MOVING]
+        estimate.shaken = onward @ estimate.shaken @ onward.T + shaken
         for node, part in enumerate(parts):
             if part.without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
                 estimate.without[node] = part.without
-                walk[GYRO_BIAS[node].start - NAV : GYRO_BIAS[node].stop - NAV] += WITHOUT_RADPS**2
-                walk[MOUNT[node].start - NAV : MOUNT[node].stop - NAV] += WITHOUT_RAD**2
+                walk[GYRO_BIAS[node].start - MOVING : GYRO_BIAS[node].stop - MOVING] += WITHOUT_RADPS**2
+                walk[MOUNT[node].start - MOVING : MOUNT[node].stop - MOVING] += WITHOUT_RAD**2
         estimate.covariance = predicted(estimate.covariance, F, Q, walk)
         estimate.state, estimate.t_s = after, t_s
         estimate.rates_radps = np.stack((parts[0].rate_radps, parts[1].rate_radps))
@@ -240,11 +238,8 @@ class TrackSteps(TrackIntake):
         if estimate.searched and not estimate.confirmed:
             _, log_det = np.linalg.slogdet(rows_H @ estimate.covariance @ rows_H.T + noise)
             estimate.fit -= 0.5 * float(log_det)
-        chi2 = self._apply(estimate, rows_H, rows_y, noise)
+        chi2 = self._apply(estimate, rows_H, rows_y, noise, teaches=True)
         estimate.fit -= 0.5 * chi2
-        # Residuals that are too large say that the units shake or drift more than their samples show by themselves.
-        excess = min(chi2, MOST_CHI2 * len(rows_y)) - len(rows_y)
-        estimate.strain = min(max(estimate.strain * math.exp(STRAIN_GAIN * excess), 1.0), MOST_STRAIN)
         estimate.surprise += chi2
         estimate.told += len(rows_y)
         estimate.light_s = max(estimate.light_s, sight.t_s)
@@ -252,9 +247,15 @@ class TrackSteps(TrackIntake):
         estimate.trigger += [(sight.t_s, sight.node, light) for _, light, _ in found.chosen]
 
     @staticmethod
-    def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats) -> float:
-        error, estimate.covariance, chi2 = anchors.kalman(estimate.covariance, H, y, noise)
+    def _apply(estimate: Estimate, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
+        before = estimate.covariance
+        error, estimate.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
         estimate.state = estimate.state.plus(error)
+        moving = H[:, :MOVING]
+        if teaches:
+            estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
+        rest = _STILL - before[:MOVING] @ H.T @ S_inverse @ moving
+        estimate.shaken = rest @ estimate.shaken @ rest.T
         return chi2
 
     def _take_depth(self, estimate: Estimate, t_s: float) -> None:
@@ -309,7 +310,7 @@ class TrackSteps(TrackIntake):
 
     def _open(self, estimate: Estimate) -> None:
         if self._keep_s:
-            still = np.eye(SIZE)[:NAV], np.zeros((NAV, NAV)), np.zeros(SIZE - NAV)
+            still = np.eye(SIZE)[:MOVING], np.zeros((MOVING, MOVING)), np.zeros(SIZE - MOVING)
             state, rates = estimate.state, estimate.rates_radps
             first = Step(estimate.t_s, state, state, estimate.covariance, *still, rates, estimate.light_s, 0)
             estimate.steps.append(first)
@@ -320,5 +321,5 @@ class TrackSteps(TrackIntake):
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)
-        Q, walk = process_noise(after, parts, self._noises(t_s, estimate.strain), span_s)
+        Q, walk, _ = process_noise(after, parts, self._noises(t_s), estimate.shaking.variances, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)

@@ -7,15 +7,19 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.track.shaking import SHAKEN_S, kept_share, shaking_noise
 from buddyline.solver_service.track.state import (
     ACCEL_BIAS,
     DELAY,
     GYRO_BIAS,
     LEVER,
     MOUNT,
+    MOVING,
     NAV,
     PHI,
     R_,
+    SHAKE,
+    SHOVE,
     SIZE,
     V_,
     State,
@@ -49,19 +53,15 @@ class Noise:
     gap_rate_radps: float = 0.15
     gap_tilt_rad: float = 0.03
     gap_heading_rad: float = 0.012
-    gyro_bias_radps: float = 1e-4
-    accel_bias_mps2: float = 1e-3
+    gyro_bias_radps: float = 4e-4
+    accel_bias_mps2: float = 6e-3
 
-    def scaled(self, unrest: float, strain: float) -> Noise:
-        """Return the same with the guessed motion's densities times unrest, and the unit's own times strain."""
-        if unrest == strain == 1.0:
+    def scaled(self, unrest: float) -> Noise:
+        """Return the same with the guessed motion's densities times unrest."""
+        if unrest == 1.0:
             return self
         return replace(
             self,
-            gyro_rad=strain * self.gyro_rad,
-            accel_mps=strain * self.accel_mps,
-            gyro_bias_radps=strain * self.gyro_bias_radps,
-            accel_bias_mps2=strain * self.accel_bias_mps2,
             gap_accel_mps=unrest * self.gap_accel_mps,
             gap_rate_radps=unrest * self.gap_rate_radps,
             gap_gyro_rad=unrest * self.gap_gyro_rad,
@@ -89,11 +89,13 @@ class Increment:
 
 
 def integrate(
-    state: State, node: int, grid_s: Floats, force_mps2: Floats, rate_radps: Floats, told: Bools
+    state: State, node: int, grid_s: Floats, force_mps2: Floats, rate_radps: Floats, told: Bools, slow_radps: Floats
 ) -> Increment:
     """Integrate one node's samples over a grid (M,) with values (M, 3) at its points, in camera axes, uncorrected.
 
     told (M - 1,): whether the accelerometer covers each interval; where not, the node moves on unaccelerated.
+    slow_radps (2, 3): the turn rates at both ends without shaking, uncorrected. Delay and lever arm are told by them:
+    by rates that are themselves shaken both would be fitted to the shaking.
     """
     R0 = state.R[node]
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
@@ -101,6 +103,7 @@ def integrate(
     w = (rate_radps - state.gyro_bias_radps[node]) @ mount.T
     f = (force_mps2 - state.accel_bias_mps2[node]) @ mount.T
     h = np.diff(grid_s)
+    slow = (slow_radps - state.gyro_bias_radps[node]) @ mount.T
     w_mid, f_mid = 0.5 * (w[1:] + w[:-1]), 0.5 * (f[1:] + f[:-1])
     halves = rotation_exp(0.5 * h[:, None] * w_mid)
     starts, R = np.empty((len(h), 3, 3)), R0
@@ -108,11 +111,10 @@ def integrate(
         starts[j] = R
         R = R @ turn
     R, R_mid = orthonormal(R), starts @ halves
-    # Once over all that is turned to level: mount, the crosses with rate and force, force, rate, and the force's slope.
-    inner = np.empty((len(h), 3, 12))
+    # Once over all that is turned to level: mount, the crosses with rate and force, force.
+    inner = np.empty((len(h), 3, 10))
     inner[:, :, 0:3], inner[:, :, 3:6], inner[:, :, 6:9] = mount, skew(w_mid), skew(f_mid)
-    inner[:, :, 9], inner[:, :, 10] = f_mid, w_mid
-    inner[:, :, 11] = (f[1:] - f[:-1]) / np.maximum(h, 1e-9)[:, None]
+    inner[:, :, 9] = f_mid
     turned = R_mid @ inner
     whole_told = bool(told.all())
     u = turned[:, :, 9] if whole_told else np.where(told[:, None], turned[:, :, 9], _AT_REST_MPS2)
@@ -129,16 +131,19 @@ def integrate(
     dp = dp - swing
 
     # The attitude's error by gyro bias, mount and delay: at the middle of each interval, and at the end.
+    passed = 1.0 - to_end / max(span, 1e-9)
+    slow_turned = (R_mid @ (slow[0] + passed[:, None] * (slow[1] - slow[0]))[:, :, None])[:, :, 0]
     steps = turned[:, :, :6] * -h[:, None, None]
     if not whole_told:
         steps[:, :, 3:] *= told[:, None, None]
     whole = np.add.accumulate(steps, axis=0)
     by_attitude = np.empty((len(h), 3, 7))
     by_attitude[:, :, :6] = whole - 0.5 * steps
-    by_attitude[:, :, 6] = (turned[:, :, 10] - R0 @ w[0]) * whole_told
+    by_attitude[:, :, 6] = (slow_turned - R0 @ slow[0]) * whole_told
     force_error = skew(-u) @ by_attitude
     force_error[:, :, 3:6] -= turned[:, :, 6:9]
-    force_error[:, :, 6] += turned[:, :, 11]
+    # Force changes as its axes turn, -w x f: gravity is nearly all of it.
+    force_error[:, :, 6] += (skew(turned[:, :, 9]) @ slow_turned[:, :, None])[:, :, 0]
     of_force = weights * told
     both = (of_force @ force_error.reshape(len(h), 21)).reshape(2, 3, 7)
     by_bias = -(of_force @ turned[:, :, :3].reshape(len(h), 9)).reshape(2, 3, 3)
@@ -149,7 +154,7 @@ def integrate(
     J[0:3, PHI[node]] = _IDENTITY
     J[0:3, GYRO_BIAS[node]] = whole[-1, :, :3]
     J[0:3, MOUNT[node]] = whole[-1, :, 3:6]
-    J[0:3, DELAY[node]] = (R @ w[-1] - R0 @ w[0]) * whole_told
+    J[0:3, DELAY[node]] = (R @ slow[1] - R0 @ slow[0]) * whole_told
     for row, block in ((3, 0), (6, 1)):
         rows = slice(row, row + 3)
         J[rows, PHI[node]] = by_turn[block]
@@ -159,39 +164,60 @@ def integrate(
         J[rows, ACCEL_BIAS[node]] = by_bias[block]
     # The lever arm's part is a difference of end points; of its errors, its own and the attitude's count.
     if whole_told:
-        J[3:6, LEVER[node]] = spin0 - spin1
-        J[6:9, LEVER[node]] = R0 + spin0 * span - R
+        slow0, slow1 = np.array((R0, R)) @ skew(slow)
+        J[3:6, LEVER[node]] = slow0 - slow1
+        J[6:9, LEVER[node]] = R0 + slow0 * span - R
     gap = float(h @ ~told)
     return Increment(R, dv, dp, J, gap, w[-1])
 
 
 def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -> tuple[State, Floats]:
-    """Move the state by both nodes' increments; return it and the rows (NAV, SIZE) of its transition that are not 1.
+    """Move the state by both nodes' increments; return it and the rows (MOVING, SIZE) of its transition that are not 1.
 
-    The errors are those of `State.plus`, at both ends.
+    The errors are those of `State.plus`, at both ends. What the units were shaken by at the start is in the increments;
+    a share of it is still there at the end (shaking.py).
     """
     a, b = parts
+    kept = kept_share(span_s)
     dv, dp = b.dv_mps - a.dv_mps, b.dp_m - a.dp_m
-    after = state.moved(
-        state.r_m + state.v_mps * span_s + dp,
-        state.v_mps + dv,
-        np.stack((a.R, b.R)),
+    gone, back_s = 1.0 - kept, span_s - SHAKEN_S * (1.0 - kept)
+    # Without a unit nothing is shaken.
+    felt = np.array([not part.without for part in parts], dtype=np.float64)
+    shake = felt[:, None] * state.shake_rad
+    shove = felt.max() * state.shove_mps
+    off = rotation_exp((state.R @ shake[:, :, None])[:, :, 0])
+    R = off @ np.stack((a.R, b.R)) @ rotation_exp(-kept * shake)
+    after = replace(
+        state,
+        r_m=state.r_m + state.v_mps * span_s + back_s * shove + dp,
+        v_mps=state.v_mps + gone * shove + dv,
+        R=R,
+        shake_rad=kept * state.shake_rad,
+        shove_mps=kept * state.shove_mps,
     )
-    F = np.zeros((NAV, SIZE))
+    F = np.zeros((MOVING, SIZE))
     F[R_] = b.jacobian[6:9] - a.jacobian[6:9]
     F[V_] = b.jacobian[3:6] - a.jacobian[3:6]
     F[PHI[0]], F[PHI[1]] = a.jacobian[0:3], b.jacobian[0:3]
     F[R_, R_] = F[V_, V_] = _IDENTITY
     F[R_, V_] = span_s * _IDENTITY
-    F[:, :NAV] = F[:, :NAV] @ plain_of_invariant(state)
+    F[R_, SHOVE] = felt.max() * back_s * _IDENTITY
+    F[V_, SHOVE] = felt.max() * gone * _IDENTITY
+    F[SHOVE, SHOVE] = kept * _IDENTITY
+    for node in (0, 1):
+        F[PHI[node], SHAKE[node]] = felt[node] * (state.R[node] - kept * R[node])
+        F[SHAKE[node], SHAKE[node]] = kept * _IDENTITY
+    F[:, :MOVING] = F[:, :MOVING] @ plain_of_invariant(state)
     return after, invariant_of_plain(after) @ F
 
 
 def process_noise(
-    after: State, parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], span_s: float
-) -> tuple[Floats, Floats]:
-    """Give what a step adds to the covariance: of the moving errors (NAV, NAV), and of each other error (SIZE-NAV,)."""
-    Q = np.zeros((NAV, NAV))
+    after: State, parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], shaking: Floats, span_s: float
+) -> tuple[Floats, Floats, Floats]:
+    """Give what a step adds to the covariance: of the moving errors (MOVING, MOVING), and of each other error
+    (SIZE-MOVING,); and the parts in the first that shaking of the variances (3,) adds, (3, MOVING, MOVING)."""
+    a, b = parts
+    Q = np.zeros((MOVING, MOVING))
     walk = np.zeros(SIZE)
     force = 0.0
     for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
@@ -208,17 +234,22 @@ def process_noise(
     Q[V_, V_] = force * _IDENTITY
     Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * _IDENTITY
     Q[R_, R_] = span_s * span_s / 3.0 * force * _IDENTITY
+    shaken = shaking_noise(after.R, shaking, span_s)
+    for k, without in enumerate((a.without, b.without, a.without and b.without)):
+        if without:
+            shaken[k, :NAV] = shaken[k, :, :NAV] = 0.0
     T = invariant_of_plain(after)
-    return T @ Q @ T.T, walk[NAV:]
+    shaken = T @ shaken @ T.T
+    return T @ Q @ T.T + shaken.sum(axis=0), walk[MOVING:], shaken
 
 
 def predicted(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:
-    """Give the covariance (SIZE, SIZE) after a step with the transition's rows F (NAV, SIZE)."""
+    """Give the covariance (SIZE, SIZE) after a step with the transition's rows F (MOVING, SIZE)."""
     across = F @ P
     after = P.copy()
-    after[:NAV, :NAV] = across @ F.T + Q
-    after[:NAV, NAV:] = across[:, NAV:]
-    after[NAV:, :NAV] = across[:, NAV:].T
-    index = np.arange(NAV, SIZE)
+    after[:MOVING, :MOVING] = across @ F.T + Q
+    after[:MOVING, MOVING:] = across[:, MOVING:]
+    after[MOVING:, :MOVING] = across[:, MOVING:].T
+    index = np.arange(MOVING, SIZE)
     after[index, index] += walk
     return after

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.state import NAV, ROW, SIZE, State
+from buddyline.solver_service.track.state import MOVING, ROW, SIZE, State
 from numpy.typing import NDArray
 
 Chosen: TypeAlias = tuple[tuple[int, int, float], ...]
@@ -29,8 +29,8 @@ class Look:
 class Step:
     """One step of a track as the smoother needs it.
 
-    before: predicted; after, covariance: with what was seen at t_s. F (NAV, SIZE), Q (NAV, NAV), walk: how it came here
-    from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
+    before: predicted; after, covariance: with what was seen at t_s. F (MOVING, SIZE), Q (MOVING, MOVING), walk: how it
+    came here from the step before. rates_radps (2, 3). lights: of how many lights its picture told, 0 where none.
     """
 
     t_s: float
@@ -49,7 +49,7 @@ class Step:
 # So many steps are packed at once.
 PACK = 128
 _UPPER = np.triu_indices(SIZE)
-_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), (len(_UPPER[0]),), (NAV, SIZE), (NAV, NAV), (SIZE - NAV,))
+_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), (len(_UPPER[0]),), (MOVING, SIZE), (MOVING, MOVING), (SIZE - MOVING,))
 _ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES])
 
 

@@ -1,0 +1,98 @@
+"""How much the inertial units are shaken in their mounts: its noise, and what the lights' residuals say of its size.
+
+A unit that fins shake turns and moves against the camera, but never away from it: so its angle in the mount, and what
+the shaking adds to the velocity, are themselves noise that lasts for SHAKEN_S (Gauss-Markov, of first order), and what
+its samples are off by is their rate, which has nothing slow in it. White noise on the samples would let the track
+drift away without light, and count ten pictures' shaking as ten steps of a walk.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.state import MOVING, PHI, R_, SHAKE, SHOVE, V_
+
+# Fins beat once or twice a second, and mounts ring faster: what is slower than 1.5 Hz is motion, 1 / (2 pi 1.5 Hz).
+SHAKEN_S: Final = 0.1
+# Before the dive tells: between a unit that is screwed to its camera and one in a loose housing, 1 sd. It counts as
+# much as FIRST residuals.
+SHAKE_RAD: Final = 5e-4
+SHOVE_MPS: Final = 5e-3
+FIRST: Final = 2.0
+LEAST: Final = np.log(np.array((5e-5, 5e-5, 5e-4)) ** 2)
+MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
+# A picture's say is halved after 200 more, some ten seconds: shaking comes and goes.
+KEPT: Final = 0.5 ** (1.0 / 200.0)
+LONGEST_STEP: Final = 0.5
+# One residual's chi^2 counts at most so much: gross errors are no shaking.
+MOST_CHI2: Final = 9.0
+_IDENTITY: Final = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Shaking:
+    """Logs of three variances, both units' angles (rad^2) and the velocity between them; and their information."""
+
+    logs: Floats
+    information: Floats
+
+    def __init__(self, logs: Floats | None = None, information: Floats | None = None) -> None:
+        first = 2.0 * np.log(np.array((SHAKE_RAD, SHAKE_RAD, SHOVE_MPS)))
+        object.__setattr__(self, "logs", first if logs is None else logs)
+        object.__setattr__(self, "information", 0.5 * FIRST * np.eye(3) if information is None else information)
+
+    @property
+    def variances(self) -> Floats:
+        """Of A's angle, B's angle, and the velocity."""
+        return np.asarray(np.exp(self.logs))
+
+    def taught(self, y: Floats, S_inverse: Floats, H: Floats, shaken: Floats) -> Shaking:
+        """Go on by one picture's residuals y (m,), H (m, NAV) and shaken (3, NAV, NAV), by Fisher's scoring.
+
+        With D_j = H shaken_j H^T = dS / dlogs_j the likelihood's slope is (z^T D_j z - tr(S^-1 D_j)) / 2, z = S^-1 y,
+        and its information tr(S^-1 D_j S^-1 D_k) / 2.
+        """
+        z = S_inverse @ y
+        chi2 = float(y @ z)
+        z = z * math.sqrt(min(1.0, MOST_CHI2 * len(y) / max(chi2, 1e-9)))
+        D = H @ shaken @ H.T
+        W = S_inverse @ D
+        slope = 0.5 * (np.einsum("i,jik,k->j", z, D, z) - np.trace(W, axis1=1, axis2=2))
+        fisher = 0.5 * np.einsum("jab,kba->jk", W, W)
+        information = KEPT * self.information + fisher + (1.0 - KEPT) * 0.5 * FIRST * np.eye(3)
+        step = np.clip(np.linalg.solve(information, slope), -LONGEST_STEP, LONGEST_STEP)
+        return Shaking(np.clip(self.logs + step, LEAST, MOST), information)
+
+
+def kept_share(span_s: float) -> float:
+    """Give the share of the shaking at one time that is left span_s later."""
+    return math.exp(-span_s / SHAKEN_S)
+
+
+def shaking_noise(R: Floats, variances: Floats, span_s: float) -> Floats:
+    """Give what shaking of these variances (3,) adds to the plain errors' covariance in a step, (3, MOVING, MOVING).
+
+    R (2, 3, 3): attitudes at the end. A unit's angle goes from q to a q + n, and the camera's attitude with it the
+    other way: phi -= R n. The velocity likewise, and the place by what it has been meanwhile, m, with
+    var n = s^2 (1 - a^2), cov(m, n) = s^2 t (1 - a)^2, var m = s^2 t^2 (2 h / t - 3 + 4 a - a^2).
+    """
+    a, t = kept_share(span_s), SHAKEN_S
+    out = np.zeros((3, MOVING, MOVING))
+    fresh = 1.0 - a * a
+    for node in (0, 1):
+        of_node, q = out[node], float(variances[node]) * fresh
+        of_node[PHI[node], PHI[node]] = of_node[SHAKE[node], SHAKE[node]] = q * _IDENTITY
+        of_node[PHI[node], SHAKE[node]] = -q * R[node]
+        of_node[SHAKE[node], PHI[node]] = -q * R[node].T
+    q, s = float(variances[2]), out[2]
+    s[V_, V_] = s[SHOVE, SHOVE] = q * fresh * _IDENTITY
+    s[V_, SHOVE] = s[SHOVE, V_] = -q * fresh * _IDENTITY
+    both = q * t * (1.0 - a) ** 2 * _IDENTITY
+    s[R_, V_] = s[V_, R_] = both
+    s[R_, SHOVE] = s[SHOVE, R_] = -both
+    s[R_, R_] = q * t * t * max(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _IDENTITY
+    return out
