@@ -75,7 +75,7 @@ class Foretold:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SearchPlan:
     """What to do with a picture. foretold: where lights are expected. regions: to search; None for the whole picture.
 
     anchors: of the first regions, the score that a candidate needs in each; without one the light is lost.
@@ -135,24 +135,24 @@ class Guide:
             while len(self._expected) > MAX_SEEN:
                 self._expected.pop(next(iter(self._expected)))
 
-    def plan(self, stamp_ns: int, width_px: int, height_px: int, *, whole: bool = False) -> Plan:
+    def plan(self, stamp_ns: int, width_px: int, height_px: int, *, whole: bool = False) -> SearchPlan:
         """Return how to search the picture taken at stamp_ns. whole: search the whole picture in any case."""
         foretold = self._foretell(stamp_ns, width_px, height_px)
         since_ns = math.inf if self._whole_ns is None else stamp_ns - self._whole_ns
         step_s = (stamp_ns - self._stamp_ns) / S_NS
         if whole or foretold is None or not 0 <= since_ns < WHOLE_EVERY_NS or step_s <= 0.0:
-            return Plan(tuple(foretold or ()))
+            return SearchPlan(tuple(foretold or ()))
         lamps = [_moved(one, step_s, width_px) for one in self._followed]
         # A solver that expects nothing has no track, and needs whole pictures to start one.
         planned = None if self._solvers else _around_steady(lamps)
         if foretold:
             planned = _around_expected(foretold, lamps)
         if planned is None or len(planned[0]) > MAX_REGIONS:
-            return Plan(tuple(foretold))
+            return SearchPlan(tuple(foretold))
         regions, anchors = planned
         if any(region.radius_px > WIDEST * width_px for region in regions):
-            return Plan(tuple(foretold))
-        return Plan(tuple(foretold), tuple(regions), tuple(anchors))
+            return SearchPlan(tuple(foretold))
+        return SearchPlan(tuple(foretold), tuple(regions), tuple(anchors))
 
     def learn(
         self, stamp_ns: int, found: Sequence[Detection], width_px: int, *, whole: bool, sized: bool = True

@@ -20,7 +20,7 @@ OWNER_CHUNKS: Final = 3
 S = TypeVar("S")
 
 
-class Source(NamedTuple):
+class PublisherId(NamedTuple):
     """One publisher: its key, and what it says of itself.
 
     A client may say any zid and eid; the key is what the hub lets it publish. So both together name a publisher, and
@@ -43,7 +43,7 @@ class Source(NamedTuple):
 class Gap:
     """The missing numbers of a publisher. known: earlier samples of the publisher have arrived."""
 
-    source: Source
+    source: PublisherId
     missing: range
     known: bool
 
@@ -72,16 +72,16 @@ class Sequence(Generic[S]):
         self.missed = 0
         self._deliver = deliver
         # By owner; sorted by last sample: the publisher that has been silent longest is first.
-        self._publishers: dict[str, dict[Source, _Sender[S]]] = {}
+        self._publishers: dict[str, dict[PublisherId, _Sender[S]]] = {}
         self._held_bytes: dict[str, int] = {}
 
-    def begin(self, source: Source, number: int) -> None:
+    def begin(self, source: PublisherId, number: int) -> None:
         """Take `number` as the first of a publisher: earlier samples can no longer be fetched."""
         self._sender(source, _Sender(number, known=True))
 
     def accept(
         self,
-        source: Source,
+        source: PublisherId,
         number: int,
         sample: S,
         *,
@@ -111,7 +111,7 @@ class Sequence(Generic[S]):
         self._pass(publisher, number, sample)
         return None
 
-    def told(self, source: Source, last: int, *, newest_only: bool = False) -> Gap | None:
+    def told(self, source: PublisherId, last: int, *, newest_only: bool = False) -> Gap | None:
         """Take a heartbeat: the publisher's last number so far. Return the gap up to it, if any.
 
         A sample may be on its way still, so it counts as missing only when the heartbeat before told of it, too.
@@ -148,7 +148,7 @@ class Sequence(Generic[S]):
         publisher.open = False
         return None
 
-    def _sender(self, source: Source, new: _Sender[S]) -> _Sender[S]:
+    def _sender(self, source: PublisherId, new: _Sender[S]) -> _Sender[S]:
         """Return what is known of a publisher, which has just been heard."""
         others = self._publishers.pop(source.owner, {})
         self._publishers[source.owner] = others
@@ -163,7 +163,7 @@ class Sequence(Generic[S]):
             self._held_bytes[source.owner] = self._held_bytes.get(source.owner, 0) - sum(one[2] for one in gone.held)
         return sender
 
-    def _hold(self, source: Source, publisher: _Sender[S], number: int, sample: S, size_bytes: int) -> None:
+    def _hold(self, source: PublisherId, publisher: _Sender[S], number: int, sample: S, size_bytes: int) -> None:
         held_bytes = self._held_bytes.setdefault(source.owner, 0)
         if len(publisher.held) >= MAX_HELD or (publisher.held and held_bytes + size_bytes > MAX_HELD_BYTES):
             return

@@ -10,7 +10,7 @@ import zenoh
 from buddyline.protocol.bus import Received, held_order
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
-from buddyline.protocol.sequence import Gap, Source
+from buddyline.protocol.sequence import Gap, PublisherId
 from buddyline.protocol.sequence import Sequence as Numbers
 from buddyline.protocol.topics import parse_key
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
@@ -112,7 +112,7 @@ class ZenohSubscription:
         chunks, payload = rest.split("/"), sample.payload.to_bytes()
         if sample.kind != zenoh.SampleKind.PUT or len(payload) != 4 or len(chunks) < 2 or not chunks[1].isdecimal():
             return
-        source = Source(key, chunks[0], int(chunks[1]))
+        source = PublisherId(key, chunks[0], int(chunks[1]))
         with self._lock:
             last = int.from_bytes(payload, "little")
             self._start_filling(self._sequence.told(source, last, newest_only=_newest_only(key)))
@@ -180,9 +180,9 @@ class ZenohSubscription:
         self._delivery.offer(received, len(received.payload))
 
 
-def _source(sample: zenoh.Sample) -> Source:
+def _source(sample: zenoh.Sample) -> PublisherId:
     key, info = str(sample.key_expr), sample.source_info
-    return Source(key, "", 0) if info is None else Source(key, str(info.source_id.zid), info.source_id.eid)
+    return PublisherId(key, "", 0) if info is None else PublisherId(key, str(info.source_id.zid), info.source_id.eid)
 
 
 def _newest_only(key: str) -> bool:

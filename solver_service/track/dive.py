@@ -20,7 +20,7 @@ from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV, State
-from buddyline.solver_service.track.stepping import Guide
+from buddyline.solver_service.track.stepping import PassGuide
 from buddyline.solver_service.track.trail import Trail
 
 # How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
@@ -254,7 +254,7 @@ def guide_by(track: TrackFilter, path: Path) -> None:
     """Tell a filter what a pass knew at each picture."""
     for step, looks in enumerate(path.looks):
         for look in looks:
-            track.guides[look.node, look.stamp_ns] = Guide(path, step, look)
+            track.guides[look.node, look.stamp_ns] = PassGuide(path, step, look)
 
 
 def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequence[int]) -> Smoothed:

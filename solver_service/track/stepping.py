@@ -38,7 +38,7 @@ BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Guide:
+class PassGuide:
     """What a whole pass over the dive knew at one picture, for the next pass to decide its lights again.
 
     path, step: of the pass. look: the picture.
@@ -58,7 +58,7 @@ class TrackSteps(TrackIntake):
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float) -> None:
         super().__init__(nodes)
         self.unrest = 1.0
-        self.guides: dict[tuple[int, int], Guide] = {}
+        self.guides: dict[tuple[int, int], PassGuide] = {}
         self._keep_s = keep_s
 
     def increments(self, estimate: Estimate, t_s: float) -> tuple[Increment, Increment]:
@@ -205,7 +205,7 @@ class TrackSteps(TrackIntake):
         at: Floats = X[0]
         return at
 
-    def _without(self, guide: Guide, sight: Sight) -> tuple[Floats, Floats, Floats]:
+    def _without(self, guide: PassGuide, sight: Sight) -> tuple[Floats, Floats, Floats]:
         """Give residuals, Jacobians and covariance by all the dive but this picture.
 
         The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 from buddyline.protocol import sequence
-from buddyline.protocol.sequence import Gap, Sequence, Source
+from buddyline.protocol.sequence import Gap, PublisherId, Sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
-A, B = Source("buddyline/node/a/depth", "z", 1), Source("buddyline/node/b/depth", "z", 1)
+A, B = PublisherId("buddyline/node/a/depth", "z", 1), PublisherId("buddyline/node/b/depth", "z", 1)
 
 
-def name_of(source: Source) -> str:
+def name_of(source: PublisherId) -> str:
     return source.key.split("/")[2]
 
 
@@ -24,13 +24,13 @@ class Listener:
         self.got: list[tuple[str, int]] = []
         self.sequence = Sequence(self.got.append)
 
-    def accept(self, source: Source, number: int, **more: Any) -> Gap | None:
+    def accept(self, source: PublisherId, number: int, **more: Any) -> Gap | None:
         return self.sequence.accept(source, number, (name_of(source), number), **more)
 
     def close(self, gap: Gap, found: list[int]) -> Gap | None:
         return self.sequence.close(gap, [(number, (name_of(gap.source), number)) for number in found])
 
-    def numbers(self, source: Source = A) -> list[int]:
+    def numbers(self, source: PublisherId = A) -> list[int]:
         return [number for name, number in self.got if name == name_of(source)]
 
 
@@ -39,11 +39,11 @@ class Listener:
     st.lists(st.integers(0, 5), max_size=60),
 )
 def test_all_available_samples_come_in_order_and_once(
-    samples: list[tuple[Source, bool, bool]], delays: list[int]
+    samples: list[tuple[PublisherId, bool, bool]], delays: list[int]
 ) -> None:
     """Some samples are lost on their way, some of those are still held; fetching takes a while."""
     listener, sent, held_by, open_gaps = Listener(), {A: 0, B: 0}, {A: [], B: []}, []
-    expected: dict[Source, list[int]] = {A: [], B: []}
+    expected: dict[PublisherId, list[int]] = {A: [], B: []}
     delay = iter(delays)
 
     def fetch(gap: Gap) -> Gap | None:
@@ -178,7 +178,7 @@ def test_a_publisher_is_known_by_its_key_and_not_by_what_it_says_of_itself_alone
     listener = Listener()
     for number in range(3):
         listener.accept(B, number)
-    forged = Source(A.key, B.zid, B.eid)
+    forged = PublisherId(A.key, B.zid, B.eid)
     assert listener.accept(forged, 10**6) == Gap(forged, range(10**6), known=False)
     assert listener.accept(B, 3) is None
     assert listener.numbers(B) == [0, 1, 2, 3]

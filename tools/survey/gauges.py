@@ -53,7 +53,7 @@ class Gauges:
 
 
 @dataclass(frozen=True, eq=False)
-class _Readings:
+class _GaugeReadings:
     """Readings of n gauges' visits. station, dive: (n,) numbers; slow_m: 1 sd that all visits of a gauge share."""
 
     legs: list[tuple[int, str]]
@@ -67,7 +67,7 @@ class _Readings:
     slow_m: Floats
 
 
-def _readings(legs: Sequence[Leg]) -> _Readings:
+def _readings(legs: Sequence[Leg]) -> _GaugeReadings:
     rows = []
     for index, leg in enumerate(legs):
         for end, name, node, depth_m, sigma_m, noise_m in (
@@ -82,7 +82,7 @@ def _readings(legs: Sequence[Leg]) -> _Readings:
             rows.append(((index, end), name, node, leg.dive, time_s, depth_m, noise, slow_m))
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[] for _ in range(8)]
     at = {name: i for i, name in enumerate(dict.fromkeys(columns[1]))}
-    return _Readings(
+    return _GaugeReadings(
         legs=list(columns[0]),
         names=list(at),
         station=np.array([at[name] for name in columns[1]], dtype=np.int64),
@@ -98,7 +98,7 @@ def _readings(legs: Sequence[Leg]) -> _Readings:
 class _Unknowns:
     """Design columns (n, k) of the shared unknowns, with their prior standard deviations (k,)."""
 
-    def __init__(self, readings: _Readings, tides: Sequence[int]) -> None:
+    def __init__(self, readings: _GaugeReadings, tides: Sequence[int]) -> None:
         columns: list[Floats] = []
         sigmas: list[float] = []
         self.tide: dict[int, int] = {}
@@ -136,9 +136,9 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
     if not readings.names:
         return Gauges({}, {}, {}, [])
     tides: list[int] = []
-    fit = _Fit(readings, _Unknowns(readings, tides))
+    fit = _GaugeFit(readings, _Unknowns(readings, tides))
     for dive in sorted(set(readings.dive.tolist())):
-        with_tide = _Fit(readings, _Unknowns(readings, [*tides, dive]))
+        with_tide = _GaugeFit(readings, _Unknowns(readings, [*tides, dive]))
         possible = abs(with_tide.shared[with_tide.unknowns.tide[dive]]) < 3 * TIDE_M_PER_S
         if possible and _revisited(readings, dive) >= LEAST_STATIONS and fit.chi2 - with_tide.chi2 > SHOWN_CHI2:
             tides, fit = [*tides, dive], with_tide
@@ -157,17 +157,17 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
     return Gauges(depths, both, rates, _alarms(readings, fit, limits or AlarmSettings()))
 
 
-def _revisited(readings: _Readings, dive: int) -> int:
+def _revisited(readings: _GaugeReadings, dive: int) -> int:
     """Return how many stations were visited in a dive with a long time between."""
     of_dive = readings.dive == dive
     visits = [readings.time_s[of_dive & (readings.station == number)] for number in range(len(readings.names))]
     return sum(len(times_s) > 1 and float(np.ptp(times_s)) > APART_S for times_s in visits)
 
 
-class _Fit:
+class _GaugeFit:
     """Weighted least squares; the stations' depths are taken out of it first, so that few unknowns remain."""
 
-    def __init__(self, readings: _Readings, unknowns: _Unknowns) -> None:
+    def __init__(self, readings: _GaugeReadings, unknowns: _Unknowns) -> None:
         self.unknowns = unknowns
         count, at, weight = len(readings.names), readings.station, readings.noise_m**-2
         total = np.bincount(at, weight, count)
@@ -193,7 +193,7 @@ class _Fit:
         self.chi2 = float((weight * self.off_m**2).sum() + ((self.shared / unknowns.sigmas) ** 2).sum())
 
 
-def _alarms(readings: _Readings, fit: _Fit, limits: AlarmSettings) -> list[str]:
+def _alarms(readings: _GaugeReadings, fit: _GaugeFit, limits: AlarmSettings) -> list[str]:
     said = []
     for number, name in enumerate(readings.names):
         here = np.flatnonzero(readings.station == number)
