@@ -20,6 +20,7 @@ def root(tmp_path, monkeypatch):
     (programs / "buddyline").chmod(0o755)
     monkeypatch.setattr(install_service.sys, "executable", str(programs / "python"))
     monkeypatch.delenv("SUDO_USER", raising=False)
+    monkeypatch.setattr(install_service.getpass, "getuser", lambda: "diver")
     return tmp_path / "root"
 
 
@@ -51,8 +52,12 @@ def test_a_nodes_unit_has_its_devices_and_chrony(root, tmp_path, capsys):
     assert int(unit["WatchdogSec"]) <= 15
     assert int(unit["TimeoutStopSec"]) >= 5
     assert unit["SupplementaryGroups"] == "video i2c"
-    # Each of these closes /dev.
-    assert not {"PrivateDevices", "ProtectClock", "DevicePolicy"} & set(unit)
+    # Each of these closes /dev to camera and I2C bus, or takes away the groups that may open them.
+    assert not {"PrivateDevices", "ProtectClock", "PrivateUsers"} & set(unit)
+    text = unit_of(root, "node").read_text()
+    assert "DevicePolicy=closed\n" in text
+    for device in ("char-video4linux", "char-media", "char-dma_heap", "char-i2c", "char-gpiochip"):
+        assert f"DeviceAllow={device} rw\n" in text
     assert "written" in capsys.readouterr().out
 
 
@@ -73,8 +78,33 @@ def test_a_unit_has_only_the_groups_of_its_devices(root, tmp_path, camera, senso
     [("/var/lib/buddyline/dives", None), ("dives", None), ("/data/my dives", '"-/data/my dives"')],
 )
 def test_a_unit_may_write_where_its_node_records(root, tmp_path, directory, writable):
-    assert install("node", "--config", node_config(tmp_path, directory=directory), "--root", root) == 0
+    words = ["--config", node_config(tmp_path, directory=directory), "--root", root, "--run-as", "pi"]
+    assert install("node", *words) == 0
     assert settings(unit_of(root, "node")).get("ReadWritePaths") == writable
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not on this machine")
+def test_systemd_calls_the_units_well_hardened(root, tmp_path):
+    """Of 10 for a service that may do everything; 2.5 at most."""
+    for service, words in {"node": ["--config", node_config(tmp_path)], "hub": [], "solver": []}.items():
+        assert install(service, *words, "--root", root, "--run-as", "nobody") == 0
+        done = subprocess.run(
+            ["systemd-analyze", "security", "--offline=true", "--threshold=25", str(unit_of(root, service))],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout[-3000:]
+
+
+def test_root_is_asked_for_a_user(root, monkeypatch, capsys):
+    monkeypatch.setattr(install_service.getpass, "getuser", lambda: "root")
+    assert install("hub", "--root", root) == 2
+    assert "--run-as USER" in capsys.readouterr().err
+    assert not unit_of(root, "hub").exists()
+    monkeypatch.setenv("SUDO_USER", "diver")
+    assert install("hub", "--root", root) == 0
+    assert settings(unit_of(root, "hub"))["User"] == "diver"
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not on this machine")
