@@ -19,6 +19,7 @@ from buddyline.solver_service.matcher import PairMatcher, Unmatched
 from buddyline.solver_service.pair import Matched, PairSolver
 from buddyline.solver_service.results import relative_pose
 from buddyline.solver_service.streams import Arrival, NodeStream
+from buddyline.solver_service.track.clocks import Clocks
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec import UNSET
 
@@ -148,7 +149,18 @@ class PairCore:
             unused=unused or UNSET,
         )
 
+    def clocks(self) -> Clocks | ClockOffset | None:
+        """Return what the dive, which is over, tells of the clocks: by the track, or else by the fixes' gaps."""
+        self.resolve(None, everything=True)
+        self.settle()
+        told = self.tracker.clocks() if self.tracker is not None else None
+        return told or (self.alignment.estimate() if self.alignment is not None else None)
+
     def _estimate_offset(self, now_ns: int) -> ClockOffset | None:
+        """Return the clocks' offset where it is told well enough: by the track, or else by the fixes' gaps."""
+        now = self.tracker.clock_now() if self.tracker is not None else None
+        if now is not None:
+            return ClockOffset(*now, self.counts["solved"]) if now[1] < REPORTED_OFFSET_SIGMA_S else None
         if self.alignment is not None and (self._aligned_ns is None or now_ns - self._aligned_ns > ALIGN_EVERY_NS):
             found = self.alignment.estimate()
             self._offset = found if found is not None and found.sigma_s < REPORTED_OFFSET_SIGMA_S else None

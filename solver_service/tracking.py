@@ -29,6 +29,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
 from buddyline.solver_service.track.dive import NodeRecord, feed, joined, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.foresight import ForeseenLight, foresee
@@ -89,6 +90,23 @@ class PairTracker:
             f"while the {sides[1 - light]} one was"
             for node, light, seconds in dark
         ]
+
+    def clock_now(self) -> tuple[float, float] | None:
+        """Return B's clock minus A's and its sigma, s, as the live track believes; None without one."""
+        return clock_now(self._filter) if self._filter is not None else None
+
+    def clocks(self) -> Clocks | None:
+        """Return what a dive that is over tells of the clocks; of a tracker that makes the whole dive's track."""
+        if self._nodes is None or self._settled_ns < 0:
+            return None
+        with np.errstate(all="ignore"):
+            try:
+                self._advance(self._settled_ns + S_NS)
+                a, b = map(joined, self._pieces)
+                return clocks_of((a, b), self._fixes)
+            except (ArithmeticError, ValueError) as error:
+                self._start_anew(str(error))
+                return None
 
     def take(self, outcomes: Sequence[Message]) -> list[Message]:
         """Go on to the newest of these outcomes; return the live tracks' messages up to there."""

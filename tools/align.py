@@ -1,4 +1,4 @@
-"""`buddyline align`: estimate the offset between two nodes' clocks from a dive in which they moved."""
+"""`buddyline align`: what a dive in which both nodes moved tells of their clocks."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from typing import Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.alignment import ClockOffset
-from buddyline.solver_service.config import SolveConfig
+from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.track.clocks import Clocks
 from buddyline.tools.dives import Dive
 from buddyline.tools.solve import messages_of, pair_of
 
@@ -24,41 +25,54 @@ PASSES: Final = 4
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate the offset; return 1 if the dive does not determine it."""
+    """Estimate offset and drift; return 1 where the dive does not tell the offset."""
     with Dive(args.dives) as dive:
-        node_a, node_b = pair_of(dive, args.nodes)
-        offset: ClockOffset | None = None
-        # Each pass corrects B's times by the offset found so far, until what is left is well below its sigma.
-        for number in range(1, PASSES + 1):
-            found = _pass(dive, args, (node_a, node_b), offset.offset_s if offset else 0.0, number)
-            offset = found and ClockOffset(
-                found.offset_s + (offset.offset_s if offset else 0.0), found.sigma_s, found.fixes
-            )
-            if found is None or abs(found.offset_s) < 0.1 * found.sigma_s:
+        pair = node_a, node_b = pair_of(dive, args.nodes)
+        found = _pass(dive, args, pair, 0.0, 1)
+        # By gaps alone, each pass corrects B's times by the offset found so far, until what is left is below its sigma.
+        number, left = 1, found
+        while isinstance(found, ClockOffset) and left is not None and number < PASSES:
+            if abs(left.offset_s) < 0.1 * left.sigma_s:
                 break
-    if offset is None:
-        log.error("align: the fixes do not determine the offset: they are too few, or the pair did not move")
+            number += 1
+            left = _pass(dive, args, pair, found.offset_s, number)
+            found = left and ClockOffset(found.offset_s + left.offset_s, left.sigma_s, left.fixes)
+    if found is None:
+        log.error("align: the fixes do not tell the offset: they are too few, or the pair did not move")
         return 1
     if args.json:
-        print(json.dumps({"node_a": node_a, "node_b": node_b, **asdict(offset)}))
+        print(json.dumps({"node_a": node_a, "node_b": node_b, **asdict(found)}))
     else:
         print(
-            f"the clock of {node_b} is {offset.offset_s * 1e3:+.2f} ms from that of {node_a} "
-            f"(1 sd {offset.sigma_s * 1e3:.2f} ms, {offset.fixes} fixes)\n"
-            f"solve with it: buddyline solve ... --clock-offset {offset.offset_s:.4f}"
+            f"the clock of {node_b} is {found.offset_s * 1e3:+.2f} ms from that of {node_a} "
+            f"(1 sd {found.sigma_s * 1e3:.2f} ms, {found.fixes} fixes)\n"
+            f"{_drift_text(found)}\n"
+            f"solve with it: buddyline solve ... --clock-offset {found.offset_s:.4f}"
         )
     return 0
 
 
+def _drift_text(found: Clocks | ClockOffset) -> str:
+    if isinstance(found, ClockOffset):
+        return "the drift is not told: not both nodes have inertial samples"
+    if found.drift is not None and found.drift_sigma is not None:
+        return f"it gains {found.drift * 1e6:+.1f} us a second (1 sd {found.drift_sigma * 1e6:.1f})"
+    if found.drift_sigma is None:
+        return "the drift is not told: the dive is too short"
+    return f"the drift is not told: the dive would tell it within {found.drift_sigma * 1e6:.0f} us a second, 1 sd"
+
+
 def _pass(
     dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
-) -> ClockOffset | None:
+) -> Clocks | ClockOffset | None:
     settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
-    core = SolverCore(settings, [pair], {pair[1]: round(offset_s * S_NS)}, align=True)
+    offsets_ns = {pair[1]: round(offset_s * S_NS)}
+    # The track finds any offset in one pass; later ones are by gaps.
+    track = track_settings("smooth", 1.0) if number == 1 else None
+    core = SolverCore(settings, [pair], offsets_ns, align=True, track=track)
     for envelope in messages_of(dive, args, dive.infos(), *pair, doing=f"align, pass {number}"):
         core.handle(envelope.message)
-    core.flush()
+    found = core.pairs[pair].clocks()
     if not core.counts["solved"]:
-        raise BuddylineError(f"{dive.name}: no trigger was solved, so the clocks' offset cannot be estimated")
-    alignment = core.pairs[pair].alignment
-    return None if alignment is None else alignment.estimate()
+        raise BuddylineError(f"{dive.name}: no trigger was solved, so that nothing tells the clocks' offset")
+    return found

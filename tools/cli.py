@@ -118,7 +118,7 @@ COMMANDS: Final = (
     ),
     Command(
         "align",
-        "find the offset between two nodes' clocks from a dive in which they moved",
+        "find offset and drift of two nodes' clocks from a dive in which they moved",
         ("align a.mcap b.mcap",),
     ),
     Command(

@@ -27,10 +27,12 @@ from buddyline.solver_service.track.trail import Trail
 UNTOLD_CLOCK_S: Final = 0.1
 CLOCK_LEFT_S: Final = 0.003
 CLOCK_WITHOUT_S: Final = 0.003
+NEAR_CLOCK_S: Final = 0.005
 FAR_CLOCK_S: Final = 0.06
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
-CLOCK_ROUNDS: Final = 3
+CLOCK_ROUNDS: Final = 4
+HEAD_NS: Final = 90 * S_NS
 # Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
 # A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
@@ -79,8 +81,9 @@ def _stamp_of(item: AttitudeSeen | DepthSeen | FixSeen | FrameSeen) -> int:
 class Smoothed:
     """A dive's track.
 
-    rows: made as they are read, once. constants: the last state, which holds what was learned of the units and clocks.
-    dark: lamps that were dark at the end: node, light, for how long (s).
+    rows: made as they are read, once. clock_sigma_s: inf where the offset is not told, but believed. constants: the
+    last state, which holds what was learned of the units and clocks. dark: lamps that were dark at the end: node,
+    light, for how long (s).
     """
 
     rows: Iterable[TrackRow]
@@ -154,18 +157,16 @@ def smooth(
     records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
 ) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    records, fixes = (_in_order(records[0]), _in_order(records[1])), sorted(fixes, key=_stamp_of)
+    records, fixes = (in_order(records[0]), in_order(records[1])), sorted(fixes, key=_stamp_of)
     told_ns = clock_ns
-    for _ in range(CLOCK_ROUNDS):
-        first = _empty_filter(records, clock_ns, UNTOLD_CLOCK_S)
-        pass_over(first, records, fixes)
-        parts = parts_of(first)
-        if not parts:
-            return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
-        if abs(parts[-1].state.clock_s) < FAR_CLOCK_S:
-            break
-        # So far off, the pass was not linear: once more, from there.
-        clock_ns += round(parts[-1].state.clock_s * 1e9)
+    if fixes and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS:
+        # What the dive's beginning tells of the clocks saves the whole dive another round.
+        head_ns = fixes[0].stamp_ns - S_NS, fixes[0].stamp_ns + HEAD_NS
+        head = records[0].between(*head_ns), records[1].between(*head_ns)
+        clock_ns = _first_pass(head, _between(fixes, *head_ns), clock_ns)[2]
+    first, parts, clock_ns = _first_pass(records, fixes, clock_ns)
+    if not parts:
+        return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
     if abs(parts[-1].state.clock_s) >= FAR_CLOCK_S or (without and abs(off_s) > FAR_WITHOUT_S):
@@ -175,7 +176,7 @@ def smooth(
         # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
-        return _smoothed(only, parts_of(only), outputs_ns)
+        return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
     # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
     learned = parts[-1]
     shift_s = learned.state.clock_s
@@ -221,7 +222,26 @@ def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Pa
     return track.path_before(path, begin_s)
 
 
-def _in_order(record: NodeRecord) -> NodeRecord:
+def _first_pass(
+    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int
+) -> tuple[TrackFilter, list[Estimate], int]:
+    """Give a filter that has passed over a dive, its tracks, and how far B's clock was believed ahead.
+
+    An offset makes the pass non-linear, so that it tells one that is too small: it is repeated from there.
+    """
+    for left in reversed(range(CLOCK_ROUNDS)):
+        first = _empty_filter(records, clock_ns, UNTOLD_CLOCK_S)
+        pass_over(first, records, fixes)
+        parts = parts_of(first)
+        without = any(any(part.without) for part in parts)
+        if not left or not parts or abs(parts[-1].state.clock_s) < (FAR_CLOCK_S if without else NEAR_CLOCK_S):
+            break
+        clock_ns += round(parts[-1].state.clock_s * 1e9)
+    return first, parts, clock_ns
+
+
+def in_order(record: NodeRecord) -> NodeRecord:
+    """Give a record by its stamps."""
     order = np.argsort(record.imu_stamps_ns, kind="stable")
     return replace(
         record,
