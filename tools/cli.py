@@ -63,6 +63,11 @@ COMMANDS: Final = (
         "run a hub, two simulated nodes and the solver on this machine, and watch the poses",
         ("demo", "demo --environment lake --seconds 30"),
     ),
+    Command(
+        "init",
+        "write a commented configuration of a node, a hub or a solver to start from",
+        ("init node --node a --connect tls/192.168.2.1:7447", "init solver"),
+    ),
     Command("hub", "run the hub that all others connect to", ("hub",)),
     Command(
         "keys",
