@@ -6,6 +6,7 @@ same track.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -77,6 +78,7 @@ class PairTracker:
         self._told_ns = -1
         self._settled_ns = -1
         self._oriented = False
+        self._clock: tuple[float, float] | None = None
 
     @property
     def problems(self) -> list[str]:
@@ -92,8 +94,10 @@ class PairTracker:
         ]
 
     def clock_now(self) -> tuple[float, float] | None:
-        """Return B's clock minus A's and its sigma, s, as the live track believes; None without one."""
-        return clock_now(self._filter) if self._filter is not None else None
+        """Return B's clock minus A's and its sigma, s, as the whole dive's track told, or the live one believes."""
+        if self._clock is not None or self._filter is None:
+            return self._clock
+        return clock_now(self._filter)
 
     def clocks(self) -> Clocks | None:
         """Return what a dive that is over tells of the clocks; of a tracker that makes the whole dive's track."""
@@ -180,6 +184,8 @@ class PairTracker:
                 return []
         self._note(found.problems)
         self._note(self._dark_lamps(found.dark))
+        told = math.isfinite(found.clock_sigma_s)
+        self._clock = (found.clock_offset_s, found.clock_sigma_s) if told else None
         return chain(messages, self._messages(found.rows, "smooth"))
 
     def _make_filter(self, nodes: tuple[TrackNode, TrackNode]) -> None:

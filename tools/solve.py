@@ -6,12 +6,14 @@ import argparse
 import json
 import logging
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from itertools import combinations, islice
 from pathlib import Path
 from typing import Final
 
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
@@ -20,6 +22,7 @@ from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Trac
 from buddyline.protocol.topics import TRACK, check_node_id
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.pair_core import PairCore, PairId
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 
@@ -48,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
             {nodes[1]: round(args.clock_offset * 1e9)},
             track=track_settings(args.track, args.track_hz),
         )
-        began_s = time.monotonic()
+        began_s, tracks = time.monotonic(), defaultdict[PairId, Tracked](Tracked)
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
@@ -59,10 +62,10 @@ def run(args: argparse.Namespace) -> int:
                 sound = [envelope for envelope in together if not _is_replaced(envelope.message, replaced)]
                 for envelope in sound:
                     writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
-                _write(writer, core.handle_many(envelope.message for envelope in sound))
-            _write(writer, core.finish())
+                _write(writer, core.handle_many(envelope.message for envelope in sound), tracks)
+            _write(writer, core.finish(), tracks)
         bad = dive.refused
-    _summarize(args, core, bad, time.monotonic() - began_s)
+    _summarize(args, core, tracks, bad, time.monotonic() - began_s)
     if not core.counts.total():
         log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))
     elif not core.matched:
@@ -146,14 +149,46 @@ def messages_of(
                 yield found
 
 
-def _write(writer: DiveLogWriter, results: Iterable[Message]) -> None:
+@dataclass
+class Tracked:
+    """What was written of one pair's track. rows: how often it tells; span_s: from its first to its last time.
+
+    longest_gap_s: the longest time without a light that it tells through.
+    """
+
+    rows: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    longest_gap_s: float = 0.0
+
+    def take(self, track: Track) -> None:
+        """Count a row."""
+        self.first_ns = self.first_ns if self.rows else track.stamp_ns
+        self.last_ns = max(self.last_ns, track.stamp_ns)
+        self.rows += 1
+        self.longest_gap_s = max(self.longest_gap_s, track.age_s)
+
+    @property
+    def span_s(self) -> float:
+        """From the first to the last row."""
+        return (self.last_ns - self.first_ns) / S_NS
+
+
+def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[PairId, Tracked]) -> None:
     """Write outcomes and track; a track of any mode goes to the topic `track`."""
     for result in results:
+        if isinstance(result, Track):
+            tracks[result.node_a, result.node_b].take(result)
         key = TRACK.key(result.node_a, result.node_b) if isinstance(result, Track) else None
         writer.write_message(result, key=key)
 
 
-def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: float) -> None:
+def _summarize(
+    args: argparse.Namespace, core: SolverCore, tracks: Mapping[PairId, Tracked], bad: int, took_s: float
+) -> None:
+    for pair in core.pairs.values():
+        for problem in pair.tracker.problems if pair.tracker is not None else ():
+            log.warning("track of %s and %s: %s", *pair.nodes, problem)
     if args.json:
         pairs = [
             {
@@ -163,6 +198,7 @@ def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: flo
                 "matched": pair.matcher.matched,
                 "solved": pair.counts["solved"],
                 "rejected": _rejected(pair.counts),
+                "track": _track_figures(pair, tracks),
             }
             for pair in core.pairs.values()
         ]
@@ -175,6 +211,8 @@ def _summarize(args: argparse.Namespace, core: SolverCore, bad: int, took_s: flo
         print(f"{args.output}: {solved} poses of {triggers} triggers, nodes {pair.nodes[0]} and {pair.nodes[1]}")
         for reason, count in _rejected(pair.counts).items():
             print(f"  {count:6d} {reason}")
+        if pair.tracker is not None:
+            print(_track_text(args.track, pair, tracks))
     if bad:
         print(f"  {bad:6d} messages that could not be used")
     print(f"  {took_s:.1f} s, {core.counts.total() / max(took_s, 1e-9):.0f} triggers/s")
@@ -192,3 +230,34 @@ def _totals(core: SolverCore) -> dict[str, object]:
 
 def _rejected(counts: Counter[str]) -> dict[str, int]:
     return {reason: count for reason, count in sorted(counts.items()) if reason != "solved"}
+
+
+def _track_figures(pair: PairCore, tracks: Mapping[PairId, Tracked]) -> dict[str, object] | None:
+    """Return the track's figures, None where none was asked for."""
+    if pair.tracker is None:
+        return None
+    told, clock = tracks.get(pair.nodes, Tracked()), pair.tracker.clock_now()
+    return {
+        "rows": told.rows,
+        "span_s": told.span_s,
+        "longest_gap_s": told.longest_gap_s,
+        "clock_offset_s": clock and clock[0],
+        "clock_sigma_s": clock and clock[1],
+        "problems": pair.tracker.problems,
+    }
+
+
+def _track_text(mode: str, pair: PairCore, tracks: Mapping[PairId, Tracked]) -> str:
+    told = tracks.get(pair.nodes, Tracked())
+    if pair.tracker is None or not told.rows:
+        return f"  no track ({mode}): it starts from a pose, or from lights and both attitudes"
+    clock = pair.tracker.clock_now()
+    clocks = (
+        f"; clock of {pair.nodes[1]} {1e3 * clock[0]:+.1f} ms from {pair.nodes[0]}'s (1 sd {1e3 * clock[1]:.1f})"
+        if clock is not None
+        else ""
+    )
+    return (
+        f"  track ({mode}): {told.rows} rows over {told.span_s:.1f} s, "
+        f"longest time without a light {told.longest_gap_s:.1f} s{clocks}"
+    )

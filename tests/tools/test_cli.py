@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from typing import get_args
@@ -70,9 +71,20 @@ def test_solve_and_its_summary(capsys, dive_log, tmp_path):
     summary = json.loads(out)
     assert summary["triggers"] == summary["solved"] + sum(summary["rejected"].values()) == 28
     assert summary["solved"] > 14
+    track = summary["track"]
+    assert track["rows"] > 100
+    assert track["span_s"] == pytest.approx((track["rows"] - 1) / 50.0)
+    assert (track["longest_gap_s"] < 1.0, track["problems"]) == (True, [])
     status, out, _ = run(capsys, "evaluate", tmp_path / "out.mcap", "--json")
     assert status == 0
     json.loads(out)
+
+
+def test_solve_says_what_its_track_covers(capsys, dive_log, tmp_path):
+    _, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "out.mcap")
+    assert re.search(r"track \(smooth\): \d+ rows over \d\.\d s, longest time without a light", out)
+    _, out, _ = run(capsys, "solve", dive_log, "-o", tmp_path / "none.mcap", "--track", "none")
+    assert "track (" not in out
 
 
 def test_solve_is_deterministic(capsys, dive_log, tmp_path):
