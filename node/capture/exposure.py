@@ -12,8 +12,9 @@ from buddyline.protocol.clock import MS_NS
 from numpy.typing import NDArray
 
 GREY_LEVELS: Final = 256
-FIRST_AMOUNT: Final = 8.0
-"""Of the first frames, before any has been seen: 4 ms with a gain of 2 show lamps and a lit scene alike."""
+FIRST_LAMPS: Final = 0.5
+FIRST_SCENE: Final = 8.0
+"""Amounts of the first frames, before any has been seen: of lamps a few metres away, and of a lit scene."""
 _SRGB_KNEE: Final = 0.04045
 
 
@@ -80,8 +81,7 @@ class ExposureRange:
 
     def first_plan(self) -> ExposurePlan:
         """Return the plan before any frame has been seen."""
-        first = self.exposure(FIRST_AMOUNT)
-        return ExposurePlan(first, first)
+        return ExposurePlan(self.exposure(FIRST_LAMPS), self.exposure(FIRST_SCENE))
 
     def within(self, longest_ns: int, gain_max: float) -> ExposureRange:
         """Return what of it is within these bounds."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
 from buddyline.node.capture.cores import Core, SceneLight
-from buddyline.node.capture.exposure import FIRST_AMOUNT, Exposure, ExposurePlan, ExposureRange
+from buddyline.node.capture.exposure import FIRST_LAMPS, FIRST_SCENE, Exposure, ExposurePlan, ExposureRange
 
 State: TypeAlias = Literal["search", "descend", "locked"]
 
@@ -69,8 +69,8 @@ class ExposureLock:
         self._context_every = context_every
         self._flicker_ns = flicker_ns
         self._target = target
-        self._scene = self._within(FIRST_AMOUNT)
-        self._amount = self._scene
+        self._scene = self._within(FIRST_SCENE)
+        self._amount = self._within(FIRST_LAMPS)
         self._good = self._within(self._scene / RUNG**4)
         self._wanted: deque[float] = deque(maxlen=REMEMBERED)
         self._missed = 0

@@ -17,7 +17,7 @@ from buddyline.node.drivers.camera_picamera2 import Picamera2Camera, choose_mode
 from buddyline.node.drivers.samples import DeviceError
 from buddyline.node.trigger import LOCKED_NS
 from buddyline.protocol.clock import MS_NS, S_NS, ManualClock, trigger_index
-from buddyline.protocol.messages import Blob
+from buddyline.protocol.messages import Blob, Candidates
 
 from tests.node.drivers import standin_picamera2 as standin
 
@@ -435,7 +435,11 @@ def look(camera, loop, n):
         frame = camera.next_frame(NEVER)
         area_px = float((frame.image[..., 0] > frame.image.max() / 2).sum())
         blob = Blob(u_px=400.0, v_px=300.0, sigma_px=0.1, area_px=area_px, peak=200.0, elongation=1.0, score=0.9)
-        camera.exposure_control.follow(loop.update(frame, [blob] if frame.image[300, 400, 0] > 20 else []))
+        message = Candidates(
+            node="a", stamp_ns=frame.stamp_ns, trigger=0, seq=0, boot="boot", width_px=820, height_px=616,
+            blobs=[blob] if frame.image[300, 400, 0] > 20 else [],
+        )  # fmt: skip
+        camera.exposure_control.follow(loop.update(frame, message))
         taken.append(frame)
     return taken
 
@@ -523,3 +527,13 @@ def test_exposures_stay_within_the_frame_and_the_cameras_own_bounds(sensor):
     assert (limits.shortest_ns, limits.longest_ns) == (75_000, 47_500_000)
     assert limits.gain_max == pytest.approx(10.67, abs=0.01)
     np.testing.assert_allclose(limits.linear, GREY)
+
+
+def test_lost_frames_do_not_disturb_the_exposure(sensor):
+    sensor.view = lamp(LIGHT_PER_MS)
+    camera = make(sensor, CameraConfig())
+    loop = ExposureLoop(ExposureConfig(context_every=10), camera.exposure_control.range)
+    look(camera, loop, 100)
+    sensor.lost = set(range(110, 400, 37))
+    lamps = [frame for frame in look(camera, loop, 150) if not frame.context]
+    assert all(150 < frame.image[300, 400, 0] < 250 for frame in lamps)
