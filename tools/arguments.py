@@ -89,10 +89,8 @@ def detect(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")
     parser.add_argument("-o", "--output", metavar="OUT.mcap", help="write a dive log instead of JSON lines")
     parser.add_argument("--draw", metavar="DIR", help="a new folder for the pictures with their candidates marked")
-    parser.add_argument("--environment", default="auto", choices=PRESETS, help="default: auto")
-    parser.add_argument(
-        "--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}; paper: the paper's"
-    )
+    parser.add_argument("--environment", default="auto", choices=PRESETS, help="of the paper's method; default: auto")
+    _method(parser)
     parser.add_argument(
         "--mask",
         action="append",
@@ -110,14 +108,21 @@ def after(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="a new folder for poses, track and report")
 
 
+def _method(parser: argparse.ArgumentParser) -> None:
+    known = ", ".join(DETECTORS)
+    parser.add_argument("--method", default=DETECTORS[0], help=f"{known}, or an installed one; default: {DETECTORS[0]}")
+
+
 def tune(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `tune`."""
-    parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")
+    parser.add_argument("inputs", nargs="*", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")
     parser.add_argument(
         "--truth", metavar="T.mcap", help="the true places of the lights; default: the dive's own, if it has them"
     )
-    parser.add_argument("--method", default=DETECTORS[0], choices=DETECTORS, help=f"default: {DETECTORS[0]}")
-    parser.add_argument("--environment", default=PRESETS[1], choices=PRESETS[1:], help="the preset to start from")
+    _method(parser)
+    parser.add_argument("--environment", default="auto", choices=PRESETS, help="of the paper's method: where to start")
+    parser.add_argument("--fit", action="store_true", help="fit the score, and print it; the pictures show no lamp")
+    parser.add_argument("--note", default="", help="with --fit: what the pictures are, for the record")
     parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
     parser.add_argument(
         "--draw", default="tuned", metavar="DIR", help="new folder for the marked pictures; default: tuned"

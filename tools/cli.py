@@ -104,12 +104,12 @@ COMMANDS: Final = (
     Command(
         "detect",
         "find light candidates in stored pictures or a dive's pictures",
-        ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap --environment lake"),
+        ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap"),
     ),
     Command(
         "tune",
         "propose detector values for a site, and show the pictures they were judged on",
-        ("tune dive.mcap", "tune pictures/ --draw judged/"),
+        ("tune dive.mcap", "tune pictures/ --draw judged/", "tune --fit without_lamps/ > score.toml"),
     ),
     Command(
         "solve",

@@ -7,7 +7,15 @@ import math
 import sys
 from dataclasses import asdict, fields
 
-from buddyline.node.sim.scenario import ENVIRONMENTS, EXPOSURES, INERTIAL_GRADES, TRAJECTORIES, DivePlan, Scenario
+from buddyline.node.sim.scenario import (
+    DECOYS,
+    ENVIRONMENTS,
+    EXPOSURES,
+    INERTIAL_GRADES,
+    TRAJECTORIES,
+    DivePlan,
+    Scenario,
+)
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.tools.progress import Progress
 
@@ -61,6 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument(
         "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
     )
+    faults.add_argument(
+        "--decoy", action="append", default=[], choices=DECOYS, help="in pictures, what is taken for lamps; repeatable"
+    )
     faults.add_argument("--pwm-hz", type=float, default=0.0, metavar="HZ", help="lights dimmed by pulses")
     faults.add_argument("--strobe-s", type=float, default=0.0, metavar="S", help="a strobe flashes so often")
     faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
@@ -97,6 +108,7 @@ def run(args: argparse.Namespace) -> int:
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
         inertial=args.inertial,
         dead_lamps=tuple(args.dead_lamp),
+        decoys=tuple(args.decoy),
         pwm_hz=args.pwm_hz,
         strobe_s=args.strobe_s,
     )

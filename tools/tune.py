@@ -2,6 +2,8 @@
 
 The values are judged by the dive's light truth, if it has any. Otherwise the likely candidates of the default detector
 replace it, and the proposed values are the strictest ones that keep these candidates.
+
+With `--fit` the pictures show no lamp, and the detector's score is fitted to them and to simulated ones (fit_score.py).
 """
 
 from __future__ import annotations
@@ -11,19 +13,19 @@ import json
 import logging
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
-from buddyline.node.detect import make_detector, presets
+from buddyline.node.detect import Detector, make_detector, values_of
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, LightTruth
 from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
-from buddyline.tools import losses
+from buddyline.tools import fit_score, losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.newfile import new_folder, write_picture
@@ -52,15 +54,17 @@ LIKELY: Final = 0.5
 ROUNDS: Final = 2
 MASK_BGR: Final = (255, 160, 60)
 BY_TRUTH: Final = "truth"
+NO_LIGHTS: Final = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with the lights that should be found in it, (L, 2) px."""
+    """A picture with the lights that should be found in it, (L, 2) px. focal_px: of its camera, if that is known."""
 
     name: str
     pixels: NDArray[np.uint8]
     lights_px: Points
+    focal_px: float | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,10 @@ class Judged:
 def run(args: argparse.Namespace) -> int:
     """Propose values; return 0."""
     cv2.setNumThreads(1)
+    if args.fit:
+        return fit_score.run(args.inputs, (pixels for _, pixels in _readable(_files(args.inputs))), args.note)
+    if not args.inputs:
+        raise BuddylineError("give pictures, a folder of them or a dive log")
     if args.pictures < 1:
         raise BuddylineError("--pictures: at least 1")
     pictures, by = load_pictures(args.inputs, args.truth, args.pictures)
@@ -90,7 +98,9 @@ def run(args: argparse.Namespace) -> int:
     if lights == 0:
         raise BuddylineError("no lights in these pictures to tune on; give pictures with the lamps on, or --truth")
     masks = still_parts([picture.pixels for picture in pictures], _true_lights(pictures, by))
-    present = dict(presets(args.method)[args.environment])
+    if args.method == "paper" and args.environment == "auto":
+        raise BuddylineError("--environment: where the paper's method is to start from; it has a set for each water")
+    present = dict(values_of(args.method, args.environment))
     folder = new_folder(args.draw)
     proposed, before, after = propose(args.method, args.environment, present, pictures)
     _write(folder, args.method, args.environment, proposed, pictures, masks)
@@ -145,10 +155,12 @@ def propose(
 
 def judge(method: str, environment: str, values: Values, pictures: Sequence[Picture]) -> Judged:
     """Return the quality of a set of values on these pictures."""
-    detector = make_detector(method, environment, values)
+    detectors: dict[float | None, Detector] = {}
     found = close = lights = false = 0
     for picture in pictures:
-        blobs = [d.blob for d in detector.detect(picture.pixels)]
+        if picture.focal_px not in detectors:
+            detectors[picture.focal_px] = make_detector(method, environment, values, picture.focal_px)
+        blobs = [d.blob for d in detectors[picture.focal_px].detect(picture.pixels)]
         at_px = np.array([(blob.u_px, blob.v_px) for blob in blobs]).reshape(-1, 2)
         apart = np.hypot(*(at_px[:, None] - picture.lights_px).transpose(2, 0, 1))
         near = apart < NEAR_WIDTHS * picture.pixels.shape[1]
@@ -164,24 +176,24 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
     dives = [name for name in inputs if Path(name).suffix == ".mcap"]
     if dives and len(dives) != len(inputs):
         raise BuddylineError("give either pictures or dive logs, not both at once")
-    known: dict[tuple[str, int], Points] = {}
-    if dives:
-        known = _truths([*dives, *([truth] if truth else [])])
-        named = list(_dive_pictures(dives, known, limit))
-    elif truth:
+    if truth and not dives:
         raise BuddylineError("--truth: is a dive's; pictures have none")
+    known = _truths([*dives, *([truth] if truth else [])]) if dives else {}
+    if dives:
+        pictures = list(_dive_pictures(dives, known, limit))
     else:
-        named = [(str(file), None, pixels) for file, pixels in _readable(_spread(_files(inputs), limit))]
-    if not named:
+        pictures = [Picture(str(file), pixels, NO_LIGHTS) for file, pixels in _readable(_spread(_files(inputs), limit))]
+    if not pictures:
         raise BuddylineError("no pictures " + ("with truth " if known else "") + f"in {', '.join(inputs)}")
     if known:
-        return [Picture(name, pixels, lights) for name, lights, pixels in named if lights is not None], BY_TRUTH
-    detector = make_detector()
-    pictures = []
-    for name, _, pixels in named:
-        likely = [d.blob for d in detector.detect(pixels) if isinstance(d.blob.score, float) and d.blob.score >= LIKELY]
-        pictures.append(Picture(name, pixels, np.array([(b.u_px, b.v_px) for b in likely]).reshape(-1, 2)))
-    return pictures, "likely candidates of the default detector"
+        return pictures, BY_TRUTH
+    return [_with_likely_lights(picture) for picture in pictures], "likely candidates of the default detector"
+
+
+def _with_likely_lights(picture: Picture) -> Picture:
+    blobs = [detection.blob for detection in make_detector(focal_px=picture.focal_px).detect(picture.pixels)]
+    likely = [(b.u_px, b.v_px) for b in blobs if isinstance(b.score, float) and b.score >= LIKELY]
+    return replace(picture, lights_px=np.array(likely).reshape(-1, 2))
 
 
 def _truths(paths: Sequence[str]) -> dict[tuple[str, int], Points]:
@@ -197,9 +209,8 @@ def _truths(paths: Sequence[str]) -> dict[tuple[str, int], Points]:
     return known
 
 
-def _dive_pictures(
-    paths: Sequence[str], known: Mapping[tuple[str, int], Points], limit: int
-) -> Iterable[tuple[str, Points | None, NDArray[np.uint8]]]:
+def _dive_pictures(paths: Sequence[str], known: Mapping[tuple[str, int], Points], limit: int) -> Iterator[Picture]:
+    """Yield the pictures of dives; where any light is known, those with known lights."""
     with Dive(list(paths)) as dive:
         infos = dive.infos()
         listed = []
@@ -213,7 +224,8 @@ def _dive_pictures(
         for node, trigger, data in _spread(listed, limit):
             name = f"{node}_{trigger}"
             try:
-                yield name, known.get((node, trigger)), decode_picture(data, name)
+                focal_px = infos[node].camera.fx_px if node in infos else None
+                yield Picture(name, decode_picture(data, name), known.get((node, trigger), NO_LIGHTS), focal_px)
             except PictureError as error:
                 losses.report([str(error)])
 
@@ -249,8 +261,8 @@ def _write(
     masks: Sequence[Rectangle],
 ) -> None:
     """Write every picture with the candidates found by the proposed values, and its lights as crosses."""
-    detector = make_detector(method, environment, values)
     for picture in pictures:
+        detector = make_detector(method, environment, values, picture.focal_px)
         marked = mark_candidates(
             picture.pixels, detector.detect(picture.pixels), [(u, v) for u, v in picture.lights_px]
         )

@@ -1,24 +1,35 @@
 """Find the other node's lights in a picture.
 
-`source` looks for the sources of light themselves and adapts to the water; `paper` is the baseline.
+`source` looks for the sources of light themselves and adapts to the water; `paper` is the baseline. Others come from
+outside: an installed distribution names its detector in the entry point group GROUP.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
 
 from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.node.detect import paper, source
-from buddyline.node.detect.detection import Detection, Detector, GuidedDetector, ImageError, Region
+from buddyline.node.detect.detection import (
+    Detection,
+    Detector,
+    DetectorFactory,
+    GuidedDetector,
+    ImageError,
+    Region,
+)
 from buddyline.node.detect.masks import Corners, MaskedDetector, Masks
 from buddyline.protocol.errors import BuddylineError
 
 METHODS: Final = DETECTORS
 ENVIRONMENTS: Final = PRESETS
+GROUP: Final = "buddyline.detectors"
 
 __all__ = [
     "ENVIRONMENTS",
+    "GROUP",
     "METHODS",
     "Detection",
     "Detector",
@@ -26,17 +37,23 @@ __all__ = [
     "ImageError",
     "Region",
     "make_detector",
-    "presets",
+    "values_of",
 ]
 
 
-def presets(method: str) -> Mapping[str, Mapping[str, float]]:
-    """Return a method's preset values for each environment; raise BuddylineError for an unknown method."""
-    if method == "source":
-        return source.PRESETS
+def values_of(method: str, environment: str = "auto") -> Mapping[str, float]:
+    """Return the values of a detector that can be overridden, as they are by default.
+
+    Raises BuddylineError for an unknown method, and for an environment that the method does not know: only `paper`
+    has values for each environment, and with `auto` takes one of these; the others adapt, and know `auto` alone.
+    """
     if method == "paper":
-        return paper.PRESETS
-    raise BuddylineError(f"detector method {method!r}: choose one of {', '.join(METHODS)}")
+        known = _known_environment(environment)
+        return paper.PRESETS["night_reef" if known == "auto" else known]
+    values: Mapping[str, float] = _factory(method).VALUES
+    if environment != "auto":
+        raise BuddylineError(f"environment {_known_environment(environment)!r}: {method} adapts by itself; give `auto`")
+    return values
 
 
 def make_detector(
@@ -48,24 +65,51 @@ def make_detector(
 ) -> Detector:
     """Make the detector of one camera.
 
-    overrides: replace values of the environment's preset, under the names that `presets` returns. focal_px: of the
-    pictures, for the size of lamps in them; without it, each picture counts as one of 49 degrees across. masks:
+    overrides: replace values of the detector, under the names that `values_of` returns. focal_px: of the pictures, for
+    the size of lamps in them; without it, each picture counts as one of 49 degrees across. masks:
     parts of the picture that are never searched, see Masks. Raises BuddylineError for an unknown method, environment or
     name, for a negative or non-finite value, and for a mask outside of the picture.
     """
-    known = presets(method)
-    if environment not in ENVIRONMENTS:
-        raise BuddylineError(f"environment {environment!r}: choose one of {', '.join(ENVIRONMENTS)}")
-    names = next(iter(known.values()))
+    names = values_of(method, environment)
     for name, value in (overrides or {}).items():
         if name not in names:
-            raise BuddylineError(f"detector value {name!r}: {method} has {', '.join(names)}")
+            raise BuddylineError(f"detector value {name!r}: {method} has {', '.join(names) or 'none'}")
         if not 0 <= value < float("inf"):
             raise BuddylineError(f"detector value {name} = {value}: must be a finite number, 0 or more")
     if focal_px is not None and not 0 < focal_px < float("inf"):
         raise BuddylineError(f"focal_px = {focal_px}: must be a finite number above 0")
     hidden = Masks(masks) if masks else None
     if method == "paper":
-        plain = paper.PaperDetector(environment, overrides or {}, focal_px)
-        return plain if hidden is None else MaskedDetector(plain, hidden)
-    return source.SourceDetector(environment, overrides or {}, focal_px, hidden)
+        plain: Detector = paper.PaperDetector(environment, overrides or {}, focal_px)
+    elif method == "source":
+        return source.SourceDetector(overrides or {}, focal_px, hidden)
+    else:
+        plain = _factory(method)(overrides or {}, focal_px)
+    return plain if hidden is None else MaskedDetector(plain, hidden)
+
+
+def _known_environment(name: str) -> str:
+    if name not in ENVIRONMENTS:
+        raise BuddylineError(f"environment {name!r}: choose one of {', '.join(ENVIRONMENTS)}")
+    return name
+
+
+def _factory(method: str) -> DetectorFactory:
+    """Return what makes the detector of this name, of this project or of another distribution."""
+    if method == "source":
+        return source.SourceDetector
+    outside = {point.name: point for point in entry_points(group=GROUP) if point.name not in METHODS}
+    if method not in outside:
+        raise BuddylineError(f"detector method {method!r}: choose one of {', '.join((*METHODS, *outside))}")
+    return _loaded(outside[method])
+
+
+def _loaded(point: EntryPoint) -> DetectorFactory:
+    by = f"detector {point.name!r} ({point.value}" + (f" of {point.dist.name})" if point.dist else ")")
+    try:
+        factory: Any = point.load()
+    except (ImportError, AttributeError) as error:
+        raise BuddylineError(f"{by}: {error}") from error
+    if not isinstance(factory, Callable) or not isinstance(getattr(factory, "VALUES", None), Mapping):  # type: ignore[arg-type]
+        raise BuddylineError(f"{by}: is no detector: it needs a mapping VALUES, and to be callable")
+    return factory  # type: ignore[no-any-return]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -45,6 +45,19 @@ class Detector(Protocol):
         """Find the candidates of one picture, the likeliest lights first.
 
         image: (H, W, 3) BGR, or (H, W) grey (a Y plane), uint8. Raises ImageError for anything else.
+        """
+        ...
+
+
+class DetectorFactory(Protocol):
+    """Makes a detector. VALUES: what can be overridden, each with its default, a number of 0 or more."""
+
+    VALUES: Mapping[str, float]
+
+    def __call__(self, values: Mapping[str, float], focal_px: float | None, /) -> Detector:
+        """Return the detector of one camera.
+
+        values: in place of those in VALUES. focal_px: of the pictures; None where it is not known.
         """
         ...
 

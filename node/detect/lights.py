@@ -40,7 +40,9 @@ class Lights(NamedTuple):
     ground, the grey level of the water around it; core_elongation, long over short axis near the top.
     unclipped: 0 (clipped) to 1. scattered: 0 to 1, see _scattered; for such a light centre_px is where its glow begins.
     In luminance: peak; height, the peak above the ground; edge_px (N, K), distances along the rays from edge_at_px to
-    the outline at half height; area_px and elongation of that outline; open_share, share of rays without an edge.
+    the outline at half height; area_px and elongation of that outline; open_share, share of rays without an edge;
+    roundest, the least elongation of the outlines at 0.5, 0.7 and 0.9 of the height (lower down, the bar that a lamp
+    lights may hang on to it); radii_px (N, 4), of the circles of equal area at 0.9, 0.7, 0.5 and 0.3 of the height.
     outstanding: as in Proposals.
     """
 
@@ -58,6 +60,8 @@ class Lights(NamedTuple):
     edge_at_px: Floats
     area_px: Floats
     elongation: Floats
+    roundest: Floats
+    radii_px: Floats
     open_share: Floats
     outstanding: Floats
 
@@ -100,9 +104,10 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
     step_px = _at_most(_GUESS * (own_circle[0, :, :2] - own_circle[_HALF, :, :2]), _GUESS_MOST * core_px)
     edge = shapes.edge_px[0, _HALF]
     radius_px = circle[_HALF, :, 2]
-    core_elongation, half_elongation = elongation(
-        np.concatenate([own_edge, edge]), np.concatenate([own_circle[_CORE], circle[_HALF]])
-    ).reshape(2, -1)
+    core_elongation, half_elongation, *higher = elongation(
+        np.concatenate([own_edge, edge, *shapes.edge_px[0, :_HALF]]),
+        np.concatenate([own_circle[_CORE], circle[_HALF], *circle[:_HALF]]),
+    ).reshape(2 + _HALF, -1)
     return Lights(
         centre + rim_px,
         core_px,
@@ -118,6 +123,8 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
         centre,
         np.pi * (radius_px * radius_px),
         half_elongation,
+        np.minimum.reduce([half_elongation, *higher]),
+        circle[..., 2].T,
         shapes.is_open[0, _HALF] @ MEAN,
         outstanding,
     )

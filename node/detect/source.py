@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Final
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 from buddyline.node.detect.centre import Centres, locate_sources
@@ -18,70 +18,72 @@ from buddyline.node.detect.masks import Masks, unmasked
 from buddyline.node.detect.proposals import Layout, ProposalFinder, Proposals
 from buddyline.node.detect.regions import RegionFinder
 from buddyline.node.detect.rings import RAY_UV, Floats
+from buddyline.node.detect.score import features, probability, texture
 from buddyline.protocol.messages import Blob
 from numpy.typing import NDArray
 
-PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
-    {
-        "cavern": {"contrast_min": 5.0, "clutter_gain": 2.0},
-        "night_reef": {"contrast_min": 5.0, "clutter_gain": 2.0},
-        "lake": {"contrast_min": 4.0, "clutter_gain": 2.0},
-        "basin": {"contrast_min": 5.0, "clutter_gain": 3.0},
-    }
-)
-_CLUTTER_GAIN: Final = 2.0
 _CONTRAST_MIN: Final = (4.0, 16.0)
 _CONTRAST_TO_NOISE: Final = 2.0
 _MEMORY: Final = 0.8
 _FAINTER: Final = 0.5
 """Share of the thresholds on contrast that holds where a light is expected."""
 _KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.5))
-"""(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.5 or more."""
+"""(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.5 or more.
+
+The solver chooses among them with both gaps and the sensors; generous lists serve it better than strict ones.
+"""
 _KEPT_NEAR: Final = ((2, 0.0), *_KEPT[1:])
 """Where only regions are searched: nearly all that is faint in them is no lamp."""
 
-_SCORE_AT_ZERO: Final = -5.2
-_SCORE_WEIGHTS: Final = np.array([2.2, 1.7, -2.8, -5.8], np.float32)
-_SCORE_LIMIT: Final = np.array([9.0, 9.0, 2.0, 1.0], np.float32)
-"""Weights of the log odds of a lamp. For: standing out of its neighbourhood, height above the ground. Against: being
-elongated, having an open outline. Fitted to the places found in rendered dives of five environments, in colour and
-grey, and in real caustics."""
+
+class Examined(NamedTuple):
+    """What was measured at the places of one picture: N lights, and the features of their score (N, F)."""
+
+    lights: Lights
+    features: Floats
 
 
 class SourceDetector:
-    """The default detector. With the environment `auto` it adapts to the noise of this picture and those before."""
+    """The default detector. It adapts to the noise of this picture and those before.
 
-    def __init__(
-        self,
-        environment: str,
-        overrides: Mapping[str, float],
-        focal_px: float | None = None,
-        masks: Masks | None = None,
-    ) -> None:
+    Among VALUES, contrast_min is the least contrast of a place, in grey levels (0: it follows the picture's noise), and
+    clutter_gain the share of its neighbourhood's mean contrast by which a place's contrast must exceed that.
+    """
+
+    VALUES: ClassVar[Mapping[str, float]] = MappingProxyType({"contrast_min": 0.0, "clutter_gain": 2.0})
+
+    def __init__(self, values: Mapping[str, float], focal_px: float | None = None, masks: Masks | None = None) -> None:
         """focal_px: of the pictures; None to take each picture's from its width. masks: what is never searched."""
         self._masks = masks
         self._focal_px = focal_px
-        self._values = {**PRESETS.get(environment, {}), **overrides}
-        self._clutter_gain = self._values.get("clutter_gain", _CLUTTER_GAIN)
+        self._values = {**self.VALUES, **values}
         self._finder = ProposalFinder(focal_px)
         self._noise: float | None = None
         # Of the last whole picture.
         self._contrast_min = _CONTRAST_MIN[0]
         self._water = 0.0
+        self._texture = 0.5
         self._shape: tuple[int, ...] = ()
         self._near: RegionFinder | None = None
 
     def detect(self, image: NDArray[np.uint8]) -> list[Detection]:
         """Find the candidates of one picture, the most likely first."""
         check_image(image)
+        return self._chosen(image, self.examine(image), _KEPT)
+
+    def examine(self, image: NDArray[np.uint8]) -> Examined | None:
+        """Measure all places of one picture where a light may be; None where there are none."""
         self._finder.load(image)
-        contrast_min = self._values.get("contrast_min")
-        self._contrast_min = self._adapt() if contrast_min is None else contrast_min
+        self._contrast_min = self._values["contrast_min"] or self._adapt()
         if image.shape != self._shape:
-            focal_px = self._focal_px or focal_of(image.shape[1])
-            self._shape, self._near = image.shape, RegionFinder(focal_px, self._finder.base_step_px, self._masks)
+            self._shape, self._near = (
+                image.shape,
+                RegionFinder(self._focal_of(image), self._finder.base_step_px, self._masks),
+            )
         self._water = water_level(image)
-        return self._measured(image, self._finder.find(self._contrast_min, self._clutter_gain, self._layout(image)))
+        proposals = self._finder.find(self._contrast_min, self._values["clutter_gain"], self._layout(image))
+        self._texture = texture(proposals.outstanding)
+        return self._measured(image, proposals)
 
     def _layout(self, image: NDArray[np.uint8]) -> Layout | None:
         """Return which places of a whole picture count; None for all."""
@@ -96,49 +98,46 @@ class SourceDetector:
 
         A lamp that stands out enough for the whole picture's search is found at the same place as there, because it is
         proposed and measured from the same pixels. Its score may differ a little: the clutter of the coarser octaves
-        is that of the tile around the region, not of a wider neighbourhood. The noise and
-        the water's brightness are those of the last whole picture.
+        is that of the tile around the region, not of a wider neighbourhood. The noise, the water's brightness and the
+        texture are those of the last whole picture.
         """
         check_image(image)
         if self._near is None or image.shape != self._shape:
             return None
-        thresholds = self._contrast_min * _FAINTER, self._clutter_gain * _FAINTER
+        thresholds = self._contrast_min * _FAINTER, self._values["clutter_gain"] * _FAINTER
         proposals = self._near.find(image, regions, *thresholds)
-        return None if proposals is None else self._measured(image, proposals, _KEPT_NEAR)
+        return None if proposals is None else self._chosen(image, self._measured(image, proposals), _KEPT_NEAR)
 
-    def _measured(
-        self, image: NDArray[np.uint8], proposals: Proposals, table: Sequence[tuple[int, float]] = _KEPT
-    ) -> list[Detection]:
-        """Measure, score and locate the proposed places, and keep the likeliest."""
+    def _measured(self, image: NDArray[np.uint8], proposals: Proposals) -> Examined | None:
         if len(proposals.radius_px) == 0:
-            return []
+            return None
         lights = measure_lights(image, proposals, self._water)
-        score = _score(lights)
-        order = np.argsort(-score, kind="stable")
-        order = order[distinct(lights.centre_px[order], lights.core_px[order], table[-1][0])]
+        return Examined(lights, features(lights, self._focal_of(image), self._texture))
+
+    def _chosen(
+        self, image: NDArray[np.uint8], seen: Examined | None, table: Sequence[tuple[int, float]]
+    ) -> list[Detection]:
+        """Score the measured places, and locate the source of the likeliest ones, as many as the table says."""
+        if seen is None:
+            return []
+        score = probability(seen.features)
+        # Of several places on one light, the one that stands out most has the scale that locates it best.
+        apart = np.array(distinct(seen.lights.centre_px, seen.lights.core_px, len(score)))
+        order = apart[np.argsort(-score[apart], kind="stable")]
         ranked = score[order].tolist()
-        chosen = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in table)]
-        likely = lights.at(chosen)
-        focal_px = self._focal_px or focal_of(image.shape[1])
-        found = _detections(likely, locate_sources(image, likely, focal_px), score[chosen], image.shape)
+        kept = order[: max(sum(likely >= least for likely in ranked[:many]) for many, least in table)]
+        likely = seen.lights.at(kept)
+        found = _detections(likely, locate_sources(image, likely, self._focal_of(image)), score[kept], image.shape)
         return unmasked(found, self._masks, image.shape)
+
+    def _focal_of(self, image: NDArray[np.uint8]) -> float:
+        return self._focal_px or focal_of(image.shape[1])
 
     def _adapt(self) -> float:
         """Return the least contrast of a place, in grey levels: from the noise of this picture and those before."""
         noise = self._finder.noise()
         self._noise = noise if self._noise is None else _MEMORY * self._noise + (1.0 - _MEMORY) * noise
         return min(max(_CONTRAST_TO_NOISE * self._noise, _CONTRAST_MIN[0]), _CONTRAST_MIN[1])
-
-
-def _score(lights: Lights) -> Floats:
-    """Return each light's probability of being a lamp, (N,)."""
-    features = np.empty((len(lights.peak), len(_SCORE_WEIGHTS)), np.float32)
-    features[:, 0] = np.log(lights.outstanding)
-    features[:, 1] = np.log(np.maximum(lights.height, 1.0) / 50.0)
-    features[:, 2] = lights.elongation - 1.0
-    features[:, 3] = lights.open_share
-    logit = _SCORE_AT_ZERO + np.minimum(features, _SCORE_LIMIT) @ _SCORE_WEIGHTS
-    return np.asarray(1.0 / (1.0 + np.exp(-logit)), np.float32)
 
 
 def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:

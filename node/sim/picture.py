@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from buddyline.node.capture.exposure import Exposure
 from buddyline.node.sim import tags
+from buddyline.node.sim.decoys import Decoys
 from buddyline.node.sim.flicker import Flicker
 from buddyline.node.sim.glow import GlowRenderer
 from buddyline.node.sim.randomness import generator
@@ -34,6 +35,7 @@ class Painter:
         self._glow = GlowRenderer(water, scenario.width_px, scenario.height_px, camera.fx_px)
         self._scenery = Scenery(scenario, camera)
         self._snow = Snow(scenario, camera, index)
+        self._decoys = Decoys(scenario, index, camera.fx_px)
         self._noise = _noise_tile(scenario, index)
         self._noise_sd = water.noise
         self._scene_exposure = scene_exposure(water)
@@ -54,6 +56,7 @@ class Painter:
         for lamp, table, lit in zip(lamps, tables, rows, strict=True):
             self._glow.add_wide(coarse, lamp, table, lit)
         self._scenery.paint(view, t_s, coarse, full)
+        self._decoys.add_behind(full, frame)
         for tag in view.tags:
             tags.paint(full, tag)
         for lamp, table, lit in zip(lamps, tables, rows, strict=True):
@@ -61,6 +64,7 @@ class Painter:
         for passer in view.passers:
             _darken(full, passer, self._scenery.passer_radiance)
         self._snow.add(full, view, t_s)
+        self._decoys.add_before(full, frame)
         noisier = 1.0
         if exposure is not None:
             full *= np.float32(exposure.amount / self._scene_exposure.amount)
@@ -69,7 +73,9 @@ class Painter:
         left, top = rng.integers(0, NOISE_MARGIN_PX, 2)
         width_px, height_px = self._size_px
         noise = self._noise[top : top + height_px, left : left + width_px]
-        return np.asarray(cv2.addWeighted(full, 255.0, noise, noisier, 0.0, dtype=cv2.CV_8U), np.uint8)
+        picture = np.asarray(cv2.addWeighted(full, 255.0, noise, noisier, 0.0, dtype=cv2.CV_8U), np.uint8)
+        self._decoys.burn_in(picture, frame)
+        return picture
 
     def _rows(self, lamp: Lamp, view: SceneView, t_s: float, exposure: Exposure | None) -> Image | None:
         """Return the share of a lamp's light that each row gets, (H,); None for a steady lamp."""

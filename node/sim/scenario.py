@@ -13,11 +13,13 @@ from buddyline.protocol.topics import check_node_id
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
 Trajectory: TypeAlias = Literal["circles", "rest"]
 InertialGrade: TypeAlias = Literal["good", "poor"]
+Decoy: TypeAlias = Literal["walls", "shells", "slabs", "bubbles", "lasers", "clock"]
 PictureExposure: TypeAlias = Literal["fixed", "auto"]
 ENVIRONMENTS: Final[tuple[str, ...]] = get_args(Environment)
 TRAJECTORIES: Final[tuple[str, ...]] = get_args(Trajectory)
 INERTIAL_GRADES: Final[tuple[str, ...]] = get_args(InertialGrade)
 EXPOSURES: Final[tuple[str, ...]] = get_args(PictureExposure)
+DECOYS: Final[tuple[str, ...]] = get_args(Decoy)
 
 Bgr: TypeAlias = tuple[float, float, float]
 
@@ -86,6 +88,7 @@ class Scenario:
     pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
     in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
     strobe_s: time between the flashes of a third diver's strobe between the nodes; 0: none.
+    decoys: what pictures show that may be taken for lamps.
     """
 
     environment: Environment = "cavern"
@@ -119,6 +122,7 @@ class Scenario:
     pwm_hz: float = 0.0
     pwm_depth: float = 0.5
     strobe_s: float = 0.0
+    decoys: tuple[Decoy, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise BuddylineError, naming the field, for what cannot be simulated."""
@@ -137,6 +141,9 @@ class Scenario:
         for lamp in self.dead_lamps:
             if lamp not in lamps:
                 raise BuddylineError(f"dead_lamps: {lamp!r} is none of {', '.join(lamps)}")
+        for decoy in self.decoys:
+            if decoy not in DECOYS:
+                raise BuddylineError(f"decoys: {decoy!r} is none of {', '.join(DECOYS)}")
         for name, lowest in _LOWEST.items():
             if not getattr(self, name) >= lowest:
                 raise BuddylineError(f"{name}: {getattr(self, name)} is below {lowest}")

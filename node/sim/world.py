@@ -131,6 +131,16 @@ class World:
         ]
         return LightTruth(node=node, stamp_ns=stamp_ns, trigger=trigger, lights=lights)
 
+    def lamps(self, node: str, stamp_ns: int) -> list[tuple[float, float, bool]]:
+        """Return where every lamp, of anyone, is in the picture taken at stamp_ns: (u, v, visible), px."""
+        index = self.scenario.index(node)
+        view = self._scene.view(index, self._seconds(index, stamp_ns))
+        return [
+            (float(lamp.pixel[0]), float(lamp.pixel[1]), candidates.visible(self._scene, index, view, lamp))
+            for lamp in (*view.lights, *view.others)
+            if lamp.stretch == 1.0 and not np.isnan(lamp.pixel).any()
+        ]
+
     def render(self, node: str, stamp_ns: int, exposure: Exposure | None = None) -> NDArray[np.uint8]:
         """Return the picture taken at stamp_ns, (H, W, 3) uint8, blue green red. exposure: None for the scene's own."""
         index = self.scenario.index(node)

@@ -10,8 +10,9 @@ from buddyline.protocol.errors import BuddylineError
 from tests.node.rendered import lamp_picture
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize(
+    ("method", "environment"), [("source", "auto"), *(("paper", environment) for environment in ENVIRONMENTS)]
+)
 def test_a_plain_lamp_is_found_first_in_every_environment(method, environment):
     image = lamp_picture([(300.3, 120.6)], seed=3)
     found = make_detector(method, environment).detect(image)
@@ -83,6 +84,8 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         make_detector("sauce")
     with pytest.raises(BuddylineError, match="night_reef"):
         make_detector("source", "pond")
+    with pytest.raises(BuddylineError, match="source adapts by itself"):
+        make_detector("source", "lake")
     with pytest.raises(BuddylineError, match="value_min"):
         make_detector("paper", "lake", {"value_mix": 3.0})
     with pytest.raises(BuddylineError, match="focal_px = -1"):

@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from buddyline.tools.bench import detect, presets
+from buddyline.tools.bench import detect
 from buddyline.tools.bench.__main__ import main
 
 
@@ -33,18 +33,7 @@ def test_memory_after_a_tenth_and_after_all_pictures(capsys):
     assert resident_kib["20"] - resident_kib["2"] < 20_000
 
 
-def test_auto_is_compared_with_every_preset(capsys, monkeypatch):
-    monkeypatch.setattr(presets, "RENDERED", ("night_reef",))
-    assert main(["presets", "--pictures", "3", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)
-    assert row["recall"]["auto"] >= max(row["recall"].values()) - 0.02
-    assert row["recall"]["auto"] > 0.5
-    assert "auto - best" in presets.table([row])
-
-
-@pytest.mark.parametrize(
-    "words", [["detect", "--pictures", "0"], ["detect", "--frames", "1"], ["presets", "--pictures", "0"]]
-)
+@pytest.mark.parametrize("words", [["detect", "--pictures", "0"], ["detect", "--frames", "1"]])
 def test_bad_arguments_give_a_one_line_error(words, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err

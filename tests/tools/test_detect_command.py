@@ -97,9 +97,9 @@ def test_a_picture_of_another_size_than_its_node_says_is_counted(tmp_path, capsy
     assert "200x100 px, its NodeInfo says 200x150" in err
 
 
-def test_a_configuration_overrides_a_preset(tmp_path):
+def test_a_configuration_overrides_a_value(tmp_path):
     path = tmp_path / "node.toml"
-    path.write_text('node = "a"\n[detector]\nenvironment = "lake"\noverrides = { contrast_min = 200.0 }\n')
+    path.write_text('node = "a"\n[detector]\noverrides = { contrast_min = 200.0 }\n')
     detector = load_node_config(path).detector
     dim = lamp_picture([AT], size=(200, 150), core=40.0, noise=1.0)
     assert make_detector(detector.method, detector.environment).detect(dim)
@@ -142,6 +142,9 @@ def test_without_truth_tune_uses_the_likely_candidates(tmp_path, capsys):
         (["nowhere.png"], "no such picture"),
         (["dark.png"], "no lights"),
         (["p.png", "--pictures", "0"], "--pictures"),
+        (["p.png", "--method", "paper"], "--environment"),
+        (["p.png", "--method", "sauce"], "source, paper"),
+        ([], "give pictures"),
     ],
 )
 def test_tune_refuses_bad_input_in_one_line(tmp_path, monkeypatch, capsys, words, says):

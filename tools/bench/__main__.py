@@ -18,7 +18,6 @@ BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
     "accuracy": "the solver: errors over the Cramer-Rao bound, and the right lights among false ones",
     "detect": "the detector: time per picture beside other finders, memory",
-    "presets": "the detector: recall of auto beside each environment's preset",
     "monitor": "the monitor: processor and memory with viewers, latency beside it, weight of the page",
     "node": "a whole node: capture to candidates published, processor, memory",
 }

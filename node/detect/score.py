@@ -1,0 +1,99 @@
+"""The probability that a place is a lamp, from what was measured of it: a logistic model with a few physical features.
+
+The weights stand in score.toml, which `buddyline tune --fit` writes and which says what they were fitted to.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from buddyline.node.detect.lights import Lights
+from buddyline.node.detect.rings import Floats
+from numpy.typing import NDArray
+
+WEIGHTS: Final = Path(__file__).with_name("score.toml")
+FOCAL_PX: Final = 904.0
+"""Focal length for which sizes in px are compared."""
+LIMITS: Final[Mapping[str, tuple[float, float]]] = {
+    "stands_out": (-1.0, 3.5),
+    "texture": (-0.7, 2.0),
+    "height": (-3.0, 1.7),
+    "out_of_round": (0.0, 1.0),
+    "open": (0.0, 1.0),
+    "size": (-0.5, 4.0),
+    "plateau": (-1.2, 0.0),
+    "halo": (0.0, 1.2),
+    "unclipped": (0.0, 0.3),
+    "ground": (0.0, 1.5),
+}
+"""The features, with the limits to which they are clipped: nothing is extrapolated beyond what the fit has seen.
+
+For the logarithm of the odds of a lamp:
+stands_out: log of the contrast over noise plus clutter. texture: log of the same of the picture's ninth to sixteenth
+places, which are no lamps as a rule: shells and caustics come in fields. height: log of the peak above the ground over
+50 levels. out_of_round: least elongation of the outlines from half height upward, minus 1; lower down, a bar that a
+lamp lights may hang on to it. open: share of rays without an edge. size: log of the radius at half height in px at
+FOCAL_PX. plateau: log of the radius at 0.9 of the height over that at 0.5; 0 for a flat top with sharp edges. halo: log
+of the radius at 0.3 over that at 0.5; 0 for a sharp edge. unclipped: how far the peak is below 240, in 100 levels.
+ground: grey level around, in 100 levels.
+"""
+PRODUCTS: Final = (
+    ("size", "size"),
+    ("size", "halo"),
+    ("size", "unclipped"),
+    ("texture", "unclipped"),
+    ("texture", "size"),
+    ("texture", "stands_out"),
+)
+"""Features that count together: a small lamp may be sharp and unclipped, a large one has a halo and clips; what stands
+out of a field of spots says less than what stands out of plain water."""
+NAMES: Final = ("constant", *LIMITS, *(f"{a}_{b}" for a, b in PRODUCTS))
+
+_LOWEST: Final = np.array([low for low, _ in LIMITS.values()], np.float32)
+_HIGHEST: Final = np.array([high for _, high in LIMITS.values()], np.float32)
+_FIRST: Final = np.array([list(LIMITS).index(a) for a, _ in PRODUCTS])
+_SECOND: Final = np.array([list(LIMITS).index(b) for _, b in PRODUCTS])
+
+
+def texture(outstanding: NDArray[np.float32]) -> float:
+    """Return how much a picture's ninth to sixteenth most outstanding places stand out; outstanding: (N,), falling."""
+    return (float(outstanding[8:16].sum()) + 0.5 * max(16 - max(len(outstanding), 8), 0)) / 8.0
+
+
+def features(lights: Lights, focal_px: float, textured: float) -> Floats:
+    """Return the features of N lights, (N, len(NAMES)). textured: of the picture, see texture."""
+    found = np.empty((len(lights.peak), len(NAMES)), np.float32)
+    r90, _, r50, r30 = np.maximum(lights.radii_px.T, 0.3)
+    alone = found[:, 1 : 1 + len(LIMITS)]
+    alone[:, 0] = np.log(np.maximum(lights.outstanding, 0.1))
+    alone[:, 1] = np.log(textured)
+    alone[:, 2] = np.log(np.maximum(lights.height, 1.0) / 50.0)
+    alone[:, 3] = lights.roundest - 1.0
+    alone[:, 4] = lights.open_share
+    alone[:, 5] = np.log(r50 * (FOCAL_PX / focal_px))
+    alone[:, 6] = np.log(r90 / r50)
+    alone[:, 7] = np.log(r30 / r50)
+    alone[:, 8] = (240.0 - lights.peak) / 100.0
+    alone[:, 9] = (lights.peak - lights.height) / 100.0
+    np.minimum(np.maximum(alone, _LOWEST, out=alone), _HIGHEST, out=alone)
+    found[:, 0] = 1.0
+    found[:, 1 + len(LIMITS) :] = alone[:, _FIRST] * alone[:, _SECOND]
+    return found
+
+
+def probability(found: Floats, weights: Floats | None = None) -> Floats:
+    """Return each light's probability of being a lamp, (N,). found: (N, len(NAMES)); weights: those of score.toml."""
+    logit = found @ (fitted() if weights is None else weights)
+    return np.asarray(1.0 / (1.0 + np.exp(-np.minimum(np.maximum(logit, -20.0), 20.0))), np.float32)
+
+
+@cache
+def fitted() -> Floats:
+    """Return the weights of score.toml, (len(NAMES),)."""
+    values = tomllib.loads(WEIGHTS.read_text())["weights"]
+    return np.array([values[name] for name in NAMES], np.float32)

@@ -1,0 +1,221 @@
+"""`buddyline tune --fit`: fit the detector's score to the simulator's pictures, and to pictures without any lamp.
+
+The simulator knows where every lamp is. It draws five waters, with and without what fools the detector, at several
+exposures and resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are added.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import cv2
+import numpy as np
+from buddyline.node.detect.score import NAMES, probability
+from buddyline.node.detect.source import SourceDetector
+from buddyline.protocol.clock import MS_NS
+from buddyline.tools.progress import Progress
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from buddyline.node.capture.exposure import Exposure
+    from buddyline.node.sim.world import World
+
+Floats = NDArray[np.float64]
+
+SEEDS: Final = range(1000, 1040)
+HELD_OUT: Final = range(2000, 2010)
+"""Seeds of the scenes: to fit, and to say how well it fits. Each makes a scene in every water."""
+VIEWS: Final = 6
+SECONDS: Final = 60.0
+CLEAN_SHARE: Final = 0.65
+"""Share of the scenes without decoys."""
+FAR: Final = (0.6, 1.4)
+"""Greatest range of a scene, as a share of the water's own: lamps that only just show count as well."""
+DARK_SHARE: Final = 0.2
+"""Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
+STOPS: Final = (0.0, 0.0, 0.0, -1.0, -2.0, -3.0, -5.0, 1.0)
+SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
+GREY_SHARE: Final = 0.15
+DECOYS: Final = (
+    ("shells",),
+    ("shells", "slabs"),
+    ("bubbles",),
+    ("shells", "lasers", "slabs"),
+    ("bubbles", "clock"),
+    ("shells", "bubbles", "slabs", "lasers", "clock"),
+    ("walls",),
+    ("walls", "slabs", "clock"),
+)
+NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
+"""A candidate counts as a lamp within 3 px or 1 % of the width, the greater."""
+BESIDE_RADII: Final = 1.5
+"""A candidate farther off, but within this many of its core's radii, counts neither as a lamp nor as none."""
+MAGNIFIED: Final = (1, 3, 5)
+"""Real pictures without lamps count once at each of these sizes: small ones hold few candidates."""
+REAL: Final = "real"
+RIDGE: Final = 3.0
+STEPS: Final = 60
+BINS: Final = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Candidates of one picture: their features (N, F), and whether each is a lamp (N,). source: water, or REAL."""
+
+    source: str
+    found: Floats
+    lamp: NDArray[np.bool_]
+
+
+def fit(samples: Sequence[Sample]) -> Floats:
+    """Return the weights (F,) of the logistic model: maximum likelihood with a small penalty, by Newton's method."""
+    found = np.concatenate([sample.found for sample in samples])
+    lamp = np.concatenate([sample.lamp for sample in samples]).astype(float)
+    weights = np.zeros(found.shape[1])
+    for _ in range(STEPS):
+        likely = probability(found, weights).astype(float)
+        curvature = (found * (likely * (1.0 - likely) + 1e-9)[:, None]).T @ found + RIDGE * np.eye(len(weights))
+        step = np.linalg.solve(curvature, found.T @ (lamp - likely) - RIDGE * weights)
+        weights += step
+        if np.abs(step).max() < 1e-6:
+            break
+    return weights
+
+
+def calibration_error(samples: Sequence[Sample], weights: Floats) -> float:
+    """Return the mean distance between score and share of lamps over bins of the score, weighted by their numbers."""
+    likely = np.concatenate([probability(sample.found, weights) for sample in samples]).astype(float)
+    lamp = np.concatenate([sample.lamp for sample in samples])
+    which = np.digitize(likely, BINS[1:-1])
+    apart = [abs(float((likely[which == k] - lamp[which == k]).sum())) for k in range(len(BINS) - 1)]
+    return sum(apart) / len(likely)
+
+
+def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[Sample]:
+    """Yield the candidates of rendered pictures, with what they are."""
+    from buddyline.node.sim.scenario import ENVIRONMENTS
+
+    for i, seed in enumerate(seeds):
+        for k, environment in enumerate(ENVIRONMENTS):
+            progress.show(done + i * len(ENVIRONMENTS) + k, f"{environment}, seed {seed}")
+            yield from _scene(environment, seed)
+
+
+def _scene(environment: str, seed: int) -> Iterator[Sample]:
+    from buddyline.node.sim.scenario import WATERS, Scenario
+    from buddyline.node.sim.world import World
+
+    rng = np.random.default_rng(seed * 10 + sum(environment.encode()))
+    width_px, height_px = SIZES[rng.integers(len(SIZES))]
+    dark = rng.random() < DARK_SHARE
+    far_m = WATERS[environment].range_max_m * rng.uniform(*FAR)
+    scenario = Scenario(
+        environment=environment,  # type: ignore[arg-type]
+        seed=seed,
+        width_px=width_px,
+        height_px=height_px,
+        range_max_m=float(far_m),
+        decoys=() if rng.random() < CLEAN_SHARE else DECOYS[rng.integers(len(DECOYS))],
+        other_lamps=int(rng.integers(0, 5)),
+        dead_lamps=("a.left", "a.right", "b.left", "b.right") if dark else (),
+    )
+    world = World(scenario)
+    exposure = _exposure(world, float(STOPS[rng.integers(len(STOPS))]))
+    grey = rng.random() < GREY_SHARE
+    detector = SourceDetector({}, None)
+    for k in range(VIEWS):
+        node = (scenario.node_a, scenario.node_b)[k % 2]
+        stamp_ns = round(1e9 * (1.0 + SECONDS * rng.random()))
+        picture = world.render(node, stamp_ns, exposure)
+        yield from _labelled(detector, picture[:, :, 1].copy() if grey else picture, world, node, stamp_ns)
+
+
+def _exposure(world: World, stops: float) -> Exposure | None:
+    """Return the scene's exposure, None, or one that is longer or shorter by so many stops, at the lowest gain."""
+    from buddyline.node.capture.exposure import Exposure
+    from buddyline.node.sim.sensor import scene_exposure
+
+    if stops == 0:
+        return None
+    return Exposure(round(scene_exposure(world.scenario.water).amount * 2.0**stops * MS_NS))
+
+
+def _labelled(
+    detector: SourceDetector, picture: NDArray[np.uint8], world: World, node: str, stamp_ns: int
+) -> Iterator[Sample]:
+    """Yield a picture's candidates, without those beside a lamp and those of a lamp that is hidden."""
+    seen = detector.examine(picture)
+    if seen is None:
+        return
+    lamps = world.lamps(node, stamp_ns)
+    at_px = np.array([lamp[:2] for lamp in lamps]).reshape(-1, 2)
+    visible = np.array([lamp[2] for lamp in lamps], bool)
+    away_px = np.linalg.norm(seen.lights.centre_px[:, None] - at_px, axis=-1)
+    near_px = max(NEAR_PX, NEAR_WIDTHS * picture.shape[1])
+    lamp = (away_px[:, visible] <= near_px).any(axis=1)
+    beside = (away_px <= BESIDE_RADII * np.maximum(seen.lights.core_px, near_px)[:, None]).any(axis=1)
+    kept = lamp | ~beside
+    yield Sample(world.scenario.environment, seen.features[kept].astype(float), lamp[kept])
+
+
+def without_lamps(pictures: Iterable[NDArray[np.uint8]]) -> Iterator[Sample]:
+    """Yield the candidates of real pictures that show no lamp."""
+    for picture in pictures:
+        for times in MAGNIFIED:
+            seen = SourceDetector({}, None).examine(
+                np.asarray(cv2.resize(picture, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC), np.uint8)
+                if times > 1
+                else picture
+            )
+            if seen is not None:
+                yield Sample(REAL, seen.features.astype(float), np.zeros(len(seen.features), bool))
+
+
+def run(folders: Sequence[str], pictures: Iterable[NDArray[np.uint8]], note: str) -> int:
+    """Fit the score to simulated pictures and to real ones without lamps; write it to stdout as TOML; return 0."""
+    from buddyline.node.sim.scenario import ENVIRONMENTS
+
+    scenes = len(SEEDS) * len(ENVIRONMENTS)
+    with Progress("fit", scenes + len(HELD_OUT) * len(ENVIRONMENTS)) as progress:
+        samples = [*simulated(SEEDS, progress), *without_lamps(pictures)]
+        held_out = list(simulated(HELD_OUT, progress, scenes))
+    sys.stdout.write(described(fit(samples), samples, held_out, [*folders, note]))
+    return 0
+
+
+def described(weights: Floats, samples: Sequence[Sample], held_out: Sequence[Sample], real: Sequence[str]) -> str:
+    """Return the weights as TOML, with where they come from and how well they are calibrated.
+
+    real: names of the real pictures, and what they are.
+    """
+    count = Counter(sample.source for sample in samples)
+    *folders, note = real
+    lines = [
+        "# Written by `buddyline tune --fit`. score.py says what the features are.",
+        "",
+        "[provenance]",
+        f'simulator = "seeds {SEEDS.start} to {SEEDS.stop - 1} in each water, {VIEWS} pictures each"',
+        f"real_pictures_without_lamps = {json.dumps(folders)}",
+        f"note = {json.dumps(note)}",
+        f"candidates = {sum(len(sample.lamp) for sample in samples)}",
+        f"lamps = {sum(int(sample.lamp.sum()) for sample in samples)}",
+        "",
+        "[provenance.pictures]",
+        *(f"{name} = {number}" for name, number in sorted(count.items())),
+        "",
+        f"# Mean distance of score and share of lamps, on pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}.",
+        "[calibration_error]",
+        *(
+            f"{name} = {calibration_error([one for one in held_out if one.source == name], weights):.3f}"
+            for name in sorted({one.source for one in held_out})
+        ),
+        "",
+        "[weights]",
+        *(f"{name} = {weight:.4f}" for name, weight in zip(NAMES, weights, strict=True)),
+    ]
+    return "\n".join(lines) + "\n"
