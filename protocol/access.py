@@ -20,16 +20,20 @@ _OF_NODES: Final = tuple(topic for topic in TOPICS if topic.id_fields == ("node"
 _SAY: Final = ["put", "delete", "reply", "declare_queryable", "liveliness_token"]
 
 
-def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]:
+def access_rules(nodes: Iterable[str], namespace: str = "", shut_out: Iterable[str] = ()) -> dict[str, object]:
     """Return Zenoh's `access_control`: a node publishes its own keys, the solver its results; all clients read all.
 
     A surveyor publishes marks for any node. A player publishes the keys of all nodes of a stored dive. A bridge to ROS
     publishes ROS's keys. Everything else is denied. Zenoh keeps its caches under `@adv`, which `*` and `**` do not
-    match; each rule therefore also names them, because history would otherwise be lost silently.
+    match; each rule therefore also names them, because history would otherwise be lost silently. shut_out: names of
+    certificates that may neither publish nor read.
     """
     root = f"{namespace}/buddyline" if namespace else "buddyline"
     everything = [f"{root}/**", f"{root}/**/@adv/**", f"{root}/@alive/**", *_ROS_KEYS]
-    clients = [node_name(node) for node in nodes] + [SOLVER, VIEWER, SURVEYOR, PLAYER, ROS]
+    gone = set(shut_out)
+    nodes = [node for node in nodes if node_name(node) not in gone]
+    clients = [node_name(node) for node in nodes]
+    clients += [role for role in (SOLVER, VIEWER, SURVEYOR, PLAYER, ROS) if role not in gone]
     rules: list[dict[str, object]] = [
         _rule("ask", ["ingress", "egress"], _ASK, everything),
         _rule("hear", ["egress"], _SAY, everything),
@@ -46,11 +50,14 @@ def access_rules(nodes: Iterable[str], namespace: str = "") -> dict[str, object]
             "player",
         ),
     ]:
+        if name in gone:
+            continue
         own = [f"{root}/@alive/{alive}/**"] + [f"{root}/{key}{end}" for key in keys for end in ("", "/@adv/**")]
         rules.append(_rule(f"say {name}", ["ingress"], _SAY, own))
         policies.append({"rules": [f"say {name}"], "subjects": [name]})
-    rules.append(_rule(f"say {ROS}", ["ingress"], _SAY, _ROS_KEYS))
-    policies.append({"rules": [f"say {ROS}"], "subjects": [ROS]})
+    if ROS not in gone:
+        rules.append(_rule(f"say {ROS}", ["ingress"], _SAY, _ROS_KEYS))
+        policies.append({"rules": [f"say {ROS}"], "subjects": [ROS]})
     return {
         "enabled": True,
         "default_permission": "deny",

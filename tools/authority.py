@@ -81,6 +81,18 @@ class Authority:
         _write_pair(paths[0], builder.sign(self._key, hashes.SHA256()), paths[1], key)
         return paths
 
+    def issued(self) -> list[tuple[str, datetime.datetime]]:
+        """Return the names of the certificates in its folder, its own left out, and when each ends, UTC."""
+        found = []
+        for path in sorted(self.directory.glob("*.crt")):
+            if path != self.certificate_path:
+                try:
+                    certificate = x509.load_pem_x509_certificate(path.read_bytes())
+                except (OSError, ValueError) as error:
+                    raise BuddylineError(f"{path}: cannot be read: {error}") from error
+                found.append((path.stem, certificate.not_valid_after_utc))
+        return found
+
     def hub_host(self) -> str:
         """Return where clients find the hub, as its certificate says."""
         path = self.directory / "hub.crt"

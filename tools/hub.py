@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
+from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.config import Config, load_config
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
@@ -15,11 +17,18 @@ from buddyline.protocol.statusfile import StatusFile
 from msgspec import field
 from msgspec.structs import replace
 
+if TYPE_CHECKING:
+    from buddyline.protocol.zenoh_bus.hub import Hub
+
 log = logging.getLogger(__name__)
+
+# How often the configuration is looked at.
+LOOK_S: Final = 1.0
 
 
 class HubConfig(Config, frozen=True, kw_only=True):
-    """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it.
+    """The hub's TOML file. nodes: who may publish, with TLS; namespace: as the clients have it. shut_out: names of
+    certificates that may neither publish nor read ("viewer", "node-b"). A changed file's lists count at once.
 
     status_file: its health report; "": in the runtime directory (protocol/statusfile.py).
     """
@@ -27,6 +36,7 @@ class HubConfig(Config, frozen=True, kw_only=True):
     listen: str = DEFAULT_ENDPOINT
     namespace: str = ""
     nodes: list[NodeId] = field(default_factory=list)
+    shut_out: list[str] = field(default_factory=list)
     tls: Tls | None = None
     status_file: str = ""
 
@@ -77,10 +87,44 @@ def run(args: argparse.Namespace) -> int:
     warning = check_exposure(config, insecure=args.insecure)
     if warning is not None:
         log.warning("hub: %s", warning)
-    access = None if config.tls is None else access_rules(config.nodes, config.namespace)
+    access = None if config.tls is None else access_rules(config.nodes, config.namespace, config.shut_out)
     service = Service("hub", StatusFile.of("hub", config.status_file))
     service.handle_signals()
-    with open_hub(config.listen, tls=config.tls, access=access):
+    with open_hub(config.listen, tls=config.tls, access=access) as hub:
         log.info("hub: listens on %s%s", config.listen, " (TLS, client certificates)" if config.tls else "")
+        if access is not None:
+            service.spawn("access", lambda: _follow_file(service, hub, args.config, config))
         service.wait(args.seconds)
     return service.join()
+
+
+def _follow_file(service: Service, hub: Hub, path: str, config: HubConfig) -> None:
+    """Take the lists of who is admitted whenever the configuration changes; one that is not valid changes nothing."""
+    from buddyline.protocol.access import access_rules
+
+    before = _state_of(path)
+    while not service.stop.wait(LOOK_S):
+        now = _state_of(path)
+        if now == before:
+            continue
+        before = now
+        try:
+            changed = load_hub_config(path)
+        except BuddylineError as error:
+            log.error("hub: %s; who is admitted stays as it was", error)
+            continue
+        if (changed.nodes, changed.shut_out) == (config.nodes, config.shut_out):
+            continue
+        config = changed
+        hub.admit(access_rules(config.nodes, config.namespace, config.shut_out))
+        out = f"; shut out: {', '.join(config.shut_out)}" if config.shut_out else ""
+        log.info("hub: nodes that may publish: %s%s", ", ".join(config.nodes) or "none", out)
+
+
+def _state_of(path: str) -> tuple[int, int] | None:
+    """Return what changes when a file is written; None where it cannot be seen."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size

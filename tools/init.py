@@ -18,6 +18,7 @@ HUB: Final = """\
 listen = "tcp/127.0.0.1:7447"     # <- this machine alone; for others tls/0.0.0.0:7447 with [tls] below
 
 # nodes = ["a", "b"]              # who may publish, with TLS; `buddyline keys node a` adds to it
+# shut_out = ["viewer"]           # certificates that may neither publish nor read
 # namespace = ""                  # a prefix of all keys, where others use the same network; the same for every client
 # status_file = ""                # its health report; default: in the runtime directory
 

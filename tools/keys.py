@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -13,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import HUB, node_name
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.arguments import subcommand
+from buddyline.tools.hub import load_hub_config
 from buddyline.tools.newfile import write_new
 
 if TYPE_CHECKING:
@@ -31,6 +33,15 @@ ROLES: Final = {
     "player": "make the certificate of `play`, which may publish what any node publishes",
 }
 
+# What each of them may do, for `keys list`.
+ROLE_WORDS: Final = {
+    "solver": "publishes poses, tracks and what nodes are to expect; reads",
+    "viewer": "reads",
+    "surveyor": "publishes marks; reads",
+    "ros2": "publishes for ROS; reads",
+    "player": "publishes what any node publishes; reads",
+}
+
 _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
 
 
@@ -40,7 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--days", type=int, metavar="N", help=f"how long it is valid; default: {DAYS}, the authority 10 years"
     )
-    whose = parser.add_subparsers(dest="whose", required=True, metavar="|".join(("init", "node", *ROLES)))
+    whose = parser.add_subparsers(
+        dest="whose", required=True, metavar="|".join(("init", "node", *ROLES, "list", "renew"))
+    )
     first = subcommand(whose, "init", "make the authority and the hub's certificate", "keys init --hub 192.168.2.1")
     first.add_argument("--hub", default="127.0.0.1", metavar="HOST", help="where clients find it; default: %(default)s")
     node = subcommand(
@@ -49,6 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
     for role, text in ROLES.items():
         subcommand(whose, role, text, f"keys {role}")
+    subcommand(whose, "list", "say who may do what, and until when", "keys list")
+    renew = subcommand(whose, "renew", "make a certificate anew, and keep the old one beside it", "keys renew node-a")
+    renew.add_argument("name", metavar="NAME", help="as `keys list` has it: hub, solver, viewer, node-a ...")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -61,7 +77,12 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError(f"--days {args.days}: at least 1")
     directory = Path(args.directory)
     days = args.days or DAYS
-    if args.whose == "init":
+    if args.whose == "list":
+        print("\n".join(_listed(Authority.open(directory))))
+        return 0
+    if args.whose == "renew":
+        made = _renewed(Authority.open(directory), args.name, days)
+    elif args.whose == "init":
         made = _init(directory, args.hub, days, args.days or AUTHORITY_DAYS)
     else:
         made = _client(Authority.open(directory), args, days)
@@ -103,6 +124,39 @@ def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[P
         f"copy ca.crt, {name}.crt, {name}.key and {name}.toml to that machine; the key stays readable by its user alone"
     )
     return [*made, path]
+
+
+def _listed(authority: Authority) -> list[str]:
+    """Return a line for each certificate: its name, what it may do, and until when."""
+    hub, may = load_hub_config(str(authority.directory / "hub.toml")), {HUB: "is the hub"} | ROLE_WORDS
+    lines = []
+    for name, until in authority.issued():
+        words = may.get(name, f"publishes as node {name.removeprefix('node-')}; reads")
+        if name in hub.shut_out:
+            words = "is shut out (`shut_out` in hub.toml)"
+        elif name not in may and name.removeprefix("node-") not in hub.nodes:
+            words = "is not admitted (`nodes` in hub.toml)"
+        left = (until - datetime.now(UTC)).days
+        ends = f"EXPIRED {until:%Y-%m-%d}" if left < 0 else f"until {until:%Y-%m-%d} ({left} days)"
+        lines.append(f"{name:<12} {ends:<26} {words}")
+    return lines
+
+
+def _renewed(authority: Authority, name: str, days: int) -> list[Path]:
+    """Make a certificate anew; the old one and its key are kept under the date on which they end."""
+    known = dict(authority.issued())
+    if name not in known:
+        raise BuddylineError(f"{name}: no certificate of this name; there are {', '.join(sorted(known))}")
+    host = authority.hub_host().strip("[]") if name == HUB else None
+    for ending in ("crt", "key"):
+        path = authority.directory / f"{name}.{ending}"
+        kept = authority.directory / f"{name}.until-{known[name]:%Y%m%d}.{ending}.old"
+        if kept.exists():
+            raise BuddylineError(f"{kept}: exists: it was renewed before; move it away first")
+        path.rename(kept)
+    made = authority.issue(name, days, server_host=host)
+    _say(f"copy {name}.crt and {name}.key to that machine and start it again; the old certificate is valid to its end")
+    return made
 
 
 def _tls_table(name: str) -> str:

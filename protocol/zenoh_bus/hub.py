@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from types import TracebackType
 from typing import Final, Self
 
@@ -17,6 +18,8 @@ from buddyline.protocol.zenoh_bus.settings import hub_settings
 # A client that invents keys or sends huge payloads must not fill the hub's memory.
 MAX_RETAINED: Final = 256
 MAX_RETAINED_BYTES: Final = 65536
+REOPEN_ATTEMPTS: Final = 20
+REOPEN_S: Final = 0.1
 
 
 class Retained:
@@ -25,8 +28,8 @@ class Retained:
     A missed message (a publisher's first may be missed) is not recovered: the next one replaces it.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._samples: dict[str, zenoh.Sample] = {}
+    def __init__(self, session: zenoh.Session, before: Retained | None = None) -> None:
+        self._samples: dict[str, zenoh.Sample] = {} if before is None else before._samples
         self._lock = threading.Lock()
         for topic in TOPICS:
             if topic.retained:
@@ -54,10 +57,30 @@ class Retained:
 class Hub:
     """The one process that listens. When it closes, its clients wait for a new hub."""
 
-    def __init__(self, session: zenoh.Session, endpoint: str) -> None:
+    def __init__(self, endpoint: str, tls: Tls | None, access: dict[str, object] | None) -> None:
         self.endpoint = endpoint
-        self._session = session
-        self._retained = Retained(session)
+        self._tls = tls
+        self._session = zenoh.open(config_of(hub_settings(endpoint, tls, access)))
+        self._retained = Retained(self._session)
+
+    def admit(self, access: dict[str, object]) -> None:
+        """Take other access rules: all clients are cut off, and those that are still admitted come back by themselves.
+
+        Zenoh cannot change the rules of an open session. What the hub retains stays, and clients fetch from each other
+        what they have missed.
+        """
+        config = config_of(hub_settings(self.endpoint, self._tls, access))
+        self._session.close()  # type: ignore[no-untyped-call]
+        for attempt in range(REOPEN_ATTEMPTS):
+            try:
+                self._session = zenoh.open(config)
+                break
+            except zenoh.ZError:
+                # The port is free as soon as the old session's sockets are.
+                if attempt == REOPEN_ATTEMPTS - 1:
+                    raise
+                time.sleep(REOPEN_S)
+        self._retained = Retained(self._session, self._retained)
 
     def close(self) -> None:
         """Stop listening."""
@@ -78,9 +101,8 @@ def open_hub(
     endpoint: str = DEFAULT_ENDPOINT, *, tls: Tls | None = None, access: dict[str, object] | None = None
 ) -> Hub:
     """Listen on endpoint; raise BuddylineError if the port is in use or the address is not this machine's."""
-    config = config_of(hub_settings(endpoint, tls, access))
     try:
-        return Hub(zenoh.open(config), endpoint)
+        return Hub(endpoint, tls, access)
     except zenoh.ZError as error:
         if "Address already in use" in str(error):
             raise BuddylineError(

@@ -440,3 +440,44 @@ def test_a_refused_node_still_records_and_reports_the_refusal(keys: Path, tmp_pa
     assert "PRIVATE KEY" not in noted["config"]
     for process in (hub, node, record):
         assert not any("PRIVATE KEY" in line for line in process.lines)
+
+
+def test_who_is_taken_off_the_list_is_out_without_a_restart(keys: Path, tmp_path: Path) -> None:
+    """The hub looks at its configuration; whoever stays comes back by itself and loses nothing."""
+    mine = copy_of(keys, tmp_path / "keys")
+    endpoint, config = tls_endpoint(), mine / "hub.toml"
+    text = config.read_text().replace("tls/0.0.0.0:7447", endpoint)
+    config.write_text(text)
+    with Process("hub", "--config", str(config)) as hub:
+        hub.wait_for("listens")
+        with (
+            join(endpoint, tls(keys, "node-a")) as a,
+            join(endpoint, tls(keys, "node-b")) as b,
+            join(endpoint, tls(keys, "solver")) as solver,
+            join(endpoint, tls(keys, "viewer")) as viewer,
+        ):
+            inbox, shut_out = Inbox(), Inbox()
+            solver.subscribe(topics.EVERYTHING, inbox)
+            viewer.subscribe(topics.EVERYTHING, shut_out)
+            depths = {node: bus.publisher(topics.DEPTH, node) for node, bus in (("a", a), ("b", b))}
+            for node in "ab":
+                depths[node].put_bytes(b'{"stamp_ns":0}')
+                inbox.wait_for(f"buddyline/node/{node}/depth")
+                shut_out.wait_for(f"buddyline/node/{node}/depth")
+            config.write_text(text.replace('nodes = ["a", "b"]', 'nodes = ["a"]\nshut_out = ["viewer"]'))
+            hub.wait_for("shut out: viewer")
+            # A file that is not valid changes nothing.
+            config.write_text("nodes = 3")
+            hub.wait_for("stays as it was")
+            for k in range(1, 50):
+                for node in "ab":
+                    depths[node].put_bytes(b'{"stamp_ns":%d}' % k)
+            expected = [b'{"stamp_ns":%d}' % k for k in range(50)]
+            inbox.wait_until(lambda: len(inbox.payloads("buddyline/node/a/depth")) >= len(expected))
+            assert inbox.payloads("buddyline/node/a/depth") == expected
+            assert inbox.payloads("buddyline/node/b/depth") == expected[:1]
+            assert shut_out.payloads("buddyline/node/a/depth") == expected[:1]
+            config.write_text(text)
+            hub.wait_for("nodes that may publish: a, b")
+            depths["b"].put_bytes(b'{"stamp_ns":50}')
+            inbox.wait_until(lambda: b'{"stamp_ns":50}' in inbox.payloads("buddyline/node/b/depth"))

@@ -169,3 +169,33 @@ def test_the_solver_and_viewers_are_refused_with_another_identity(spoilt):
 def test_a_viewer_finds_hub_and_identity_in_its_configuration(keys):
     found = client_config(argparse.Namespace(config=str(keys / "viewer.toml"), connect=None))
     assert found == ClientConfig(connect="tls/127.0.0.1:7447", tls=tls(keys, "viewer"))
+
+
+def test_the_list_says_who_may_do_what_and_until_when(spoilt, capsys):
+    hub = spoilt / "hub.toml"
+    hub.write_text(hub.read_text().replace('nodes = ["a", "b"]', 'nodes = ["a"]\nshut_out = ["viewer"]'))
+    expired(spoilt, "surveyor")
+    capsys.readouterr()
+    assert main(["keys", "--directory", str(spoilt), "list"]) == 0
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines()}
+    assert "publishes as node a" in lines["node-a"]
+    assert "(729 days)" in lines["node-a"]
+    assert "not admitted" in lines["node-b"]
+    assert "shut out" in lines["viewer"]
+    assert "EXPIRED" in lines["surveyor"]
+    assert "publishes poses" in lines["solver"]
+    assert "ca" not in lines
+
+
+def test_a_certificate_is_renewed_and_the_old_one_is_kept(spoilt, capsys):
+    before = (spoilt / "node-a.key").read_bytes()
+    assert main(["keys", "--directory", str(spoilt), "--days", "3", "renew", "node-a"]) == 0
+    check_identity(tls(spoilt, "node-a"), "node-a")
+    assert (spoilt / "node-a.key").read_bytes() != before
+    (kept,) = spoilt.glob("node-a.until-*.key.old")
+    assert kept.read_bytes() == before
+    assert main(["keys", "--directory", str(spoilt), "renew", "hub"]) == 0
+    check_identity(tls(spoilt, "hub"), "hub")
+    capsys.readouterr()
+    assert main(["keys", "--directory", str(spoilt), "renew", "node-z"]) == 2
+    assert "there are hub, node-a" in capsys.readouterr().err
