@@ -61,11 +61,11 @@ class Shaking:
         z = z * math.sqrt(min(1.0, MOST_CHI2 * len(y) / max(chi2, 1e-9)))
         D = H @ shaken @ H.T
         W = S_inverse @ D
-        slope = 0.5 * (np.einsum("i,jik,k->j", z, D, z) - np.trace(W, axis1=1, axis2=2))
-        fisher = 0.5 * np.einsum("jab,kba->jk", W, W)
-        information = KEPT * self.information + fisher + (1.0 - KEPT) * 0.5 * FIRST * np.eye(3)
-        step = np.clip(np.linalg.solve(information, slope), -LONGEST_STEP, LONGEST_STEP)
-        return Shaking(np.clip(self.logs + step, LEAST, MOST), information)
+        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
+        fisher = 0.5 * (W.reshape(3, -1) @ np.swapaxes(W, 1, 2).reshape(3, -1).T)
+        information = KEPT * self.information + fisher + (1.0 - KEPT) * 0.5 * FIRST * _IDENTITY
+        step = np.minimum(np.maximum(np.linalg.solve(information, slope), -LONGEST_STEP), LONGEST_STEP)
+        return Shaking(np.minimum(np.maximum(self.logs + step, LEAST), MOST), information)
 
 
 def kept_share(span_s: float) -> float:

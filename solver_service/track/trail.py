@@ -48,8 +48,9 @@ class Step:
 
 # So many steps are packed at once.
 PACK = 128
-_UPPER = np.triu_indices(SIZE)
-_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), (len(_UPPER[0]),), (MOVING, SIZE), (MOVING, MOVING), (SIZE - MOVING,))
+_UPPER, _MOVING_UPPER = np.triu_indices(SIZE), np.triu_indices(MOVING)
+_HALVES = (len(_UPPER[0]),), (len(_MOVING_UPPER[0]),)
+_SHAPES = ((), (), (), (2, 3), (ROW,), (ROW,), *_HALVES, (MOVING, SIZE), (SIZE - MOVING,))
 _ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES])
 
 
@@ -57,7 +58,7 @@ _ENDS = np.cumsum([int(np.prod(shape)) for shape in _SHAPES])
 class _Pack:
     """Steps as rows of numbers: the first row (W,), and of the others the columns (N, V) in which any differs from it.
 
-    Half of each covariance is kept, and nothing of what never changes: zeros of the transition, most constants.
+    Half of each covariance and noise is kept, and nothing of what never changes: zeros of the transition, constants.
     """
 
     first: Floats
@@ -80,20 +81,20 @@ def _packed(steps: list[Step]) -> _Pack:
 
 def _row_of(step: Step) -> Floats:
     numbers = np.array((step.t_s, step.light_s, step.lights))
-    parts = step.rates_radps, step.F, step.Q, step.walk
-    rates, F, Q, walk = (part.ravel() for part in parts)
-    return np.concatenate(
-        (numbers, rates, step.before.to_row(), step.after.to_row(), step.covariance[_UPPER], F, Q, walk)
-    )
+    states = step.before.to_row(), step.after.to_row()
+    halves = step.covariance[_UPPER], step.Q[_MOVING_UPPER]
+    return np.concatenate((numbers, step.rates_radps.ravel(), *states, *halves, step.F.ravel(), step.walk))
 
 
 def _step_of(row: Floats, looks: tuple[Look, ...]) -> Step:
     parts = np.split(row, _ENDS[:-1])
-    t_s, light_s, lights, rates, before, after, half, F, Q, walk = (
+    t_s, light_s, lights, rates, before, after, half, of_Q, F, walk = (
         part.reshape(shape) for part, shape in zip(parts, _SHAPES, strict=True)
     )
     covariance = np.empty((SIZE, SIZE))
     covariance[_UPPER] = covariance.T[_UPPER] = half
+    Q = np.empty((MOVING, MOVING))
+    Q[_MOVING_UPPER] = Q.T[_MOVING_UPPER] = of_Q
     states = State.of_row(before), State.of_row(after)
     return Step(float(t_s), *states, covariance, F, Q, walk, rates, float(light_s), int(lights), looks)
 
