@@ -1,6 +1,10 @@
 """Estimate the difference of two nodes' heading biases from the poses. Magnetometer biases change slowly.
 
 A Kalman filter on one angle that drifts. The scatter of the headings about it, its measurement noise, is estimated too.
+
+Why the track does not replace it: a fix must not depend on the track (see prior.py), and compasses.py needs to know how
+far two compasses usually are apart, to tell a third party's lights. Without it, the dives of prior.py give 9,277 poses
+in place of 9,364.
 """
 
 from __future__ import annotations

@@ -3,6 +3,11 @@
 A constant-velocity filter on T_a_b, twelve error states: position (m), small rotation (rad), velocity (m/s) and
 turn rate (rad/s), all in A's camera frame. A fix outside the gate resets the filter; the prior never
 overrides a measurement.
+
+Why the track does not replace it: the track starts from fixes and restarts where fixes contradict it, so a fix must not
+depend on the track. Without the prior, 28 dives (10 Hz, 30 to 60 s) give 7,619 poses in place of 9,364, and 9 wrong
+ones in place of 2: hardly a pose of three lights is sure enough without it. The track is the same in most of them, but
+has nothing to start from in one.
 """
 
 from __future__ import annotations

@@ -61,6 +61,12 @@ class CandidateBearings:
         variance: Floats = self.table[5]
         return variance
 
+    def variance_of(self, trigger: int) -> float:
+        """Give the mean variance of the bearings of one trigger, rad^2 per axis; 0 without candidates."""
+        first, _, last = self.starts[2 * trigger : 2 * trigger + 3].tolist()
+        mean: float = self.variance[first:last].sum() / max(last - first, 1)
+        return mean
+
 
 def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> CandidateBearings:
     """Turn all views into bearings.

@@ -45,8 +45,10 @@ _ANYTHING: Final = np.array([[2.0], [2.0 * math.pi], [DEPTH_SPREAD_M]])
 _OVER_CHANCE: Final = np.array([[PITCH_SPREAD / (2.0 * math.pi)], [HEADING_SPREAD], [DEPTH_SPREAD_M]])
 _RIGHT: Final = _OVER_CHANCE * (1.0 - _BROKEN) / np.sqrt([[1.0], [2.0 * math.pi], [2.0 * math.pi]])
 _WRONG: Final = _OVER_CHANCE * _BROKEN / _ANYTHING
-# Odds of a false candidate among four lights from which on three are tried.
-POOR_FIT: Final = 2e-3
+# The odds of a false light, per its density where the lights fit and per candidate within one variance.
+_FALSE_LIGHT: Final = MISSING_ODDS * 2.0 * math.pi * _PREDICTED_VARIANCE
+# Log odds of a false candidate among four lights from which on three are tried.
+POOR_FIT: Final = math.log(2e-3)
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
 AGREES: Final = 20.0
 
@@ -72,14 +74,13 @@ def log_gaps(chi2: Floats, gaps: int) -> Floats:
     return density
 
 
-def false_light_odds(chi2: Floats, clutter: Floats) -> Floats:
-    """Give the odds that one of four lights is missing and a false candidate stands in for it.
+def log_false_light(log_fit: Floats, clutter: Floats) -> Floats:
+    """Give the log odds (M,) that one of four lights is missing and a false candidate stands in for it.
 
-    chi2: of the pose. clutter: candidates that chance puts into the variance of the lights' positions. The other
-    three predict where a light stands; a false candidate falls there by chance.
+    log_fit: of both gaps, as `log_gaps` gives it. clutter: candidates that chance puts into the variance of the lights'
+    positions. The other three predict where a light stands; a false candidate falls there by chance.
     """
-    density = np.maximum(np.exp(log_gaps(chi2, 2)), 1e-300)
-    odds: Floats = MISSING_ODDS * clutter * 2.0 * math.pi * _PREDICTED_VARIANCE / density
+    odds: Floats = np.log(_FALSE_LIGHT * clutter) - log_fit
     return odds
 
 

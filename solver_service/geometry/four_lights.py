@@ -13,8 +13,8 @@ from buddyline.solver_service.geometry.evidence import (
     CHANCE_ODDS,
     POOR_FIT,
     Support,
-    false_light_odds,
     log_chance,
+    log_false_light,
     log_gaps,
     weigh,
 )
@@ -54,12 +54,12 @@ class FourLights:
         """Tell in which triggers (T,) no reading is likely enough by pictures and sensors alone, or fits poorly."""
         settings, triggers, readings = batch.settings, batch.triggers, self.read.readings
         trigger = np.arange(triggers).repeat(self.read.starts[1:] - self.read.starts[:-1])
-        chi2 = readings.refined.solved.chi2
-        log_ratio = readings.log_ratio + log_gaps(chi2, settings.gaps)
+        fit = log_gaps(readings.refined.solved.chi2, settings.gaps)
+        log_ratio = readings.log_ratio + fit
         log_ratio[~readings.refined.sound] = -np.inf
         best = largest(trigger, log_ratio, triggers, -np.inf)
         total = np.bincount(trigger, np.exp(log_ratio), minlength=triggers)
-        poor = (log_ratio == best[trigger]) & (false_light_odds(chi2, readings.clutter) > POOR_FIT)
+        poor = (log_ratio == best[trigger]) & (log_false_light(fit, readings.clutter) > POOR_FIT)
         unlikely = ~(np.exp(best) > settings.min_probability * (CHANCE_ODDS + total))
         return unlikely | (np.bincount(trigger[poor], minlength=triggers) > 0)
 

@@ -1,4 +1,8 @@
-"""One light short: six coordinates for six unknowns, and attitude and depth to tell whether they belong together."""
+"""One light short: six coordinates for six unknowns, and attitude and depth to tell whether they belong together.
+
+Why the track does not replace it: with a lamp dark for the whole dive, the track has no other fix to start from. In the
+dives of prior.py, poses of three lights are 1,876 of 9,364.
+"""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ import numpy as np
 from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.compasses import HeadingGap, compare_headings
-from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT, false_light_odds
+from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT
 from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.four_lights import FourLights, read_four_lights
 from buddyline.solver_service.geometry.observation import (
@@ -118,7 +118,6 @@ class _Batched:
     """
 
     batch: Batch
-    bearing_variance: Floats
     four: FourLights
     three: Read | None
     tried: NDArray[np.bool_]
@@ -133,18 +132,15 @@ class _Batched:
         tried = np.zeros(batch.triggers, dtype=bool)
         if batch.triggers > 1 and told.any():
             tried = told & four.doubtful(batch)
-        seen, triggers = batch.candidates, batch.triggers
-        total = np.bincount(seen.image >> 1, seen.variance, minlength=triggers)
-        mean = total / np.maximum(seen.counts.sum(1), 1)
         three = read_three_lights(batch, tried) if tried.any() else None
-        return _Batched(batch, mean, four, three, tried, batch.sensors.both.tolist(), told.tolist())
+        return _Batched(batch, four, three, tried, batch.sensors.both.tolist(), told.tolist())
 
     def decide(self, trigger: int, prior: Prior | None, heading: Heading | None, rarity: float = 1.0) -> Fix | NoFix:
         """Apply the past to one trigger, and choose."""
         settings = self.batch.settings
         if not self.oriented[trigger]:
             heading = None
-        past = Past.of(prior, heading, self.bearing_variance[trigger], self.batch.rigs, settings)
+        past = Past.of(prior, heading, self.batch.candidates.variance_of(trigger), self.batch.rigs, settings)
         four, why = None, self.four.why[trigger]
         found: Fix | NoFix
         if why is None:
@@ -194,7 +190,7 @@ class _Batched:
         false_light = ratio * float(readings.lone_odds[place]) * math.exp(-float(weighed.log_past[k]))
         # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
         if unsure or widened > 1.0:
-            false_light = ratio * float(false_light_odds(weighed.chi2[k], readings.clutter[place]))
+            false_light = ratio * math.exp(weighed.log_false[k])
         chance = CHANCE_ODDS * (1.0 if short else rarity)
         probability = agreeing / (chance + agreeing + others + false_light)
         required = settings.min_probability
@@ -294,8 +290,7 @@ def _is_doubtful(found: Fix | NoFix, weighed: Weighed | None) -> bool:
     if weighed is None or isinstance(found, NoFix):
         return True
     k = int(weighed.log_ratio.argmax())
-    readings, place = weighed.sources[k]
-    return bool(weighed.log_prior[k] < 0.0 or false_light_odds(weighed.chi2[k], readings.clutter[place]) > POOR_FIT)
+    return bool(weighed.log_prior[k] < 0.0 or weighed.log_false[k] > POOR_FIT)
 
 
 def _like(weighed: Weighed, k: int, range_m: float) -> NDArray[np.bool_]:

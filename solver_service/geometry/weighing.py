@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.evidence import log_gaps
+from buddyline.solver_service.geometry.evidence import log_false_light, log_gaps
 from buddyline.solver_service.geometry.observation import Settings
 from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.readings import Read, Readings
@@ -27,7 +27,8 @@ class Weighed:
     """M readings of one trigger, poses between the cameras' frames.
 
     covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound. log_prior: (M,)
-    the prediction's part in it, log_past (M,) all that the past says. others: the likelihood ratios of all that is not
+    the prediction's part in it, log_past (M,) all that the past says. log_false: (M,) log odds that a false candidate
+    stands in for one of four lights. others: the likelihood ratios of all that is not
     here, together. sources: the readings that each is one of, and its place there.
     """
 
@@ -37,6 +38,7 @@ class Weighed:
     log_ratio: Floats
     log_prior: Floats
     log_past: Floats
+    log_false: Floats
     others: float
     sources: list[tuple[Readings, int]]
 
@@ -57,6 +59,7 @@ class Weighed:
             log_ratio=both(self.log_ratio, more.log_ratio),
             log_prior=both(self.log_prior, more.log_prior),
             log_past=both(self.log_past, more.log_past),
+            log_false=both(self.log_false, more.log_false),
             others=self.others + more.others,
             sources=self.sources + more.sources,
         )
@@ -99,6 +102,7 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         log_ratio=log_ratio,
         log_prior=log_prior,
         log_past=log_past,
+        log_false=log_false_light(fit, readings.clutter[place]),
         others=others,
         sources=[(readings, k) for k in place.tolist()],
     )
