@@ -74,7 +74,8 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     """The solver's configuration.
 
     nodes: solve every pair of these nodes. pairs: solve these pairs, A first. Neither: solve every pair that appears.
-    status_file: its path; "" for the runtime directory (protocol/statusfile.py).
+    status_file: its path; "" for the runtime directory (protocol/statusfile.py). journal: where it keeps what it has
+    answered, so that it answers nothing twice; "" likewise.
     """
 
     nodes: list[NodeId] = field(default_factory=list)
@@ -83,6 +84,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     namespace: str = ""
     tls: Tls | None = None
     status_file: str = ""
+    journal: str = ""
     solve: SolveConfig = field(default_factory=SolveConfig)
     track: TrackConfig = field(default_factory=TrackConfig)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import Clock, SystemClock
@@ -14,9 +15,10 @@ from buddyline.protocol.messages import Candidates, Message, Rejected, RelativeP
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, Topic, key_of
-from buddyline.solver_service.answered import Answered
+from buddyline.solver_service.answered import Answered, Outcome
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.journal import Journal
 from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
 
 if TYPE_CHECKING:
@@ -48,6 +50,9 @@ class SolverService(Service):
         self._refused = ""
         self._news = False
         self._answered = Answered()
+        self._journal = (
+            Journal(Path(config.journal)) if config.journal else Journal.of(config.connect, config.namespace)
+        )
         self._joined_ns: int | None = None
 
     def start(self) -> None:
@@ -92,7 +97,8 @@ class SolverService(Service):
     def attach(self, bus: Bus) -> None:
         """Subscribe to the nodes on this bus, and publish on it from now on."""
         self._bus = bus
-        self._answered = Answered(_said_before(bus))
+        kept = self._journal.read() if self._journal is not None else []
+        self._answered = Answered(_newest_of(_said_before(bus), kept))
         self.problems = ["no two nodes yet"]
         self._declare()
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
@@ -168,7 +174,16 @@ class SolverService(Service):
         unsaid = self._answered.unsaid(messages)
         for message in unsaid:
             self._publishers[key_of(message)].put(message)
+        if self._journal is not None:
+            self._journal.add(unsaid)
         self.core.saw_published(unsaid, self.clock.now_ns())
+
+
+def _newest_of(held: Iterable[Outcome], kept: Iterable[Outcome]) -> list[Outcome]:
+    """Return what the hub holds, and for pairs of which it holds nothing what the journal has."""
+    known = list(held)
+    pairs = {(one.node_a, one.node_b) for one in known}
+    return known + [one for one in kept if (one.node_a, one.node_b) not in pairs]
 
 
 def _said_before(bus: Bus) -> list[RelativePose | Rejected]:

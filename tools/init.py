@@ -36,6 +36,7 @@ connect = "tcp/127.0.0.1:7447"    # <- the hub
 # pairs = [["a", "b"]]            # or these pairs alone
 # namespace = ""                  # as the hub has it
 # status_file = ""                # its health report; default: in the runtime directory
+# journal = ""                    # what it has answered, so that it answers nothing twice; default: likewise
 
 [solve]
 method = "refined"

@@ -101,6 +101,21 @@ def solver(times: int) -> Report:
     return kill_and_return("solver", times, seed=3)
 
 
+def hub_and_solver(times: int) -> Report:
+    """Both are killed at once: nobody but the solver's journal knows what was answered."""
+    report, rng = Report("hub and solver killed (-9) and back"), random.Random(5)
+    with running() as system:
+        for _ in range(times):
+            time.sleep(rng.uniform(0.5, 2.5))
+            for name in rng.sample(["hub", "solver"], 2):
+                system.kill(name)
+            time.sleep(rng.uniform(0.0, 2.0))
+            system.start("hub", "solver")
+            measure(system, report, time.time_ns())
+        report.tally = system.finish()
+    return report
+
+
 def frozen_viewer(times: int) -> Report:
     """A recorder of everything is stopped for 5 s; the others are not affected, and it misses nothing."""
     report = Report(f"viewer frozen for {FREEZE_S:g} s")
@@ -196,6 +211,7 @@ SCENARIOS: dict[str, Callable[[int], Report]] = {
     "frozen_hub": frozen_hub,
     "node": node,
     "solver": solver,
+    "hub_and_solver": hub_and_solver,
     "viewer": frozen_viewer,
     "stopped": frozen_node,
     "link": cut_link,

@@ -66,7 +66,9 @@ class System:
         if name == "hub":
             words = ["hub", "--listen", self.endpoint, *([] if is_loopback(self.endpoint) else ["--insecure"])]
         elif name == "solver":
-            words = ["solver", *connect]
+            config = self.directory / "solver.toml"
+            config.write_text(f'connect = "{self.endpoint}"\njournal = "{self.directory / "solver.answered"}"\n')
+            words = ["solver", "--config", str(config)]
         elif name == "recorder":
             words = ["record", str(self.directory / "recorder.mcap"), *connect]
         elif name == "monitor":

@@ -1,0 +1,114 @@
+"""The last outcomes that a live solver has published, in a small file that outlives a kill of solver and hub."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
+
+from buddyline.protocol.codec import decode, encode
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Message, Rejected, RelativePose
+from buddyline.solver_service.answered import Outcome
+
+log = logging.getLogger(__name__)
+
+# From this size on only the last line of each pair is kept.
+MOST_BYTES: Final = 256 * 1024
+
+
+class Journal:
+    """One line for each outcome: whose, of which trigger, when. A write error is logged once, and the solver goes on.
+
+    A line is in the system's hands as soon as it is written, so it outlives the process; a power cut ends the dive for
+    nodes and solver alike.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._last: dict[tuple[str, str], bytes] = {}
+        self._file: int | None = None
+        self._bytes = 0
+        self._failed = False
+
+    @classmethod
+    def of(cls, endpoint: str, namespace: str = "") -> Journal | None:
+        """Return the journal of the solver at a hub, in the runtime directory; None if there is none."""
+        given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+        session = os.environ.get("XDG_RUNTIME_DIR")
+        directory = Path(given) if given else Path(session) / "buddyline" if session else None
+        name = re.sub(r"[^A-Za-z0-9]+", "-", f"{endpoint} {namespace}").strip("-")
+        return None if directory is None else cls(directory / f"solver-{name}.answered")
+
+    def read(self) -> list[Outcome]:
+        """Return the last outcome of each pair; a line that was cut off is left out."""
+        try:
+            lines = self.path.read_bytes().splitlines()
+        except OSError:
+            return []
+        found: dict[tuple[str, str], Rejected] = {}
+        for line in lines:
+            try:
+                one = decode(line, Rejected)
+            except MessageError:
+                continue
+            found[one.node_a, one.node_b] = one
+            self._last[one.node_a, one.node_b] = line + b"\n"
+        return list(found.values())
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Note the outcomes among messages that were published."""
+        lines = []
+        for message in messages:
+            # Outcomes `late` are out of order, and show nothing of earlier triggers.
+            if isinstance(message, Outcome) and not (isinstance(message, Rejected) and message.reason == "late"):
+                pair = message.node_a, message.node_b
+                self._last[pair] = _line(message)
+                lines.append(self._last[pair])
+        if lines:
+            self._write(b"".join(lines))
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def _write(self, text: bytes) -> None:
+        try:
+            if self._file is None or self._bytes + len(text) > MOST_BYTES:
+                self._begin()
+            else:
+                os.write(self._file, text)
+                self._bytes += len(text)
+        except OSError as error:
+            if not self._failed:
+                log.warning("solver: journal %s cannot be written: %s", self.path, error.strerror)
+            self._failed = True
+        else:
+            self._failed = False
+
+    def _begin(self) -> None:
+        """Put the last line of each pair into a new file, which takes the old one's place at once."""
+        self.close()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        file = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+        text = b"".join(self._last.values())
+        os.write(file, text)
+        fresh.replace(self.path)
+        self._file, self._bytes = file, len(text)
+
+
+def _line(outcome: RelativePose | Rejected) -> bytes:
+    short = Rejected(
+        node_a=outcome.node_a,
+        node_b=outcome.node_b,
+        stamp_ns=outcome.stamp_ns,
+        trigger=outcome.trigger,
+        reason="ambiguous",
+    )
+    return encode(short) + b"\n"
