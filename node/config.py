@@ -12,6 +12,10 @@ from buddyline.protocol.security import Tls
 from msgspec import UNSET, Meta, field
 from msgspec.structs import replace
 
+# By BCM number, as on the 40-pin header; 0 and 1 are the HAT's memory.
+Pin = Annotated[int, Meta(ge=2, le=27)]
+I2C_PINS = {1: (2, 3)}
+
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
 # Filters and reading delay samples by some milliseconds; a tenth of a second is a wrong unit.
@@ -123,6 +127,26 @@ class PreviewConfig(Config, frozen=True, kw_only=True):
     quality: Annotated[int, Meta(ge=1, le=100)] = 70
 
 
+class PanelConfig(Config, frozen=True, kw_only=True):
+    """[panel]: one button, lamp, buzzer, dive lights and leak probe at the Pi's pins; all optional.
+
+    shutdown_command: the words of what a long hold of the button runs; [] for nothing.
+    """
+
+    button_pin: Pin | None = None
+    lamp_pin: Pin | None = None
+    buzzer_pin: Pin | None = None
+    lights_pin: Pin | None = None
+    leak_pin: Pin | None = None
+    shutdown_command: list[str] = field(default_factory=list)
+
+    @property
+    def pins(self) -> dict[str, int]:
+        """The configured pins by field."""
+        names = ("button_pin", "lamp_pin", "buzzer_pin", "lights_pin", "leak_pin")
+        return {name: number for name in names if (number := getattr(self, name)) is not None}
+
+
 class SimulationConfig(Config, frozen=True, kw_only=True):
     """[simulation]: the world of the simulated camera and sensors; the same for both nodes."""
 
@@ -149,6 +173,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     calibration: CalibrationConfig | None = None
     record: RecordConfig = field(default_factory=RecordConfig)
     preview: PreviewConfig = field(default_factory=PreviewConfig)
+    panel: PanelConfig = field(default_factory=PanelConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
 
     @property
@@ -179,6 +204,16 @@ class NodeConfig(Config, frozen=True, kw_only=True):
                     f"node {self.node}: calibration.camera.{name} = {found_px:g} is not near the middle of pictures "
                     f"of {self.camera.width_px}x{self.camera.height_px}: calibrate in the mode that dives"
                 )
+
+    def check_pins(self) -> None:
+        """Raise ConfigError for a pin with two uses."""
+        used = {
+            number: "the I2C bus" for number in I2C_PINS.get(self.sensors.i2c_bus, ()) if self.sensors.name == "i2c"
+        }
+        for name, number in self.panel.pins.items():
+            if number in used:
+                raise ConfigError(f"panel.{name} = {number}: this pin is in use by {used[number]}")
+            used[number] = f"panel.{name}"
 
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
         """Return NodeInfo from [calibration]; raise ConfigError if there is none."""
@@ -214,4 +249,8 @@ class NodeConfig(Config, frozen=True, kw_only=True):
 def load_node_config(path: Path | str) -> NodeConfig:
     """Read a node's TOML file; raise ConfigError naming file, field and value."""
     config = load_config(path, NodeConfig)
+    try:
+        config.check_pins()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
     return config if config.tls is None else replace(config, tls=config.tls.beside(path))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import statistics
 import threading
 import time
 import uuid
@@ -17,6 +18,7 @@ import msgspec
 import numpy as np
 from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
+from buddyline.node.capture.cores import is_likely
 from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.clock_watch import ClockWatch
@@ -28,6 +30,7 @@ from buddyline.node.guide import Guide
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
+from buddyline.node.underwater.panel import Panel
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.config import ConfigError, config_sha256
 from buddyline.protocol.health import stale_after_s
@@ -82,6 +85,7 @@ class NodeService(Service):
         # Stored pictures may be far apart.
         self._watched = config.camera.name != "stored" and config.rate_hz >= 1.0
         self._detect_s: deque[float] = deque(maxlen=100)
+        self._lights_seen: deque[int] = deque(maxlen=10)
         self._frames: deque[Frame] = deque()
         self._frame_ready = threading.Condition()
         self._capturing = True
@@ -115,6 +119,7 @@ class NodeService(Service):
         self.pictures = PictureLog(path, f"{self.config.node}-*", min_free_bytes, metadata=metadata)
         self.recorder = Recorder(path, metadata=metadata, pictures=self.pictures)
         self.outlet = Outlet(self.config.node, self.recorder, self.clock)
+        self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
         self.outlet.send(info)
 
@@ -166,6 +171,7 @@ class NodeService(Service):
         self.spawn("status", self._report)
         self.spawn("clock", lambda: self._clock_sync.follow_chrony(self.stop))
         self.spawn("bus", self._connect)
+        self.spawn("panel", lambda: self._panel.run(self.stop))
 
     def close(self) -> int:
         """Stop all threads, write the log's end; return the exit status."""
@@ -179,6 +185,7 @@ class NodeService(Service):
         else:
             log.info("%s: log %s", self.name, self.recorder.path)
         self.camera.close()
+        self._panel.close()
         for source in self.sources:
             source.close()
         return status
@@ -242,7 +249,9 @@ class NodeService(Service):
                 continue
             self.outlet.send(candidates)
             self._expose(frame, candidates)
-            self._images.send(frame)
+            self._lights_seen.append(sum(map(is_likely, candidates.blobs)))
+            if self._panel.takes_pictures:
+                self._images.send(frame)
 
     def _expose(self, frame: Frame, candidates: Candidates) -> None:
         """Lock the camera's exposure to the other node's lamps, where it can be changed."""
@@ -318,6 +327,7 @@ class NodeService(Service):
                 report_s += REPORT_S
                 self.status_message = status = self.status()
                 self.outlet.send(status)
+                self._panel.show(status, self.problems)
 
     def status(self) -> NodeStatus:
         """Return the node's health; rates are over the time since the last call."""
@@ -350,6 +360,7 @@ class NodeService(Service):
             disk_free_bytes=UNSET if free_bytes is None else free_bytes,
             temperature_degc=UNSET if temperature_degc is None else temperature_degc,
             bus_retries=max(retries) if retries else UNSET,
+            lights_seen=statistics.median_low(list(self._lights_seen)) if self._lights_seen else UNSET,
             **self._clock_sync.status_fields(),
             log=self.recorder.path.name,
             problem="; ".join(self.problems),
@@ -392,6 +403,7 @@ class NodeService(Service):
         # A simulated world is on this machine's own clock, whoever keeps that.
         if self._clock_sync.problem and self.config.camera.name != "simulated":
             problems.append(f"clock: {self._clock_sync.problem}")
+        problems += self._panel.problems
         if self._clock_watch.problem:
             problems.append(self._clock_watch.problem)
         if self.recorder.error is not None:

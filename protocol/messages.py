@@ -293,7 +293,8 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     """Health of a node, 1 Hz.
 
     rates_hz: messages per second by topic. drops: lost messages by cause. ages_s: time since the newest sample of each
-    device. bus_retries: repeated transfers on the sensors' I2C bus. problem: what is wrong, in words; empty if nothing.
+    device. bus_retries: repeated transfers on the sensors' I2C bus. lights_seen: likely lights in the newest pictures
+    (their median), two of which are another node's. problem: what is wrong, in words; empty if nothing.
     clock_offset_s: this clock minus true time, estimated by chrony. clock_rms_s: its long-term RMS.
     clock_bound_s: greatest possible error of this clock. clock_frequency_ppm: rate at which the uncorrected clock
     gains. clock_source: the reference that chrony follows, empty if none. All five are absent without chrony.
@@ -317,6 +318,7 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     disk_free_bytes: Count | UnsetType = UNSET
     temperature_degc: float | UnsetType = UNSET
     bus_retries: Count | UnsetType = UNSET
+    lights_seen: Count | UnsetType = UNSET
     log: str = ""
     problem: str = ""
 

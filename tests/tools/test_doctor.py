@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from buddyline.node.capture.exposure import Exposure
 from buddyline.node.chrony import decode_tracking
-from buddyline.node.config import NodeConfig, load_node_config
+from buddyline.node.config import NodeConfig, PanelConfig, load_node_config
 from buddyline.node.detect import Detection
+from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.local_bus import LocalNetwork
@@ -381,3 +382,29 @@ def test_the_program(capsys, monkeypatch, tmp_path):
     (tmp_path / "bad.toml").write_text('node = "a"\nrate = 3\n')
     assert main(["doctor", "--config", str(tmp_path / "bad.toml")]) == 2
     assert "unknown key `rate`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("facts", "level", "said"),
+    [({}, "ok", "lamp GPIO 27"),
+     ({"leak": True, "pressed": True}, "problem", "wet"), ({"pressed": True}, "warning", "held"),
+     ({"absent": "halt"}, "problem", "halt"), ({"problems": ["lamp: GPIO 27: busy"]}, "problem", "busy")],
+)  # fmt: skip
+def test_the_panel_is_judged(facts, level, said):
+    known = {"problems": [], "pressed": False, "leak": False, "absent": ""}
+    found = judge_rig.panel({"lamp_pin": 27}, **{**known, **facts})
+    assert (found.level, said in found.text) == (level, True)
+
+
+def test_the_panels_pins_are_tried_and_left_dark(monkeypatch):
+    mock = pytest.importorskip("gpiozero.pins.mock", reason="gpiozero is not installed")
+    factory = mock.MockFactory()
+    monkeypatch.setattr(rig, "PanelPins", lambda panel: PanelPins(panel, factory))
+    panel = PanelConfig(button_pin=17, lamp_pin=27, leak_pin=24, shutdown_command=["no-such-program"])
+    node = NodeConfig(node="a", panel=panel)
+    assert "no-such-program" in rig.check_panel(node)[0].text
+    assert not factory.pin(27).state
+    factory.pin(24).drive_high()
+    factory.pin(24)._set_pull = lambda value: None  # the probe is stronger than the Pi's pull-down
+    assert levels(rig.check_panel(node)) == {"panel": "problem"}
+    assert rig.check_panel(NodeConfig(node="a")) == []

@@ -57,7 +57,12 @@ def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
     if f"node/{node.node}" in seen.alive:
         return [*findings, Finding("camera", "skipped", f"in use: node {node.node} runs, and says how it is above")]
     return findings + together(
-        {"the camera": lambda: rig.check_camera(node), "the sensors": lambda: rig.check_sensors(node)}, ends_s
+        {
+            "the camera": lambda: rig.check_camera(node),
+            "the sensors": lambda: rig.check_sensors(node),
+            "the panel": lambda: rig.check_panel(node),
+        },
+        ends_s,
     )
 
 

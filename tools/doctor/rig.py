@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import threading
 import time
@@ -12,6 +13,7 @@ from buddyline.node.config import NodeConfig
 from buddyline.node.detect import Detection, make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.pipeline import Pipeline
+from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu, Message, NodeInfo
@@ -136,6 +138,25 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
         heard=any(message.mag_t is not UNSET for message in given),
     )
     return [*findings, compass, judge.imu_place(config.calibration, chips)]
+
+
+def check_panel(config: NodeConfig) -> list[Finding]:
+    """Open each pin of the panel and read the inputs; lamp, buzzer and lights stay off."""
+    if not config.panel.pins:
+        return []
+    pins = PanelPins(config.panel)
+    try:
+        pressed = None if pins.button is None else pins.button.read()
+        leak = None if pins.leak is None else pins.leak.read()
+        for output in (pins.lamp, pins.buzzer, pins.lights):
+            if output is not None:
+                output.write(False)
+        problems = [f"{pin.name}: {pin.problem}" for pin in pins.all if pin.problem]
+    finally:
+        pins.close()
+    command = config.panel.shutdown_command
+    absent = command[0] if command and shutil.which(command[0]) is None else ""
+    return [judge.panel(config.panel.pins, problems, pressed=bool(pressed), leak=bool(leak), absent=absent)]
 
 
 def _listen(sources: list[Source]) -> dict[str, list[Message]]:

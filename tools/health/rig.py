@@ -129,6 +129,21 @@ def _plausible(message: Imu | Attitude | Depth) -> tuple[str, str]:
     return f"attitude within {sigma_deg:.0f} degrees", ""
 
 
+def panel(pins: dict[str, int], problems: list[str], *, pressed: bool, leak: bool, absent: str) -> Finding:
+    """Judge the panel's pins, by field. absent: the shutdown command's program, if it cannot be found."""
+    if leak:
+        return Finding("panel", "problem", "the leak probe is wet", "open the housing, dry it, and find the leak")
+    if problems:
+        advice = "is the pin in use elsewhere? see node/README.md, The panel"
+        return Finding("panel", "problem", "; ".join(problems), advice)
+    if pressed:
+        advice = "take the magnet away, or look for a short: the button goes to ground"
+        return Finding("panel", "warning", "the button is held", advice)
+    if absent:
+        return Finding("panel", "problem", f"shutdown_command: {absent} is not found", "name a program that is there")
+    return Finding("panel", "ok", ", ".join(f"{name.removesuffix('_pin')} GPIO {pin}" for name, pin in pins.items()))
+
+
 def imu_place(entered: CalibrationConfig | None, chips: bool) -> Finding:
     """Judge whether the inertial unit's place is known; chips: real ones, not simulated."""
     if not chips:

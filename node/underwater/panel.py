@@ -1,0 +1,143 @@
+"""The panel of a running node: reads the button, drives lamp, buzzer and dive lights, and does what the diver asks."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from buddyline.node.config import NodeConfig
+from buddyline.node.underwater.codes import PanelAction
+from buddyline.node.underwater.machine import PanelInput, PanelState, step
+from buddyline.node.underwater.pins import PanelPins
+from buddyline.protocol.clock import Clock
+from buddyline.protocol.messages import Mark, Message, NodeStatus
+from buddyline.protocol.topics import CANDIDATES
+from msgspec import UNSET
+
+log = logging.getLogger(__name__)
+
+PERIOD_S: Final = 0.02
+# The status comes once a second. Without it the node is stuck, and the lamp must not tell that all is well.
+STATUS_WITHIN_S: Final = 5.0
+COMMAND_WITHIN_S: Final = 10.0
+# Two lights are a node's.
+LIGHTS: Final = 2
+
+
+class Panel:
+    """Runs in a thread of its own; without any pin in [panel] it does nothing.
+
+    send: takes the diver's marks. pins: gpiozero's by default.
+    """
+
+    def __init__(
+        self, config: NodeConfig, clock: Clock, send: Callable[[Message], None], pins: PanelPins | None = None
+    ) -> None:
+        self._node = config.node
+        self._config = config.panel
+        self._clock = clock
+        self._send = send
+        self._pins = pins or PanelPins(config.panel)
+        self._state = PanelState()
+        self._view = PanelInput(booting=True)
+        self._leak = False
+        self._status_s: float | None = None
+        self._refused = ""
+
+    @property
+    def takes_pictures(self) -> bool:
+        """Whether pictures are to be recorded and shown: the diver has not stopped them."""
+        return self._state.started
+
+    @property
+    def leak(self) -> bool | None:
+        """Whether water is in the housing; None without a probe."""
+        return None if self._pins.leak is None else self._leak
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong, in words."""
+        found = ["LEAK: water in the housing"] if self._leak else []
+        found += [f"panel: {pin.name}: {pin.problem}" for pin in self._pins.all if pin.problem]
+        return found + ([f"panel: {self._refused}"] if self._refused else [])
+
+    def show(self, status: NodeStatus, problems: list[str]) -> None:
+        """Take the node's newest status, and its problems one by one."""
+        timeless = [text for text in problems if text.startswith("clock:")]
+        fault = len(problems) > len(timeless)
+        self._view = PanelInput(
+            fault=fault,
+            booting=self._view.booting and not fault and not status.rates_hz.get(CANDIDATES.name),
+            timeless=bool(timeless),
+            sees_other=status.lights_seen is not UNSET and status.lights_seen >= LIGHTS,
+        )
+        self._status_s = time.monotonic()
+
+    def run(self, stop: threading.Event) -> None:
+        """Read and drive the pins until stop is set."""
+        if not self._pins.all:
+            return
+        while not stop.wait(PERIOD_S):
+            self.turn(time.monotonic_ns())
+
+    def turn(self, now_ns: int) -> None:
+        """Read the inputs, take one step, drive the outputs. now_ns: of the monotonic clock."""
+        pins, view = self._pins, self._view
+        wet = None if pins.leak is None else pins.leak.read()
+        # A probe that cannot be read keeps its last word; that it cannot is a fault of its own.
+        self._leak = self._leak if wet is None else wet
+        silent = self._status_s is not None and time.monotonic() - self._status_s > STATUS_WITHIN_S
+        given = replace(
+            view,
+            pressed=None if pins.button is None else pins.button.read(),
+            leak=self._leak,
+            fault=view.fault or silent,
+        )
+        self._state, action = step(self._state, given, now_ns)
+        for pin, on in (
+            (pins.lamp, self._state.is_lamp_on(now_ns)),
+            (pins.buzzer, self._state.is_buzzer_on(now_ns)),
+            (pins.lights, self._state.lights),
+        ):
+            if pin is not None:
+                pin.write(on)
+        if action is not None:
+            self._do(action)
+
+    def _do(self, action: PanelAction) -> None:
+        log.info("panel: %s", action.value)
+        self._refused = ""
+        if action is PanelAction.MARK:
+            self._send(Mark(node=self._node, stamp_ns=self._clock.now_ns(), kind="point", note="by the button"))
+            return
+        self._send(Mark(node=self._node, stamp_ns=self._clock.now_ns(), kind="note", note=f"button: {action.value}"))
+        if action is PanelAction.SHUT_DOWN:
+            self._refused = self._shut_down()
+            if self._refused:
+                log.error("panel: %s", self._refused)
+                self._state = replace(self._state, ending=False)
+
+    def _shut_down(self) -> str:
+        """Run the configured command; return why that failed, "" if it did not. What it ends closes the log itself."""
+        command = self._config.shutdown_command
+        if not command:
+            return "shut down: panel.shutdown_command is empty"
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, errors="replace", timeout=COMMAND_WITHIN_S, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return f"shut down: panel.shutdown_command = {command}: {error}"
+        if done.returncode == 0:
+            return ""
+        said = done.stderr.strip().splitlines()[-1:]
+        return ": ".join([f"shut down: panel.shutdown_command = {command}: exit status {done.returncode}", *said])
+
+    def close(self) -> None:
+        """Free the pins: lamp and dive lights go out."""
+        self._pins.close()
