@@ -227,3 +227,39 @@ def test_a_lamp_that_is_hidden_is_made_room_for_without_hunting(delay):
     late = amounts[200:]
     assert np.mean(np.array(late) >= needed) > 0.8
     assert sum(a != b for a, b in pairwise(late)) <= 12
+
+
+def lit(amount, light):
+    return Metering(Exposure(round(amount * 1e6)), [Core(0.0, 0.0, light, False)])
+
+
+def test_frames_older_than_what_is_asked_for_do_not_count_as_misses():
+    """After a descent, frames of the rungs that were too dark for the lamp are still to come."""
+    lock = ExposureLock(RANGE, 0)
+    lock.update(lit(1.0, 0.6))
+    for _ in range(LOST + 5):
+        lock.update(Metering(Exposure(80_000), []))
+    assert lock.state == "locked"
+    for _ in range(LOST):
+        lock.update(Metering(Exposure(1_000_000), []))
+    assert lock.state == "search"
+
+
+def test_one_frame_that_is_brighter_or_darker_than_the_others_changes_nothing():
+    lock = ExposureLock(RANGE, 0)
+    for _ in range(20):
+        lock.update(lit(1.0, 0.6))
+    before = lock.plan.lamps
+    for odd in (0.95, 0.05):
+        lock.update(lit(1.0, odd))
+        for _ in range(10):
+            lock.update(lit(1.0, 0.6))
+            assert lock.plan.lamps == before
+
+
+def test_what_is_darker_than_the_scene_gets_no_more_than_the_scene():
+    """Snow in a dark cave is no lamp, however likely it looks."""
+    lock = ExposureLock(RANGE, 0)
+    for _ in range(100):
+        lock.update(lit(lock.plan.lamps.amount, 0.01))
+    assert lock.plan.lamps.amount <= 1.01 * lock.plan.scene.amount
