@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.track.dive import UNTOLD_CLOCK_S, NodeRecord, in_order, smooth
+from buddyline.solver_service.track.dive import TOLD_CLOCK_S, NodeRecord, in_order, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.state import CLOCK
@@ -19,8 +19,6 @@ Records: TypeAlias = tuple[NodeRecord, NodeRecord]
 
 # A track tells the offset of a stretch as well as of a dive, where it is not much shorter than this.
 STRETCH_NS: Final = 60 * S_NS
-# What a stretch tells worse than this is nothing: a resting pair's offset is as wide as it was believed before.
-LEAST_TOLD_S: Final = 0.5 * UNTOLD_CLOCK_S
 MIN_FIXES: Final = 20
 # Quartz clocks drift apart by less than twice this, 1 sd; what a dive tells worse is not told.
 DRIFT_TOLD: Final = 20e-6
@@ -108,6 +106,6 @@ def _clock_of_stretch(records: Records, fixes: Sequence[FixSeen]) -> tuple[float
         return None
     found = smooth(records, fixes, ())
     offset_s, sigma_s = found.clock_offset_s, found.clock_sigma_s
-    if not sigma_s < LEAST_TOLD_S:
+    if not sigma_s < TOLD_CLOCK_S:
         return None
     return 0.5 * (fixes[0].stamp_ns + fixes[-1].stamp_ns) / S_NS, offset_s, sigma_s, len(fixes)

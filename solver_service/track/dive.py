@@ -31,6 +31,9 @@ NEAR_CLOCK_S: Final = 0.005
 FAR_CLOCK_S: Final = 0.06
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
+# An offset is told where it is told better than this, and another one where it is so many of its sigmas off.
+TOLD_CLOCK_S: Final = 0.008
+TOLD_SIGMAS: Final = 6.0
 CLOCK_ROUNDS: Final = 4
 HEAD_NS: Final = 90 * S_NS
 # Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
@@ -169,7 +172,7 @@ def smooth(
         return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
-    if abs(parts[-1].state.clock_s) >= FAR_CLOCK_S or (without and abs(off_s) > FAR_WITHOUT_S):
+    if clock_off_by(parts[-1], FAR_CLOCK_S) or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
@@ -179,7 +182,7 @@ def smooth(
         return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
     # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
     learned = parts[-1]
-    shift_s = learned.state.clock_s
+    shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < TOLD_CLOCK_S**2 else 0.0
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
     second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
     second.restarts = False
@@ -234,10 +237,16 @@ def _first_pass(
         pass_over(first, records, fixes)
         parts = parts_of(first)
         without = any(any(part.without) for part in parts)
-        if not left or not parts or abs(parts[-1].state.clock_s) < (FAR_CLOCK_S if without else NEAR_CLOCK_S):
+        if not left or not parts or not clock_off_by(parts[-1], FAR_CLOCK_S if without else NEAR_CLOCK_S):
             break
         clock_ns += round(parts[-1].state.clock_s * 1e9)
     return first, parts, clock_ns
+
+
+def clock_off_by(part: Estimate, limit_s: float) -> bool:
+    """Whether a track tells clocks that are as far apart: one at rest tells little, and less than it believes."""
+    sigma_s = math.sqrt(part.covariance[CLOCK, CLOCK])
+    return abs(part.state.clock_s) >= max(limit_s, TOLD_SIGMAS * sigma_s)
 
 
 def in_order(record: NodeRecord) -> NodeRecord:

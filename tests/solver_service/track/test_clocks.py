@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.track.clocks import MIN_FIXES, clocks_of, line_through
+from buddyline.solver_service.track.dive import clock_off_by, filter_of, last_ns, parts_of
+from buddyline.solver_service.track.state import CLOCK
 
 from tests.solver_service.track.dives import Setting, make
 from tests.solver_service.track.test_track import bare_of
@@ -62,3 +64,15 @@ def test_a_drift_that_is_badly_told_is_not_said() -> None:
     assert found.drift is None
     assert found.drift_sigma == pytest.approx(0.0015 * np.sqrt(2.0) / 60.0)
     assert found.fixes == 800
+
+
+def test_a_pair_at_rest_is_not_believed() -> None:
+    """As a pair at rest told (ms, 1 sd): by 55 +- 14, then 109 +- 14, then 86 +- 16; others 300 and 50 ms apart."""
+    dive = make(8, Setting(seconds=4.0))
+    filtered = filter_of(dive.records, dive.fixes)
+    filtered.advance(last_ns(dive.records))
+    (part,) = parts_of(filtered)
+    for offset_s, sigma_s, off in ((-0.055, 0.0143, False), (0.251, 0.0095, True), (0.05, 0.0015, True)):
+        part.state = replace(part.state, clock_s=offset_s)
+        part.covariance[CLOCK, CLOCK] = sigma_s**2
+        assert clock_off_by(part, 0.005) == off
