@@ -33,7 +33,7 @@ AHEAD_NS: Final = S_NS // 2
 MAX_SEEN: Final = 4
 # Sizes as shares of the picture's width. A candidate may stand so far beside its light, whatever the expectation.
 FLOOR: Final = 0.012
-# Regions wider than this are no guidance.
+# Regions wider than this are no guidance: in a wide one some candidate is soon taken for an uncertain track's light.
 WIDEST: Final = 0.08
 # How much a lamp's speed in the picture may change in a second, and what it is before it is known (widths, 1 sd).
 CHANGE_PER_S2: Final = 0.55
@@ -239,7 +239,6 @@ Planned = tuple[list[Region], list[float]]
 def _around_expected(foretold: Sequence[Foretold], lamps: Sequence[tuple[Followed, float]]) -> Planned | None:
     """Return regions around expected lights, then around the other lamps; None where a light's size is not known."""
     regions, anchors = [], []
-    taken: set[int] = set()
     for place in foretold:
         near = [
             (lamp.score, i)
@@ -248,13 +247,16 @@ def _around_expected(foretold: Sequence[Foretold], lamps: Sequence[tuple[Followe
         ]
         if not near:
             return None
-        taken |= {i for _, i in near}
-        score, i = max(near)
-        regions.append(Region((place.u_px, place.v_px), place.radius_px, lamps[i][0].light_px))
-        anchors.append(max(FAINTEST, min(FADED * score, LIKELY)))
-    regions += [
-        _region(lamp, sigma) for i, (lamp, sigma) in enumerate(lamps) if lamp.score >= LIKELY and i not in taken
-    ]
+        lamp, _ = lamps[max(near)[1]]
+        regions.append(Region((place.u_px, place.v_px), place.radius_px, lamp.light_px))
+        anchors.append(max(FAINTEST, min(FADED * lamp.score, LIKELY)))
+    expected = tuple(regions)
+    for lamp, radius_px in lamps:
+        covered = any(
+            math.hypot(lamp.u_px - r.centre_px[0], lamp.v_px - r.centre_px[1]) <= r.radius_px for r in expected
+        )
+        if lamp.score >= LIKELY and not covered:
+            regions.append(_region(lamp, radius_px))
     return regions, anchors
 
 

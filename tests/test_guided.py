@@ -6,7 +6,7 @@ import time
 from buddyline.node.guide import Guide
 from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import encode
-from buddyline.protocol.messages import Candidates
+from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.protocol.topics import EXPECT, key_of, parse_key
 from buddyline.protocol.zenoh_bus import connect
 from buddyline.protocol.zenoh_bus.hub import open_hub
@@ -14,7 +14,7 @@ from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.service import SolverService
 
 from tests.processes import PATIENCE_S, free_endpoint
-from tests.solver_service.conftest import PERIOD_NS, dive_messages
+from tests.solver_service.conftest import dive_messages
 
 
 def join(endpoint):
@@ -30,23 +30,26 @@ def until(condition):
         pause.wait(0.01)
 
 
+def newest_ns(service, node, sensor):
+    stream = service.core.streams.get(node)
+    return (stream and getattr(stream, sensor).newest_ns) or 0
+
+
+def is_calibrated(service, node):
+    stream = service.core.streams.get(node)
+    return stream is not None and stream.calibration(0) is not None
+
+
 class Told(Guide):
-    """A guide that lets a test wait for what it is told."""
+    """A guide that remembers what it is told of."""
 
     def __init__(self, node):
         super().__init__(node)
         self.stamps_ns = set()
-        self.changed = threading.Condition()
 
     def expect(self, message):
         super().expect(message)
-        with self.changed:
-            self.stamps_ns.add(message.stamp_ns)
-            self.changed.notify_all()
-
-    def wait_for(self, stamp_ns):
-        with self.changed:
-            return self.changed.wait_for(lambda: stamp_ns in self.stamps_ns, PATIENCE_S)
+        self.stamps_ns.add(message.stamp_ns)
 
 
 def test_a_node_hears_where_its_next_picture_shows_the_lights():
@@ -70,23 +73,28 @@ def test_a_node_hears_where_its_next_picture_shows_the_lights():
                     publishers[key] = nodes.publisher(topic, *ids)
                 publishers[key].put_bytes(encode(message))
 
-            # Keys overtake each other: what the last frames are solved with has to be there before them.
-            last_ns = max(message.stamp_ns for message in messages if isinstance(message, Candidates))
-            last = [message for message in messages if isinstance(message, Candidates) and message.stamp_ns == last_ns]
+            # Keys overtake each other: what the frames are solved with has to be there before them.
+            frames = [message for message in messages if isinstance(message, Candidates)]
+            last_ns = max(frame.stamp_ns for frame in frames)
             service.clock.set_ns(last_ns)
             for message in messages:
-                if message not in last:
+                if not isinstance(message, Candidates):
                     send(message)
+            for info in (message for message in messages if isinstance(message, NodeInfo)):
+                # What is put before the subscriber knows of the publisher may be lost.
+                until(lambda info=info: is_calibrated(service, info.node) or send(info))
+            for node in guides:
+                for sensor in ("imu", "attitude", "depth"):
+                    until(lambda node=node, sensor=sensor: newest_ns(service, node, sensor) >= last_ns)
+            for i, frame in enumerate(frames):
+                send(frame)
+                until(lambda due=i + 1: sum(stream.received for stream in service.core.streams.values()) >= due)
             for node, guide in guides.items():
-                assert guide.wait_for(last_ns), sorted(guide.stamps_ns)
-                until(lambda node=node: (service.core.streams[node].imu.newest_ns or 0) >= last_ns)
-                until(lambda node=node: (service.core.streams[node].attitude.newest_ns or 0) >= last_ns)
-            for message in last:
-                send(message)
-            for node, guide in guides.items():
-                assert guide.wait_for(last_ns + PERIOD_NS), sorted(guide.stamps_ns)
-                plan = guide.plan(last_ns + PERIOD_NS, 820, 616)
-                truth = world.light_truth(node, last_ns + PERIOD_NS, 0).lights
+                # Of so many, one or two may be dropped on a busy machine.
+                until(lambda guide=guide: len(guide.stamps_ns) >= 10)
+                stamp_ns = max(guide.stamps_ns)
+                plan = guide.plan(stamp_ns, 820, 616)
+                truth = world.light_truth(node, stamp_ns, 0).lights
                 assert len(plan.foretold) == len(truth) == 2
                 for place in plan.foretold:
                     away = [((place.u_px - one.u_px) ** 2 + (place.v_px - one.v_px) ** 2) ** 0.5 for one in truth]
