@@ -32,24 +32,30 @@ _CLIPPED = 249.0
 _FOCAL_OF_MODEL_PX = 904.0
 _ROBUST_SD = 3.0
 
-# The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
-# kept for tuning). They are a little larger than those errors, because other waters will differ.
-_FLOOR_PX: Final = 0.045
+# The terms of sigma. Their squares are the variances that explain the errors on rendered pictures best (maximum
+# likelihood, all terms at once): dives kept for tuning, of another renderer, and this project's
+# simulator at 0 to -5 stops. The simulator's clean pictures alone would have a floor of 0.015 px.
+_FLOOR_PX: Final = 0.04
 # Share of the core's radius: the rim of the clipped core is not a perfect circle.
 _RIM_SHARE: Final = 0.008
-_NOISE_SCALE: Final = 0.155
-_GROWTH_SCALE: Final = 0.45
+_NOISE_SCALE: Final = 0.1
+_GROWTH_SCALE: Final = 0.6
 # Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
 # core, whose estimate is less certain.
-_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
-# Share of the core's radius, per unit of elongation above 1. A long core is partly hidden, or two lights merge in it.
-_ELONGATED_SHARE: Final = 0.15
-_SCATTERED_PX: Final = 2.0
+_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.3, 0.65
+# Share of the core's radius, per unit of elongation above 1, and per unit above _LONG besides: such a core is partly
+# hidden, or two lights merge in it.
+_ELONGATED_SHARE, _LONG_SHARE, _LONG = 0.16, 0.3, 1.3
+_SCATTERED_PX: Final = 1.5
+# Where the border cuts a light: px, and share of the core's radius. It counts from this many radii plus px inward.
+_CUT_PX, _CUT_SHARE = 0.33, 0.15
+_CUT_RADII, _CUT_FROM_PX = 1.2, 4.0
+
 
 MODEL: Mapping[str, float] = {
-    "growth": 0.7,
+    "growth": 0.78,
     "growth_veil": 0.55,
-    "growth_size": 0.45,
+    "growth_size": 0.52,
     "growth_sd": 0.35,
     "steepness": 0.75,
     "inner": 0.6,
@@ -90,10 +96,22 @@ def locate_sources(
     share = holds * (1.0 - lights.scattered)
     own_px2 = _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
     variance_px2 = np.where(holds, own_px2, prior_px2)
-    variance_px2 += (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2
+    elongated = lights.core_elongation
+    stretched = _ELONGATED_SHARE * (elongated - 1.0) + _LONG_SHARE * np.maximum(elongated - _LONG, 0.0)
+    variance_px2 += (stretched * radius_px) ** 2
+    cut = np.maximum(
+        1.0 - _to_border(start_px + share[:, None] * moved, image) / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0
+    )
+    variance_px2 += cut * _CUT_PX**2 + (_CUT_SHARE * cut * radius_px) ** 2
     in_doubt = share * (_MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped)
     variance_px2 += 0.5 * in_doubt * in_doubt * moved_px2
     return Centres(start_px + share[:, None] * moved, np.sqrt(variance_px2), lean * holds[:, None])
+
+
+def _to_border(centre_px: Floats, image: NDArray[np.uint8]) -> Floats:
+    """Return the distance of places (N, 2) from the picture's nearest border, (N,), px; 0 outside."""
+    far_px = np.array(image.shape[1::-1], np.float32) - np.float32(0.5)
+    return np.asarray(np.maximum(np.minimum(centre_px + np.float32(0.5), far_px - centre_px).min(axis=1), 0.0))
 
 
 def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
