@@ -59,7 +59,8 @@ class PairTracker:
     """Follows a pair. The past up to a trigger is taken once its outcome is known; what comes later is left out."""
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
-        self._problems: list[str] = []
+        self._filter: TrackFilter | None = None
+        self._past: list[str] = []
         self._streams = stream_a, stream_b
         self._settings = settings
         self._period_ns = round(S_NS / settings.rate_hz)
@@ -67,6 +68,8 @@ class PairTracker:
 
     def forget(self) -> None:
         """Start anew: a clock was set."""
+        if self._filter is not None:
+            self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
         self._infos: tuple[NodeInfo, NodeInfo] | None = None
         self._nodes: tuple[TrackNode, TrackNode] | None = None
         self._filter: TrackFilter | None = None
@@ -82,8 +85,11 @@ class PairTracker:
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong: what was found so far, and the lamps that are dark now."""
-        return self._problems + (self._dark_lamps(self._filter.lamps.dark()) if self._filter is not None else [])
+        """What is wrong, what was (it says so), and the lamps that are dark now."""
+        if self._filter is None:
+            return self._past
+        found = [problem for problem in self._filter.problems if problem not in self._past]
+        return self._past + found + self._dark_lamps(self._filter.lamps.dark())
 
     def _dark_lamps(self, dark: Iterable[tuple[int, int, float]]) -> list[str]:
         sides = ("left", "right")
@@ -124,7 +130,7 @@ class PairTracker:
     def _start_anew(self, why: str) -> None:
         """Drop a track that absurd but finite values have spoiled, such as a depth of 1e308 m."""
         node_a, node_b = (stream.node for stream in self._streams)
-        self._note([f"values from {node_a} or {node_b} are out of numeric range ({why}): the track starts anew"])
+        self._note([f"values from {node_a} or {node_b} were out of numeric range ({why}): the track started anew"])
         self.forget()
 
     def _take(self, outcomes: Sequence[Message]) -> list[Message]:
@@ -183,7 +189,8 @@ class PairTracker:
                 self._start_anew(str(error))
                 return []
         self._note(found.problems)
-        self._note(self._dark_lamps(found.dark))
+        if self._filter is None:
+            self._note(self._dark_lamps(found.dark))
         told = math.isfinite(found.clock_sigma_s)
         self._clock = (found.clock_offset_s, found.clock_sigma_s) if told else None
         return chain(messages, self._messages(found.rows, "smooth"))
@@ -222,7 +229,6 @@ class PairTracker:
         rows = self._filter.advance(to_ns, due)
         if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
             raise ArithmeticError("no finite covariance")
-        self._note(self._filter.problems)
         messages = list(self._messages(rows, "filter")) if "filter" in self._settings.modes else []
         if self._lag is not None:
             self._lag.ask(due)
@@ -280,7 +286,7 @@ class PairTracker:
         return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
 
     def _note(self, problems: Iterable[str]) -> None:
-        self._problems += [problem for problem in problems if problem not in self._problems]
+        self._past += [problem for problem in problems if problem not in self._past]
 
     def _messages(self, rows: Iterable[TrackRow], mode: TrackMode) -> Iterator[Message]:
         node_a, node_b = (stream.node for stream in self._streams)

@@ -110,7 +110,8 @@ class TrackFilter(TrackPool):
         """Whether the clocks prove further apart than a live track bears; `problems` says so then."""
         apart = self.main is not None and abs(self.main.state.clock_s) > FAR_CLOCK_S
         if apart:
-            self._report(f"{self.both}: their clocks are far apart: no live track")
+            said = f"{self.both}: their clocks are far apart: no live track"
+            self._problems.report(said, self.main.t_s if self.main else -math.inf)
         return apart
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
@@ -174,10 +175,11 @@ class TrackFilter(TrackPool):
         state, covariance = made
         if attitudes[1] is not None and not self._faces(state, covariance, attitudes[1][1]):
             self._refused += 1
-            if self._refused == REFUSED_TO_SAY:
+            if self._refused >= REFUSED_TO_SAY:
                 why = "another's lights, or a wrong mount"
-                self._report(f"{self.both}: attitudes and fixes contradict each other: {why}")
+                self._problems.report(f"{self.both}: attitudes and fixes contradict each other: {why}", t_s)
             return None
+        self._refused = 0
         estimate = Estimate(t_s, state, covariance, t_s, agreed_s=t_s, agreed=1)
         if attitudes[0] is not None:
             estimate.attitude_s[0] = t_s

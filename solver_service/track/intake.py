@@ -11,6 +11,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, Stamps, TrackNode
 from buddyline.solver_service.track.lights import Sight, sight_of
+from buddyline.solver_service.track.problems import Problems
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.turning import Turning
 from buddyline.solver_service.track.units import clipped, fault_of
@@ -29,7 +30,7 @@ class TrackIntake:
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         self.nodes = nodes
-        self.problems: list[str] = []
+        self._problems = Problems()
         self.epoch_ns: int | None = None
         self.clock_ns = 0
         self.samples = (Samples(), Samples())
@@ -40,6 +41,7 @@ class TrackIntake:
         self._ports = np.stack([node.rig.depth_port_m for node in self.nodes])
         self._count = 0
         self._checked_s = -np.inf
+        self._rejected = [0, 0]
 
     def seconds(self, node: int, stamp_ns: int) -> float:
         """Give a stamp of a node as s since the epoch, on A's clock as first believed."""
@@ -72,7 +74,8 @@ class TrackIntake:
         """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""
         if not (seen.sigma_rad > LEAST_SIGMA_RAD).all():
             seen = replace(seen, sigma_rad=np.maximum(seen.sigma_rad, UNTOLD_SIGMA_RAD))
-            self._report(f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown")
+            said = f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown"
+            self._problems.report(said, self.seconds(node, seen.stamp_ns))
         t_s = self.seconds(node, seen.stamp_ns)
         bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
         self._turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
@@ -96,7 +99,7 @@ class TrackIntake:
         """Take a pose that one trigger's lights gave by themselves; one out of numeric range is left out."""
         numbers = np.concatenate((fix.t_a_b_m.ravel(), fix.R_a_b.ravel(), fix.covariance.ravel()))
         if not np.isfinite(numbers).all() or np.abs(numbers).max() > BEYOND:
-            self._report(f"{self.both}: fixes out of numeric range are left out")
+            self._problems.report(f"{self.both}: fixes out of numeric range are left out", self.between(fix.stamp_ns))
             return
         self._push(self.between(fix.stamp_ns), 0, fix)
 
@@ -112,6 +115,7 @@ class TrackIntake:
 
     def _check_units(self, t_s: float) -> None:
         """Every seconds, say what is wrong with a unit; it is not used until it is well again."""
+        self._problems.pass_to(t_s)
         if t_s - self._checked_s < CHECK_EVERY_S:
             return
         # At the dive's start there is little to judge by: at every picture, until there is enough.
@@ -125,21 +129,22 @@ class TrackIntake:
             fault = fault_of(self.nodes[node].name, samples.last(t_s, CHECK_EVERY_S)[:, :3], down)
             samples.trusted = fault is None
             if fault is not None:
-                self._report(fault)
-            if samples.rejected > REJECTED_TO_SAY:
+                self._problems.report(fault, t_s)
+            if samples.rejected > self._rejected[node] + REJECTED_TO_SAY:
                 name = self.nodes[node].name
-                self._report(f"node {name}: inertial samples not finite, clipped or sent twice are left out")
+                said = f"node {name}: inertial samples not finite, clipped or sent twice are left out"
+                self._problems.report(said, t_s)
+                self._rejected[node] = samples.rejected
 
     @property
     def both(self) -> str:
         """The two nodes, in words."""
         return f"nodes {self.nodes[0].name} and {self.nodes[1].name}"
 
-    def _report(self, problem: str) -> None:
-        """Add a problem, each kind once."""
-        kind = problem.split(":")[0:1] + problem.split(":")[-1:]
-        if all(known.split(":")[0:1] + known.split(":")[-1:] != kind for known in self.problems):
-            self.problems.append(problem)
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong, in words; what has ended says so."""
+        return self._problems.texts()
 
     def _forget_before(self, t_s: float) -> None:
         """Drop what no step will look at again."""
