@@ -72,7 +72,7 @@ class PairTracker:
             self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
         self._infos: tuple[NodeInfo, NodeInfo] | None = None
         self._nodes: tuple[TrackNode, TrackNode] | None = None
-        self._filter: TrackFilter | None = None
+        self._filter = None
         self._lag: TrackLag | None = None
         self._pieces: tuple[list[NodeRecord], list[NodeRecord]] = ([], [])
         self._fixes: list[FixSeen] = []

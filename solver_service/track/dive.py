@@ -6,7 +6,7 @@ import bisect
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, combinations
 from typing import Final, TypeVar
 
 import numpy as np
@@ -35,6 +35,11 @@ LEAST_EARLIER_S: Final = 0.15
 TOLD_CLOCK_S: Final = 0.008
 TOLD_SIGMAS: Final = 6.0
 CLOCK_ROUNDS: Final = 4
+# Offsets that are tried where none is told and the tracks fall to pieces: a pass finds one that is 0.3 s off. Pieces
+# whose clocks differ by so much are of wrong clocks.
+CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
+PIECES_S: Final = 0.1
+PIECES_SIGMAS: Final = 4.0
 HEAD_NS: Final = 90 * S_NS
 # Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
@@ -166,13 +171,16 @@ def smooth(
         # What the dive's beginning tells of the clocks saves the whole dive another round.
         head_ns = fixes[0].stamp_ns - S_NS, fixes[0].stamp_ns + HEAD_NS
         head = records[0].between(*head_ns), records[1].between(*head_ns)
-        clock_ns = _first_pass(head, _between(fixes, *head_ns), clock_ns)[2]
-    first, parts, clock_ns = _first_pass(records, fixes, clock_ns)
+        clock_ns = _first_pass(head, _between(fixes, *head_ns), clock_ns, CLOCK_TRIES_S)[2]
+        first, parts, clock_ns = _first_pass(records, fixes, clock_ns)
+    else:
+        first, parts, clock_ns = _first_pass(records, fixes, clock_ns, CLOCK_TRIES_S)
     if not parts:
         return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
-    if clock_off_by(parts[-1], FAR_CLOCK_S) or (without and abs(off_s) > FAR_WITHOUT_S):
+    far = in_pieces(parts) or clock_off_by(parts[-1], FAR_CLOCK_S)
+    if far or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
@@ -226,12 +234,34 @@ def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Pa
 
 
 def _first_pass(
-    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int
+    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int, tries_s: Sequence[float] = ()
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Give a filter that has passed over a dive, its tracks, and how far B's clock was believed ahead.
 
-    An offset makes the pass non-linear, so that it tells one that is too small: it is repeated from there.
+    tries_s: other offsets to try where the tracks of this one fall to pieces; the one that explains most is taken.
     """
+    best = _rounds(records, fixes, clock_ns)
+    for try_s in tries_s:
+        if not in_pieces(best[1]):
+            break
+        other = _rounds(records, fixes, clock_ns + round(try_s * 1e9))
+        best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))
+    return best
+
+
+def in_pieces(parts: Sequence[Estimate]) -> bool:
+    """Whether tracks replace each other and do not agree on the clocks: they are far apart, by more than was tried."""
+    told = [(part.state.clock_s, float(part.covariance[CLOCK, CLOCK])) for part in parts]
+    return any(
+        abs(one_s - other_s) > max(PIECES_S, PIECES_SIGMAS * math.sqrt(one_variance + other_variance))
+        for (one_s, one_variance), (other_s, other_variance) in combinations(told, 2)
+    )
+
+
+def _rounds(
+    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int
+) -> tuple[TrackFilter, list[Estimate], int]:
+    """Pass over a dive again and again: an offset makes a pass non-linear, so that it tells one that is too small."""
     for left in reversed(range(CLOCK_ROUNDS)):
         first = _empty_filter(records, clock_ns, UNTOLD_CLOCK_S)
         pass_over(first, records, fixes)

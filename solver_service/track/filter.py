@@ -18,7 +18,7 @@ from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
-from buddyline.solver_service.track.state import State
+from buddyline.solver_service.track.state import CLOCK, State
 from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TOGETHER_S
 
 # Log odds by which a track must explain its pictures better than clutter, or a challenger better than the track.
@@ -45,7 +45,9 @@ IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 CONTRADICTS: Final = 33.0
 REFUSED_TO_SAY: Final = 10
 # Clocks further apart than this: the filter is not linear in them, and what it tells meanwhile is not honest.
-FAR_CLOCK_S: Final = 0.15
+FAR_CLOCK_S: Final = 0.1
+APART_S: Final = 20.0
+FAR_SIGMAS: Final = 6.0
 # Longest step, without a picture, over which a track tells its present state.
 BRIDGED_S: Final = 1.0
 # What is older than this is dropped: the noise of slow sensors is learned from so much.
@@ -66,6 +68,7 @@ class TrackFilter(TrackPool):
         self.lamps = LampWatch()
         self._waiting: list[Estimate] = []
         self._refused = 0
+        self._apart_s = -np.inf
 
     def advance(self, to_ns: int, outputs_ns: list[int] | None = None) -> list[TrackRow]:
         """Go on to to_ns, up to which all has been added; return the track at the asked stamps in between.
@@ -107,11 +110,19 @@ class TrackFilter(TrackPool):
         return state, P, rates_radps
 
     def clocks_apart(self) -> bool:
-        """Whether the clocks prove further apart than a live track bears; `problems` says so then."""
-        apart = self.main is not None and abs(self.main.state.clock_s) > FAR_CLOCK_S
+        """Whether the clocks prove further apart than a live track bears, or did lately; `problems` says so then.
+
+        A track that starts anew believes in its clocks anew.
+        """
+        if self.main is None:
+            return False
+        # A pair at rest tells little of its clocks, and less than it believes.
+        sigma_s = math.sqrt(self.main.covariance[CLOCK, CLOCK])
+        if abs(self.main.state.clock_s) > max(FAR_CLOCK_S, FAR_SIGMAS * sigma_s):
+            self._apart_s = self.main.t_s
+        apart = self.main.t_s - self._apart_s < APART_S
         if apart:
-            said = f"{self.both}: their clocks are far apart: no live track"
-            self._problems.report(said, self.main.t_s if self.main else -math.inf)
+            self._problems.report(f"{self.both}: their clocks are far apart: no live track", self.main.t_s)
         return apart
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:

@@ -38,7 +38,7 @@ LEVER_TOLD_M: Final = 0.006
 LEVER_UNTOLD_M: Final = 0.05
 DELAY_TOLD_S: Final = 0.001
 DELAY_UNTOLD_S: Final = 0.004
-CLOCK_S: Final = 0.05
+CLOCK_S: Final = 0.1
 DEPTH_OFFSET_M: Final = 0.2
 # A later pass starts as if nothing were known but roughly where: its lights tell the rest.
 BROAD_R_M: Final = 0.5

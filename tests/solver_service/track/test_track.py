@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buddyline.solver_service.track.dive import NodeRecord, filter_of, last_ns, smooth
+from buddyline.solver_service.track.dive import NodeRecord, filter_of, in_pieces, last_ns, parts_of, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
@@ -300,3 +300,33 @@ def test_absurd_input_never_crashes(dive: Dive, harm: str) -> None:
     assert all(np.isfinite(row.covariance).all() and np.isfinite(row.t_a_b_m).all() for row in rows)
     if rows:
         assert score(dive, rows).wrong == 0
+
+
+@pytest.mark.parametrize(("parts_clock_s", "expected"), [([0.02], False), ([0.02, 0.05], False), ([0.0, 0.2], True)])
+def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
+    dive: Dive, parts_clock_s: list[float], expected: bool
+) -> None:
+    first = filter_of(dive.records, dive.fixes)
+    first.advance(dive.stamps_ns[0] + 3_000_000_000)
+    [part] = parts_of(first)
+    parts = [replace(part, state=replace(part.state, clock_s=clock_s)) for clock_s in parts_clock_s]
+    assert in_pieces(parts) is expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clock_s", [0.5, -0.8])
+def test_clocks_more_than_half_a_second_apart(clock_s: float) -> None:
+    for seed in range(4):
+        dive = make(80 + seed, replace(SHORT, seconds=30.0, clock_s=clock_s))
+        result = smooth(dive.records, dive.fixes, dive.stamps_ns)
+        judged = score(dive, result.rows)
+        assert judged.wrong == 0
+        assert abs(result.clock_offset_s - clock_s) < 0.02 or judged.rows == 0
+
+
+def test_a_live_track_of_clocks_half_a_second_apart_is_not_told() -> None:
+    dive = make(2, replace(SHORT, seconds=14.0, clock_s=0.5))
+    track = filter_of(dive.records, dive.fixes)
+    rows = track.advance(dive.stamps_ns[-1], dive.stamps_ns)
+    assert len(rows) < 0.3 * len(dive.stamps_ns)
+    assert any("clocks are far apart" in problem for problem in track.problems)
