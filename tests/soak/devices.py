@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from buddyline.node.capture.exposure import Exposure
 from buddyline.node.config import NodeConfig
 from buddyline.node.sim.devices import DEPTH_HZ, IMU_HZ, SimulatedCamera, SimulatedSensor, scenario_of
 from buddyline.node.sim.world import World
@@ -37,7 +38,8 @@ class RenderedBefore(World):
         render = super().render
         self._pictures = [render(config.node, start_ns + i * step_ns) for i in range(PICTURES + 1)]
 
-    def render(self, node: str, stamp_ns: int) -> NDArray[np.uint8]:
+    def render(self, node: str, stamp_ns: int, exposure: Exposure | None = None) -> NDArray[np.uint8]:
+        """Return the picture rendered before, which has the scene's exposure."""
         shown_ns = instant_shown(self._config, stamp_ns) - self._config.simulation.start_ns
         return self._pictures[round(shown_ns * PICTURES / STRETCH_NS)].copy()
 
