@@ -20,6 +20,8 @@ def test_times_are_compared_with_other_finders(capsys):
     assert row["source"] == "cavern"
     assert row["ms"]["source"] > 0
     assert row["ratio"]["cv2.aruco 36h11"] == pytest.approx(row["ms"]["source"] / row["ms"]["cv2.aruco 36h11"])
+    assert row["ms"]["source, guided"] > 0
+    assert 0 <= row["guided_share"] <= 1
     assert row["ms"]["pupil-apriltags"] is None
     table = detect.table([row])
     assert "SimpleBlob" in table
@@ -33,7 +35,15 @@ def test_memory_after_a_tenth_and_after_all_pictures(capsys):
     assert resident_kib["20"] - resident_kib["2"] < 20_000
 
 
-@pytest.mark.parametrize("words", [["detect", "--pictures", "0"], ["detect", "--frames", "1"]])
+def test_lamps_that_the_exposure_keeps_small_are_searched_in_regions(capsys):
+    assert main(["detect", "--pictures", "2", "--width", "820", "--stops", "5", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["guided_share"] > 0
+
+
+@pytest.mark.parametrize(
+    "words", [["detect", "--pictures", "0"], ["detect", "--stops", "-1"], ["detect", "--frames", "1"]]
+)
 def test_bad_arguments_give_a_one_line_error(words, capsys):
     assert main(words) == 2
     error = capsys.readouterr().err
