@@ -10,7 +10,6 @@ from buddyline.solver_service.track.strapdown import Bools, Noise
 
 # Further apart, and what lies between two samples is not told.
 GAP_S: Final = 0.06
-STANDARD_GRAVITY: Final = 9.80665
 # Over so long shaking has no mean to speak of, and motion changes little.
 SLOW_S: Final = 0.4
 _NOISE_SPAN_S: Final = 2.0
