@@ -15,6 +15,8 @@ from msgspec.structs import replace
 # By BCM number, as on the 40-pin header; 0 and 1 are the HAT's memory.
 Pin = Annotated[int, Meta(ge=2, le=27)]
 I2C_PINS = {1: (2, 3)}
+# By the address pins of the chips.
+GAUGE_ADDRESSES = {"none": range(0), "ina219": range(0x40, 0x50), "ads1115": range(0x48, 0x4C)}
 
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 
@@ -147,6 +149,35 @@ class PanelConfig(Config, frozen=True, kw_only=True):
         return {name: number for name in names if (number := getattr(self, name)) is not None}
 
 
+class PowerConfig(Config, frozen=True, kw_only=True):
+    """[power]: the battery gauge on sensors.i2c_bus, and what is left out when the node gets hot.
+
+    address: of the chip; by default the first of its kind. shunt_ohm: of an INA219. channel, divider: of an ADS1115:
+    its input, and the battery's voltage over the input's. cells: lithium-ion cells in series, to judge the charge.
+    lower_load: leave out pictures, then every second trigger, before the processor slows down.
+    """
+
+    battery: Literal["none", "ina219", "ads1115"] = "none"
+    address: int | None = None
+    shunt_ohm: Positive = 0.1
+    channel: Annotated[int, Meta(ge=0, le=3)] = 0
+    divider: Annotated[float, Meta(ge=1)] = 1.0
+    cells: Annotated[int, Meta(ge=1, le=20)] | None = None
+    lower_load: bool = True
+
+    @property
+    def gauge_address(self) -> int:
+        """The gauge's address on the bus."""
+        return GAUGE_ADDRESSES[self.battery][0] if self.address is None else self.address
+
+    def check(self) -> None:
+        """Raise ConfigError for an address that the gauge cannot have."""
+        known = GAUGE_ADDRESSES[self.battery]
+        if self.address is not None and self.address not in known:
+            allowed = f"0x{known[0]:02x} to 0x{known[-1]:02x}" if known else "no address"
+            raise ConfigError(f"power.address = 0x{self.address:02x}: battery = {self.battery!r} takes {allowed}")
+
+
 class SimulationConfig(Config, frozen=True, kw_only=True):
     """[simulation]: the world of the simulated camera and sensors; the same for both nodes."""
 
@@ -174,6 +205,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     record: RecordConfig = field(default_factory=RecordConfig)
     preview: PreviewConfig = field(default_factory=PreviewConfig)
     panel: PanelConfig = field(default_factory=PanelConfig)
+    power: PowerConfig = field(default_factory=PowerConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
 
     @property
@@ -251,6 +283,7 @@ def load_node_config(path: Path | str) -> NodeConfig:
     config = load_config(path, NodeConfig)
     try:
         config.check_pins()
+        config.power.check()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
     return config if config.tls is None else replace(config, tls=config.tls.beside(path))

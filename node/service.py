@@ -30,6 +30,7 @@ from buddyline.node.guide import Guide
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
+from buddyline.node.power.watch import PowerWatch
 from buddyline.node.underwater.panel import Panel
 from buddyline.protocol.clock import S_NS, Clock, SystemClock
 from buddyline.protocol.config import ConfigError, config_sha256
@@ -54,7 +55,6 @@ HANGS_S: Final = 5.0
 FIRST_S: Final = 15.0
 LOOK_S: Final = 0.2
 REPORT_S: Final = 1.0
-TEMPERATURE: Final = Path("/sys/class/thermal/thermal_zone0/temp")
 REFUSED_RETRY_S: Final = 5.0
 
 
@@ -119,6 +119,7 @@ class NodeService(Service):
         self.pictures = PictureLog(path, f"{self.config.node}-*", min_free_bytes, metadata=metadata)
         self.recorder = Recorder(path, metadata=metadata, pictures=self.pictures)
         self.outlet = Outlet(self.config.node, self.recorder, self.clock)
+        self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
         self.outlet.send(info)
@@ -171,6 +172,7 @@ class NodeService(Service):
         self.spawn("status", self._report)
         self.spawn("clock", lambda: self._clock_sync.follow_chrony(self.stop))
         self.spawn("bus", self._connect)
+        self.spawn("power", lambda: self._power.run(self.stop))
         self.spawn("panel", lambda: self._panel.run(self.stop))
 
     def close(self) -> int:
@@ -186,6 +188,7 @@ class NodeService(Service):
             log.info("%s: log %s", self.name, self.recorder.path)
         self.camera.close()
         self._panel.close()
+        self._power.close()
         for source in self.sources:
             source.close()
         return status
@@ -241,6 +244,9 @@ class NodeService(Service):
                 if not self._frames:
                     return
                 frame = self._frames.popleft()
+            if self._power.skips(frame.stamp_ns):
+                self._seen_s = time.monotonic()
+                continue
             began_s = time.perf_counter()
             candidates = self.pipeline.candidates(frame)
             self._detect_s.append(time.perf_counter() - began_s)
@@ -250,7 +256,7 @@ class NodeService(Service):
             self.outlet.send(candidates)
             self._expose(frame, candidates)
             self._lights_seen.append(sum(map(is_likely, candidates.blobs)))
-            if self._panel.takes_pictures:
+            if self._panel.takes_pictures and self._power.takes_pictures:
                 self._images.send(frame)
 
     def _expose(self, frame: Frame, candidates: Candidates) -> None:
@@ -345,7 +351,7 @@ class NodeService(Service):
         self.problems = self._find_problems(ages_s, free_bytes)
         residual_s = self.pipeline.residual_s
         retries = [source.retries for source in self.sources]
-        temperature_degc = cpu_temperature_degc()
+        leak = self._panel.leak
         return NodeStatus(
             node=self.config.node,
             stamp_ns=self.clock.now_ns(),
@@ -358,9 +364,10 @@ class NodeService(Service):
             trigger_residual_s=UNSET if residual_s is None else residual_s,
             detect_s=float(np.median(self._detect_s)) if self._detect_s else UNSET,
             disk_free_bytes=UNSET if free_bytes is None else free_bytes,
-            temperature_degc=UNSET if temperature_degc is None else temperature_degc,
             bus_retries=max(retries) if retries else UNSET,
             lights_seen=statistics.median_low(list(self._lights_seen)) if self._lights_seen else UNSET,
+            leak=UNSET if leak is None else leak,
+            **self._power.status_fields(),
             **self._clock_sync.status_fields(),
             log=self.recorder.path.name,
             problem="; ".join(self.problems),
@@ -403,7 +410,7 @@ class NodeService(Service):
         # A simulated world is on this machine's own clock, whoever keeps that.
         if self._clock_sync.problem and self.config.camera.name != "simulated":
             problems.append(f"clock: {self._clock_sync.problem}")
-        problems += self._panel.problems
+        problems += self._panel.problems + self._power.problems
         if self._clock_watch.problem:
             problems.append(self._clock_watch.problem)
         if self.recorder.error is not None:
@@ -417,11 +424,3 @@ class NodeService(Service):
         elif free_bytes < self.config.record.min_free_mb * 1e6:
             problems.append(f"disk: {free_bytes / 1e6:.0f} MB free")
         return problems
-
-
-def cpu_temperature_degc() -> float | None:
-    """Return the processor's temperature, None where the machine does not tell."""
-    try:
-        return int(TEMPERATURE.read_text()) / 1e3
-    except (OSError, ValueError):
-        return None

@@ -29,6 +29,15 @@ HEADINGS_APART_RAD: Final = math.radians(20.0)
 # A Raspberry Pi slows down at 80 degrees.
 HOT_DEGC: Final = 70.0
 TOO_HOT_DEGC: Final = 80.0
+# Bits of a Pi's firmware (vcgencmd get_throttled): now, and since the start. NodeStatus.throttled_bits has them all.
+UNDERVOLTAGE_NOW: Final = 1 << 0
+SLOWED_NOW: Final = 1 << 1 | 1 << 2 | 1 << 3  # frequency capped, throttled, soft limit of temperature
+UNDERVOLTAGE_SINCE_START: Final = UNDERVOLTAGE_NOW << 16
+SLOWED_SINCE_START: Final = SLOWED_NOW << 16
+POWER_NOW: Final = UNDERVOLTAGE_NOW | SLOWED_NOW
+# Of a lithium-ion cell under load: a quarter is left, and the steep end of the curve, where the dive is over.
+BATTERY_LOW_CELL_V: Final = 3.5
+BATTERY_EMPTY_CELL_V: Final = 3.2
 # The disk should have room for a dive with reserve.
 DIVE_H: Final = 4.0
 

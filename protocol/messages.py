@@ -294,7 +294,9 @@ class NodeStatus(Message, frozen=True, kw_only=True):
 
     rates_hz: messages per second by topic. drops: lost messages by cause. ages_s: time since the newest sample of each
     device. bus_retries: repeated transfers on the sensors' I2C bus. lights_seen: likely lights in the newest pictures
-    (their median), two of which are another node's. problem: what is wrong, in words; empty if nothing.
+    (their median), two of which are another node's. throttled_bits: the Pi firmware's (protocol/health.py).
+    battery_v, battery_a: at the battery, discharging positive; battery_cell_v: of one cell. leak: water in the housing.
+    load: what the node leaves out because of heat or undervoltage. problem: what is wrong, in words; empty if nothing.
     clock_offset_s: this clock minus true time, estimated by chrony. clock_rms_s: its long-term RMS.
     clock_bound_s: greatest possible error of this clock. clock_frequency_ppm: rate at which the uncorrected clock
     gains. clock_source: the reference that chrony follows, empty if none. All five are absent without chrony.
@@ -319,6 +321,12 @@ class NodeStatus(Message, frozen=True, kw_only=True):
     temperature_degc: float | UnsetType = UNSET
     bus_retries: Count | UnsetType = UNSET
     lights_seen: Count | UnsetType = UNSET
+    throttled_bits: Count | UnsetType = UNSET
+    battery_v: float | UnsetType = UNSET
+    battery_a: float | UnsetType = UNSET
+    battery_cell_v: float | UnsetType = UNSET
+    leak: bool | UnsetType = UNSET
+    load: Literal["full", "no_pictures", "half_rate"] | UnsetType = UNSET
     log: str = ""
     problem: str = ""
 

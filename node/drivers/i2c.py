@@ -88,9 +88,9 @@ class I2cBus:
         self._transfer(address, register, self._message.write(address, [register]), reply)
         return bytes(reply)
 
-    def write(self, address: int, register: int, value: int) -> None:
-        """Write one register."""
-        self._transfer(address, register, self._message.write(address, [register, value]))
+    def write(self, address: int, register: int, *values: int) -> None:
+        """Write a register, byte by byte, in one transfer."""
+        self._transfer(address, register, self._message.write(address, [register, *values]))
 
     def command(self, address: int, command: int) -> None:
         """Send a command byte without data."""

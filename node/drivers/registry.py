@@ -7,8 +7,11 @@ from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
+from buddyline.node.config import NodeConfig
+from buddyline.node.drivers.ads1115 import Ads1115
 from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.samples import DepthDevice, DeviceError, ImuDevice
+from buddyline.node.drivers.ina219 import Ina219
+from buddyline.node.drivers.samples import DepthDevice, DeviceError, GaugeDevice, ImuDevice
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
@@ -69,6 +72,19 @@ def open_depth(bus: I2cBus, name: str = AUTO, clock: Clock | None = None) -> Dep
     target, model = DEPTHS[name]
     device: DepthDevice = _load(target).open(bus, model, clock or SystemClock())
     return device
+
+
+def open_gauge(config: NodeConfig) -> tuple[I2cBus, GaugeDevice]:
+    """Return the battery gauge of [power], not yet started, and the bus it is on, opened for it alone.
+
+    Transfers of several users of one bus take turns in the kernel. Raises DeviceError if the bus cannot be opened.
+    """
+    power = config.power
+    bus = I2cBus(config.sensors.i2c_bus)
+    bus.open()
+    if power.battery == "ina219":
+        return bus, Ina219(bus, power.gauge_address, power.shunt_ohm)
+    return bus, Ads1115(bus, power.gauge_address, power.channel, power.divider)
 
 
 def check_names(imu: str, depth: str) -> None:

@@ -46,6 +46,14 @@ class DepthSample:
     temperature_degc: float
 
 
+@dataclass(frozen=True, slots=True)
+class BatterySample:
+    """Voltage of the battery, and the current out of it; None where the chip does not measure that."""
+
+    voltage_v: float
+    current_a: float | None = None
+
+
 class ImuDevice(Protocol):
     """Accelerometer, gyroscope and, on most boards, magnetometer.
 
@@ -77,4 +85,16 @@ class DepthDevice(Protocol):
 
         Call it at every turn of the loop that owns the bus. Raises DeviceError; later calls try again.
         """
+        ...
+
+
+class GaugeDevice(Protocol):
+    """A battery gauge."""
+
+    def start(self) -> None:
+        """Set the chip up; raise DeviceError if it cannot be."""
+        ...
+
+    def read(self) -> BatterySample:
+        """Return the newest reading; raise DeviceError if there is none. The chip is then to be started again."""
         ...

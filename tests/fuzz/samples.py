@@ -68,6 +68,14 @@ SOUND: tuple[m.Message, ...] = (
         clock_bound_s=0.002,
         clock_frequency_ppm=-3.5,
         clock_source="192.0.2.1",
+        temperature_degc=61.0,
+        lights_seen=2,
+        throttled_bits=0x50000,
+        battery_v=11.1,
+        battery_a=0.8,
+        battery_cell_v=3.7,
+        leak=False,
+        load="no_pictures",
     ),
     m.ClockBeacon(
         **_NODE, boot="x", heard=[m.HeardClock(node="b", boot="y", sent_ns=STAMP_NS, received_ns=STAMP_NS + 300_000)]

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from buddyline.node.capture.exposure import Exposure
 from buddyline.node.chrony import decode_tracking
-from buddyline.node.config import NodeConfig, PanelConfig, load_node_config
+from buddyline.node.config import NodeConfig, PanelConfig, PowerConfig, load_node_config
 from buddyline.node.detect import Detection
+from buddyline.node.drivers.samples import BatterySample, DeviceError
+from buddyline.node.power.board import Throttled, temperature_degc
 from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import BuddylineError
@@ -23,6 +25,8 @@ from buddyline.tools.doctor import bus, diagnosis, machine, rig
 from buddyline.tools.health import machine as judge_machine
 from buddyline.tools.health import rig as judge_rig
 from buddyline.tools.health.finding import Finding, status_of
+from buddyline.tools.health.pair import reported
+from buddyline.tools.health.words import power_words
 from msgspec import UNSET
 
 from tests.node.test_chrony import FOLLOWS, LOST, SERVES
@@ -209,8 +213,8 @@ def test_a_missing_place_of_the_inertial_unit_is_a_warning():
 
 def test_the_pis_system_files_are_read(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert machine.temperature_degc(tmp_path) is None
-    assert machine.throttled(tmp_path) is None
+    assert temperature_degc(tmp_path) is None
+    assert Throttled(tmp_path).read() is None
     assert not machine.timesyncd(tmp_path)
     files = {
         "sys/class/thermal/thermal_zone0/temp": "48312\n",
@@ -222,17 +226,17 @@ def test_the_pis_system_files_are_read(tmp_path, monkeypatch):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    assert machine.temperature_degc(tmp_path) == pytest.approx(48.312)
-    assert machine.throttled(tmp_path) == 1
+    assert temperature_degc(tmp_path) == pytest.approx(48.312)
+    assert Throttled(tmp_path).read() == 1
     assert machine.timesyncd(tmp_path)
     script = tmp_path / "vcgencmd"
     script.write_text("#!/bin/sh\necho throttled=0x50000\n")
     script.chmod(0o755)
-    assert machine.throttled(tmp_path) == 0x50000
+    assert Throttled(tmp_path).read() == 0x50000
     firmware = tmp_path / "sys/devices/platform/soc/soc:firmware/get_throttled"
     firmware.parent.mkdir(parents=True)
     firmware.write_text("50005\n")
-    assert machine.throttled(tmp_path) == 0x50005
+    assert Throttled(tmp_path).read() == 0x50005
 
 
 def test_free_space_is_that_of_the_nearest_existing_folder(tmp_path):
@@ -408,3 +412,44 @@ def test_the_panels_pins_are_tried_and_left_dark(monkeypatch):
     factory.pin(24)._set_pull = lambda value: None  # the probe is stronger than the Pi's pull-down
     assert levels(rig.check_panel(node)) == {"panel": "problem"}
     assert rig.check_panel(NodeConfig(node="a")) == []
+
+
+@pytest.mark.parametrize(
+    ("sample", "cells", "level", "said"),
+    [(BatterySample(11.8, 0.83), 3, "ok", "11.8 V, 0.83 A"), (BatterySample(10.4), 3, "warning", "10.4 V"),
+     (BatterySample(9.5), 3, "problem", "9.5 V"), (BatterySample(9.5), None, "ok", "9.5 V"),
+     (None, 3, "problem", "no answer")],
+)  # fmt: skip
+def test_the_battery_is_judged(sample, cells, level, said):
+    found = judge_machine.battery(sample, cells, "" if sample else "no answer")
+    assert (found.level, found.text) == (level, said)
+
+
+def test_a_gauge_that_is_not_there_is_a_problem_and_none_is_no_finding(monkeypatch):
+    def opens(config):
+        raise DeviceError("I2C bus 1: no /dev/i2c-1")
+
+    monkeypatch.setattr("buddyline.node.power.watch.open_gauge", opens)
+    (found,) = rig.check_battery(NodeConfig(node="a", power=PowerConfig(battery="ina219")))
+    assert (found.level, "no /dev/i2c-1" in found.text) == ("problem", True)
+    assert rig.check_battery(NodeConfig(node="a")) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [({"throttled_bits": 0x50000, "temperature_degc": 50.0}, ["undervoltage since the start"]),
+     ({"throttled_bits": 1}, []), ({"battery_cell_v": 3.4}, ["3.40 V"]), ({"battery_cell_v": 3.9}, []),
+     ({"battery_cell_v": 3.0}, [])],
+)  # fmt: skip
+def test_what_deserves_a_warning_is_read_from_the_status(fields, said):
+    found = reported("node a", msgspec.structs.replace(status(), **fields))
+    assert [finding.level for finding in found] == ["warning"] * len(said)
+    assert all(words in finding.text for words, finding in zip(said, found, strict=True))
+
+
+def test_power_is_shown_in_words():
+    known = {"temperature_degc": 76.4, "battery_v": 11.24, "battery_a": 0.8, "throttled_bits": 1, "load": "half_rate"}
+    assert power_words(msgspec.structs.replace(status(), **known)) == [
+        "76 °C", "battery 11.2 V, 0.80 A", "undervoltage", "load lowered: no pictures, half the rate"
+    ]  # fmt: skip
+    assert power_words(status()) == []

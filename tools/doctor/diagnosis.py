@@ -12,6 +12,7 @@ from typing import Final
 
 from buddyline.node.chrony import ChronyError, read_tracking
 from buddyline.node.config import NodeConfig, load_node_config
+from buddyline.node.power.board import Throttled, temperature_degc
 from buddyline.protocol.config import load_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.client import ClientConfig
@@ -61,6 +62,7 @@ def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
             "the camera": lambda: rig.check_camera(node),
             "the sensors": lambda: rig.check_sensors(node),
             "the panel": lambda: rig.check_panel(node),
+            "the battery": lambda: rig.check_battery(node),
         },
         ends_s,
     )
@@ -81,8 +83,8 @@ def check_machine(node: NodeConfig | None) -> list[Finding]:
     return [
         judge.clock(tracking, error, machine.timesyncd(), stamps=stamps),
         judge.disk(str(directory.absolute()), free_bytes, min_free_bytes, rate_px, unwritable),
-        judge.temperature(machine.temperature_degc()),
-        judge.power(machine.throttled()),
+        judge.temperature(temperature_degc()),
+        judge.power(Throttled().read()),
     ]
 
 

@@ -13,10 +13,12 @@ from buddyline.node.config import NodeConfig
 from buddyline.node.detect import Detection, make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.pipeline import Pipeline
+from buddyline.node.power.watch import BatteryGauge
 from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu, Message, NodeInfo
+from buddyline.tools.health import machine as judge_machine
 from buddyline.tools.health import rig as judge
 from buddyline.tools.health.finding import Finding
 from msgspec import UNSET
@@ -29,6 +31,8 @@ FRAMES_WITHIN_S: Final = 5.0
 LISTEN_S: Final = 3.0
 # Longer than the search for the chips plus the two seconds of samples that the surface pressure needs.
 SENSE_S: Final = 4.0
+# Of a battery gauge's first conversion.
+GAUGE_S: Final = 0.3
 
 
 def check_camera(config: NodeConfig) -> list[Finding]:
@@ -157,6 +161,21 @@ def check_panel(config: NodeConfig) -> list[Finding]:
     command = config.panel.shutdown_command
     absent = command[0] if command and shutil.which(command[0]) is None else ""
     return [judge.panel(config.panel.pins, problems, pressed=bool(pressed), leak=bool(leak), absent=absent)]
+
+
+def check_battery(config: NodeConfig) -> list[Finding]:
+    """Read the battery gauge once."""
+    gauge = BatteryGauge(config)
+    if gauge.absent:
+        return []
+    try:
+        gauge.look(time.monotonic())
+        if not gauge.problem:
+            time.sleep(GAUGE_S)
+            gauge.look(time.monotonic())
+    finally:
+        gauge.close()
+    return [judge_machine.battery(gauge.sample, config.power.cells, gauge.problem)]
 
 
 def _listen(sources: list[Source]) -> dict[str, list[Message]]:

@@ -5,19 +5,33 @@ from __future__ import annotations
 from typing import Final
 
 from buddyline.node.chrony import Tracking
-from buddyline.protocol.health import CLOCK_OFF_S, DIVE_H, HOT_DEGC, TOO_HOT_DEGC
+from buddyline.node.drivers.samples import BatterySample
+from buddyline.protocol.health import (
+    BATTERY_EMPTY_CELL_V,
+    BATTERY_LOW_CELL_V,
+    CLOCK_OFF_S,
+    DIVE_H,
+    HOT_DEGC,
+    SLOWED_NOW,
+    SLOWED_SINCE_START,
+    TOO_HOT_DEGC,
+    UNDERVOLTAGE_NOW,
+    UNDERVOLTAGE_SINCE_START,
+)
 from buddyline.tools.health.finding import Finding, Level
 
 # Bytes per pixel of JPEGs of quality 90 of dark water with lamps; bytes per second of all else that a node records.
 BYTES_A_PIXEL: Final = 0.25
 BYTES_A_SECOND: Final = 50_000
 
+CHARGE: Final = "end the dive, or charge it before the next"
+
 # Bits of vcgencmd get_throttled, the worst first: the present ones, then those since the start.
 _POWER: Final[tuple[tuple[int, Level, str, str], ...]] = (
-    (1 << 0, "problem", "undervoltage now", "charge or change the battery; thicker, shorter cables"),
-    (1 << 2, "problem", "the processor is slowed down now", "cool it, and check the supply"),
-    (1 << 16, "warning", "undervoltage since the start", "charge the battery, check cables, reboot"),
-    (1 << 18, "warning", "was slowed down since the start", "cool it, and check the supply"),
+    (UNDERVOLTAGE_NOW, "problem", "undervoltage now", "charge or change the battery; thicker, shorter cables"),
+    (SLOWED_NOW, "problem", "the processor is slowed down now", "cool it, and check the supply"),
+    (UNDERVOLTAGE_SINCE_START, "warning", "undervoltage since the start", "charge the battery, check cables, reboot"),
+    (SLOWED_SINCE_START, "warning", "was slowed down since the start", "cool it, and check the supply"),
 )
 
 
@@ -67,6 +81,22 @@ def power(throttled: int | None) -> Finding:
         if throttled & bit:
             return Finding("power", level, text, advice)
     return Finding("power", "ok", "no undervoltage since the start")
+
+
+def battery(sample: BatterySample | None, cells: int | None, problem: str) -> Finding:
+    """Judge the battery by its gauge. cells: in series; None: its charge cannot be judged."""
+    if sample is None:
+        return Finding("battery", "problem", problem or "gives nothing", "check its wiring; see node/README.md")
+    text = f"{sample.voltage_v:.1f} V" + ("" if sample.current_a is None else f", {sample.current_a:.2f} A")
+    if cells is None:
+        return Finding("battery", "ok", text)
+    level = charge(sample.voltage_v / cells)
+    return Finding("battery", level, text, "" if level == "ok" else CHARGE)
+
+
+def charge(cell_v: float) -> Level:
+    """Judge the charge by the voltage of one cell under load."""
+    return "problem" if cell_v <= BATTERY_EMPTY_CELL_V else "warning" if cell_v <= BATTERY_LOW_CELL_V else "ok"
 
 
 def disk(place: str, free_bytes: int, min_free_bytes: int, picture_px_a_second: float, error: str) -> Finding:

@@ -18,6 +18,7 @@ from buddyline.protocol.health import (
 from buddyline.protocol.messages import NodeStatus
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, SOLVER_STATUS
 from buddyline.tools.estimate import sigma_m
+from buddyline.tools.health import machine
 from buddyline.tools.health.finding import Finding, worst_first
 from buddyline.tools.health.words import REASONS, reason_words
 from msgspec import UNSET
@@ -50,13 +51,22 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
 
 
 def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
-    """Return the findings from a node's status: its problem (since since_ns), temperature and clock."""
+    """Return the findings from a node's status: its problem (since since_ns), temperature, supply, battery and clock.
+
+    What is a problem of supply, battery and load, the node's own `problem` says; here is what deserves a warning.
+    """
     said = []
     if status.problem:
         said.append(Finding(name, "problem", f"{_named(name)} reports: {status.problem}", "", since_ns))
     if status.temperature_degc is not UNSET and status.temperature_degc >= HOT_DEGC:
         hot = f"{_named(name)} is hot: {status.temperature_degc:.0f} degrees C."
         said.append(Finding(name, "warning", hot, "cool it, or lower its picture rate"))
+    supply = machine.power(None if status.throttled_bits is UNSET else status.throttled_bits)
+    if supply.level == "warning":
+        said.append(Finding(name, "warning", f"{_named(name)}: {supply.text}.", supply.advice))
+    if status.battery_cell_v is not UNSET and machine.charge(status.battery_cell_v) == "warning":
+        low = f"The battery of {name} is low: {status.battery_cell_v:.2f} V in each cell."
+        said.append(Finding(name, "warning", low, machine.CHARGE))
     if status.clock_offset_s is not UNSET and abs(status.clock_offset_s) > CLOCK_OFF_S:
         off = f"The clock of {name} is off by {status.clock_offset_s * 1e3:.1f} ms."
         said.append(Finding(name, "warning", off, "wait for chrony, or check the time server"))

@@ -1,11 +1,14 @@
-"""Rejection reasons and durations in words."""
+"""Rejection reasons, a node's power and durations in words."""
 
 from __future__ import annotations
 
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.health import UNDERVOLTAGE_NOW
+from buddyline.protocol.messages import NodeStatus
 from buddyline.tools.health.finding import Finding
+from msgspec import UNSET
 
 # Each rejection reason of the protocol: what it means, and what may help.
 REASONS: Final[dict[str, tuple[str, str]]] = {
@@ -40,9 +43,27 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
 }
 
 
+LOADS: Final = {"no_pictures": "load lowered: no pictures", "half_rate": "load lowered: no pictures, half the rate"}
+
+
 def reason_words(reason: str) -> str:
     """Return a rejection's reason in words."""
     return REASONS.get(reason, (reason.replace("_", " "), ""))[0]
+
+
+def power_words(status: NodeStatus) -> list[str]:
+    """Return what a node's status says of heat, supply, battery and load, as far as it is known."""
+    said = []
+    if status.temperature_degc is not UNSET:
+        said.append(f"{status.temperature_degc:.0f} °C")
+    if status.battery_v is not UNSET:
+        current = "" if status.battery_a is UNSET else f", {status.battery_a:.2f} A"
+        said.append(f"battery {status.battery_v:.1f} V{current}")
+    if status.throttled_bits is not UNSET and status.throttled_bits & UNDERVOLTAGE_NOW:
+        said.append("undervoltage")
+    if status.load is not UNSET and status.load != "full":
+        said.append(LOADS[status.load])
+    return said
 
 
 def sentence(finding: Finding, now_ns: int) -> str:

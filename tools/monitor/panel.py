@@ -13,7 +13,7 @@ from buddyline.tools.draw.marks import marked_svg
 from buddyline.tools.estimate import Estimate, known, range_sigma_m, sigma_m
 from buddyline.tools.health.finding import Finding
 from buddyline.tools.health.pair import findings
-from buddyline.tools.health.words import duration_words, reason_words, sentence
+from buddyline.tools.health.words import duration_words, power_words, reason_words, sentence
 from buddyline.tools.monitor.picture import NodePicture, PairPicture
 from msgspec import UNSET
 
@@ -137,8 +137,7 @@ def _node_facts(node: NodePicture, now_ns: int) -> list[str]:
     facts += [f"{count} {cause.replace('_', ' ')} dropped" for cause, count in status.drops.items() if count]
     if status.disk_free_bytes is not UNSET:
         facts.append(f"{status.disk_free_bytes / 1e9:.1f} GB free")
-    if status.temperature_degc is not UNSET:
-        facts.append(f"{status.temperature_degc:.0f} °C")
+    facts += power_words(status)
     if status.clock_offset_s is not UNSET:
         facts.append(f"clock {status.clock_offset_s * 1e3:+.1f} ms")
     return facts

@@ -245,6 +245,7 @@ def test_a_whole_node_takes_marks_by_the_button_and_shows_its_status(tmp_path, m
         until(lambda: service.status_message and service.status_message.lights_seen is not UNSET)
         pin(LEAK).drive_high()
         until(lambda: "LEAK" in service.status_message.problem)
+        assert service.status_message.leak is True
     finally:
         assert service.close() == 0
     assert not pin(LIGHTS).state
