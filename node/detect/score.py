@@ -23,11 +23,11 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     "stands_out": (-1.0, 3.5),
     "texture": (-0.7, 2.0),
     "height": (-3.0, 1.7),
-    "out_of_round": (0.0, 1.0),
-    "open": (0.0, 1.0),
     "size": (-0.5, 4.0),
     "plateau": (-1.2, 0.0),
     "halo": (0.0, 1.2),
+    "out_of_round": (0.0, 1.0),
+    "open": (0.0, 1.0),
     "unclipped": (0.0, 0.3),
     "ground": (0.0, 1.5),
 }
@@ -70,14 +70,15 @@ def features(lights: Lights, focal_px: float, textured: float) -> Floats:
     found = np.empty((len(lights.peak), len(NAMES)), np.float32)
     r90, _, r50, r30 = np.maximum(lights.radii_px.T, 0.3)
     alone = found[:, 1 : 1 + len(LIMITS)]
-    alone[:, 0] = np.log(np.maximum(lights.outstanding, 0.1))
-    alone[:, 1] = np.log(textured)
-    alone[:, 2] = np.log(np.maximum(lights.height, 1.0) / 50.0)
-    alone[:, 3] = lights.roundest - 1.0
-    alone[:, 4] = lights.open_share
-    alone[:, 5] = np.log(r50 * (FOCAL_PX / focal_px))
-    alone[:, 6] = np.log(r90 / r50)
-    alone[:, 7] = np.log(r30 / r50)
+    alone[:, 0] = np.maximum(lights.outstanding, 0.1)
+    alone[:, 1] = textured
+    alone[:, 2] = np.maximum(lights.height, 1.0) / 50.0
+    alone[:, 3] = r50 * (FOCAL_PX / focal_px)
+    alone[:, 4] = r90 / r50
+    alone[:, 5] = r30 / r50
+    np.log(alone[:, :6], out=alone[:, :6])
+    alone[:, 6] = lights.roundest - 1.0
+    alone[:, 7] = lights.open_share
     alone[:, 8] = (240.0 - lights.peak) / 100.0
     alone[:, 9] = (lights.peak - lights.height) / 100.0
     np.minimum(np.maximum(alone, _LOWEST, out=alone), _HIGHEST, out=alone)

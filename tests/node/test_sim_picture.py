@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from buddyline.node.sim.glow import FAR_PX, GLARE, NEAR_PX, SCALE_PX, GlowRenderer, phase, stands_out
 from buddyline.node.sim.rig import SPILL
-from buddyline.node.sim.scenario import ENVIRONMENTS, WATERS, Scenario
+from buddyline.node.sim.scenario import DECOYS, ENVIRONMENTS, WATERS, Scenario
 from buddyline.node.sim.scene import Lamp
 from buddyline.node.sim.world import World
+from buddyline.protocol.errors import BuddylineError
 
 S_NS = 1_000_000_000
 BEAM_RAD = np.radians(12)
@@ -189,3 +190,24 @@ def test_noise_is_new_in_every_frame_and_of_the_stated_size():
     one, two = (world.render("a", k * S_NS).astype(float) for k in range(2))
     difference = (one - two)[:60, :300]
     assert np.std(difference) == pytest.approx(np.sqrt(2) * WATERS["lake"].noise, rel=0.15)
+
+
+@pytest.mark.parametrize("decoy", DECOYS)
+def test_each_decoy_is_drawn_and_moves_no_lamp(decoy):
+    plain, fooled = (World(Scenario("cavern", seed=4, decoys=decoys, **QUIET)) for decoys in ((), (decoy,)))
+    changed = cv2.absdiff(plain.render("a", S_NS), fooled.render("a", S_NS)).max(axis=2) > 20
+    assert changed.sum() > 15
+    assert plain.light_truth("a", S_NS, 0) == fooled.light_truth("a", S_NS, 0)
+    assert np.array_equal(fooled.render("a", S_NS), fooled.render("a", S_NS))
+
+
+def test_an_unknown_decoy_is_refused():
+    with pytest.raises(BuddylineError, match="decoys: 'fish'"):
+        Scenario(decoys=("fish",))
+
+
+def test_the_lamps_of_anyone_are_told_and_reflections_are_not():
+    world = World(Scenario("basin", seed=4, other_lamps=2, interruptions=False))
+    assert len(world.lamps("a", S_NS)) <= 4
+    own = world.light_truth("a", S_NS, 0).lights
+    assert {(x.u_px, x.v_px, x.visible) for x in own} <= set(world.lamps("a", S_NS))
