@@ -15,7 +15,7 @@ SLOW_S: Final = 0.4
 _NOISE_SPAN_S: Final = 2.0
 # Below these densities what the model leaves out rules: scale, cross-axis, interpolation, shake.
 GYRO_FLOOR: Final = 1e-4
-ACCEL_FLOOR: Final = 2e-3
+ACCEL_FLOOR: Final = 1e-3
 
 
 class Samples:

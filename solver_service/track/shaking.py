@@ -22,7 +22,7 @@ SHAKEN_S: Final = 0.1
 # much as FIRST residuals.
 SHAKE_RAD: Final = 5e-4
 SHOVE_MPS: Final = 5e-3
-FIRST: Final = 2.0
+FIRST: Final = 0.5
 LEAST: Final = np.log(np.array((5e-5, 5e-5, 5e-4)) ** 2)
 MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
 # A picture's say is halved after 200 more, some ten seconds: shaking comes and goes.

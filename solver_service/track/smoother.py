@@ -31,7 +31,8 @@ class Path:
 
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
     covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
-    attitude by shaking, of both by their samples, and of the velocity by shaking. oldest (SIZE, SIZE): the whole
+    attitude by shaking, of both by their samples, and of the velocity by shaking. without (N, 2): which node had no
+    inertial unit in that step. oldest (SIZE, SIZE): the whole
     covariance at the first step.
     """
 
@@ -42,6 +43,7 @@ class Path:
     states: Floats
     halves: Floats
     drawn: Floats
+    without: NDArray[np.bool_]
     looks: Sequence[tuple[Look, ...]]
     oldest: Floats
 
@@ -84,6 +86,7 @@ def smoothed(steps: Trail) -> Path:
         states=np.empty((count, ROW)),
         halves=np.empty((count, len(_UPPER[0]))),
         drawn=np.empty((count, 5)),
+        without=np.empty((count, 2), dtype=bool),
         looks=looks,
         oldest=np.empty((SIZE, SIZE)),
     )
@@ -101,8 +104,10 @@ def smoothed(steps: Trail) -> Path:
             P = 0.5 * (P + P.T)
             state = step.after.plus(error)
         path.t_s[k], path.light_s[k], path.lights[k] = step.t_s, step.light_s, step.lights
-        path.rates_radps[k], path.states[k], path.halves[k] = step.rates_radps, state.to_row(), P[_BLOCK_UPPER]
-        path.drawn[k] = _drawn(step.Q)
+        path.states[k], path.halves[k] = state.to_row(), P[_BLOCK_UPPER]
+        path.drawn[k], path.without[k] = _drawn(step.Q)
+        # Without a unit the turn rate is estimated, too (strapdown.process_noise).
+        path.rates_radps[k] = np.where(path.without[k][:, None], -state.gyro_bias_radps, step.rates_radps)
         looks[k] = step.looks
         later = step
     if count:
@@ -155,24 +160,28 @@ def _rows_together(path: Path, times_s: Floats, stamps_ns: Sequence[int]) -> lis
     )
 
 
-def _drawn(Q: Floats) -> Floats:
-    """Give a row of Path.drawn for a step's Q (MOVING, MOVING)."""
+def _drawn(Q: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Give a row of Path.drawn and of Path.without for a step's Q (MOVING, MOVING)."""
     of = np.diag(Q)[[PHI[0].start, PHI[1].start, V_.start, SHAKE[0].start, SHAKE[1].start, SHOVE.start]]
     # Without a unit its shaking is drawn, but moves nothing.
-    shaken = np.minimum(of[:3], of[3:])
-    return np.array((*shaken[:2], *(of[:2] - shaken[:2]), shaken[2]))
+    moved = np.array([Q[PHI[0], SHAKE[0]].any(), Q[PHI[1], SHAKE[1]].any(), Q[V_, SHOVE].any()])
+    shaken = np.where(moved, of[3:], 0.0)
+    without = np.asarray(~moved[:2] & (of[:2] > 0.0))
+    return np.array((*shaken[:2], *(of[:2] - shaken[:2]), shaken[2])), without
 
 
 def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, share: Floats) -> Floats:
     """Give what states between two steps may be off by, whatever is known at both, (M, C, C) of COLUMNS.
 
-    share (M,): of the span that has passed since the first. Of what noise of density q does in a step h, white noise
-    leaves s (h - s) / h^2, shaking (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2. Shaking does no
-    more than what the interpolation takes from the rates at both ends, which are shaken too.
+    share (M,): of the span that has passed since the first. Of what noise does in a step h, white noise leaves
+    s (h - s) / h^2, a walk of the turn rate the cube of that, and shaking
+    (1 - e^(-2 s / t)) (1 - e^(-2 (h - s) / t)) / (1 - e^(-2 h / t))^2, but no more than what the interpolation takes
+    from the rates at both ends, which are shaken too.
     """
     gone = [-np.expm1(-2.0 * passed * span_s / SHAKEN_S) for passed in (share, 1.0 - share, np.ones_like(share))]
     shaken = path.drawn[two] * (gone[0] * gone[1] / gone[2] ** 2)[:, None]
-    white = path.drawn[two, 2:4] * (share * (1.0 - share))[:, None]
+    left = (share * (1.0 - share))[:, None]
+    white = path.drawn[two, 2:4] * np.where(path.without[two], left**3, left)
     slopes = span_s**2 * ((share * (1.0 - share) ** 2) ** 2 + (share**2 * (1.0 - share)) ** 2)
     most = slopes[:, None] * path.swings()[two]
     variances = np.zeros((len(two), NAV))

@@ -15,7 +15,7 @@ from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals
 from buddyline.solver_service.track.smoother import Path
-from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, SIZE, State
+from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, PHI, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
 from buddyline.solver_service.track.trail import Look, Step
 
@@ -30,6 +30,10 @@ MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
 WITHOUT_RAD: Final = 0.03
+# Beyond this chi^2 (3 degrees of freedom, a chance of 0.01) a node without a unit is taken to have begun to turn, by
+# at most so much: a head turned by 45 degrees in a second speeds up by 4 rad/s^2.
+STARTLED: Final = 11.3
+MOST_GAP_RATE: Final = 4.0
 # How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
 # 0.7 of its sigma in half a second.
 WANDER_PER_ROOT_S: Final = 1.0
@@ -95,7 +99,9 @@ class TrackSteps(TrackIntake):
         span_s = t_s - estimate.t_s
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)
-        Q, walk, shaken = process_noise(after, parts, self._noises(t_s), estimate.shaking.variances, span_s)
+        a, b = self._noises(t_s)
+        noises = self._startled(estimate, after, F, 0, a, t_s), self._startled(estimate, after, F, 1, b, t_s)
+        Q, walk, shaken = process_noise(after, parts, noises, estimate.shaking.variances, span_s)
         onward = F[:, :MOVING]
         estimate.shaken = onward @ estimate.shaken @ onward.T + shaken
         for node, part in enumerate(parts):
@@ -108,6 +114,27 @@ class TrackSteps(TrackIntake):
         estimate.state, estimate.t_s = after, t_s
         estimate.rates_radps = np.stack((parts[0].rate_radps, parts[1].rate_radps))
         return F, Q, walk
+
+    def _startled(self, estimate: Estimate, after: State, F: Floats, node: int, noise: Noise, to_s: float) -> Noise:
+        """Return the noise of a step to to_s; more of it where a node without a unit turns otherwise than it did.
+
+        A diver who looks away turns within tenths of a second as he has not for minutes: attitude messages say so.
+        """
+        near = self._turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] else None
+        if near is None:
+            return noise
+        R_level_camera, variances = near
+        y = anchors.attitude_residual(after, node, R_level_camera)[0] - after.mount_rad[node]
+        H = F[PHI[node]].copy()
+        H[:, MOUNT[node]] += np.eye(3)
+        span_s = to_s - estimate.t_s
+        walks = (noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)
+        S = H @ estimate.covariance @ H.T + np.diag(np.square(walks) * span_s)
+        S += noise.gap_rate_radps**2 * span_s**3 / 3.0 * np.eye(3) + (R_level_camera * variances) @ R_level_camera.T
+        if float(y @ np.linalg.solve(S, y)) < STARTLED:
+            return noise
+        rate = math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3)
+        return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, min(rate, MOST_GAP_RATE)))
 
     def _step(self, estimate: Estimate, t_s: float, sight: Sight | None) -> None:
         """Bring an estimate to t_s, by ticks where that is long, and update it."""

@@ -43,7 +43,8 @@ class Noise:
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
     gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
     gyro's bias, and of the attitude filter's own error, which stands in place of the mount (by its stated sigmas,
-    where it states any).
+    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk. Good units walk by a fifth of it, units
+    that fins shake and water cools by twice as much: too steady a bias is worse than too loose a one (docs/track.md).
     """
 
     gyro_rad: float
@@ -53,8 +54,8 @@ class Noise:
     gap_rate_radps: float = 0.15
     gap_tilt_rad: float = 0.03
     gap_heading_rad: float = 0.012
-    gyro_bias_radps: float = 4e-4
-    accel_bias_mps2: float = 6e-3
+    gyro_bias_radps: float = 2.5e-4
+    accel_bias_mps2: float = 4e-3
 
     def scaled(self, unrest: float) -> Noise:
         """Return the same with the guessed motion's densities times unrest."""
