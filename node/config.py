@@ -213,6 +213,11 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         """Time between triggers."""
         return round(1e9 / self.rate_hz)
 
+    @property
+    def uses_i2c(self) -> bool:
+        """Whether sensors or a battery gauge are on the I2C bus."""
+        return self.sensors.name == "i2c" or self.power.battery != "none"
+
     def earth_field(self, stamp_ns: int) -> EarthField | None:
         """Return the Earth's field at sensors.position_deg; None if that is not given."""
         position_deg = self.sensors.position_deg
@@ -239,9 +244,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
 
     def check_pins(self) -> None:
         """Raise ConfigError for a pin with two uses."""
-        used = {
-            number: "the I2C bus" for number in I2C_PINS.get(self.sensors.i2c_bus, ()) if self.sensors.name == "i2c"
-        }
+        used = {number: "the I2C bus" for number in I2C_PINS.get(self.sensors.i2c_bus, ()) if self.uses_i2c}
         for name, number in self.panel.pins.items():
             if number in used:
                 raise ConfigError(f"panel.{name} = {number}: this pin is in use by {used[number]}")

@@ -165,7 +165,7 @@ def _source(args: argparse.Namespace) -> UnitSource:
 
         node = load_node_config(config)
         groups = ["video"] if node.camera.name == "picamera2" else []
-        groups += ["i2c"] if node.sensors.name == "i2c" else []
+        groups += ["i2c"] if node.uses_i2c else []
         groups += ["gpio"] if node.panel.pins else []
         directory = Path(node.record.directory)
         writable = (directory,) if directory.is_absolute() and not directory.is_relative_to(STATE) else ()

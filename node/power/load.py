@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from buddyline.protocol.health import POWER_NOW
+from buddyline.protocol.health import POWER_NOW, SLOWED_NOW
 
 LoadLevel = Literal["full", "no_pictures", "half_rate"]
 LEVELS: Final[tuple[LoadLevel, ...]] = ("full", "no_pictures", "half_rate")
@@ -17,6 +17,8 @@ WORDS: Final[dict[LoadLevel, str]] = {
 # The firmware slows a Pi down at 80 degrees. Each step is taken this early, and taken back so much lower.
 STEPS_DEGC: Final = (74.0, 77.0)
 BACK_DEGC: Final = 6.0
+# The firmware's bits of now that ask for each step. A weak supply alone, often a thin cable, costs pictures only.
+STEPS_BITS: Final = (POWER_NOW, SLOWED_NOW)
 # A sealed housing's processor takes some ten seconds to follow its load, and minutes to cool.
 LOWER_AFTER_S: Final = 15.0
 RAISE_AFTER_S: Final = 120.0
@@ -34,16 +36,15 @@ class NodeLoad:
 def next_load(load: NodeLoad, temperature_degc: float | None, throttled_bits: int | None, now_s: float) -> NodeLoad:
     """Return the load from now on: one step at a time, down after LOWER_AFTER_S, up after RAISE_AFTER_S of calm.
 
-    Any of the firmware's bits of the present (undervoltage, slowed down) asks for the next step down.
+    Each step has a temperature and bits of the firmware that ask for it. None: not known, asks for nothing.
     """
     index = LEVELS.index(load.level)
-    weak = bool((throttled_bits or 0) & POWER_NOW)
-    hot_degc = -300.0 if temperature_degc is None else temperature_degc
-    if index < len(STEPS_DEGC) and (weak or hot_degc >= STEPS_DEGC[index]):
+    bits, degc = throttled_bits or 0, -273.0 if temperature_degc is None else temperature_degc
+    if index < len(STEPS_DEGC) and (bits & STEPS_BITS[index] or degc >= STEPS_DEGC[index]):
         if now_s - load.since_s < LOWER_AFTER_S:
             return NodeLoad(load.level, load.since_s)
         return NodeLoad(LEVELS[index + 1], now_s)
-    if index == 0 or weak or hot_degc > STEPS_DEGC[index - 1] - BACK_DEGC:
+    if index == 0 or bits & STEPS_BITS[index - 1] or degc > STEPS_DEGC[index - 1] - BACK_DEGC:
         return NodeLoad(load.level, load.since_s)
     calm_s = now_s if load.calm_s is None else load.calm_s
     if now_s - calm_s >= RAISE_AFTER_S:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -75,7 +76,9 @@ class GpioPin:
     def _drop(self) -> None:
         device, self._device, self._value = self._device, None, False
         if device is not None:
-            device.close()
+            # A pin that has failed may fail again here, with an error of its back end.
+            with contextlib.suppress(Exception):
+                device.close()
 
 
 class PanelPins:

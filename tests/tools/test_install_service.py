@@ -73,6 +73,13 @@ def test_a_unit_has_only_the_groups_of_its_devices(root, tmp_path, camera, senso
     assert ("PrivateDevices" in unit) == (groups is None)
 
 
+def test_a_panel_and_a_battery_gauge_need_their_groups(root, tmp_path):
+    config = node_config(tmp_path, "simulated", "simulated")
+    config.write_text(config.read_text() + '\n[panel]\nlamp_pin = 27\n[power]\nbattery = "ina219"\n')
+    assert install("node", "--config", config, "--root", root, "--run-as", "pi") == 0
+    assert settings(unit_of(root, "node"))["SupplementaryGroups"] == "i2c gpio"
+
+
 @pytest.mark.parametrize(
     ("directory", "writable"),
     [("/var/lib/buddyline/dives", None), ("dives", None), ("/data/my dives", '"-/data/my dives"')],

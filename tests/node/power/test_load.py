@@ -56,10 +56,18 @@ def test_a_short_calm_does_not_add_up():
     assert levels(passed) == ["no_pictures"]
 
 
-@pytest.mark.parametrize("bits", [UNDERVOLTAGE_NOW, 1 << 1, 1 << 2, 1 << 3])
-def test_the_firmwares_bits_of_the_present_lower_it_too_and_keep_it_there(bits):
+@pytest.mark.parametrize("bits", [1 << 1, 1 << 2, 1 << 3, UNDERVOLTAGE_NOW | 1 << 2])
+def test_a_processor_that_is_slowed_down_lowers_it_too_and_keeps_it_there(bits):
     assert levels(follow(40.0, 60, bits=bits)) == ["no_pictures", "half_rate"]
     assert levels(follow(40.0, 600, bits=bits, load=NodeLoad("half_rate", 0.0))) == ["half_rate"]
+
+
+def test_undervoltage_alone_costs_pictures_and_no_triggers():
+    assert levels(follow(40.0, 600, bits=UNDERVOLTAGE_NOW)) == ["no_pictures"]
+    assert levels(follow(40.0, 600, bits=UNDERVOLTAGE_NOW, load=NodeLoad("half_rate", 0.0))) == [
+        "half_rate",
+        "no_pictures",
+    ]
 
 
 @pytest.mark.parametrize("bits", [None, 0, SLOWED_SINCE_START])

@@ -5,7 +5,7 @@ import threading
 import time
 
 import pytest
-from buddyline.node.config import CameraConfig, NodeConfig, PanelConfig, RecordConfig, load_node_config
+from buddyline.node.config import CameraConfig, NodeConfig, PanelConfig, PowerConfig, RecordConfig, load_node_config
 from buddyline.node.service import NodeService
 from buddyline.node.underwater import pins as pins_module
 from buddyline.node.underwater.codes import PanelAction
@@ -16,6 +16,7 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import Mark, NodeStatus
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from tests.processes import PATIENCE_S, free_endpoint
 
@@ -183,6 +184,39 @@ def test_a_pin_in_use_is_named_the_others_work_and_it_is_tried_again(monkeypatch
     rig.panel.close()
 
 
+class Unsteady:
+    """A device that fails at will, also when it is closed."""
+
+    fails = False
+
+    @property
+    def value(self):
+        if self.fails:
+            raise RuntimeError("GPIO busy")
+        return 1
+
+    def close(self):
+        if self.fails:
+            raise RuntimeError("GPIO busy")
+
+
+def test_a_pin_that_fails_in_mid_dive_is_opened_again(monkeypatch):
+    monkeypatch.setattr(pins_module, "RETRY_S", 0.0)
+    devices = []
+
+    def opens(number):
+        devices.append(Unsteady())
+        return devices[-1]
+
+    pin = pins_module.GpioPin("button", BUTTON, opens)
+    assert pin.read() is True
+    devices[0].fails = True
+    assert pin.read() is None
+    assert pin.problem == f"GPIO {BUTTON}: GPIO busy"
+    assert pin.read() is True
+    assert (pin.problem, len(devices)) == ("", 2)
+
+
 def test_a_machine_without_gpiozero_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gpiozero", None)
     rig = Rig()
@@ -198,6 +232,13 @@ def test_without_pins_there_is_no_panel_and_all_is_on():
     panel.run(threading.Event())
     assert (panel.takes_pictures, panel.leak, panel.problems) == (True, None, [])
     panel.close()
+
+
+def test_a_gauges_bus_has_its_pins_too():
+    config = NodeConfig(node="a", panel=PanelConfig(lamp_pin=2))
+    config.check_pins()
+    with pytest.raises(ConfigError, match=r"panel\.lamp_pin = 2: .*I2C"):
+        replace(config, power=PowerConfig(battery="ads1115")).check_pins()
 
 
 @pytest.mark.parametrize(
