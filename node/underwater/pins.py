@@ -59,6 +59,10 @@ class GpioPin:
             value = act(self._device)
         except ModuleNotFoundError as error:
             self._health.update(f"needs {error.name}: make install EXTRAS=pi")
+        except ImportError:  # gpiozero's BadPinFactory; its warnings on stderr have the reasons
+            self._health.update(
+                f"GPIO {self._number}: cannot be reached: apt install python3-lgpio, and the group gpio"
+            )
         except Exception as error:  # the back ends of gpiozero have errors of their own, such as lgpio.error
             self._drop()
             self._health.update(f"GPIO {self._number}: {error or type(error).__name__}")

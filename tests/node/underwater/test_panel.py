@@ -226,6 +226,17 @@ def test_a_machine_without_gpiozero_says_what_to_install(monkeypatch):
     rig.panel.close()
 
 
+def test_a_machine_without_gpio_says_what_it_needs():
+    from gpiozero.exc import BadPinFactory
+
+    def opens(number):
+        raise BadPinFactory("Unable to load any default pin factory!")
+
+    pin = pins_module.GpioPin("lamp", LAMP, opens)
+    pin.write(True)
+    assert pin.problem == f"GPIO {LAMP}: cannot be reached: apt install python3-lgpio, and the group gpio"
+
+
 def test_without_pins_there_is_no_panel_and_all_is_on():
     config = NodeConfig(node="a")
     panel = Panel(config, ManualClock(7), print)
