@@ -110,7 +110,9 @@ class Samples:
         Shaking is gone from it, motion is SLOW_S / 2 late in it.
         """
         first, stop = np.searchsorted(self.times_s, (time_s - SLOW_S, min(time_s + 0.1 * SLOW_S, known_s)))
-        return np.asarray(self._values[first:stop, 3:].mean(axis=0)) if stop > first else None
+        if stop <= first:
+            return None
+        return np.asarray(np.add.reduce(self._values[first:stop, 3:]) / (stop - first))
 
     def near(self, time_s: float, known_s: float) -> bool:
         """Whether there is a sample within a second before time_s, nothing later than known_s looked at."""

@@ -278,11 +278,12 @@ class TrackSteps(TrackIntake):
         before = estimate.covariance
         error, estimate.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
         estimate.state = estimate.state.plus(error)
-        moving = H[:, :MOVING]
+        # Depth and attitudes take little of what shaking adds: it is not worth their time.
         if teaches:
+            moving = H[:, :MOVING]
             estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
-        rest = _STILL - before[:MOVING] @ H.T @ S_inverse @ moving
-        estimate.shaken = rest @ estimate.shaken @ rest.T
+            rest = _STILL - before[:MOVING] @ H.T @ S_inverse @ moving
+            estimate.shaken = rest @ estimate.shaken @ rest.T
         return chi2
 
     def _take_depth(self, estimate: Estimate, t_s: float) -> None:
