@@ -89,7 +89,12 @@ def detect(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("inputs", nargs="+", metavar="IMAGE|FOLDER|DIVE.mcap", help="pictures, or a dive of pictures")
     parser.add_argument("-o", "--output", metavar="OUT.mcap", help="write a dive log instead of JSON lines")
     parser.add_argument("--draw", metavar="DIR", help="a new folder for the pictures with their candidates marked")
-    parser.add_argument("--environment", default="auto", choices=PRESETS, help="of the paper's method; default: auto")
+    parser.add_argument(
+        "--environment",
+        default="auto",
+        choices=PRESETS,
+        help="of the paper's method; `source` adapts by itself; default: auto",
+    )
     _method(parser)
     parser.add_argument(
         "--mask",

@@ -44,15 +44,13 @@ __all__ = [
 def values_of(method: str, environment: str = "auto") -> Mapping[str, float]:
     """Return the values of a detector that can be overridden, as they are by default.
 
-    Raises BuddylineError for an unknown method, and for an environment that the method does not know: only `paper`
-    has values for each environment, and with `auto` takes one of these; the others adapt, and know `auto` alone.
+    Raises BuddylineError for an unknown method or environment. Only `paper` has values for each environment, and with
+    `auto` takes one of these; the others adapt to each picture, and take any environment alike.
     """
+    known = _known_environment(environment)
     if method == "paper":
-        known = _known_environment(environment)
         return paper.PRESETS["night_reef" if known == "auto" else known]
     values: Mapping[str, float] = _factory(method).VALUES
-    if environment != "auto":
-        raise BuddylineError(f"environment {_known_environment(environment)!r}: {method} adapts by itself; give `auto`")
     return values
 
 

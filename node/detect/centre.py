@@ -32,21 +32,21 @@ _CLIPPED = 249.0
 _FOCAL_OF_MODEL_PX = 904.0
 _ROBUST_SD = 3.0
 
-# The terms of sigma. Their squares are the variances that explain the errors on rendered pictures best (maximum
-# likelihood, all terms at once): dives kept for tuning, of another renderer, and this project's
-# simulator at 0 to -5 stops. The simulator's clean pictures alone would have a floor of 0.015 px.
-_FLOOR_PX: Final = 0.04
+# The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
+# kept for tuning), those of the border by maximum likelihood. They are a little larger than those errors, because
+# other waters will differ. Larger ones for long and hidden cores explain their errors better, and let glows whose lamp
+# is hidden pass for lights that fit.
+_FLOOR_PX: Final = 0.045
 # Share of the core's radius: the rim of the clipped core is not a perfect circle.
 _RIM_SHARE: Final = 0.008
-_NOISE_SCALE: Final = 0.1
-_GROWTH_SCALE: Final = 0.6
+_NOISE_SCALE: Final = 0.155
+_GROWTH_SCALE: Final = 0.45
 # Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
 # core, whose estimate is less certain.
-_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.3, 0.65
-# Share of the core's radius, per unit of elongation above 1, and per unit above _LONG besides: such a core is partly
-# hidden, or two lights merge in it.
-_ELONGATED_SHARE, _LONG_SHARE, _LONG = 0.16, 0.3, 1.3
-_SCATTERED_PX: Final = 1.5
+_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
+# Share of the core's radius, per unit of elongation above 1: a long core is partly hidden, or two lights merge in it.
+_ELONGATED_SHARE: Final = 0.15
+_SCATTERED_PX: Final = 2.0
 # Where the border cuts a light: px, and share of the core's radius. It counts from this many radii plus px inward.
 _CUT_PX, _CUT_SHARE = 0.33, 0.15
 _CUT_RADII, _CUT_FROM_PX = 1.2, 4.0
@@ -96,9 +96,7 @@ def locate_sources(
     share = holds * (1.0 - lights.scattered)
     own_px2 = _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
     variance_px2 = np.where(holds, own_px2, prior_px2)
-    elongated = lights.core_elongation
-    stretched = _ELONGATED_SHARE * (elongated - 1.0) + _LONG_SHARE * np.maximum(elongated - _LONG, 0.0)
-    variance_px2 += (stretched * radius_px) ** 2
+    variance_px2 += (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2
     cut = np.maximum(
         1.0 - _to_border(start_px + share[:, None] * moved, image) / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0
     )

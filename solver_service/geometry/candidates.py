@@ -17,8 +17,9 @@ from buddyline.solver_service.geometry.rotation import Floats, Indices
 _MAX_CANDIDATES: Final = 64
 # No detector finds a light's centre better than this.
 _MIN_SIGMA_PX: Final = 0.05
-# A score is a detector's opinion: its log odds count half, and at most 3 either way.
-_SCORE_WEIGHT: Final = 0.5
+# A score is the probability of a lamp, fitted to pictures (node/detect/score.toml): its log odds count, at most 3
+# either way, because no fit knows every water.
+_SCORE_WEIGHT: Final = 1.0
 _LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
 # The instant of the pose is the mean of both stamps: half their difference before the one, and after the other.
 _LATER: Final[Floats] = np.array([[1.0], [-1.0]])

@@ -1,4 +1,4 @@
-"""The sigma of located lights against their errors, in another renderer's dives, to which nothing was fitted."""
+"""The sigma of located lights against their errors, in the dives of another renderer, whose figures were looked at."""
 
 from pathlib import Path
 from typing import NamedTuple
