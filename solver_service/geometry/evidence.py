@@ -80,7 +80,9 @@ def log_false_light(log_fit: Floats, clutter: Floats) -> Floats:
     log_fit: of both gaps, as `log_gaps` gives it. clutter: candidates that chance puts into the variance of the lights'
     positions. The other three predict where a light stands; a false candidate falls there by chance.
     """
-    odds: Floats = np.log(_FALSE_LIGHT * clutter) - log_fit
+    # Without another candidate none can stand in.
+    with np.errstate(divide="ignore"):
+        odds: Floats = np.log(_FALSE_LIGHT * clutter) - log_fit
     return odds
 
 
