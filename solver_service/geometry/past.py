@@ -19,7 +19,9 @@ from buddyline.solver_service.geometry.sensors import off_rad
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
-# A prediction from earlier fixes is wrong this often, and where it is right it is believed this much at most (log).
+# A prediction from earlier fixes is wrong this often. Where it is right, the pose that it foretells gains this much at
+# most (log), and a pose beside it less. With one bound for all poses near it, a false light close to the right one gained
+# as much as that.
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
 # A matrix (9,) times this: half its antisymmetric part as a vector, and its trace.
@@ -50,7 +52,7 @@ class Motion:
 class Prediction:
     """Where earlier fixes put this one: T_a_b, and the information (6, 6) of a pose against it.
 
-    log_gain: of a pose that is exactly there, against chance.
+    log_gain: of a pose that is exactly there, against chance, at most _MAX_LOG_PRIOR.
     """
 
     T_a_b: SE3
@@ -73,16 +75,16 @@ class Prediction:
         log_chance = -math.log(range2**1.5 * spread * rigs.views_sr2 * 2.0 * math.pi)
         log_area = 0.5 * float(np.linalg.slogdet(total)[1]) + 3.0 * math.log(2.0 * math.pi)
         information: Floats = np.asarray(np.linalg.inv(total), dtype=np.float64)
-        return Prediction(prior.T_a_b, information, -log_area - log_chance)
+        return Prediction(prior.T_a_b, information, min(-log_area - log_chance, _MAX_LOG_PRIOR))
 
     def weigh(self, T_a_b: SE3) -> Floats:
-        """Weigh K poses: a bounded gain and a bounded loss (log)."""
+        """Weigh K poses between the cameras' frames: give a bounded gain and a bounded loss (log), (K,)."""
         # Of the turn from there: the sine about each axis, and the trace; half a turn away the sine is short again.
         turned = (T_a_b.R @ self.T_a_b.R.T).reshape(-1, 9) @ _SINES_AND_TRACE
         off = np.concatenate((T_a_b.t_m - self.T_a_b.t_m, turned[:, :3]), axis=1)
         chi2 = inner(off @ self.information, off)
         near = turned[:, 3] > 1.0
-        log_gain = np.where(near, np.minimum(self.log_gain - 0.5 * chi2, _MAX_LOG_PRIOR), -np.inf)
+        log_gain = np.where(near, self.log_gain - 0.5 * chi2, -np.inf)
         gain: Floats = np.log(_PRIOR_WRONG + (1.0 - _PRIOR_WRONG) * np.exp(log_gain))
         return gain
 
