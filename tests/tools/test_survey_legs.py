@@ -171,7 +171,7 @@ def test_a_rest_with_rejected_poses_is_reported(messages):
 
 def test_a_compass_that_states_more_may_wander_more_while_its_node_rests():
     course = world.line(np.random.default_rng(11), 8)
-    found = derived(world.dive(course, np.random.default_rng(11), world.Flaws(compass_deg=5.0), rest_s=6.0, swim_s=2.0))
+    found = derived(world.dive(course, np.random.default_rng(11), world.Flaws(compass_deg=5.0), rest_s=8.0, swim_s=2.0))
     assert len(found.legs) == 8
 
 
