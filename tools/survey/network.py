@@ -148,36 +148,18 @@ def adjust(project: Project) -> Adjusted:
     Declination and convergence are each leg's own, so on a map grid a first adjustment gives the places of the legs.
     """
     grid = grid_of(project)
-    first = _adjust(project, grid, {})
-    if grid.declination is None or (grid.projection is None and grid.declination.stated_rad is not None):
-        return first
-    return _adjust(project, grid, {name: one.position_m for name, one in first.positions.items()})
-
-
-def _adjust(project: Project, grid: Grid, at: dict[str, Floats]) -> Adjusted:
-    """Adjust with each leg's north that of its place; at: where stations are, as far as known."""
-    depths = held_depths(project)
     fixed = fixed_points(project, grid)
     stations = {name for leg in project.leg for name in (leg.from_, leg.to)}
     for name in fixed:
         if name not in stations:
             raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
     read_m = adjust_gauges(project.leg).corrected_m
-    lines: list[Line] = []
-    left_out: list[tuple[Leg, str]] = []
-    for number, leg in enumerate(project.leg):
-        edit = project.edit_of(leg)
-        turn_rad = grid.turn_rad(leg_date(project, leg), at.get(leg.from_))
-        line = line_of(leg, project, turn_rad, depths, read_m=read_m.get(number))
-        if edit is not None and not edit.use:
-            left_out.append((leg, f"taken out{': ' + edit.note if edit.note else ''}"))
-        elif line is None or leg.from_ == leg.to:
-            left_out.append((leg, "no bearing, or no slope that its distance allows"))
-        else:
-            lines.append(line)
-    reached = _tree(lines, fixed)
-    left_out += [(line.leg, "not connected to a fixed point") for line in lines if line.leg.from_ not in reached]
-    lines = [line for line in lines if line.leg.from_ in reached]
+    at: dict[str, Floats] = {}
+    lines, left_out = _lines(project, grid, fixed, read_m, at)
+    if grid.projection is not None or (grid.declination is not None and grid.declination.stated_rad is None):
+        first = _Solution(lines, fixed)
+        at = {name: first.x[i] for name, i in first.at.items()}
+        lines, left_out = _lines(project, grid, fixed, read_m, at)
     solution = _Solution(lines, fixed)
     common_rad = math.radians(project.settings.compass_common_deg)
     positions = solution.positions(common_rad)
@@ -210,6 +192,31 @@ def _adjust(project: Project, grid: Grid, at: dict[str, Floats]) -> Adjusted:
         solution.proposals(common_rad, gauge_sigma_m),
         left_out,
     )
+
+
+def _lines(
+    project: Project, grid: Grid, fixed: Fixed, read_m: dict[int, tuple[float, float]], at: dict[str, Floats]
+) -> tuple[list[Line], list[tuple[Leg, str]]]:
+    """Return the legs that are connected to a fixed point, as lines, and the others, each with the reason.
+
+    read_m: both depths of a leg by its number, as `Gauges.corrected_m`. at: where stations are, as far as known.
+    """
+    depths = held_depths(project)
+    lines: list[Line] = []
+    left_out: list[tuple[Leg, str]] = []
+    for number, leg in enumerate(project.leg):
+        edit = project.edit_of(leg)
+        turn_rad = grid.turn_rad(leg_date(project, leg), at.get(leg.from_))
+        line = line_of(leg, project, turn_rad, depths, read_m=read_m.get(number))
+        if edit is not None and not edit.use:
+            left_out.append((leg, f"taken out{': ' + edit.note if edit.note else ''}"))
+        elif line is None or leg.from_ == leg.to:
+            left_out.append((leg, "no bearing, or no slope that its distance allows"))
+        else:
+            lines.append(line)
+    reached = _tree(lines, fixed)
+    left_out += [(line.leg, "not connected to a fixed point") for line in lines if line.leg.from_ not in reached]
+    return [line for line in lines if line.leg.from_ in reached], left_out
 
 
 class _Solution:
