@@ -19,6 +19,13 @@ from buddyline.protocol.messages import Message
 log = logging.getLogger(__name__)
 
 
+def runtime_directory() -> Path | None:
+    """Return systemd's RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/buddyline; None if there is neither."""
+    given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+    session = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(given) if given else Path(session) / "buddyline" if session else None
+
+
 class StatusFile:
     """The status file of one service. A write error is logged once, and the service continues."""
 
@@ -28,17 +35,11 @@ class StatusFile:
 
     @classmethod
     def of(cls, name: str, configured: str = "") -> StatusFile | None:
-        """Return the file of a service: the configured path, else `<name>.json` in the runtime directory.
-
-        The runtime directory is systemd's RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/buddyline. None if there is neither.
-        """
+        """Return the file of a service: the configured path, else `<name>.json` in the runtime directory, if any."""
         if configured:
             return cls(Path(configured))
-        given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-        if given:
-            return cls(Path(given) / f"{name}.json")
-        session = os.environ.get("XDG_RUNTIME_DIR")
-        return cls(Path(session) / "buddyline" / f"{name}.json") if session else None
+        directory = runtime_directory()
+        return cls(directory / f"{name}.json") if directory is not None else None
 
     def write(self, service: str, problems: list[str], status: Message | None) -> None:
         """Replace the file's content with the present state."""

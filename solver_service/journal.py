@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.messages import Message, Rejected, RelativePose
+from buddyline.protocol.statusfile import runtime_directory
 from buddyline.solver_service.answered import Outcome
 
 log = logging.getLogger(__name__)
@@ -38,9 +39,7 @@ class Journal:
     @classmethod
     def of(cls, endpoint: str, namespace: str = "") -> Journal | None:
         """Return the journal of the solver at a hub, in the runtime directory; None if there is none."""
-        given = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
-        session = os.environ.get("XDG_RUNTIME_DIR")
-        directory = Path(given) if given else Path(session) / "buddyline" if session else None
+        directory = runtime_directory()
         name = re.sub(r"[^A-Za-z0-9]+", "-", f"{endpoint} {namespace}").strip("-")
         return None if directory is None else cls(directory / f"solver-{name}.answered")
 

@@ -13,7 +13,7 @@ from buddyline.protocol.errors import BuddylineError
 
 COMMAND: Final = "buddyline experiments -o report/ --readme README.md"
 # The solver's modules that pass poses on and do not decide them.
-_CARRY: Final = ("__main__.py", "answered.py", "health.py", "service.py")
+_CARRY: Final = ("__main__.py", "answered.py", "health.py", "journal.py", "service.py")
 _MARKED: Final = re.compile(r"<!-- accuracy of code ([0-9a-f]{16}),.*?-->\n(.*?)<!-- end of accuracy -->\n", re.DOTALL)
 
 
