@@ -74,30 +74,27 @@ class ZenohPublisher(Publisher):
     ) -> None:
         super().__init__(topic, key, cap)
         self._declare = declare
-        self._declare_lock = threading.Lock()
+        # A publisher cannot be undeclared while another thread, such as a device's, is in its put.
+        self._lock = threading.Lock()
         self._publisher = declare()
 
     def _send(self, payload: bytes) -> bool:
-        if self._publisher is None:
-            with self._declare_lock:
-                self._publisher = self._publisher or self._declare()
-        if self._publisher is None:
-            return False
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError:
-            # The session may be closed while a device's thread publishes.
+        with self._lock:
             if self._closed:
                 return False
-            raise
+            self._publisher = self._publisher or self._declare()
+            if self._publisher is None:
+                return False
+            self._publisher.put(payload)
         return True
 
     def close(self) -> None:
         """Stop publishing; the cache is dropped."""
-        if not self._closed:
-            self._closed = True
-            if self._publisher is not None:
-                self._publisher.undeclare()  # type: ignore[no-untyped-call]
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                if self._publisher is not None:
+                    self._publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 class ZenohBus(Bus):

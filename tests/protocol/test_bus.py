@@ -396,6 +396,29 @@ def test_a_closed_bus_sends_nothing_and_leaves_no_thread(client: Connect) -> Non
     assert set(threading.enumerate()) - before == set()
 
 
+def test_a_bus_closes_while_another_thread_publishes(client: Connect) -> None:
+    """As a device's thread does."""
+    bus = client()
+    publisher = bus.publisher(topics.DEPTH, "a")
+    begun, ended, sent_after_close = threading.Event(), threading.Event(), []
+
+    def publish() -> None:
+        while not ended.is_set():
+            publisher.put_bytes(b"{}")
+            begun.set()
+        sent_after_close.append(publisher.put_bytes(b"{}"))
+
+    device = threading.Thread(target=publish, daemon=True)
+    device.start()
+    assert begun.wait(PATIENCE_S)
+    try:
+        bus.close()
+    finally:
+        ended.set()
+        device.join(PATIENCE_S)
+    assert sent_after_close == [False]
+
+
 def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(200):
