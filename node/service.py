@@ -11,11 +11,10 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import msgspec
-import numpy as np
 from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
 from buddyline.node.capture.cores import is_likely
@@ -27,6 +26,7 @@ from buddyline.node.detect import make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.drivers.samples import AbsentError
 from buddyline.node.guide import Guide
+from buddyline.node.hub_connection import HubConnection
 from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
@@ -38,14 +38,10 @@ from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import Candidates, NodeInfo, NodeStatus
 from buddyline.protocol.pictures import PictureLog
 from buddyline.protocol.recorder import Recorder, RecordError
-from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import CANDIDATES, EXPECT, IMU, TOPICS
+from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS
 from msgspec import UNSET
-
-if TYPE_CHECKING:
-    from buddyline.protocol.bus import Bus
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +51,6 @@ HANGS_S: Final = 5.0
 FIRST_S: Final = 15.0
 LOOK_S: Final = 0.2
 REPORT_S: Final = 1.0
-REFUSED_RETRY_S: Final = 5.0
 
 
 class NodeService(Service):
@@ -89,7 +84,6 @@ class NodeService(Service):
         self._frames: deque[Frame] = deque()
         self._frame_ready = threading.Condition()
         self._capturing = True
-        self._problems: dict[str, str] = {}
         self._sent_before: Counter[str] = Counter()
         self._status_s = self._started_s
         self._clock_watch = ClockWatch(self.clock.now_ns)
@@ -122,6 +116,7 @@ class NodeService(Service):
         self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
+        self._hub = HubConnection(self.config, self.outlet, self._clock_sync, self._guide)
         self.outlet.send(info)
 
     def _open_or_await_camera(self) -> CameraDevice:
@@ -171,7 +166,7 @@ class NodeService(Service):
             self.spawn(source.name, lambda source=source: self._read(source))  # type: ignore[misc]
         self.spawn("status", self._report)
         self.spawn("clock", lambda: self._clock_sync.follow_chrony(self.stop))
-        self.spawn("bus", self._connect)
+        self.spawn("bus", lambda: self._hub.run(self.stop, lambda error: self.fail("bus", error)))
         self.spawn("power", lambda: self._power.run(self.stop))
         self.spawn("panel", lambda: self._panel.run(self.stop))
 
@@ -278,52 +273,6 @@ class NodeService(Service):
             for message in messages:
                 self.outlet.send(message)
 
-    def _connect(self) -> None:
-        bus = self._open_bus()
-        if bus is None:
-            return
-        with bus:
-            bus.on_failure(lambda error: self.fail("bus", error))
-            if bus.is_alive(f"node/{self.config.node}"):
-                raise ConfigError(
-                    f"another node with the id {self.config.node!r} is on the bus at {self.config.connect}; "
-                    "give each its own `node`"
-                )
-            bus.declare_alive(f"node/{self.config.node}")
-            self.outlet.connect(bus)
-            log.info("%s: connected to %s", self.name, self.config.connect)
-            if self._guide is not None:
-                # Without history: an old expectation says nothing of the next picture.
-                bus.subscribe(EXPECT.key(self.config.node), self._guide.hear, history=False)
-                bus.watch_alive(self._guide.saw_process)
-            self._clock_sync.exchange(bus, self.outlet, self.stop)
-            self.outlet.disconnect()
-
-    def _open_bus(self) -> Bus | None:
-        """Connect, again and again where the hub and this node do not accept each other: the log goes on anyway."""
-        from buddyline.protocol.zenoh_bus import connect
-
-        while not self.stop.is_set():
-            try:
-                if self.config.tls is not None:
-                    check_identity(self.config.tls, node_name(self.config.node))
-                bus = connect(
-                    self.config.connect,
-                    namespace=self.config.namespace or None,
-                    stop=self.stop,
-                    on_wait=lambda text: log.info("%s: %s; recording meanwhile", self.name, text),
-                    tls=self.config.tls,
-                )
-            except (SecurityError, RefusedError) as error:
-                if self._problems.get("bus") != str(error):
-                    log.error("%s: not on the bus: %s; recording meanwhile", self.name, error)
-                self._problems["bus"] = str(error)
-                self.stop.wait(REFUSED_RETRY_S)
-            else:
-                self._problems.pop("bus", None)
-                return bus
-        return None
-
     def _report(self) -> None:
         report_s = time.monotonic() + REPORT_S
         while not self.stop.wait(LOOK_S):
@@ -362,7 +311,7 @@ class NodeService(Service):
             drops=self._all_drops(),
             ages_s=ages_s,
             trigger_residual_s=UNSET if residual_s is None else residual_s,
-            detect_s=float(np.median(self._detect_s)) if self._detect_s else UNSET,
+            detect_s=statistics.median(list(self._detect_s)) if self._detect_s else UNSET,
             disk_free_bytes=UNSET if free_bytes is None else free_bytes,
             bus_retries=max(retries) if retries else UNSET,
             lights_seen=statistics.median_low(list(self._lights_seen)) if self._lights_seen else UNSET,
@@ -402,7 +351,8 @@ class NodeService(Service):
         problems = [
             f"{name}: nothing for {age_s:.1f} s" for name, age_s in ages_s.items() if age_s > self._stale_after_s(name)
         ]
-        problems += [f"{name}: {text}" for name, text in list(self._problems.items())]
+        if self._hub.problem:
+            problems.append(f"bus: {self._hub.problem}")
         devices = [("camera", self.camera.problem), *((source.name, source.problem) for source in self.sources)]
         problems += [f"{name}: {text}" for name, text in devices if text]
         if self._exposure is not None and self._exposure.problem:

@@ -1,0 +1,90 @@
+"""A node's connection to the hub: tried until it works, and kept until the node stops."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from buddyline.node.clock_sync import ClockSync
+from buddyline.node.config import NodeConfig
+from buddyline.node.guide import Guide
+from buddyline.node.outlet import Outlet
+from buddyline.protocol.config import ConfigError
+from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
+from buddyline.protocol.topics import EXPECT
+
+if TYPE_CHECKING:
+    from buddyline.protocol.bus import Bus
+
+log = logging.getLogger(__name__)
+
+REFUSED_RETRY_S: Final = 5.0
+
+
+class HubConnection:
+    """Runs in a thread of its own, while the node records anyway.
+
+    guide: takes the solver's expectations; None: they are not used. problem: why hub and node do not accept each other;
+    "" if they do, and while no hub answers.
+    """
+
+    def __init__(self, config: NodeConfig, outlet: Outlet, clock_sync: ClockSync, guide: Guide | None) -> None:
+        self.problem = ""
+        self._config = config
+        self._outlet = outlet
+        self._clock_sync = clock_sync
+        self._guide = guide
+
+    def run(self, stop: threading.Event, on_failure: Callable[[BaseException], None]) -> None:
+        """Connect, and stay connected until stop is set. on_failure: takes an error of the bus's own threads.
+
+        Raises ConfigError if another node has this node's id.
+        """
+        config = self._config
+        bus = self._open(stop)
+        if bus is None:
+            return
+        with bus:
+            bus.on_failure(on_failure)
+            if bus.is_alive(f"node/{config.node}"):
+                raise ConfigError(
+                    f"another node with the id {config.node!r} is on the bus at {config.connect}; "
+                    "give each its own `node`"
+                )
+            bus.declare_alive(f"node/{config.node}")
+            self._outlet.connect(bus)
+            log.info("node %s: connected to %s", config.node, config.connect)
+            if self._guide is not None:
+                # Without history: an old expectation says nothing of the next picture.
+                bus.subscribe(EXPECT.key(config.node), self._guide.hear, history=False)
+                bus.watch_alive(self._guide.saw_process)
+            self._clock_sync.exchange(bus, self._outlet, stop)
+            self._outlet.disconnect()
+
+    def _open(self, stop: threading.Event) -> Bus | None:
+        """Return the open bus; None once stop is set. A refusal may be mended at the hub, so it is tried again."""
+        from buddyline.protocol.zenoh_bus import connect
+
+        config = self._config
+        while not stop.is_set():
+            try:
+                if config.tls is not None:
+                    check_identity(config.tls, node_name(config.node))
+                bus = connect(
+                    config.connect,
+                    namespace=config.namespace or None,
+                    stop=stop,
+                    on_wait=lambda text: log.info("node %s: %s; recording meanwhile", config.node, text),
+                    tls=config.tls,
+                )
+            except (SecurityError, RefusedError) as error:
+                if self.problem != str(error):
+                    log.error("node %s: not on the bus: %s; recording meanwhile", config.node, error)
+                self.problem = str(error)
+                stop.wait(REFUSED_RETRY_S)
+            else:
+                self.problem = ""
+                return bus
+        return None
