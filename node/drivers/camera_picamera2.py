@@ -1,8 +1,8 @@
 """A Raspberry Pi camera through picamera2 (0.3.25 or later): free-running, one frame a trigger.
 
 The camera is never started or stopped for a picture, and its own automatics are off. The frame duration is changed to
-lock the phase; exposure time and gain follow the node's plan, where they are not fixed. Such a change rides on the next
-request and shows about buffers + 3 frames later: each frame's metadata tell what it had.
+lock the phase; exposure time and gain follow the node's plan, where they are not fixed. Such a change is sent with
+the next request and takes effect about buffers + 3 frames later: each frame's metadata say what it had.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ class Picamera2Camera:
         camera.set_controls(self._controls(camera.camera_controls, model))
 
     def _first_exposure(self, known: dict[str, tuple[Any, Any, Any]], model: str) -> Exposure:
-        """Return the exposure to start with, and make what changes it, unless it is fixed."""
+        """Return the exposure to start with; where it is not fixed, make the control that changes it."""
         if self._config.exposure_us is not None:
             return Exposure(self._config.exposure_us * 1000, self._config.gain)
         exposures = self._exposure_range(known, model)
@@ -213,9 +213,9 @@ class Picamera2Camera:
         line_ns = self._timer.line_ns
         # A whole number of lines, whether the camera truncates or rounds.
         lines = max(round(exposure.time_ns / line_ns), 1)
-        free = self.exposure_control is None
+        fixed = self.exposure_control is None
         return {
-            "ExposureTime": exposure.time_ns // 1000 if free else round((lines + 0.25) * line_ns / 1000),
+            "ExposureTime": exposure.time_ns // 1000 if fixed else round((lines + 0.25) * line_ns / 1000),
             "AnalogueGain": exposure.gain,
         }
 
@@ -318,7 +318,7 @@ class Picamera2Camera:
             log.info("camera: a line takes %.3f us", self._timer.line_ns / 1000)
 
     def _ask_exposure(self, stamp_ns: int, exposure: Exposure) -> int:
-        """Ask for the exposure of a frame to come; return the time of this frame that the phase's lock is to see."""
+        """Ask for the exposure of a frame to come; return this frame's time as the phase lock is to see it."""
         control = self.exposure_control
         if control is None:
             return stamp_ns
