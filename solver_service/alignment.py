@@ -3,23 +3,25 @@
 If the clocks disagree, A and B take their pictures of one trigger at different instants. While the pair moves, the
 range gap and the twist gap then follow the motion. Each fix gives two linear equations for the offset, with the
 motion taken from the fixes around it. A constant bias of each gap, from calibration errors, is estimated too.
+
+Why track/clocks.py does not replace it: the track finds the offset more exactly, but only where both nodes have an
+inertial unit, and a solver can run without a track. docs/track.md has the figures of both.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.geometry.closed_form import closed_form
-from buddyline.solver_service.geometry.rotation import quat_to_matrix, rotation_exp
+from buddyline.solver_service.geometry.closed_form import closed_form, wrap
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix, Rig
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
 
 STEP_S: Final = 1e-3
 MIN_FIXES: Final = 20
@@ -52,7 +54,6 @@ class _Sighting:
 
     time_s: float
     fix: Fix
-    R_a_b: Floats
     known_s: float
     sigma_rad: tuple[float, float]
 
@@ -83,7 +84,7 @@ class ClockAlignment:
         if self._window and not 0 < time_s - self._window[-1].time_s <= HALF_WINDOW_S:
             self._window.clear()
             self._next = 0
-        self._window.append(_Sighting(time_s, fix, quat_to_matrix(fix.q_a_b_xyzw), known_s, sigma_rad))
+        self._window.append(_Sighting(time_s, fix, known_s, sigma_rad))
         while self._window[self._next].time_s <= time_s - HALF_WINDOW_S:
             centre = self._window[self._next]
             rates = self._rates(centre)
@@ -105,21 +106,7 @@ class ClockAlignment:
         times_s = np.array([s.time_s - centre.time_s for s in near])
         if (times_s < 0).sum() < MIN_NEIGHBOURS or (times_s > 0).sum() < MIN_NEIGHBOURS:
             return None
-        turned = np.array([s.R_a_b for s in near]) @ centre.R_a_b.T
-        # Within the window a pair turns by some tenths of a radian, too much to take the sine for the angle.
-        sine = (
-            np.stack(
-                (
-                    turned[:, 2, 1] - turned[:, 1, 2],
-                    turned[:, 0, 2] - turned[:, 2, 0],
-                    turned[:, 1, 0] - turned[:, 0, 1],
-                ),
-                axis=1,
-            )
-            / 2
-        )
-        angle = np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
-        moved = np.hstack((np.array([s.fix.t_a_b_m for s in near]), sine / np.sinc(angle / np.pi)[:, None]))
+        moved = _poses(near).minus(centre.fix.T_a_b)
         powers = times_s[:, None] ** np.arange(4 if len(near) >= MIN_FOR_CUBIC else 2)
         return np.asarray(np.linalg.lstsq(powers, moved, rcond=None)[0][1])
 
@@ -128,18 +115,17 @@ class ClockAlignment:
         if not self._moving or self._rigs is None:
             return
         sightings = [sighting for sighting, _ in self._moving]
-        t = np.array([s.fix.t_a_b_m for s in sightings])
-        R = np.array([s.R_a_b for s in sightings])
+        T_a_b = _poses(sightings)
         rates = np.array([rates for _, rates in self._moving])
         self._moving.clear()
-        expected, slopes, apart_rad = gap_slopes(t, R, rates, self._rigs)
+        expected, slopes, apart_rad = gap_slopes(T_a_b, rates, self._rigs)
         sigma_rad = np.array([s.sigma_rad for s in sightings]).T
         sd = math.sqrt(2.0) * np.hypot(sigma_rad[0] / apart_rad[0], sigma_rad[1] / apart_rad[1])
         seen = np.array(
             [[math.log(s.fix.range_a_m / s.fix.range_b_m) for s in sightings], [s.fix.twist_gap_rad for s in sightings]]
         )
         known_s = np.array([s.known_s for s in sightings])
-        value = _wrapped(seen - expected) - slopes * known_s
+        value = wrap(seen - expected) - slopes * known_s
         kind = np.repeat([[0.0], [1.0]], len(sightings), axis=1)
         self._rows.append(np.stack((kind, slopes, value, np.stack((sd, sd)))).reshape(4, -1))
         while sum(batch.shape[1] for batch in self._rows) > MAX_EQUATIONS:
@@ -167,32 +153,30 @@ class ClockAlignment:
         return ClockOffset(float(solution[0]), sigma_s, len(kind) // 2)
 
 
-def gap_slopes(t_a_b_m: Floats, R_a_b: Floats, rates: Floats, rigs: tuple[Rig, Rig]) -> tuple[Floats, Floats, Floats]:
+def gap_slopes(T_a_b: SE3, rates: Floats, rigs: tuple[Rig, Rig]) -> tuple[Floats, Floats, Floats]:
     """Return the gaps of noise-free views, their derivatives by the delay of B's view, and the angles between lights.
 
-    t_a_b_m: (K, 3), R_a_b: (K, 3, 3), rates: (K, 6), m/s and rad/s. All three results are (2, K). Gaps: the log of the
+    T_a_b: K poses, rates: (K, 6), m/s and rad/s. All three results are (2, K). Gaps: the log of the
     ratio of both ranges, and the twist gap (rad). Derivatives: per s. Angles (alpha): rad, between the bearings of
     B's lights in A's view, and of A's lights in B's view.
     """
-    count = len(t_a_b_m)
+    count = len(T_a_b)
     shifts_s = np.repeat([0.0, -STEP_S, STEP_S], count)[:, None]
-    in_a = np.tile(_bearings(rigs[1].lights_m @ R_a_b.swapaxes(1, 2) + t_a_b_m[:, None]), (3, 1, 1))
-    turned, moved = np.tile(rates[:, 3:], (3, 1)), np.tile(rates[:, :3], (3, 1))
-    R_later = rotation_exp(shifts_s * turned) @ np.tile(R_a_b, (3, 1, 1))
-    t_later = np.tile(t_a_b_m, (3, 1)) + shifts_s * moved
-    in_b = _bearings((rigs[0].lights_m - t_later[:, None]) @ R_later)
+    in_a = np.tile(_bearings(rigs[1].lights_m @ T_a_b.R.swapaxes(1, 2) + T_a_b.t_m[:, None]), (3, 1, 1))
+    later = T_a_b[np.tile(np.arange(count), 3)].retract(shifts_s * np.tile(rates, (3, 1)))
+    in_b = _bearings((rigs[0].lights_m - later.t_m[:, None]) @ later.R)
     # (3 K, 2 lights, 3) of each view into the closed form's (2 views, 3, 3 K) of each light.
     views = np.stack((in_a, in_b)).transpose(2, 0, 3, 1)
     solved = closed_form(views[0], views[1], *rigs)
     gaps = np.stack((np.log(solved.range_m[0] / solved.range_m[1]), solved.twist_gap_rad)).reshape(2, 3, count)
-    slopes = _wrapped(gaps[:, 2] - gaps[:, 1]) / (2 * STEP_S)
+    slopes = wrap(gaps[:, 2] - gaps[:, 1]) / (2 * STEP_S)
     apart = [np.arccos(np.clip((v[:count, 0] * v[:count, 1]).sum(1), -1.0, 1.0)) for v in (in_a, in_b)]
     return gaps[:, 0], slopes, np.array(apart)
 
 
+def _poses(sightings: Sequence[_Sighting]) -> SE3:
+    return SE3(np.array([s.fix.T_a_b.R for s in sightings]), np.array([s.fix.t_a_b_m for s in sightings]))
+
+
 def _bearings(points: Floats) -> Floats:
     return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
-
-
-def _wrapped(angle_rad: Floats) -> Floats:
-    return np.asarray(angle_rad - 2 * np.pi * np.rint(angle_rad / (2 * np.pi)))
