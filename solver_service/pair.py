@@ -80,7 +80,7 @@ class PairSolver:
         The triggers come in increasing order, also from call to call. Their distribution over calls does not change
         the results.
         """
-        # Absurd values give rejections, not numpy's warnings.
+        # Absurd values give rejections, not numpy's warnings, also in the filters that learn from the fixes.
         with np.errstate(all="ignore"):
             return [fix for batch in _batches(matched) for fix in self._solve_batch(batch)]
 

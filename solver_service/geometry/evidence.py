@@ -78,11 +78,10 @@ def log_false_light(log_fit: Floats, clutter: Floats) -> Floats:
     """Give the log odds (M,) that one of four lights is missing and a false candidate stands in for it.
 
     log_fit: of both gaps, as `log_gaps` gives it. clutter: candidates that chance puts into the variance of the lights'
-    positions. The other three predict where a light stands; a false candidate falls there by chance.
+    positions; without any the odds are -inf. The other three predict where a light stands; a false candidate falls
+    there by chance.
     """
-    # Without another candidate none can stand in.
-    with np.errstate(divide="ignore"):
-        odds: Floats = np.log(_FALSE_LIGHT * clutter) - log_fit
+    odds: Floats = np.log(_FALSE_LIGHT * clutter) - log_fit
     return odds
 
 

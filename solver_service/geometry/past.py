@@ -102,7 +102,7 @@ class Past:
     def of(
         prior: Prior | None, heading: Heading | None, bearing_variance: float, rigs: RigPair, settings: Settings
     ) -> Past:
-        """Take a sound prediction, None where there is none, and what is learned of the headings."""
+        """Take the prediction, None where there is none, and what is learned of the headings."""
         prediction = None if prior is None else Prediction.of(prior, bearing_variance, rigs, settings)
         return Past(prediction, heading, prior, settings)
 
@@ -124,10 +124,3 @@ class Past:
             return np.zeros(len(log_heading))
         angle_rad = off_rad(turn, self.heading.offset_rad)
         return weigh_heading(angle_rad, self.heading.variance + variance) - log_heading
-
-
-def is_sound(prior: Prior) -> bool:
-    """Tell whether a prediction has finite values of the right shape."""
-    parts = prior.T_a_b.t_m, prior.T_a_b.R, prior.covariance, prior.rates, prior.rates_covariance
-    finite = math.isfinite(sum(float(part.sum()) for part in parts if part is not None))
-    return finite and prior.covariance.shape == (6, 6)

@@ -1,8 +1,8 @@
 """Triggers: what two nodes saw, and the one pose that explains it, or why there is none.
 
 What pictures and sensors say is worked out for many triggers at once, without the past (`read_triggers`); what earlier
-fixes say is then applied trigger by trigger (`Reading.decide`). Pure functions: the same input gives the same output,
-whatever was solved before or beside it.
+fixes say is then applied trigger by trigger (`TriggerReadings.decide`). Pure functions: the same input gives the same
+output, whatever was solved before or beside it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from buddyline.solver_service.geometry.observation import (
     Settings,
     View,
 )
-from buddyline.solver_service.geometry.past import Past, is_sound
+from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.readings import Read, Readings
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats
@@ -49,7 +49,6 @@ __all__ = [
     "Settings",
     "View",
     "read_triggers",
-    "solve_trigger",
     "solve_triggers",
 ]
 
@@ -70,43 +69,26 @@ _NEGLIGIBLE: Final = 1e-6
 _RIVAL: Final = 6.0
 
 
-def solve_trigger(
-    view_a: View,
-    view_b: View,
-    rig_a: Rig,
-    rig_b: Rig,
-    sensed_a: Sensed,
-    sensed_b: Sensed,
-    settings: Settings,
-    prior: Prior | None = None,
-    heading: Heading | None = None,
-) -> Fix | NoFix:
-    """Find the four lights among both nodes' candidates, and T_a_b from them, or say why there is none.
-
-    prior, heading: what earlier fixes tell of this one, and of the headings.
-    """
-    observed = Observation(view_a, view_b, sensed_a, sensed_b)
-    if prior is not None and not is_sound(prior):
-        prior = None
-    with np.errstate(all="ignore"):
-        return read_triggers([observed], rig_a, rig_b, settings).decide(0, prior, heading)
-
-
 def solve_triggers(
     observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, settings: Settings
 ) -> list[Fix | NoFix]:
     """Solve triggers without a past, all at once."""
-    with np.errstate(all="ignore"):
-        readings = read_triggers(observations, rig_a, rig_b, settings)
-        return [readings.decide(k, None, None) for k in range(len(observations))]
+    readings = read_triggers(observations, rig_a, rig_b, settings)
+    return [readings.decide(k, None, None) for k in range(len(observations))]
 
 
 def read_triggers(observations: Sequence[Observation], rig_a: Rig, rig_b: Rig, settings: Settings) -> TriggerReadings:
     """Work out what the pictures and sensors of some triggers say, without the past."""
     for name, rig in (("A", rig_a), ("B", rig_b)):
         if not rig.usable:
-            return TriggerReadings(None, NoFix("degenerate", f"the lights of {name} are less than 1 mm apart"))
-    return TriggerReadings(_Batched.of(Batch.of(observations, (rig_a, rig_b), settings)))
+            return TriggerReadings(NoFix("degenerate", f"the lights of {name} are less than 1 mm apart"))
+    with _silent():
+        return TriggerReadings(_Batched.of(Batch.of(observations, (rig_a, rig_b), settings)))
+
+
+def _silent() -> np.errstate:
+    """Silence numpy's warnings: absurd values end as infinite or NaN likelihoods, and those as rejections."""
+    return np.errstate(all="ignore")
 
 
 @dataclass(eq=False, slots=True)
@@ -319,13 +301,16 @@ def _spread(weighed: Weighed, k: int, same: NDArray[np.bool_]) -> Floats:
 
 @dataclass(eq=False, slots=True)
 class TriggerReadings:
-    """What the pictures and sensors of some triggers say; or, where the rigs cannot be used, why it says nothing."""
+    """What the pictures and sensors of some triggers say; where the rigs cannot be used, the reason."""
 
-    readings: _Batched | None
-    why: NoFix | None = None
+    readings: _Batched | NoFix
 
     def decide(self, trigger: int, prior: Prior | None, heading: Heading | None, rarity: float = 1.0) -> Fix | NoFix:
-        """Solve one of the triggers with what earlier fixes tell of it, and how rare four lights are."""
-        if self.readings is None:
-            return self.why or NoFix("degenerate", "")
-        return self.readings.decide(trigger, prior, heading, rarity)
+        """Find the four lights of one trigger, and T_a_b from them, or say why there is none.
+
+        prior, heading: what earlier fixes tell of this pose, and of the headings. rarity: as Rarity.factor has it.
+        """
+        if isinstance(self.readings, NoFix):
+            return self.readings
+        with _silent():
+            return self.readings.decide(trigger, prior, heading, rarity)

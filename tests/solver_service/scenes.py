@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.observation import Observation, Sensed, View
 from buddyline.solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, Rig
-from buddyline.solver_service.geometry.trigger import Sensed, View
+from buddyline.solver_service.geometry.trigger import read_triggers
 
 HD = Camera("pinhole", 1640, 1232, 1800.0, 1800.0, 819.5, 615.5)
 IDEAL = Rig(HD, np.array([[-0.44, 0.0, 0.0], [0.44, 0.0, 0.0]]))
@@ -116,6 +117,11 @@ class Scene:
             sigma = np.array((TILT_SIGMA_RAD, TILT_SIGMA_RAD, HEADING_SIGMA_RAD))
             out.append(Sensed(quaternion(R), sigma, depth + noise(DEPTH_SIGMA_M) + wrong[1], DEPTH_SIGMA_M))
         return out
+
+
+def solve_trigger(views, rigs, sensed, settings, prior=None):
+    """Solve one trigger alone; views, rigs, sensed: A's and B's."""
+    return read_triggers([Observation(*views, *sensed)], *rigs, settings).decide(0, prior, None)
 
 
 def view(pixels, sigma_px=1.0, dt_s=0.0, stamp_ns=0, score=math.nan):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
-from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings, solve_trigger
+from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings
 
-from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, view
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, solve_trigger, view
 
 SETTINGS = Settings()
 
@@ -22,7 +22,7 @@ def without(scene, missing, rng, sigma_px=1.0):
 
 
 def solve(scene, views, sensed, settings=SETTINGS, prior=None):
-    return solve_trigger(*views, scene.rig_a, scene.rig_b, *sensed, settings, prior)
+    return solve_trigger(views, (scene.rig_a, scene.rig_b), sensed, settings, prior)
 
 
 def followed(scene, rng, sigma=(0.1, 0.05)):
