@@ -8,6 +8,9 @@ import socket
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -20,6 +23,14 @@ def free_endpoint() -> str:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def until(condition: Callable[[], object], pause_s: float = 0.005) -> None:
+    """Wait for a condition that no event announces; try it again after each pause."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come"
+        time.sleep(pause_s)
 
 
 def buddyline(*words: str, timeout: float = PATIENCE_S, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -111,3 +122,18 @@ class Process:
 
     def __exit__(self, *_: object) -> None:
         self.end()
+
+
+@contextmanager
+def recorded_solver(out: Path) -> Iterator[tuple[str, Process]]:
+    """A hub, a solver and `record` into out; yields the hub's endpoint and the recorder, when all are connected."""
+    endpoint = free_endpoint()
+    with (
+        Process("hub", "--listen", endpoint) as hub,
+        Process("solver", "--connect", endpoint) as solver,
+        Process("record", out, "--connect", endpoint) as record,
+    ):
+        hub.wait_for("listens")
+        solver.wait_for("connected")
+        record.wait_for("into")
+        yield endpoint, record

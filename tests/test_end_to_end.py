@@ -2,7 +2,6 @@
 
 import json
 import signal
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import Rejected, RelativePose
 from buddyline.tools.dives import Dive
 
-from tests.processes import PATIENCE_S, Process, buddyline, free_endpoint
+from tests.processes import Process, buddyline, free_endpoint, recorded_solver, until
 from tests.solver_service.conftest import assert_same_outcomes, dive_messages
 
 
@@ -56,46 +55,25 @@ def two_logs(tmp_path):
 def test_live_playback_gives_the_offline_poses(tmp_path, two_logs, speed):
     offline = buddyline("solve", *two_logs, "-o", tmp_path / "offline.mcap", "--json")
     assert offline.returncode == 0, offline.stderr
-    endpoint = free_endpoint()
-    with (
-        Process("hub", "--listen", endpoint) as hub,
-        Process("solver", "--connect", endpoint) as solver,
-        Process("record", tmp_path / "live.mcap", "--connect", endpoint) as record,
-    ):
-        hub.wait_for("listens")
-        solver.wait_for("connected")
-        record.wait_for("into")
+    recorded = tmp_path / "live.mcap"
+    with recorded_solver(recorded) as (endpoint, record):
         played = buddyline("play", *two_logs, "--connect", endpoint, "--speed", speed)
         assert played.returncode == 0, played.stderr
         expected, _ = results_of(tmp_path / "offline.mcap")
         last = max(expected)
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
-            # The recorder syncs every second. The last trigger's outcome comes before the track up to it.
-            if last in results_of(tmp_path / "live.mcap")[0] and modes_of(tmp_path / "live.mcap", "track_lag"):
-                break
-            solver.wait_for("connected")
-            time.sleep(0.2)
+        # The recorder syncs every second. The last trigger's outcome comes before the track up to it.
+        until(lambda: last in results_of(recorded)[0] and modes_of(recorded, "track_lag"), 0.2)
         assert record.end(signal.SIGINT) == 130
-    live, counts = results_of(tmp_path / "live.mcap")
+    live, counts = results_of(recorded)
     assert sorted(live) == sorted(expected)
     assert_same_outcomes(map(live.get, sorted(live)), map(expected.get, sorted(live)))
     assert set(counts.values()) == {1}
-    with DiveLogReader(tmp_path / "live.mcap") as reader:
+    with DiveLogReader(recorded) as reader:
         assert reader.damage == []
-    with Dive([tmp_path / "live.mcap"]) as dive:
+    with Dive([recorded]) as dive:
         assert sum(1 for _ in dive.messages("imu")) == 2 * 400
-    assert modes_of(tmp_path / "live.mcap", "track") == {"filter"}
-    assert modes_of(tmp_path / "live.mcap", "track_lag") == {"lag"}
-
-
-def wait_until_gone(pids):
-    deadline = time.monotonic() + PATIENCE_S
-    while time.monotonic() < deadline:
-        if not [pid for pid in pids if Path(f"/proc/{pid}").exists()]:
-            return True
-        time.sleep(0.05)
-    return False
+    assert modes_of(recorded, "track") == {"filter"}
+    assert modes_of(recorded, "track_lag") == {"lag"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
@@ -107,7 +85,7 @@ def test_a_killed_demo_leaves_nothing_running(number):
         assert len(children) == 4
         demo.send(number)
         assert demo.wait() in (0, -signal.SIGKILL)
-        assert wait_until_gone(children)
+        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children))
     finally:
         demo.end()
 

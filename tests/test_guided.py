@@ -1,7 +1,6 @@
 """From the solver to the node over Zenoh: the track foretells the lights, and the node is told where to look."""
 
 import threading
-import time
 
 from buddyline.node.guide import Guide
 from buddyline.protocol.clock import ManualClock
@@ -13,7 +12,7 @@ from buddyline.protocol.zenoh_bus.hub import open_hub
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.service import SolverService
 
-from tests.processes import PATIENCE_S, free_endpoint
+from tests.processes import free_endpoint, until
 from tests.solver_service.conftest import dive_messages
 
 
@@ -21,13 +20,6 @@ def join(endpoint):
     bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None)
     assert bus is not None
     return bus
-
-
-def until(condition):
-    deadline_s, pause = time.monotonic() + PATIENCE_S, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline_s, "it did not come"
-        pause.wait(0.01)
 
 
 def newest_ns(service, node, sensor):

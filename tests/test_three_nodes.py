@@ -1,16 +1,14 @@
 """Three nodes, one solver: every pair has its outcomes, offline and with real processes over a hub."""
 
 import json
-import time
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import Candidates, Rejected, RelativePose, SolverStatus
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S, REPOSITORY, Process, buddyline, free_endpoint
+from tests.processes import REPOSITORY, buddyline, recorded_solver, until
 from tests.solver_service.conftest import assert_same_outcomes, dive_messages
 
 PAIRS = {("a", "b"), ("a", "c"), ("b", "c")}
@@ -94,31 +92,15 @@ def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):
         assert len(poses) > 0.8 * len(outcomes[pair])
 
 
-def wait_for_outcomes(path: Path, expected):
-    ends_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < ends_s:
-        found = log_of(path)
-        if all(set(found[0][pair]) >= set(expected[pair]) for pair in PAIRS):
-            return found
-        time.sleep(0.3)
-    raise AssertionError({pair: len(found[0][pair]) for pair in PAIRS})
-
-
 def test_three_nodes_on_one_hub_and_one_solver(three_logs, offline, tmp_path):
     logs, _ = three_logs
     expected, _, _ = log_of(offline[0])
-    endpoint = free_endpoint()
-    with (
-        Process("hub", "--listen", endpoint) as hub,
-        Process("solver", "--connect", endpoint) as solver,
-        Process("record", tmp_path / "live.mcap", "--connect", endpoint) as record,
-    ):
-        hub.wait_for("listens")
-        solver.wait_for("connected")
-        record.wait_for("into")
+    live = tmp_path / "live.mcap"
+    with recorded_solver(live) as (endpoint, _):
         played = buddyline("play", *logs, "--connect", endpoint)
         assert played.returncode == 0, played.stderr
-        outcomes, counts, statuses = wait_for_outcomes(tmp_path / "live.mcap", expected)
+        until(lambda: all(set(log_of(live)[0][pair]) >= set(expected[pair]) for pair in PAIRS), 0.3)
+    outcomes, counts, statuses = log_of(live)
     assert set(counts.values()) == {1}
     assert {(one.node_a, one.node_b) for one in statuses} == PAIRS
     for pair in PAIRS:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,47 +17,12 @@ from buddyline.protocol.local_bus import LocalNetwork, key_matches
 from buddyline.protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
 from buddyline.protocol.zenoh_bus import connect, open_hub
 
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, free_endpoint, until
+from tests.protocol.inbox import Inbox
 
 NOW_NS = 1_700_000_000_000_000_000
 
 Connect = Callable[[], Bus]
-
-
-class Inbox:
-    """A handler that keeps its messages; wait_for blocks until there are enough."""
-
-    def __init__(self) -> None:
-        self.received: list[Received] = []
-        self._changed = threading.Condition()
-
-    def __call__(self, received: Received) -> None:
-        with self._changed:
-            self.received.append(received)
-            self._changed.notify_all()
-
-    def wait_for(self, count: int) -> list[Received]:
-        with self._changed:
-            assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S), self.received
-            return list(self.received)
-
-    @property
-    def triggers(self) -> list[int]:
-        return [decode(received.payload, Rejected).trigger for received in self.received]
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition that no event announces."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.002)
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +58,10 @@ def client(request: pytest.FixtureRequest) -> Iterator[Connect]:
 
 def rejected(trigger: int) -> Rejected:
     return Rejected(node_a="a", node_b="b", stamp_ns=trigger, trigger=trigger, reason="late")
+
+
+def triggers(inbox: Inbox) -> list[int]:
+    return [decode(received.payload, Rejected).trigger for received in inbox.received]
 
 
 def status(node: str, uptime_s: float) -> NodeStatus:
@@ -138,7 +106,7 @@ def test_a_publishers_messages_come_in_order_and_once(client: Connect) -> None:
     for trigger in range(500):
         publisher.put(rejected(trigger))
     inbox.wait_for(500)
-    assert inbox.triggers == list(range(500))
+    assert triggers(inbox) == list(range(500))
 
 
 def test_a_late_joiner_gets_the_history_before_new_messages(client: Connect) -> None:
@@ -149,7 +117,7 @@ def test_a_late_joiner_gets_the_history_before_new_messages(client: Connect) -> 
     for trigger in range(100, 150):
         publisher.put(rejected(trigger))
     inbox.wait_for(150)
-    assert inbox.triggers == list(range(150))
+    assert triggers(inbox) == list(range(150))
     assert subscription.missed == 0
 
 
@@ -205,10 +173,10 @@ def test_the_newest_message_is_known_after_its_publisher_is_gone(client: Connect
     assert known() == []
     publishers = [solver.publisher(topics.REJECTED, "gone", end) for end in "hi"]
     # The hub may miss a publisher's first message; subscribers recover it, but the hub's retained copy does not.
-    triggers = iter(range(10_000))
+    numbers = iter(range(10_000))
 
     def all_known() -> bool:
-        trigger = next(triggers)
+        trigger = next(numbers)
         for publisher in publishers:
             publisher.put(rejected(trigger))
         return [trigger for _, trigger in known()] == [trigger, trigger]
@@ -217,7 +185,7 @@ def test_the_newest_message_is_known_after_its_publisher_is_gone(client: Connect
     solver.close()
     newest = known()
     assert [key for key, _ in newest] == [topics.REJECTED.key("gone", end) for end in "hi"]
-    assert newest[0][1] == newest[1][1] == next(triggers) - 1
+    assert newest[0][1] == newest[1][1] == next(numbers) - 1
     assert reader.newest(topics.POSE) == []
 
 
@@ -234,7 +202,7 @@ def test_without_history_only_new_messages_come(client: Connect) -> None:
         publisher.put(rejected(trigger))
         trigger += 1
         time.sleep(0.002)
-    assert min(inbox.triggers) >= 10
+    assert min(triggers(inbox)) >= 10
     assert subscription.missed == 0
 
 
@@ -280,7 +248,7 @@ def test_a_slow_handler_loses_the_oldest_messages_and_they_are_counted(client: C
     until(lambda: subscription.dropped >= 25)
     go_on.set()
     inbox.wait_for(6)
-    assert inbox.triggers == [0, 26, 27, 28, 29, 30]
+    assert triggers(inbox) == [0, 26, 27, 28, 29, 30]
     assert (subscription.dropped, subscription.missed) == (25, 0)
 
 
@@ -424,7 +392,7 @@ def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     for trigger in range(200):
         publisher.put(rejected(trigger))
     client().subscribe("buddyline/pair/a/b/rejected", inbox).close()
-    assert inbox.triggers == list(range(200))
+    assert triggers(inbox) == list(range(200))
 
 
 def test_a_handler_can_publish(client: Connect) -> None:
@@ -441,7 +409,7 @@ def test_a_handler_can_publish(client: Connect) -> None:
         Candidates(node="a", stamp_ns=1, trigger=3, seq=0, boot="x", width_px=640, height_px=480, blobs=[])
     )
     inbox.wait_for(1)
-    assert inbox.triggers == [3]
+    assert triggers(inbox) == [3]
 
 
 @pytest.mark.parametrize(

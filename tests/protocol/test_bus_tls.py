@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,6 +27,7 @@ from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S, Process, buddyline, free_endpoint
+from tests.protocol.inbox import Inbox
 from tests.tools.identities import copy_of, expired, make_keys, tls
 
 
@@ -45,42 +46,20 @@ def join(endpoint: str, identity: Tls | None) -> ZenohBus:
     return bus
 
 
-class Inbox:
-    def __init__(self) -> None:
-        self.keys: list[str] = []
-        self.received: list[Received] = []
-        self._changed = threading.Condition()
-
-    def __call__(self, received: Received) -> None:
-        with self._changed:
-            self.keys.append(received.key)
-            self.received.append(received)
-            self._changed.notify_all()
-
-    def wait_for(self, key: str) -> None:
-        with self._changed:
-            assert self._changed.wait_for(lambda: key in self.keys, PATIENCE_S), self.keys
-
-    def wait_until(self, condition: Callable[[], bool]) -> None:
-        with self._changed:
-            assert self._changed.wait_for(condition, PATIENCE_S), self.received[-20:]
-
-    def payloads(self, key: str) -> list[bytes]:
-        return [received.payload for received in self.received if received.key == key]
+@contextmanager
+def joined(endpoint: str, keys: Path, *names: str) -> Iterator[list[ZenohBus]]:
+    """One client for each of these certificates."""
+    with ExitStack() as clients:
+        yield [clients.enter_context(join(endpoint, tls(keys, name))) for name in names]
 
 
 def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
-        join(endpoint, tls(keys, "node-a")) as a,
-        join(endpoint, tls(keys, "node-b")) as b,
-        join(endpoint, tls(keys, "solver")) as solver,
-        join(endpoint, tls(keys, "viewer")) as viewer,
-        join(endpoint, tls(keys, "surveyor")) as surveyor,
-        join(endpoint, tls(keys, "player")) as player,
-        join(endpoint, tls(keys, "viewer")) as watcher,
+        joined(endpoint, keys, "node-a", "node-b", "solver", "viewer", "surveyor", "player", "viewer") as clients,
     ):
+        a, b, solver, viewer, surveyor, player, watcher = clients
         inbox, alive = Inbox(), Inbox()
         watcher.subscribe(topics.EVERYTHING, inbox)
         watcher.watch_alive(lambda name, here: alive(Received(f"{name} {here}", b"", 0, "")))
@@ -104,7 +83,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
         viewer.declare_alive("solver/any")
         for bus, name in ((a, "node/a"), (b, "node/b"), (solver, "solver/a_b"), (viewer, "viewer/v")):
             bus.declare_alive(name)
-            alive.wait_for(f"{name} True")
+            alive.wait_for_key(f"{name} True")
         said = [
             "buddyline/node/a/depth",
             "buddyline/node/a/mark",
@@ -113,13 +92,13 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
         ]
         said += ["buddyline/node/c/candidates", "buddyline/pair/a/b/pose", "buddyline/pair/a/b/truth"]
         for key in said:
-            inbox.wait_for(key)
+            inbox.wait_for_key(key)
         # Denied messages are not in any history either; allowed ones are.
         late = Inbox()
         with join(endpoint, tls(keys, "viewer")) as latecomer:
             latecomer.subscribe(topics.EVERYTHING, late)
             for key in said:
-                late.wait_for(key)
+                late.wait_for_key(key)
         assert sorted(inbox.keys) == said
         assert sorted(late.keys) == said
         assert sorted(set(alive.keys)) == [f"{n} True" for n in ("node/a", "node/b", "solver/a_b", "viewer/v")]
@@ -137,9 +116,7 @@ def test_a_node_removed_from_the_hubs_list_can_neither_publish_nor_read(keys: Pa
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"])),
-        join(endpoint, tls(keys, "node-a")) as a,
-        join(endpoint, tls(keys, "node-b")) as shut_out,
-        join(endpoint, tls(keys, "viewer")) as viewer,
+        joined(endpoint, keys, "node-a", "node-b", "viewer") as (a, shut_out, viewer),
     ):
         inbox, nothing = Inbox(), Inbox()
         viewer.subscribe(topics.EVERYTHING, inbox)
@@ -147,7 +124,7 @@ def test_a_node_removed_from_the_hubs_list_can_neither_publish_nor_read(keys: Pa
         for bus, node in ((shut_out, "b"), (a, "a")):
             bus.declare_alive(f"node/{node}")
             assert bus.publisher(topics.CANDIDATES, node).put_bytes(b'{"stamp_ns":1}')
-        inbox.wait_for("buddyline/node/a/candidates")
+        inbox.wait_for_key("buddyline/node/a/candidates")
         assert viewer.is_alive("node/a")
         assert not viewer.is_alive("node/b")
         assert not shut_out.is_alive("node/a")
@@ -160,8 +137,7 @@ def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> No
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a"])),
-        join(endpoint, tls(keys, "node-a")) as a,
-        join(endpoint, tls(keys, "solver")) as solver,
+        joined(endpoint, keys, "node-a", "solver") as (a, solver),
     ):
         publisher = a.publisher(topics.CANDIDATES, "a")
         for k in range(50):
@@ -210,9 +186,7 @@ def test_nobody_can_mute_another_by_stating_its_source(keys: Path, role: str, ow
     endpoint = tls_endpoint()
     with (
         open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
-        join(endpoint, tls(keys, "node-b")) as b,
-        join(endpoint, tls(keys, "solver")) as solver,
-        join(endpoint, tls(keys, "viewer")) as recorder,
+        joined(endpoint, keys, "node-b", "solver", "viewer") as (b, solver, recorder),
     ):
         forger = raw(endpoint, tls(keys, role))
         everything, candidates = Inbox(), Inbox()
@@ -243,7 +217,7 @@ def test_nobody_can_mute_another_by_stating_its_source(keys: Path, role: str, ow
             forger.delete(key, source_info=zenoh.SourceInfo(identity, 70))
         # The forger's words have arrived when a last one without a number has.
         forger.put(f"buddyline/{own}", b'{"stamp_ns":-2}')
-        everything.wait_for(f"buddyline/{own}")
+        everything.wait_for_key(f"buddyline/{own}")
         for _ in range(100):
             say()
         for inbox in (everything, candidates):
@@ -454,26 +428,20 @@ def test_a_refused_node_still_records_and_reports_the_refusal(keys: Path, tmp_pa
 
 def test_who_is_taken_off_the_list_is_out_without_a_restart(keys: Path, tmp_path: Path) -> None:
     """The hub looks at its configuration; whoever stays comes back by itself and loses nothing."""
-    mine = copy_of(keys, tmp_path / "keys")
-    endpoint, config = tls_endpoint(), mine / "hub.toml"
-    text = config.read_text().replace("tls/0.0.0.0:7447", endpoint)
-    config.write_text(text)
-    with Process("hub", "--config", str(config)) as hub:
+    own = copy_of(keys, tmp_path / "own")
+    endpoint, config = at(own, tls_endpoint()), own / "hub.toml"
+    text = config.read_text()
+    with Process("hub", "--config", config) as hub:
         hub.wait_for("listens")
-        with (
-            join(endpoint, tls(keys, "node-a")) as a,
-            join(endpoint, tls(keys, "node-b")) as b,
-            join(endpoint, tls(keys, "solver")) as solver,
-            join(endpoint, tls(keys, "viewer")) as viewer,
-        ):
+        with joined(endpoint, keys, "node-a", "node-b", "solver", "viewer") as (a, b, solver, viewer):
             inbox, shut_out = Inbox(), Inbox()
             solver.subscribe(topics.EVERYTHING, inbox)
             viewer.subscribe(topics.EVERYTHING, shut_out)
             depths = {node: bus.publisher(topics.DEPTH, node) for node, bus in (("a", a), ("b", b))}
             for node in "ab":
                 depths[node].put_bytes(b'{"stamp_ns":0}')
-                inbox.wait_for(f"buddyline/node/{node}/depth")
-                shut_out.wait_for(f"buddyline/node/{node}/depth")
+                inbox.wait_for_key(f"buddyline/node/{node}/depth")
+                shut_out.wait_for_key(f"buddyline/node/{node}/depth")
             config.write_text(text.replace('nodes = ["a", "b"]', 'nodes = ["a"]\nshut_out = ["viewer"]'))
             hub.wait_for("shut out: viewer")
             # A file that is not valid changes nothing.

@@ -10,13 +10,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
 import zenoh
 from buddyline.protocol import topics
-from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.bus import Bus
 from buddyline.protocol.connection import cut_connection
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
@@ -25,7 +25,8 @@ from buddyline.protocol.zenoh_bus import subscription as subscription_module
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, free_endpoint, until
+from tests.protocol.inbox import Inbox
 
 HUB = """
 import sys
@@ -75,48 +76,15 @@ print(json.dumps(result))
 """
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def run_client(endpoint: str, **more: object) -> Bus:
     bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, **more)  # type: ignore[arg-type]
     assert bus is not None
     return bus
 
 
-def numbers(received: list[Received]) -> list[int]:
-    return [int(r.payload) for r in received]
-
-
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition that no event announces."""
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
-class Inbox:
-    def __init__(self) -> None:
-        self.received: list[Received] = []
-        self._changed = threading.Condition()
-
-    def __call__(self, received: Received) -> None:
-        with self._changed:
-            self.received.append(received)
-            self._changed.notify_all()
-
-    def wait_for(self, count: int) -> list[int]:
-        with self._changed:
-            assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S), numbers(self.received)
-            return numbers(self.received)
-
-    def wait_for_sizes(self, count: int) -> None:
-        with self._changed:
-            assert self._changed.wait_for(lambda: len(self.received) >= count, PATIENCE_S)
+def numbers(inbox: Inbox, count: int) -> list[int]:
+    """Wait for so many messages; return the numbers in all."""
+    return [int(received.payload) for received in inbox.wait_for(count)]
 
 
 @contextmanager
@@ -199,7 +167,7 @@ def test_namespaces_keep_two_systems_apart() -> None:
         first.declare_alive("node/a")
         second.publisher(topics.DEPTH, "a").put_bytes(b"2")
         first.publisher(topics.DEPTH, "a").put_bytes(b"1")
-        assert (one.wait_for(1), two.wait_for(1)) == ([1], [2])
+        assert (numbers(one, 1), numbers(two, 1)) == ([1], [2])
         assert one.received[0].key == "buddyline/node/a/depth"
         assert not second.is_alive("node/a")
         poses = first.publisher(topics.POSE, "a", "b")
@@ -254,11 +222,11 @@ def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
             publisher.put_bytes(b"%d" % number)
             late.put_bytes(b"%d" % (number - 50))
     with hub_process(endpoint):
-        assert known.wait_for(300) == list(range(300))
-        assert unheard.wait_for(250) == list(range(250))
+        assert numbers(known, 300) == list(range(300))
+        assert numbers(unheard, 250) == list(range(250))
         assert back.wait(PATIENCE_S)
         publisher.put_bytes(b"300")
-        assert known.wait_for(301)[-1] == 300
+        assert numbers(known, 301)[-1] == 300
         assert (candidates.missed, candidates.dropped, depths.missed) == (0, 0, 0)
         assert changes == [("node/a", True), ("node/a", False), ("node/a", True)]
         node.close()
@@ -278,7 +246,7 @@ def test_an_outage_longer_than_the_cache_is_counted() -> None:
         for number in range(1, 101):
             publisher.put_bytes(b"%d" % number)
     with hub_process(endpoint):
-        assert inbox.wait_for(31) == [0, *range(71, 101)]
+        assert numbers(inbox, 31) == [0, *range(71, 101)]
         assert subscription.missed == 70
         node.close()
         solver.close()
@@ -329,7 +297,7 @@ def test_a_connection_that_receives_nothing_is_cut_and_made_again(
         publisher.put_bytes(b"1")
         hub.send_signal(signal.SIGCONT)
         publisher.put_bytes(b"2")
-        assert inbox.wait_for(3) == [0, 1, 2]
+        assert numbers(inbox, 3) == [0, 1, 2]
 
 
 def test_only_the_given_connection_is_cut() -> None:
@@ -389,10 +357,10 @@ def test_lost_samples_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
 
             for number in (0, 1, 5, 6, 6, 7):
                 send(number)
-            assert inbox.wait_for(5) == [0, 1, 5, 6, 7]
+            assert numbers(inbox, 5) == [0, 1, 5, 6, 7]
             send(3)
             foreign.put("buddyline/node/a/depth", "8")
-            assert inbox.wait_for(6)[-1] == 8
+            assert numbers(inbox, 6)[-1] == 8
         assert subscription.missed == 3
 
 
@@ -410,6 +378,6 @@ def test_the_hub_passes_on_no_payload_above_its_topics_limit(namespace: str | No
             for size in all_sizes:
                 sender.put(f"buddyline/node/a/{name}", b"1" * size)
                 sender.put(f"buddyline/node/a/{name}/@adv/pub/1/1/_", b"1" * (size + 1))
-        inbox.wait_for_sizes(4)
+        inbox.wait_for(4)
         assert sorted(len(received.payload) for received in inbox.received) == [1, 2, depth, image]
         sender.close()  # type: ignore[no-untyped-call]

@@ -3,8 +3,6 @@
 import contextlib
 import errno
 import os
-import threading
-import time
 
 import pytest
 from buddyline.protocol import recorder as module
@@ -16,7 +14,7 @@ from buddyline.protocol.spool import Spool
 from buddyline.tools.dives import Dive
 
 from tests.disks import small_disk
-from tests.processes import PATIENCE_S
+from tests.processes import until
 
 MIB = 1024 * 1024
 PICTURE = "buddyline/node/a/image"
@@ -27,14 +25,6 @@ DEPTH = "buddyline/node/a/depth"
 def quick(monkeypatch):
     monkeypatch.setattr(module, "SYNC_INTERVAL_S", 0.02)
     monkeypatch.setattr(module, "RETRY_S", 0.02)
-
-
-def until(condition):
-    """Wait for a condition that another thread fulfils."""
-    deadline, pause = time.monotonic() + PATIENCE_S, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline
-        pause.wait(0.005)
 
 
 class Sender:
