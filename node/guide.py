@@ -15,12 +15,11 @@ from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 import msgspec
-from buddyline.node.detect import Detection, Region
+from buddyline.node.detect.detection import LIKELY, Detection, Region, is_likely, score_of
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.messages import Expect
 from buddyline.protocol.topics import EXPECT
-from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Received
@@ -42,8 +41,6 @@ FASTEST_PER_S: Final = 20.0
 SIGMAS: Final = 3.0
 # More regions cost as much as the whole picture.
 MAX_REGIONS: Final = 5
-# A candidate from this score on is followed from picture to picture.
-LIKELY: Final = 0.5
 # An expected light is found where a candidate is at least this likely, or has this share of its last score.
 FAINTEST: Final = 0.1
 FADED: Final = 0.5
@@ -89,7 +86,7 @@ class SearchPlan:
         """Return whether a light that should be in its region is in none of its candidates."""
         regions = self.regions or ()
         return any(
-            not any(_score(d) >= least and _within(d, region) for d in found)
+            not any(score_of(d.blob) >= least and _within(d, region) for d in found)
             for region, least in zip(regions, self.anchors, strict=False)
         )
 
@@ -213,13 +210,13 @@ def expected_first(found: list[Detection], foretold: Sequence[Foretold]) -> list
         near = [
             (_log_odds(d) - 0.5 * (_away(d, place.u_px, place.v_px) / place.sigma_px) ** 2, i)
             for i, d in enumerate(found)
-            if i not in first and _score(d) >= LIKELY and _away(d, place.u_px, place.v_px) <= place.radius_px
+            if i not in first and is_likely(d.blob) and _away(d, place.u_px, place.v_px) <= place.radius_px
         ]
         if near:
             first.append(max(near)[1])
     if not first:
         return found
-    best = max(_score(d) for d in found)
+    best = max(score_of(d.blob) for d in found)
     chosen = [replace(found[i], blob=msgspec.structs.replace(found[i].blob, score=best)) for i in sorted(first)]
     return chosen + [d for i, d in enumerate(found) if i not in first]
 
@@ -295,23 +292,19 @@ def _follow(
         if _away(d, one.u_px, one.v_px) <= radius_px
     ]
     if not near:
-        return Followed(blob.u_px, blob.v_px, light_px, _score(d))
+        return Followed(blob.u_px, blob.v_px, light_px, score_of(blob))
     last = before[min(near)[1]]
     rate_pxps = (blob.u_px - last.u_px) / step_s, (blob.v_px - last.v_px) / step_s
-    return Followed(blob.u_px, blob.v_px, light_px if sized else last.light_px, _score(d), rate_pxps, last.pictures + 1)
+    light_px = light_px if sized else last.light_px
+    return Followed(blob.u_px, blob.v_px, light_px, score_of(blob), rate_pxps, last.pictures + 1)
 
 
 def _region(lamp: Followed, radius_px: float) -> Region:
     return Region((lamp.u_px, lamp.v_px), radius_px, lamp.light_px)
 
 
-def _score(d: Detection) -> float:
-    """Return a candidate's score; that of one without a score is a likely one's."""
-    return LIKELY if d.blob.score is UNSET else d.blob.score
-
-
 def _log_odds(d: Detection) -> float:
-    score = min(max(_score(d), 1e-6), 1.0 - 1e-6)
+    score = min(max(score_of(d.blob), 1e-6), 1.0 - 1e-6)
     return math.log(score / (1.0 - score))
 
 

@@ -17,12 +17,12 @@ import cv2
 import msgspec
 from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
-from buddyline.node.capture.cores import is_likely
 from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.clock_watch import ClockWatch
 from buddyline.node.config import NodeConfig
 from buddyline.node.detect import make_detector
+from buddyline.node.detect.detection import is_likely
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.drivers.samples import AbsentError
 from buddyline.node.guide import Guide

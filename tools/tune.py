@@ -20,6 +20,7 @@ from typing import Any, Final, TypeAlias
 import cv2
 import numpy as np
 from buddyline.node.detect import Detector, make_detector, values_of
+from buddyline.node.detect.detection import is_likely
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
@@ -50,7 +51,6 @@ FIRST: Final = 8
 NEAR_WIDTHS: Final = 0.01
 CLOSE_PX: Final = 2.0
 COST_OF_FALSE: Final = 0.01
-LIKELY: Final = 0.5
 ROUNDS: Final = 2
 MASK_BGR: Final = (255, 160, 60)
 BY_TRUTH: Final = "truth"
@@ -191,8 +191,8 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
 
 
 def _with_likely_lights(picture: Picture) -> Picture:
-    blobs = [detection.blob for detection in make_detector(focal_px=picture.focal_px).detect(picture.pixels)]
-    likely = [(b.u_px, b.v_px) for b in blobs if isinstance(b.score, float) and b.score >= LIKELY]
+    found = make_detector(focal_px=picture.focal_px).detect(picture.pixels)
+    likely = [(d.blob.u_px, d.blob.v_px) for d in found if is_likely(d.blob)]
     return replace(picture, lights_px=np.array(likely).reshape(-1, 2))
 
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.node.detect.detection import is_likely
 from buddyline.protocol.messages import Blob
-from msgspec import UNSET
 from numpy.typing import NDArray
 
-LIKELY: Final = 0.5
 LAMPS: Final = 2
 CLIPPED: Final = 250
 CORE_SHARE: Final = 0.5
@@ -38,11 +37,6 @@ class SceneLight:
 
     mean: float
     clipped: float
-
-
-def is_likely(blob: Blob) -> bool:
-    """Return whether a candidate is likely a lamp; one without a score is."""
-    return blob.score is UNSET or blob.score >= LIKELY
 
 
 def choose_lamps(blobs: Sequence[Blob], expected: int = 0) -> list[Blob]:

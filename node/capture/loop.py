@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from buddyline.node.capture.cores import choose_lamps, is_likely, measure_cores, measure_scene
+from buddyline.node.capture.cores import choose_lamps, measure_cores, measure_scene
 from buddyline.node.capture.exposure import ExposurePlan, ExposureRange
 from buddyline.node.capture.flicker import FlickerWatch
 from buddyline.node.capture.lock import ExposureLock, Metering
 from buddyline.node.config import ExposureConfig
+from buddyline.node.detect.detection import is_likely
 from buddyline.node.devices import Frame
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates

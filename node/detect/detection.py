@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob
+from msgspec import UNSET
 from numpy.typing import NDArray
+
+LIKELY: Final = 0.5
+"""From this score on, a candidate is likely a lamp: the score is a probability."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,16 @@ class DetectorFactory(Protocol):
         values: in place of those in VALUES. focal_px: of the pictures; None where it is not known.
         """
         ...
+
+
+def score_of(blob: Blob) -> float:
+    """Return a candidate's score; LIKELY where its detector gives none."""
+    return LIKELY if blob.score is UNSET else blob.score
+
+
+def is_likely(blob: Blob) -> bool:
+    """Return whether a candidate is likely a lamp; one without a score is."""
+    return score_of(blob) >= LIKELY
 
 
 def focal_of(width_px: int) -> float:

@@ -21,13 +21,13 @@ from typing import Any, Final, TypeAlias
 import cv2
 import numpy as np
 from buddyline.node.detect import METHODS, GuidedDetector, Region, make_detector
-from buddyline.node.guide import FLOOR, LIKELY, SIGMAS
+from buddyline.node.detect.detection import is_likely
+from buddyline.node.guide import FLOOR, SIGMAS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.measure.load import load_of
 from buddyline.tools.measure.pictures import simulated_world, spread, stored_pictures, views
 from buddyline.tools.measure.tables import text_table
 from buddyline.tools.measure.turns import by_turns
-from msgspec import UNSET
 from numpy.typing import NDArray
 
 Pictures: TypeAlias = list[NDArray[np.uint8]]
@@ -134,7 +134,7 @@ class _Guided:
             sigma_px = SIGMA * picture.shape[1]
             regions: list[Region] = []
             for d in self._detector.detect(picture):
-                if d.blob.score is not UNSET and d.blob.score >= LIKELY and len(regions) < 2:
+                if is_likely(d.blob) and len(regions) < 2:
                     u, v = np.add((d.blob.u_px, d.blob.v_px), rng.normal(0.0, sigma_px, 2)).tolist()
                     radius_px = SIGMAS * sigma_px + FLOOR * picture.shape[1]
                     regions.append(Region((u, v), radius_px, float(np.sqrt(d.blob.area_px / np.pi))))

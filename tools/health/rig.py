@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from buddyline.node.capture.exposure import Exposure
 from buddyline.node.config import CalibrationConfig
-from buddyline.node.detect import Detection
+from buddyline.node.detect.detection import Detection, is_likely
 from buddyline.node.drivers.samples import STANDARD_GRAVITY_MPS2
 from buddyline.protocol.clock import MS_NS
 from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu, Message, NodeInfo
 from buddyline.tools.health.finding import Finding
 from msgspec import UNSET
 from numpy.typing import NDArray
-
-LIKELY: Final = 0.5
 
 
 def calibration(entered: CalibrationConfig | None, info: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:
@@ -84,7 +80,7 @@ def exposure(state: str | None, had: Exposure | None) -> Finding:
 
 def lights(frames: list[list[Detection]]) -> Finding:
     """Judge whether lights are seen. frames: the detections of each test frame."""
-    counts = [sum(1 for d in found if d.blob.score is UNSET or d.blob.score >= LIKELY) for found in frames]
+    counts = [sum(is_likely(d.blob) for d in found) for found in frames]
     best = max(counts, default=0)
     text = f"{best} likely in a test frame" if best else "none likely in a test frame"
     if best >= 2:
