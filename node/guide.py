@@ -1,8 +1,8 @@
 """Where to look in the next picture: where the solver expects the lights, else where the last pictures had them.
 
-A guided search looks at regions around these places only. It is given up for the whole picture wherever it may hide
-something: at least once a second, when an expected light is not in its region, when an expectation is too wide or of a
-light that the last picture did not show, and when there are too many lamps. So a wrong expectation costs one search.
+A guided search looks at regions around these places only. The whole picture is searched wherever regions may hide
+something: at least once a second; when an expected light is not in its region; when an expectation is too wide; when
+the last picture did not show the expected light; when there are too many lamps. A wrong expectation costs one search.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -26,15 +25,15 @@ if TYPE_CHECKING:
 
 # The whole picture is searched again after this time; at 10 Hz, with jitter, that is before a second is over.
 WHOLE_EVERY_NS: Final = 9 * S_NS // 10
-# How far ahead of a picture an expectation may be: its pictures were lost.
+# An expectation may be for a time this much later than the picture's.
 AHEAD_NS: Final = S_NS // 2
-# Expectations of so many other nodes are kept.
+# The expectations of so many other nodes are kept.
 MAX_SEEN: Final = 4
-# Sizes as shares of the picture's width. A candidate may stand so far beside its light, whatever the expectation.
+# Lengths as shares of the picture's width. A candidate may be so far from its light, however sure the expectation is.
 FLOOR: Final = 0.012
-# Regions wider than this are no guidance: in a wide one some candidate is soon taken for an uncertain track's light.
+# Regions of a larger radius do not guide: in a wide one, another lamp may be taken for the light of an uncertain track.
 WIDEST: Final = 0.08
-# How much a lamp's speed in the picture may change in a second, and what it is before it is known (widths, 1 sd).
+# How much a lamp's speed in the picture may change in a second, and the speed before it is known (widths, 1 sd).
 CHANGE_PER_S2: Final = 0.55
 UNKNOWN_PER_S: Final = 0.1
 FASTEST_PER_S: Final = 20.0
@@ -44,7 +43,7 @@ MAX_REGIONS: Final = 5
 # An expected light is found where a candidate is at least this likely, or has this share of its last score.
 FAINTEST: Final = 0.1
 FADED: Final = 0.5
-# Without a solver, so many lamps have to be in so many pictures in a row.
+# Without a solver, at least STEADY_LAMPS lamps must each be in STEADY pictures in a row.
 STEADY: Final = 3
 STEADY_LAMPS: Final = 2
 
@@ -94,7 +93,7 @@ class SearchPlan:
 class Guide:
     """Plans the search of one node's pictures. Expectations come from another thread than pictures.
 
-    guided, whole: number of pictures searched in each way. refused: number of expectations that were no use.
+    guided, whole: number of pictures searched in each way. refused: number of expectations that could not be used.
     """
 
     def __init__(self, node: str) -> None:
@@ -116,7 +115,7 @@ class Guide:
                 (self._solvers.add if alive else self._solvers.discard)(name)
 
     def hear(self, received: Received) -> None:
-        """Take an expectation from the bus; what is none is counted and reported."""
+        """Take an expectation from the bus; count and report any other payload."""
         envelope = self.refusals.open(received)
         if envelope is not None and isinstance(envelope.message, Expect):
             self.expect(envelope.message)
@@ -156,8 +155,8 @@ class Guide:
     ) -> None:
         """Follow the candidates of the picture taken at stamp_ns.
 
-        whole: whether all of it was searched. sized: whether the lights are as large as in the next picture; not so
-        where this one was exposed otherwise: then it also does not count as the last whole picture.
+        whole: whether all of it was searched. sized: whether the lights have the size that they have in the next
+        picture. A picture with another exposure shows another size, and does not count as the last whole picture.
         """
         step_s = (stamp_ns - self._stamp_ns) / S_NS
         before = [_moved(one, step_s, width_px) for one in self._followed] if 0.0 < step_s < 1.0 else []
@@ -171,7 +170,7 @@ class Guide:
             self.guided += 1
 
     def elsewhere(self, found: int) -> int:
-        """Return how many candidates the last whole picture had more than a guided one with so many."""
+        """Return how many candidates more than `found`, those of a guided picture, the last whole picture had."""
         return max(self._elsewhere - found, 0)
 
     def _foretell(self, stamp_ns: int, width_px: int, height_px: int) -> list[Foretold] | None:
@@ -199,11 +198,12 @@ class Guide:
         return found
 
 
-def expected_first(found: list[Detection], foretold: Sequence[Foretold]) -> list[Detection]:
-    """Return the candidates with the likely ones that were expected first; they get the best score of the picture.
+def expected_first(found: list[Detection], foretold: Sequence[Foretold]) -> tuple[list[Detection], int]:
+    """Return the candidates with the expected ones first, and how many these are.
 
-    All likely lamps have nearly the same score, whosesoever they are. Of two candidates near one place the likelier
-    one was expected: by its score, and by its distance in sigmas.
+    An expected candidate is a likely one near an expected place. It gets the picture's best score: all likely lamps
+    have nearly the same one, the other node's and strange ones. Of two near one place, the likelier by score and by
+    distance in sigmas is the expected one.
     """
     first: list[int] = []
     for place in foretold:
@@ -215,19 +215,10 @@ def expected_first(found: list[Detection], foretold: Sequence[Foretold]) -> list
         if near:
             first.append(max(near)[1])
     if not first:
-        return found
+        return found, 0
     best = max(score_of(d.blob) for d in found)
     chosen = [replace(found[i], blob=msgspec.structs.replace(found[i].blob, score=best)) for i in sorted(first)]
-    return chosen + [d for i, d in enumerate(found) if i not in first]
-
-
-def count_expected(found: Sequence[Detection], foretold: Sequence[Foretold]) -> int:
-    """Return how many of the first candidates, as `expected_first` orders them, are where a light is expected."""
-    lights = takewhile(
-        lambda d: any(_away(d, place.u_px, place.v_px) <= place.radius_px for place in foretold),
-        found[: len(foretold)],
-    )
-    return sum(1 for _ in lights)
+    return chosen + [d for i, d in enumerate(found) if i not in first], len(first)
 
 
 Planned = tuple[list[Region], list[float]]
@@ -268,7 +259,7 @@ def _around_steady(lamps: Sequence[tuple[Followed, float]]) -> Planned | None:
 
 
 def _moved(one: Followed, step_s: float, width_px: int) -> tuple[Followed, float]:
-    """Return a candidate where it should be so much later, and the radius, px, within which it should be."""
+    """Return a candidate as it should be step_s later, and the radius, px, within which it should be then."""
     if one.rate_pxps is None:
         return one, (FLOOR + SIGMAS * UNKNOWN_PER_S * step_s) * width_px
     moved = replace(one, u_px=one.u_px + one.rate_pxps[0] * step_s, v_px=one.v_px + one.rate_pxps[1] * step_s)
@@ -283,7 +274,7 @@ def _follow(
     *,
     sized: bool,
 ) -> Followed:
-    """Return a candidate with what the last picture says of it."""
+    """Return a candidate, with its speed if the last picture had it. moved, before: those of the last picture."""
     blob = d.blob
     light_px = math.sqrt(blob.area_px / math.pi)
     near = [

@@ -8,7 +8,7 @@ from collections import deque
 import msgspec
 from buddyline.node.detect import Detection, Detector, GuidedDetector
 from buddyline.node.devices import Frame
-from buddyline.node.guide import Guide, count_expected, expected_first
+from buddyline.node.guide import Guide, expected_first
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.messages import MAX_BLOBS, Blob, Candidates
 from msgspec import UNSET, UnsetType
@@ -31,8 +31,8 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
 class Pipeline:
     """Detects the candidates of one camera's frames, and numbers the messages.
 
-    guide: plans where to look in each frame; None to search all of each. expected: so many of the last frame's first
-    candidates are where the solver expects the other node's lights.
+    guide: plans where to look in each frame; None to search all of each. expected: number of the last frame's
+    candidates that are where the solver expects the other node's lights; they come first.
     """
 
     def __init__(
@@ -98,8 +98,7 @@ class Pipeline:
             found = self._detector.detect(image)
         guide.learn(stamp_ns, found, width, whole=whole, sized=lamps)
         elsewhere = UNSET if whole else guide.elsewhere(len(found))
-        found = expected_first(found, plan.foretold)
-        self.expected = count_expected(found, plan.foretold)
+        found, self.expected = expected_first(found, plan.foretold)
         return found, elsewhere
 
     @property

@@ -273,14 +273,15 @@ def test_an_unlikely_candidate_is_not_put_first():
     guide = Guide("a")
     guide.expect(expect(1, light(100.0, 100.0)))
     found = [detection(300.0, 300.0, 0.99), detection(100.0, 100.0, 0.2)]
-    assert expected_first(found, guide.plan(PERIOD_NS, *SIZE).foretold) == found
+    assert expected_first(found, guide.plan(PERIOD_NS, *SIZE).foretold) == (found, 0)
 
 
 def test_of_two_near_an_expected_place_the_nearer_comes_first():
     guide = Guide("a")
     guide.expect(expect(1, light(100.0, 100.0)))
     found = [detection(300.0, 300.0, 0.99), detection(110.0, 100.0, 0.98), detection(101.0, 100.0, 0.97)]
-    ordered = expected_first(found, guide.plan(PERIOD_NS, *SIZE).foretold)
+    ordered, expected = expected_first(found, guide.plan(PERIOD_NS, *SIZE).foretold)
+    assert expected == 1
     assert [d.blob.u_px for d in ordered] == [101.0, 300.0, 110.0]
     assert ordered[0].blob.score == 0.99
 
