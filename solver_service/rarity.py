@@ -36,10 +36,9 @@ class Rarity:
         return float(max(self._other / self._full, 1.0) ** PERSISTENCE)
 
     def take(self, found: Fix | NoFix) -> None:
-        """Count a trigger's outcome."""
+        """Count a trigger by how likely it shows all four lights, whatever came of it."""
         if isinstance(found, NoFix) and found.reason in SILENT:
             return
         kept = 1.0 - 1.0 / MEMORY
-        full = isinstance(found, Fix) and found.method != "three_lights"
-        self._full = START + kept * (self._full - START) + full
-        self._other = START + kept * (self._other - START) + (not full)
+        self._full = START + kept * (self._full - START) + found.all_four
+        self._other = START + kept * (self._other - START) + 1.0 - found.all_four

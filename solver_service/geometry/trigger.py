@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -125,26 +125,25 @@ class _Batched:
         past = Past.of(prior, heading, self.batch.candidates.variance_of(trigger), self.batch.rigs, settings)
         four, why = None, self.four.why[trigger]
         found: Fix | NoFix
+        all_four = 0.0
         if why is None:
             four = weigh_readings(self.four.read, trigger, past, settings, three=False)
-            found = self._choose(trigger, four, heading, rarity)
+            all_four = _all_four(four)
+            four = four.rarer(rarity)
+            found = self._choose(trigger, four, heading)
         else:
             found = NoFix(*why)
-        if not self.three_told[trigger] or not _is_doubtful(found, four):
-            return found
-        read = self.three
-        if read is None or not self.tried[trigger]:
-            read = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
-        if not read.readings.refined.sound[read.places_of(trigger)].any():
-            return found
-        three = weigh_readings(read, trigger, past, settings, three=True)
-        return self._choose(trigger, three if four is None else four.joined(three), heading, rarity)
+        if self.three_told[trigger] and _is_doubtful(found, four):
+            read = self.three
+            if read is None or not self.tried[trigger]:
+                read = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
+            if read.readings.refined.sound[read.places_of(trigger)].any():
+                three = weigh_readings(read, trigger, past, settings, three=True)
+                found = self._choose(trigger, three if four is None else four.joined(three), heading)
+        return replace(found, all_four=all_four)
 
-    def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None, rarity: float) -> Fix | NoFix:
-        """Publish the likeliest reading where it stands alone.
-
-        rarity: by how much chance is likelier against all four lights than usual.
-        """
+    def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None) -> Fix | NoFix:
+        """Publish the likeliest reading where it stands alone."""
         settings, others = self.batch.settings, weighed.others
         k = int(weighed.log_ratio.argmax())
         if weighed.log_ratio[k] == -np.inf:
@@ -173,8 +172,7 @@ class _Batched:
         # What is widened for a gross error may as well be wrong by more: the lights do not fit each other.
         if unsure or widened > 1.0:
             false_light = ratio * math.exp(weighed.log_false[k])
-        chance = CHANCE_ODDS * (1.0 if short else rarity)
-        probability = agreeing / (chance + agreeing + others + false_light)
+        probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         required = settings.min_probability
         if short:
             required = max(required, _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY)
@@ -191,8 +189,8 @@ class _Batched:
             return NoFix("attitude", f"{what} is {math.sqrt(tilt_chi2):.1f} sigma off the attitudes")
         if depth_chi2 > AGREES:
             return NoFix("depth", f"{what} is {math.sqrt(depth_chi2):.1f} sigma off the depths")
-        why = "one light may be a false candidate" if false_light > chance else "chance may give it"
-        if widened > 1.0 and false_light > chance + others:
+        why = "one light may be a false candidate" if false_light > CHANCE_ODDS else "chance may give it"
+        if widened > 1.0 and false_light > CHANCE_ODDS + others:
             in_range = abs(math.log(float(readings.range_m[place, 0] / readings.range_m[place, 1])))
             reason: Reason = "range_gap" if in_range > abs(float(readings.twist_gap_rad[place])) else "twist_gap"
             return NoFix(reason, f"{what} does not fit its lights (chi2 {chi2:.1f}): {why}")
@@ -273,6 +271,12 @@ def _is_doubtful(found: Fix | NoFix, weighed: Weighed | None) -> bool:
         return True
     k = int(weighed.log_ratio.argmax())
     return bool(weighed.log_prior[k] < 0.0 or weighed.log_false[k] > POOR_FIT)
+
+
+def _all_four(weighed: Weighed) -> float:
+    """Return the probability that the candidates are all four lights, by the pictures and sensors of one trigger."""
+    total = float(np.exp(weighed.log_ratio - weighed.log_past).sum())
+    return total / (total + CHANCE_ODDS) if math.isfinite(total) else 1.0
 
 
 def _like(weighed: Weighed, k: int, range_m: float) -> NDArray[np.bool_]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -45,6 +46,19 @@ class Weighed:
     def __len__(self) -> int:
         """Count them."""
         return len(self.sources)
+
+    def rarer(self, rarity: float) -> Weighed:
+        """Give readings of four lights where these are found so many times more rarely than usual."""
+        if rarity == 1.0:
+            return self
+        log_rarity = math.log(rarity)
+        # That one of them is a false candidate is as likely as before.
+        return replace(
+            self,
+            log_ratio=self.log_ratio - log_rarity,
+            log_false=self.log_false + log_rarity,
+            others=self.others / rarity,
+        )
 
     def joined(self, more: Weighed) -> Weighed:
         """Give both together, these first."""

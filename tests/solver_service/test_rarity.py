@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from buddyline.protocol.messages import RelativePose
+from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.observation import Observation, Settings
 from buddyline.solver_service.geometry.trigger import read_triggers
 from buddyline.solver_service.rarity import Rarity
 
+from tests.solver_service.conftest import dive_messages
 from tests.solver_service.scenes import random_scene
 
 
@@ -48,3 +51,24 @@ def test_triggers_that_say_nothing_of_the_lamps_do_not_count(reason):
     for _ in range(100):
         rarity.take(NoFix(reason, ""))
     assert rarity.factor == 1.0
+
+
+def test_triggers_that_cannot_choose_among_fours_do_not_make_four_lights_rare():
+    """Cameras alone often leave two poses: that says nothing against all four lights."""
+    rarity = Rarity()
+    for _ in range(1000):
+        rarity.take(NoFix("ambiguous", "", all_four=0.9))
+    assert rarity.factor == 1.0
+
+
+def test_a_dive_that_only_ranges_check_keeps_its_poses(monkeypatch):
+    messages, _ = dive_messages(seconds=40.0)
+
+    def poses():
+        core = SolverCore(Settings(checks=frozenset({"range"})), [("a", "b")])
+        found = core.handle_many(messages) + core.flush()
+        return sum(isinstance(one, RelativePose) for one in found)
+
+    with_rarity = poses()
+    monkeypatch.setattr(Rarity, "factor", 1.0)
+    assert 0 < poses() <= 1.1 * with_rarity
