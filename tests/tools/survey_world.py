@@ -18,6 +18,7 @@ from buddyline.protocol.messages import Attitude, Blob, Candidates, Depth, Imu, 
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.tools.survey.derive import Derived
+from buddyline.tools.survey.gauges import adjust_gauges
 from buddyline.tools.survey.project import About, AdjustSettings, Leg, Project
 from msgspec.structs import replace
 
@@ -326,7 +327,11 @@ def project_of(legs, depth="absolute", points=(), **tables):
     derived.legs = list(legs)
     tables.setdefault("survey", About(name="demo", title="Demo cave", team=["A. Diver", "B. Diver"]))
     return Project(
-        leg=list(legs), point=list(points), station=derived.stations(), adjust=AdjustSettings(depth=depth), **tables
+        leg=list(legs),
+        point=list(points),
+        station=derived.stations(adjust_gauges(derived.legs).depths),
+        adjust=AdjustSettings(depth=depth),
+        **tables,
     )
 
 

@@ -54,7 +54,7 @@ def test_a_leapfrog_dive_gives_its_legs(messages):
         assert 1.2 < leg.azimuth_sigma_deg < 1.8
         assert leg.fixes >= 8
         assert leg.fixes_used
-    assert [station.name for station in found.stations()] == [str(k) for k in range(6)]
+    assert [station.name for station in found.stations({})] == [str(k) for k in range(6)]
 
 
 def test_every_fix_of_a_rest_is_used_or_its_reason_is_given(messages):
@@ -77,7 +77,7 @@ def test_marks_name_stations_and_keep_their_notes(messages):
     mark = Mark(node=second.from_node, stamp_ns=second.start_ns + 10**9, name="T1", note="big flake")
     found = derived([*messages, mark])
     assert [(leg.from_, leg.to) for leg in found.legs][:3] == [("0", "T1"), ("T1", "2"), ("2", "3")]
-    assert next(station for station in found.stations() if station.name == "T1").notes == ["big flake"]
+    assert next(station for station in found.stations({}) if station.name == "T1").notes == ["big flake"]
 
 
 def test_a_mark_of_an_earlier_station_closes_the_loop(messages):
@@ -385,6 +385,6 @@ def test_a_mark_by_hand_takes_precedence_and_equate_joins_stations(messages):
     assert found.legs[2].to == "T12"
     found.equate(["T12", found.legs[0].from_])
     assert found.legs[0].from_ == "T12"
-    assert "T12" in {station.name for station in found.stations()}
+    assert "T12" in {station.name for station in found.stations({})}
     with pytest.raises(BuddylineError, match="equate of 'T21'"):
         found.equate(["T12", "T21"])

@@ -117,8 +117,8 @@ def _legs(args: argparse.Namespace) -> int:
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
     for one_place in project.equate:
         derived.equate(one_place.stations)
-    stations = derived.stations()
     gauges = adjust_gauges(derived.legs, project.alarms)
+    stations = derived.stations(gauges.depths)
     for text in gauges.alarms:
         derived.add_problem(text)
     for dive, rate in gauges.tides_m_per_h.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any, Final
@@ -16,7 +16,7 @@ from buddyline.protocol.messages import Mark
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.averages import Mean
 from buddyline.tools.survey.chain import Stop, find_standings
-from buddyline.tools.survey.gauges import adjust_gauges
+from buddyline.tools.survey.gauges import StationDepth
 from buddyline.tools.survey.magnetism import usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
 from buddyline.tools.survey.readings import PairReadings
@@ -121,9 +121,8 @@ class Derived:
         for other in others:
             self.notes[first] += [note for note in self.notes.pop(other, []) if note not in self.notes[first]]
 
-    def stations(self) -> list[Station]:
-        """Return all stations in the order of the legs, each with the depth that all gauges' readings give it."""
-        depths = adjust_gauges(self.legs).depths
+    def stations(self, depths: Mapping[str, StationDepth]) -> list[Station]:
+        """Return all stations in the order of the legs. depths: by station, from the gauges."""
         stations = []
         for name in dict.fromkeys(name for leg in self.legs for name in (leg.from_, leg.to)):
             known: dict[str, Any] = {}
