@@ -7,11 +7,11 @@ import re
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.security import HUB, node_name
+from buddyline.protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.hub import load_hub_config
@@ -24,22 +24,20 @@ PORT: Final = 7447
 DAYS: Final = 730
 AUTHORITY_DAYS: Final = 3650
 
-# The role of each certificate, and what it is for.
-ROLES: Final = {
-    "solver": "make the solver's certificate, which may publish poses",
-    "viewer": "make the certificate for commands that only read: record, monitor",
-    "surveyor": "make the certificate for marking stations: mark, survey watch; it reads as well",
-    "ros2": "make the certificate of `ros2`, which may publish its messages for ROS; it reads as well",
-    "player": "make the certificate of `play`, which may publish what any node publishes",
-}
 
-# What each of them may do, for `keys list`.
-ROLE_WORDS: Final = {
-    "solver": "publishes poses, tracks and what nodes are to expect; reads",
-    "viewer": "reads",
-    "surveyor": "publishes marks; reads",
-    "ros2": "publishes for ROS; reads",
-    "player": "publishes what any node publishes; reads",
+class Role(NamedTuple):
+    """A certificate that is no node's: the commands that use it, and what it may do."""
+
+    used_by: str
+    may: str
+
+
+ROLES: Final = {
+    SOLVER: Role("solver", "publishes poses, tracks and what nodes are to expect; reads"),
+    VIEWER: Role("record, monitor and other readers", "reads"),
+    SURVEYOR: Role("mark and survey watch", "publishes marks; reads"),
+    ROS: Role("ros2", "publishes for ROS; reads"),
+    PLAYER: Role("play", "publishes what any node publishes; reads"),
 }
 
 _NODES_LINE: Final = re.compile(r"^nodes = \[(.*)\]$", re.MULTILINE)
@@ -60,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         whose, "node", "make a node's certificate; the hub then lets it publish its own keys", "keys node a"
     )
     node.add_argument("node", metavar="ID", help="the node's id, as in its configuration")
-    for role, text in ROLES.items():
-        subcommand(whose, role, text, f"keys {role}")
+    for name, role in ROLES.items():
+        subcommand(whose, name, f"make the certificate for {role.used_by}: {role.may}", f"keys {name}")
     subcommand(whose, "list", "say who may do what, and until when", "keys list")
     renew = subcommand(whose, "renew", "make a certificate anew, and keep the old one beside it", "keys renew node-a")
     renew.add_argument("name", metavar="NAME", help="as `keys list` has it: hub, solver, viewer, node-a ...")
@@ -128,7 +126,8 @@ def _client(authority: Authority, args: argparse.Namespace, days: int) -> list[P
 
 def _listed(authority: Authority) -> list[str]:
     """Return a line for each certificate: its name, what it may do, and until when."""
-    hub, may = load_hub_config(str(authority.directory / "hub.toml")), {HUB: "is the hub"} | ROLE_WORDS
+    hub = load_hub_config(str(authority.directory / "hub.toml"))
+    may = {HUB: "is the hub"} | {name: role.may for name, role in ROLES.items()}
     lines = []
     for name, until in authority.issued():
         words = may.get(name, f"publishes as node {name.removeprefix('node-')}; reads")
