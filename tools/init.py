@@ -55,6 +55,9 @@ expect = true                     # tell the nodes where to look for lights
 # key = "solver.key"
 """
 
+# The table [tls], commented out or not, up to the next empty line.
+_TLS_TABLE: Final = re.compile(r"^(?:# )?\[tls\].*(?:\n.+)*", re.MULTILINE)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -86,22 +89,17 @@ def text_of(service: str, node: str = "a", connect: str | None = None, *, simula
     if service == "node":
         example = "a.toml" if simulated else "pi.toml"
         text = (resources.files("buddyline.node") / "examples" / example).read_text(encoding="utf-8")
-        text = text.replace('node = "a"  ', f'node = "{check_node_id(node)}"  ', 1).replace("node-a.", f"node-{node}.")
-        text = re.sub(r'^node = "a"$', f'node = "{node}"', text, count=1, flags=re.MULTILINE)
-        text = text.replace("keys node a", f"keys node {node}").replace('# <- or "b"', "", 1)
+        text = re.sub(r'^node = "a".*', f'node = "{check_node_id(node)}"', text, count=1, flags=re.MULTILINE)
+        text = text.replace("node-a.", f"node-{node}.").replace("keys node a", f"keys node {node}")
     else:
         text = HUB if service == "hub" else SOLVER
     if connect is None:
         return text
     text = re.sub(r'^(connect|listen) = "[^"]*"', rf'\1 = "{connect}"', text, count=1, flags=re.MULTILINE)
-    secure = connect.startswith("tls/")
-    head, found, rest = text.partition("[tls]" if not secure else "# [tls]")
-    if not found or (not secure and head.endswith("# ")):
-        return text
-    # The table ends at the next one, or with the file.
-    table, _, after = rest.partition("\n[")
-    after = f"\n[{after}" if after else ""
-    if secure:
-        return f"{head}[tls]{table.replace(chr(10) + '# ', chr(10))}{after}"
-    lines = f"[tls]{table}".split("\n")
-    return head + "\n".join(f"# {line}" if line.strip() else line for line in lines) + after
+    return _TLS_TABLE.sub(lambda table: _switched(table[0], on=connect.startswith("tls/")), text, count=1)
+
+
+def _switched(lines: str, *, on: bool) -> str:
+    """Return lines of a configuration, taken in or commented out, whatever they were before."""
+    plain = [line.removeprefix("# ") for line in lines.split("\n")]
+    return "\n".join(line if on else f"# {line}" for line in plain)

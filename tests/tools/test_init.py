@@ -33,9 +33,16 @@ def test_a_node_has_its_own_name_and_certificate(tmp_path, simulated):
     assert config.camera.name == ("simulated" if simulated else "picamera2")
 
 
-@pytest.mark.parametrize("service", ["node", "hub", "solver"])
-def test_a_secure_hub_takes_the_keys_along(service):
-    text = text_of(service, "c", "tls/192.168.7.9:7447")
+def test_a_hub_that_listens_elsewhere_differs_in_one_line():
+    before, after = HUB.splitlines(), text_of("hub", connect="tcp/127.0.0.1:7448").splitlines()
+    assert [one for one in zip(before, after, strict=True) if one[0] != one[1]] == [
+        (before[1], before[1].replace(":7447", ":7448", 1))
+    ]
+
+
+@pytest.mark.parametrize(("service", "simulated"), [("node", False), ("node", True), ("hub", False), ("solver", False)])
+def test_a_secure_hub_takes_the_keys_along(service, simulated):
+    text = text_of(service, "c", "tls/192.168.7.9:7447", simulated=simulated)
     table = text.partition("\n[tls]")[2].partition("\n[")[0]
     name = {"node": "node-c", "hub": "hub", "solver": "solver"}[service]
     assert f'certificate = "{name}.crt"' in table
