@@ -113,9 +113,9 @@ def _accuracy_text(accuracy: Accuracy) -> str:
         rows.append(_stats_row("inclination, deg", accuracy.inclination_rad, 3, _DEGREES))
     rows += [
         _stats_row("NEES, pose", accuracy.nees6, 2),
-        ["  were it honest", "", "5.35", "12.59", "6.93", "6.00"],
+        ["  expected", "", "5.35", "12.59", "6.93", "6.00"],
         _stats_row("NEES, position", accuracy.nees3, 2),
-        ["  were it honest", "", "2.37", "7.81", "3.87", "3.00"],
+        ["  expected", "", "2.37", "7.81", "3.87", "3.00"],
     ]
     inside = (
         f"inside the 95 % bound of the covariance: pose {percent(accuracy.honest6)},"
