@@ -346,7 +346,7 @@ def _same_rig(info: NodeInfo, other: NodeInfo) -> bool:
 
 def _frame_of(view: View) -> FrameSeen:
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
-    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.score, view.elsewhere)
+    return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere)
 
 
 def _fix_of(pose: RelativePose) -> FixSeen:

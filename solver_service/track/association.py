@@ -35,7 +35,6 @@ class Association:
     chosen: tuple[tuple[int, int, float], ...]
     seen: Floats
     evidence: float
-    open_lights: int
 
 
 def associate(
@@ -83,9 +82,7 @@ def associate(
             doubt = gross / (common + gross)
             added_px2 = doubt * GROSS_PX**2 if doubt > 1.0 - SURE else 0.0
             chosen.append((k, light, float(sigma_px[k]) ** 2 + added_px2))
-    taken = {light for _, light, _ in chosen}
-    left = sum(1 for light in range(2) if light not in taken and seen[light] > 0.5)
-    return Association(tuple(chosen), seen, top + math.log(total), left)
+    return Association(tuple(chosen), seen, top + math.log(total))
 
 
 def _weigh_single(

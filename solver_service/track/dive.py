@@ -19,12 +19,11 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
-from buddyline.solver_service.track.state import CLOCK, NAV, State
+from buddyline.solver_service.track.state import CLOCK, NAV
 from buddyline.solver_service.track.stepping import PassGuide
 from buddyline.solver_service.track.trail import Trail
 
-# How far a clock may be off that nobody told of, and by how much the first pass may err beside its own sigma, 1 sd.
-UNTOLD_CLOCK_S: Final = 0.1
+# By how much the first pass may err in the clocks' offset beside its own sigma, 1 sd.
 CLOCK_LEFT_S: Final = 0.003
 CLOCK_WITHOUT_S: Final = 0.003
 NEAR_CLOCK_S: Final = 0.005
@@ -89,13 +88,11 @@ def _stamp_of(item: AttitudeSeen | DepthSeen | FixSeen | FrameSeen) -> int:
 class Smoothed:
     """A dive's track.
 
-    rows: made as they are read, once. clock_sigma_s: inf where the offset is not told, but believed. constants: the
-    last state, which holds what was learned of the units and clocks. dark: lamps that were dark at the end: node,
-    light, for how long (s).
+    rows: made as they are read, once. clock_sigma_s: inf where the offset is not estimated, but assumed. dark: the
+    lamps that were dark at the end: node, light, for how long (s).
     """
 
     rows: Iterable[TrackRow]
-    constants: State | None
     clock_offset_s: float
     clock_sigma_s: float
     problems: list[str]
@@ -124,21 +121,6 @@ def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
         track.add_depth(node, depth)
     for frame in record.frames:
         track.add_frame(node, frame)
-
-
-def filter_of(
-    records: tuple[NodeRecord, NodeRecord],
-    fixes: Sequence[FixSeen],
-    clock_ns: int = 0,
-    clock_sigma_s: float = CLOCK_S,
-) -> TrackFilter:
-    """Make a filter that keeps its steps and holds a whole dive."""
-    track = _empty_filter(records, clock_ns, clock_sigma_s)
-    for node, record in enumerate(records):
-        feed(track, node, record)
-    for fix in fixes:
-        track.add_fix(fix)
-    return track
 
 
 def _empty_filter(records: tuple[NodeRecord, NodeRecord], clock_ns: int, clock_sigma_s: float) -> TrackFilter:
@@ -176,13 +158,13 @@ def smooth(
     else:
         first, parts, clock_ns = _first_pass(records, fixes, clock_ns, CLOCK_TRIES_S)
     if not parts:
-        return Smoothed([], None, clock_ns * 1e-9, math.inf, first.problems)
+        return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], FAR_CLOCK_S)
     if far or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
-        return Smoothed([], None, clock_ns * 1e-9, math.inf, [*first.problems, said])
+        return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
         # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
@@ -217,7 +199,7 @@ def smooth(
 
 def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Path, since_s: float) -> Path | None:
     """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
-    track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=UNTOLD_CLOCK_S)
+    track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=CLOCK_S)
     track.clock_ns = clock_ns
     first_ns = min(frame.stamp_ns for record in records for frame in record.frames[:1])
     track.seconds(0, first_ns)
@@ -263,7 +245,7 @@ def _rounds(
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Pass over a dive again and again: an offset makes a pass non-linear, so that it tells one that is too small."""
     for left in reversed(range(CLOCK_ROUNDS)):
-        first = _empty_filter(records, clock_ns, UNTOLD_CLOCK_S)
+        first = _empty_filter(records, clock_ns, CLOCK_S)
         pass_over(first, records, fixes)
         parts = parts_of(first)
         without = any(any(part.without) for part in parts)
@@ -323,11 +305,10 @@ def _smoothed(track: TrackFilter, parts: Sequence[Estimate], outputs_ns: Sequenc
         paths.append(smoothed(part.steps))
         part.steps = Trail()
     if not paths:
-        return Smoothed([], None, track.clock_ns * 1e-9, math.inf, track.problems)
+        return Smoothed([], track.clock_ns * 1e-9, math.inf, track.problems)
     stamps = sorted(outputs_ns)
     times_s = np.array([track.between(stamp) for stamp in stamps])
-    constants = paths[-1].state(-1)
-    clock_s = track.clock_ns * 1e-9 + constants.clock_s
+    clock_s = track.clock_ns * 1e-9 + paths[-1].state(-1).clock_s
     sigma_s = math.sqrt(paths[-1].covariance(-1)[NAV, NAV])
     rows = chain.from_iterable(rows_between(path, times_s, stamps) for path in paths)
-    return Smoothed(rows, constants, clock_s, sigma_s, track.problems, track.lamps.dark())
+    return Smoothed(rows, clock_s, sigma_s, track.problems, track.lamps.dark())

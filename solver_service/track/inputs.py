@@ -30,15 +30,14 @@ class TrackNode:
 class FrameSeen:
     """The light candidates of one picture.
 
-    pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns; score (K,): how likely each
-    is a light, NaN where unknown. elsewhere: how many more the whole picture held, where only parts were searched.
+    pixels (K, 2) and sigma_px (K,); dt_ns (K,): each row's exposure minus stamp_ns. elsewhere: how many more the whole
+    picture held, where only parts were searched.
     """
 
     stamp_ns: int
     pixels: Floats
     sigma_px: Floats
     dt_ns: Stamps = field(default_factory=lambda: np.zeros(0, np.int64))
-    score: Floats = field(default_factory=lambda: np.zeros(0))
     elsewhere: int = 0
 
 

@@ -11,7 +11,6 @@ from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.state import CLOCK, NAV, State
-from numpy.typing import NDArray
 
 # The errors that move a light in a picture: NAV of them, and the clock's.
 COLUMNS: Final = np.array((*range(NAV), CLOCK))
@@ -131,13 +130,12 @@ def pixel_of(camera: Camera, X: Floats) -> Floats | None:
 class Sight:
     """One picture as the track uses it: bearings and tangents of its sound candidates.
 
-    index (K,): their places in the frame. t_s: on A's clock as believed; dt_s (K,). elsewhere: as in FrameSeen.
+    t_s: on A's clock as believed; dt_s (K,): of each candidate after it. elsewhere: as in FrameSeen.
     """
 
     stamp_ns: int
     t_s: float
     node: int
-    index: NDArray[np.intp]
     bearings: Floats
     tangents: Floats
     sigma_px: Floats
@@ -147,7 +145,7 @@ class Sight:
     @property
     def clutter(self) -> float:
         """How many candidates chance may have put into the whole picture: all but one, and never none."""
-        return max(len(self.index) + self.elsewhere - 1.0, 1.0)
+        return max(len(self.bearings) + self.elsewhere - 1.0, 1.0)
 
 
 def sight_of(
@@ -164,6 +162,4 @@ def sight_of(
     with np.errstate(all="ignore"):
         bearings, tangents = rig.camera.rays(pixels.reshape(-1, 2))
     sound = np.isfinite(bearings).all(1) & np.isfinite(tangents).all((1, 2)) & np.isfinite(sigma_px) & (sigma_px > 0.0)
-    keep = np.flatnonzero(sound)
-    seen = bearings[keep], tangents[keep], sigma_px[keep], dt_s[keep]
-    return Sight(stamp_ns, t_s, node, keep, *seen, elsewhere)
+    return Sight(stamp_ns, t_s, node, bearings[sound], tangents[sound], sigma_px[sound], dt_s[sound], elsewhere)

@@ -36,7 +36,6 @@ REPLAY_SHARE: Final = 0.1
 REPLAY_RAD: Final = 0.15
 REPLAY_SIGMAS: Final = 3.0
 REPLAYS: Final = 2
-REPLAY_EVERY_S: Final = 0.5
 
 
 class TrackPool(TrackSteps):
@@ -176,7 +175,7 @@ class TrackPool(TrackSteps):
                 gain = -0.5 * chi2 - 0.5 * math.log(np.linalg.det(S)) - math.log(2.0 * math.pi) - log_clutter
                 child.evidence += gain + math.log(0.2)
                 chosen = ((k, light, START_PX**2),)
-                self._update_lights(child, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+                self._update_lights(child, Association(chosen, np.ones(2), 0.0), y, H, sight)
                 child.used[sight.node, sight.stamp_ns] = chosen
                 if child.steps:
                     child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
@@ -189,5 +188,5 @@ class TrackPool(TrackSteps):
         y, H = residuals(sight.bearings, sight.tangents, X, D)
         chosen = tuple((k, light, START_PX**2) for k, light in lights)
         if np.isfinite([y[k, light] for k, light in lights]).all():
-            self._update_lights(estimate, Association(chosen, np.ones(2), 0.0, 0), y, H, sight)
+            self._update_lights(estimate, Association(chosen, np.ones(2), 0.0), y, H, sight)
             estimate.used[sight.node, sight.stamp_ns] = chosen

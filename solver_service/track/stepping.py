@@ -202,7 +202,7 @@ class TrackSteps(TrackIntake):
         guide = self.guides.get((observer, sight.stamp_ns))
         given = estimate.given.get((observer, sight.stamp_ns))
         if given is not None:
-            found = Association(given, np.zeros(2), 0.0, 0)
+            found = Association(given, np.zeros(2), 0.0)
         elif guide is None:
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:

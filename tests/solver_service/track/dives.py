@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log
-from buddyline.solver_service.track.dive import NodeRecord
+from buddyline.solver_service.track.dive import NodeRecord, feed
+from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.output import TrackRow
 
@@ -45,7 +47,6 @@ class Dive:
     stamps_ns: list[int]
     t_a_b_m: Floats
     R_a_b: Floats
-    gap: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 class Sway:
@@ -139,6 +140,16 @@ def make(seed: int, setting: Setting) -> Dive:
     apart = motion.places(1, times) - motion.places(0, times)
     toward = np.swapaxes(R_a, 1, 2)
     return Dive((records[0], records[1]), fixes, stamps, (toward @ apart[:, :, None])[:, :, 0], toward @ R_b)
+
+
+def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen]) -> TrackFilter:
+    """Make a filter that keeps its steps and holds a whole dive."""
+    track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf)
+    for node, record in enumerate(records):
+        feed(track, node, record)
+    for fix in fixes:
+        track.add_fix(fix)
+    return track
 
 
 def shifted(frame: FrameSeen, clock_s: float) -> FrameSeen:

@@ -10,14 +10,13 @@ from buddyline.node.sim.world import World
 from buddyline.protocol.messages import LightTruth, NodePose, Track, Truth
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
-from buddyline.solver_service.track.dive import filter_of, last_ns, smooth
+from buddyline.solver_service.track.dive import last_ns, smooth
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.tracking import TrackSettings
 
-from tests.solver_service.track.dives import Dive, Setting, make, score
+from tests.solver_service.track.dives import EPOCH_NS, Dive, Setting, filter_of, make, score
 
 LAMPS = ((1, 0), (1, 1), (0, 0), (0, 1))
-START_NS = 1_764_000_000_000_000_000
 
 
 def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> Dive:
@@ -64,7 +63,7 @@ def test_twenty_dives_with_a_dark_lamp() -> None:
     shares = []
     for seed in range(20):
         lamp = ("b.left", "b.right", "a.left", "a.right")[seed % 4]
-        scenario = Scenario(ENVIRONMENTS[seed % 5], seed=1000 + seed, start_ns=START_NS, dead_lamps=(lamp,))
+        scenario = Scenario(ENVIRONMENTS[seed % 5], seed=1000 + seed, start_ns=EPOCH_NS, dead_lamps=(lamp,))
         world = World(scenario)
         core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("smooth",))))
         told = [

@@ -14,14 +14,15 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.track.lamps import LampWatch
 from buddyline.solver_service.tracking import TrackSettings
 
-START_NS = 1_764_000_000_000_000_000
+from tests.solver_service.track.dives import EPOCH_NS
+
 # More dives of the same kind.
 SLOW = pytest.mark.slow
 
 
 @cache
 def simulated(seed, seconds, dead_lamps):
-    scenario = Scenario(ENVIRONMENTS[seed % 5], seed=300 + seed, start_ns=START_NS, dead_lamps=dead_lamps)
+    scenario = Scenario(ENVIRONMENTS[seed % 5], seed=300 + seed, start_ns=EPOCH_NS, dead_lamps=dead_lamps)
     plan = DivePlan(seconds=seconds, imu=True)
     found = [message for _, _, message in messages(World(scenario), plan)]
     return [message for message in found if not isinstance(message, Truth | LightTruth | NodePose)]

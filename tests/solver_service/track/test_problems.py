@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from buddyline.solver_service.track.dive import filter_of
 from buddyline.solver_service.track.problems import Problems
 
-from tests.solver_service.track.dives import EPOCH_NS, Setting, make
+from tests.solver_service.track.dives import EPOCH_NS, Setting, filter_of, make
 
 
 def test_a_problem_that_ended_says_so_and_may_begin_again() -> None:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from buddyline.solver_service.track.dive import NodeRecord, filter_of, in_pieces, last_ns, parts_of, smooth
+from buddyline.solver_service.track.dive import NodeRecord, in_pieces, last_ns, parts_of, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
 
-from tests.solver_service.track.dives import Dive, Setting, fix_errors, make, score
+from tests.solver_service.track.dives import Dive, Setting, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from buddyline.solver_service.track.dive import filter_of, last_ns, parts_of
+from buddyline.solver_service.track.dive import last_ns, parts_of
 from buddyline.solver_service.track.smoother import smoothed
 from buddyline.solver_service.track.trail import PACK, Step, Trail
 
-from tests.solver_service.track.dives import Setting, make
+from tests.solver_service.track.dives import Setting, filter_of, make
 
 
 def steps_of() -> list[Step]:
