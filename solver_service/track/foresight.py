@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.filter import TrackFilter
-from buddyline.solver_service.track.lights import COLUMNS, light_positions, pixel_of
+from buddyline.solver_service.track.lights import BLOCK, in_picture, light_positions, pixel_of
 from buddyline.solver_service.track.stepping import HOLD_S
 
 # How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
@@ -55,7 +54,7 @@ def foresee(track: TrackFilter, observer: int, known_ns: int, stamp_ns: int) -> 
     found = []
     for light in sorted({0, 1} - dark):
         at, later = (pixel_of(rig.camera, X[k, light]) for k in (0, 1))
-        if at is None or later is None or not _inside(rig.camera, at):
+        if at is None or later is None or not in_picture(rig.camera, at):
             continue
         bearing, tangents = (values[0] for values in rig.camera.rays(at[None]))
         J = tangents @ D[0, light] / float(bearing @ X[0, light])
@@ -63,15 +62,10 @@ def foresee(track: TrackFilter, observer: int, known_ns: int, stamp_ns: int) -> 
         range_m = float(np.linalg.norm(X[0, light]))
         # Twice the integral of an unknown acceleration: of the turn, and of the way seen from so far.
         growth = px_per_rad * float(np.hypot(TURN_RADPS2, PUSH_MPS2 / range_m))
-        covariance = J @ P[np.ix_(COLUMNS, COLUMNS)] @ J.T + (0.5 * growth * ahead_s**2) ** 2 * np.eye(2)
+        covariance = J @ P[BLOCK] @ J.T + (0.5 * growth * ahead_s**2) ** 2 * np.eye(2)
         worst_px2 = float(np.linalg.eigvalsh(covariance)[-1]) if np.isfinite(covariance).all() else np.inf
         if not 0.0 < worst_px2 < (WORST_SHARE * rig.camera.width_px) ** 2:
             continue
         rate_pxps = (later - at) / STEP_S
         found.append(ForeseenLight(light, at, covariance, rate_pxps, growth * ahead_s))
     return found
-
-
-def _inside(camera: Camera, pixel_px: Floats) -> bool:
-    u, v = pixel_px.tolist()
-    return bool(-0.5 <= u <= camera.width_px - 0.5 and -0.5 <= v <= camera.height_px - 0.5)

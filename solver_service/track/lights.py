@@ -12,8 +12,9 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
 from buddyline.solver_service.track.state import CLOCK, NAV, State
 
-# The errors that move a light in a picture: NAV of them, and the clock's.
+# The errors that move a light in a picture: NAV of them, and the clock's; and their part of a covariance.
 COLUMNS: Final = np.array((*range(NAV), CLOCK))
+BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 # After a step of Newton's method as small, the next is nothing.
 SMALL_PX: Final = 1e-4
 
@@ -85,12 +86,11 @@ def residuals(bearings: Floats, tangents: Floats, X: Floats, D: Floats) -> tuple
     return y, H
 
 
-def in_picture(camera: Camera, X: Floats, margin_px: float = 2.0) -> bool:
-    """Whether a point (3,) of the camera frame is imaged."""
-    pixel = pixel_of(camera, X)
-    if pixel is None:
+def in_picture(camera: Camera, pixel_px: Floats | None, margin_px: float = 0.0) -> bool:
+    """Whether a pixel (2,) lies in the picture, margin_px from its edges; None does not."""
+    if pixel_px is None:
         return False
-    u, v = pixel
+    u, v = pixel_px.tolist()
     return bool(
         -0.5 + margin_px <= u <= camera.width_px - 0.5 - margin_px
         and -0.5 + margin_px <= v <= camera.height_px - 0.5 - margin_px

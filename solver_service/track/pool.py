@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -13,11 +12,12 @@ from buddyline.solver_service.track.association import Association
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import newest_before
-from buddyline.solver_service.track.lights import Sight, light_positions, residuals
+from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
 from buddyline.solver_service.track.state import PHI, R_, State
-from buddyline.solver_service.track.stepping import BLOCK, HOLD_S, TICK_S, TrackSteps
+from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TrackSteps
+from buddyline.solver_service.track.trail import Chosen
 
 # A start without a fix: how often one is tried, how long after the last fix, for how long it and how many are kept.
 SEARCH_EVERY_S: Final = 0.45
@@ -135,22 +135,23 @@ class TrackPool(TrackSteps):
         self._searched_s = t_s
         attitudes = of_a[1], of_b[1]
         for state, P, lights in starts(self.nodes, sight, attitudes, self.clock_sigma_s):
-            estimate = Estimate(t_s, state, P, t_s, skip_s=0.006, patience_s=SEARCH_PATIENCE_S)
-            estimate.unseen_by = 1 - sight.node
-            self._begin_searched(estimate, [(sight, tuple((k, light) for light, k in enumerate(lights)))])
-
-    def _begin_searched(self, estimate: Estimate, seen: Sequence[tuple[Sight, tuple[tuple[int, int], ...]]]) -> None:
-        """Follow a start without a fix, of these (candidate, light) of pictures."""
-        estimate.searched = True
-        estimate.attitude_s = [estimate.t_s, estimate.t_s]
-        estimate.rates_radps = np.zeros((2, 3))
-        for sight, lights in seen:
-            self._force(estimate, sight, lights)
-        if self.main and self.main.confirmed:
-            estimate.baseline = self.main.evidence
-            estimate.detection = self.main.detection.copy()
-        self._open(estimate)
-        self.challengers.append(estimate)
+            estimate = Estimate(
+                t_s,
+                state,
+                P,
+                t_s,
+                attitude_s=[t_s, t_s],
+                skip_s=0.006,
+                patience_s=SEARCH_PATIENCE_S,
+                unseen_by=1 - sight.node,
+                searched=True,
+            )
+            self._force(estimate, sight, tuple((k, light, START_PX**2) for light, k in enumerate(lights)))
+            if self.main and self.main.confirmed:
+                estimate.baseline = self.main.evidence
+                estimate.detection = self.main.detection.copy()
+            self._open(estimate)
+            self.challengers.append(estimate)
 
     def _fork(self, estimate: Estimate, t_s: float, sight: Sight) -> None:
         """Follow each candidate of the node that has not yet told anything as each light, as estimates of their own."""
@@ -158,10 +159,7 @@ class TrackPool(TrackSteps):
             return
         base = estimate.copied(unseen_by=None)
         self._step(base, t_s, None)
-        lights_m = self.nodes[1 - sight.node].rig.lights_m
-        offset_s = sight.dt_s + (t_s - base.t_s)
-        X, D = light_positions(base.state, sight.node, lights_m, base.rates_radps, offset_s)
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        _, y, H = self._compared(sight, base.state, base.rates_radps, sight.t_s - base.t_s)
         log_clutter = math.log(sight.clutter / self.nodes[sight.node].rig.camera.area_px2)
         for k in range(len(y)):
             for light in (0, 1):
@@ -181,12 +179,9 @@ class TrackPool(TrackSteps):
                     child.steps.last = replace(child.steps.last, after=child.state, covariance=child.covariance)
                 self.challengers.append(child)
 
-    def _force(self, estimate: Estimate, sight: Sight, lights: tuple[tuple[int, int], ...]) -> None:
-        lights_m = self.nodes[1 - sight.node].rig.lights_m
-        offset_s = sight.dt_s + (sight.t_s - estimate.t_s)
-        X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, offset_s)
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
-        chosen = tuple((k, light, START_PX**2) for k, light in lights)
-        if np.isfinite([y[k, light] for k, light in lights]).all():
+    def _force(self, estimate: Estimate, sight: Sight, chosen: Chosen) -> None:
+        """Update a start by the lights of the picture that it is made of."""
+        _, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        if np.isfinite([y[k, light] for k, light, _ in chosen]).all():
             self._update_lights(estimate, Association(chosen, np.ones(2), 0.0), y, H, sight)
             estimate.used[sight.node, sight.stamp_ns] = chosen

@@ -9,7 +9,7 @@ drift away without light, and count ten pictures' shaking as ten steps of a walk
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -37,13 +37,8 @@ _IDENTITY: Final = np.eye(3)
 class Shaking:
     """Logs of three variances, both units' angles (rad^2) and the velocity between them; and their information."""
 
-    logs: Floats
-    information: Floats
-
-    def __init__(self, logs: Floats | None = None, information: Floats | None = None) -> None:
-        first = 2.0 * np.log(np.array((SHAKE_RAD, SHAKE_RAD, SHOVE_MPS)))
-        object.__setattr__(self, "logs", first if logs is None else logs)
-        object.__setattr__(self, "information", 0.5 * FIRST * np.eye(3) if information is None else information)
+    logs: Floats = field(default_factory=lambda: 2.0 * np.log(np.array((SHAKE_RAD, SHAKE_RAD, SHOVE_MPS))))
+    information: Floats = field(default_factory=lambda: 0.5 * FIRST * np.eye(3))
 
     @property
     def variances(self) -> Floats:

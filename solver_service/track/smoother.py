@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -32,8 +33,7 @@ class Path:
     t_s, light_s (N,), lights (N,), rates_radps (N, 2, 3): of the steps. states: rows of State.to_row. halves: of the
     covariance of COLUMNS, its upper half. drawn (N, 5): variances that noise added in the step before: of A's and B's
     attitude by shaking, of both by their samples, and of the velocity by shaking. without (N, 2): which node had no
-    inertial unit in that step. oldest (SIZE, SIZE): the whole
-    covariance at the first step.
+    inertial unit in that step. oldest (SIZE, SIZE): the whole covariance at the first step.
     """
 
     t_s: Floats
@@ -55,8 +55,9 @@ class Path:
         """Give the state at a step."""
         return State.of_row(self.states[k])
 
+    @cached_property
     def swings(self) -> Floats:
-        """Give the variance of each node's turn rate, one axis, as its changes from step to step show it, (N, 2)."""
+        """The variance of each node's turn rate, one axis, as its changes from step to step show it, (N, 2)."""
         changes = np.zeros((len(self), 2))
         changes[2:] = 0.5 * ((self.rates_radps[2:] - self.rates_radps[1:-1]) ** 2).mean(axis=2)
         near = np.stack([np.convolve(changes[:, node], np.ones(SWINGS) / SWINGS, "full") for node in (0, 1)], axis=1)
@@ -183,7 +184,7 @@ def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, sh
     left = (share * (1.0 - share))[:, None]
     white = path.drawn[two, 2:4] * np.where(path.without[two], left**3, left)
     slopes = span_s**2 * ((share * (1.0 - share) ** 2) ** 2 + (share**2 * (1.0 - share)) ** 2)
-    most = slopes[:, None] * path.swings()[two]
+    most = slopes[:, None] * path.swings[two]
     variances = np.zeros((len(two), NAV))
     variances[:, PHI[0]] = (np.minimum(shaken[:, 0], most[:, 0]) + white[:, 0])[:, None]
     variances[:, PHI[1]] = (np.minimum(shaken[:, 1], most[:, 1]) + white[:, 1])[:, None]

@@ -13,7 +13,15 @@ from buddyline.solver_service.track.association import Association, associate
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.inputs import TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
-from buddyline.solver_service.track.lights import COLUMNS, Sight, in_picture, light_positions, residuals
+from buddyline.solver_service.track.lights import (
+    BLOCK,
+    COLUMNS,
+    Sight,
+    in_picture,
+    light_positions,
+    pixel_of,
+    residuals,
+)
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, PHI, SIZE, State
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
@@ -26,6 +34,8 @@ TICK_S: Final = 0.1
 # Two pictures nearer than this share a step: the state is carried over so short a time by its rates.
 TOGETHER_S: Final = 0.005
 ATTITUDE_EVERY_S: Final = 0.5
+# A light nearer to the picture's edge need not be found: part of its spot is outside.
+EDGE_PX: Final = 2.0
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
@@ -38,7 +48,6 @@ MOST_GAP_RATE: Final = 4.0
 # 0.7 of its sigma in half a second.
 WANDER_PER_ROOT_S: Final = 1.0
 _STILL: Final = np.eye(MOVING)
-BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -185,20 +194,17 @@ class TrackSteps(TrackIntake):
 
     def _take_lights(self, estimate: Estimate, sight: Sight) -> Look:
         observer = sight.node
-        lights_m = self.nodes[1 - observer].rig.lights_m
         camera = self.nodes[observer].rig.camera
-        offset_s = sight.t_s - estimate.t_s
-        X, D = light_positions(estimate.state, observer, lights_m, estimate.rates_radps, sight.dt_s + offset_s)
-        detection = estimate.detection[observer].copy()
+        X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        detection = estimate.detection[observer]
         wide = estimate.covariance[:3, :3].trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
         if wide:
             inside = [True, True]
         else:
             at = X[0] if len(X) else self._expected(estimate, observer)
-            inside = [in_picture(camera, at[light]) for light in (0, 1)]
+            inside = [in_picture(camera, pixel_of(camera, at[light]), EDGE_PX) for light in (0, 1)]
             detection = detection * np.where(inside, 1.0, 0.02)
         clutter = sight.clutter / camera.area_px2
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
         guide = self.guides.get((observer, sight.stamp_ns))
         given = estimate.given.get((observer, sight.stamp_ns))
         if given is not None:
@@ -226,6 +232,15 @@ class TrackSteps(TrackIntake):
             estimate.told_by[observer] += 1
         return Look(observer, sight.stamp_ns, sight.t_s, found.chosen)
 
+    def _compared(
+        self, sight: Sight, state: State, rates_radps: Floats, after_s: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """Give the lights in the camera frame (K, 2, 3) of a picture after_s after a state, residuals and Jacobians."""
+        lights_m = self.nodes[1 - sight.node].rig.lights_m
+        X, D = light_positions(state, sight.node, lights_m, rates_radps, sight.dt_s + after_s)
+        y, H = residuals(sight.bearings, sight.tangents, X, D)
+        return X, y, H
+
     def _expected(self, estimate: Estimate, observer: int) -> Floats:
         lights_m = self.nodes[1 - observer].rig.lights_m
         X, _ = light_positions(estimate.state, observer, lights_m, estimate.rates_radps, np.zeros(1))
@@ -237,12 +252,10 @@ class TrackSteps(TrackIntake):
 
         The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
         """
-        lights_m = self.nodes[1 - sight.node].rig.lights_m
-        path, chosen = guide.path, guide.look.chosen
-        dt_s = sight.dt_s + (guide.look.t_s - float(path.t_s[guide.step]))
-        X, D = light_positions(path.state(guide.step), sight.node, lights_m, path.rates_radps[guide.step], dt_s)
-        y, H = residuals(sight.bearings, sight.tangents, X, D)
-        P = path.covariance(guide.step)
+        path, step, chosen = guide.path, guide.step, guide.look.chosen
+        after_s = guide.look.t_s - float(path.t_s[step])
+        _, y, H = self._compared(sight, path.state(step), path.rates_radps[step], after_s)
+        P = path.covariance(step)
         if chosen:
             H_used = np.concatenate([H[k, light] for k, light, _ in chosen])
             y_used = np.concatenate([y[k, light] for k, light, _ in chosen])

@@ -10,7 +10,7 @@ import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track.anchors import attitude_residual, depth_residual
-from buddyline.solver_service.track.lights import COLUMNS, light_positions, residuals
+from buddyline.solver_service.track.lights import BLOCK, COLUMNS, light_positions, residuals
 from buddyline.solver_service.track.output import at_one_time, at_one_time_jacobian, pose_jacobian
 from buddyline.solver_service.track.state import (
     CLOCK,
@@ -197,7 +197,7 @@ def test_pose_covariance() -> None:
     J = differences(pose, range(SIZE))
     P = np.diag(np.linspace(0.1, 1.0, SIZE))
     own = pose_jacobian(now) @ at_one_time_jacobian(state, rate)
-    covariance = own @ P[np.ix_(COLUMNS, COLUMNS)] @ own.T
+    covariance = own @ P[BLOCK] @ own.T
     whole = J @ P @ J.T
     assert np.allclose(covariance[:6, :6], whole[:6, :6], atol=3e-3)
     assert np.allclose(covariance[6:9, 6:9], whole[6:, 6:], atol=1e-6)
