@@ -54,7 +54,7 @@ class Publisher(ABC):
         self.key = key
         self._cap = cap
         self._closed = False
-        self._too_large = 0
+        self._warned = False
 
     def put(self, message: Message) -> bool:
         """Encode and send a message; return False as put_bytes does. Raises MessageError."""
@@ -65,9 +65,9 @@ class Publisher(ABC):
     def put_bytes(self, payload: bytes) -> bool:
         """Send an encoded message; return False if its size, the rate cap or a closed bus prevents it."""
         if len(payload) > self.topic.max_bytes:
-            if not self._too_large:
+            if not self._warned:
                 log.warning("%s: %d bytes, at most %d: not sent", self.key, len(payload), self.topic.max_bytes)
-            self._too_large += 1
+            self._warned = True
             return False
         return not self._closed and self._cap.passes() and self._send(payload)
 

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Final, Generic, NamedTuple, TypeVar
 
-# Limits by the first chunks of a key, which the hub's access rules give to one client: whoever invents publishers with
-# gaps makes others forget nothing. MAX_HELD_BYTES: samples of one owner that wait for a gap to close.
+# An owner is the first chunks of a key, which the hub's access rules give to one client. MAX_PUBLISHERS and
+# MAX_HELD_BYTES (samples that wait for a gap to close) are for each owner: a client that invents publishers with gaps
+# takes nothing from another owner. MAX_HELD: samples of one publisher.
 MAX_OWNERS: Final = 256
 MAX_PUBLISHERS: Final = 256
 MAX_HELD: Final = 8192
@@ -52,17 +53,17 @@ class Gap:
 class _Sender(Generic[S]):
     """The next expected number of a publisher, and its samples that arrived after a gap that is still open.
 
-    told: the last number that its heartbeat has told of.
+    announced: the number in its last heartbeat.
     """
 
     due: int
     known: bool
     open: bool = False
-    told: int = -1
+    announced: int = -1
     held: list[tuple[int, S, int]] = field(default_factory=list)
 
 
-class Sequence(Generic[S]):
+class SampleSequence(Generic[S]):
     """Passes samples to `deliver` in order. A gap holds back the later samples of its publisher until it is closed.
 
     missed: number of samples that could not be fetched.
@@ -111,13 +112,13 @@ class Sequence(Generic[S]):
         self._pass(publisher, number, sample)
         return None
 
-    def told(self, source: PublisherId, last: int, *, newest_only: bool = False) -> Gap | None:
-        """Take a heartbeat: the publisher's last number so far. Return the gap up to it, if any.
+    def heartbeat(self, source: PublisherId, last: int, *, newest_only: bool = False) -> Gap | None:
+        """Take a heartbeat, which has the publisher's last number so far; return the gap that it shows, if any.
 
-        A sample may be on its way still, so it counts as missing only when the heartbeat before told of it, too.
+        A sample may still be on its way. So the gap ends at the number in the heartbeat before this one.
         """
         publisher = self._sender(source, _Sender(0, known=False))
-        before, publisher.told = publisher.told, last
+        before, publisher.announced = publisher.announced, last
         if publisher.open or before < publisher.due:
             return None
         if newest_only:

@@ -10,16 +10,16 @@ import zenoh
 from buddyline.protocol.bus import Received, held_order
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
-from buddyline.protocol.sequence import Gap, PublisherId
-from buddyline.protocol.sequence import Sequence as Numbers
+from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from buddyline.protocol.topics import parse_key
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
 from buddyline.protocol.zenoh_bus.session import RETRY_S
 
 QUERY_S: Final = 2.0
-# Threads that fetch, of one owner of keys and of all.
-MAX_FETCHING: Final = 8
-MOST_FETCHING: Final = 64
+# Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all.
+MAX_OWNER_GAPS: Final = 8
+MAX_GAPS: Final = 64
+# Queries for one gap.
 FETCHES: Final = 16
 
 
@@ -47,15 +47,14 @@ class ZenohSubscription:
         self._clock = clock
         self._failures = failures
         self._lock = threading.Lock()
-        self._sequence = Numbers(self._deliver)
+        self._sequence = SampleSequence(self._deliver)
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
         subscribers = [(key_expr, self._accept, self._declare(key_expr)) for key_expr in key_exprs]
         if history:
-            beats = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
-            subscribers += [(beat, self._heed, self._declare(beat)) for beat in beats]
-        if history:
-            held = [sample for key_expr in key_exprs for sample in self._query(f"{key_expr}/@adv/pub/**")]
+            beside = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
+            subscribers += [(selector, self._accept_heartbeat, self._declare(selector)) for selector in beside]
+            held = [sample for selector in beside for sample in self._query(selector)]
             for sample in sorted(held, key=_number):
                 self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
@@ -106,8 +105,8 @@ class ZenohSubscription:
             )
             self._start_filling(gap)
 
-    def _heed(self, sample: zenoh.Sample) -> None:
-        """Take a publisher's heartbeat: on its key and `@adv/pub/ZID/EID/_`, its last number as four bytes."""
+    def _accept_heartbeat(self, sample: zenoh.Sample) -> None:
+        """Take a publisher's heartbeat: on its key with `/@adv/pub/ZID/EID/_`, its last number as four bytes."""
         key, _, rest = str(sample.key_expr).partition("/@adv/pub/")
         chunks, payload = rest.split("/"), sample.payload.to_bytes()
         if sample.kind != zenoh.SampleKind.PUT or len(payload) != 4 or len(chunks) < 2 or not chunks[1].isdecimal():
@@ -115,14 +114,13 @@ class ZenohSubscription:
         source = PublisherId(key, chunks[0], int(chunks[1]))
         with self._lock:
             last = int.from_bytes(payload, "little")
-            self._start_filling(self._sequence.told(source, last, newest_only=_newest_only(key)))
+            self._start_filling(self._sequence.heartbeat(source, last, newest_only=_newest_only(key)))
 
     def _start_filling(self, gap: Gap | None) -> None:
         """Fetch a gap in a thread of its own; the lock is held."""
         # Limited by owner: a client that invents publishers with gaps takes no thread from another's.
         while gap is not None and (
-            list(self._fetching.values()).count(gap.source.owner) >= MAX_FETCHING
-            or len(self._fetching) >= MOST_FETCHING
+            list(self._fetching.values()).count(gap.source.owner) >= MAX_OWNER_GAPS or len(self._fetching) >= MAX_GAPS
         ):
             gap = self._sequence.close(gap, [])
         if gap is not None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from buddyline.protocol import sequence
-from buddyline.protocol.sequence import Gap, PublisherId, Sequence
+from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,7 +22,7 @@ class Listener:
 
     def __init__(self) -> None:
         self.got: list[tuple[str, int]] = []
-        self.sequence = Sequence(self.got.append)
+        self.sequence = SampleSequence(self.got.append)
 
     def accept(self, source: PublisherId, number: int, **more: Any) -> Gap | None:
         return self.sequence.accept(source, number, (name_of(source), number), **more)
@@ -196,11 +196,11 @@ def test_whoever_invents_publishers_makes_others_forget_nothing() -> None:
 def test_a_heartbeat_tells_of_the_last_sample_and_the_next_one_that_it_is_lost() -> None:
     listener = Listener()
     listener.accept(A, 0)
-    assert listener.sequence.told(A, 0) is None
-    assert listener.sequence.told(A, 2) is None
-    gap = listener.sequence.told(A, 3)
+    assert listener.sequence.heartbeat(A, 0) is None
+    assert listener.sequence.heartbeat(A, 2) is None
+    gap = listener.sequence.heartbeat(A, 3)
     assert gap == Gap(A, range(1, 3), known=True)
-    assert listener.sequence.told(A, 3) is None
+    assert listener.sequence.heartbeat(A, 3) is None
     # What comes meanwhile waits; what was late and is fetched as well comes once.
     assert listener.accept(A, 2) is None
     assert listener.accept(A, 3) is None
@@ -212,10 +212,10 @@ def test_a_heartbeat_tells_of_the_last_sample_and_the_next_one_that_it_is_lost()
 def test_what_a_heartbeat_tells_of_and_nobody_has_is_missed_once() -> None:
     listener = Listener()
     listener.accept(A, 0)
-    listener.sequence.told(A, 4)
-    gap = listener.sequence.told(A, 4)
+    listener.sequence.heartbeat(A, 4)
+    gap = listener.sequence.heartbeat(A, 4)
     assert listener.close(gap, [2]) is None
-    assert listener.sequence.told(A, 4) is None
+    assert listener.sequence.heartbeat(A, 4) is None
     assert listener.accept(A, 5) is None
     assert listener.numbers() == [0, 2, 5]
     assert listener.sequence.missed == 3
@@ -223,8 +223,8 @@ def test_what_a_heartbeat_tells_of_and_nobody_has_is_missed_once() -> None:
 
 def test_of_a_state_the_newest_alone_is_fetched() -> None:
     listener = Listener()
-    listener.sequence.told(A, 7, newest_only=True)
-    gap = listener.sequence.told(A, 7, newest_only=True)
+    listener.sequence.heartbeat(A, 7, newest_only=True)
+    gap = listener.sequence.heartbeat(A, 7, newest_only=True)
     assert gap == Gap(A, range(7, 8), known=False)
     assert listener.close(gap, [7]) is None
     assert listener.numbers() == [7]
