@@ -175,7 +175,7 @@ def _admit(path: Path, node: str) -> None:
     nodes = [word for word in re.findall(r'"([^"]*)"', line.group(1)) if word != node] + [node]
     listed = ", ".join(f'"{word}"' for word in sorted(nodes))
     path.write_text(f"{text[: line.start()]}nodes = [{listed}]{text[line.end() :]}", encoding="utf-8")
-    _say(f"{path}: node {node} may publish; a hub that runs reads it when it is started again")
+    _say(f"{path}: node {node} may publish; a running hub takes that within seconds")
 
 
 def _say(text: str) -> None:
