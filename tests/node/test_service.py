@@ -33,7 +33,7 @@ from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import NodeStatus
 
 from tests.disks import small_disk
-from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint
+from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint, until
 
 CONFIG = """
 node = "a"
@@ -105,13 +105,6 @@ def node(tmp_path, directory, images_hz=0.0):
     finally:
         process.end()
         manager.close()
-
-
-def until(condition):
-    deadline, pause = time.monotonic() + PATIENCE_S, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come"
-        pause.wait(0.02)
 
 
 def problems(status):

@@ -1,6 +1,5 @@
 """A solver that is started again says what has not been said, and nothing twice."""
 
-import time
 from collections import Counter
 
 import pytest
@@ -16,7 +15,7 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S
+from tests.processes import until
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 
 
@@ -130,10 +129,3 @@ def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
 
 def payload_trigger(received):
     return decode(received.payload, parse_key(received.key)[0].schema).trigger
-
-
-def until(condition):
-    ends_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < ends_s
-        time.sleep(0.005)

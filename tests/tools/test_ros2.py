@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import struct
 import threading
 from pathlib import Path
@@ -155,9 +154,7 @@ def test_an_attachment_is_33_bytes() -> None:
 def test_over_the_bus_keys_tokens_and_sequence_are_those_of_rmw_zenoh(store: Any) -> None:
     from buddyline.protocol.zenoh_bus import open_hub, open_session
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    endpoint = free_endpoint()
     came: list[Any] = []
     enough = threading.Event()
 

@@ -18,7 +18,7 @@ from buddyline.protocol.messages import Mark, NodeStatus
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S, free_endpoint
+from tests.processes import free_endpoint, until
 
 mock = pytest.importorskip("gpiozero.pins.mock", reason="gpiozero is not installed")
 
@@ -279,19 +279,12 @@ def test_a_whole_node_takes_marks_by_the_button_and_shows_its_status(tmp_path, m
     )
     service = NodeService(config)
     service.open()
-    deadline_s, pause = time.monotonic() + PATIENCE_S, threading.Event()
-
-    def until(condition):
-        while not condition():
-            assert time.monotonic() < deadline_s
-            pause.wait(0.02)
-
     try:
         service.start()
         pin = gpiozero.Device.pin_factory.pin
         until(lambda: service.outlet.sent["candidates"] and pin(LIGHTS).function == "output" and pin(LIGHTS).state)
         pin(BUTTON).drive_low()
-        pause.wait(0.3)
+        time.sleep(0.3)
         pin(BUTTON).drive_high()
         until(lambda: service.outlet.sent["mark"])
         until(lambda: service.status_message and service.status_message.lights_seen is not UNSET)
