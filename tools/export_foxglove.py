@@ -30,16 +30,14 @@ from buddyline.protocol.messages import (
 from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
+from buddyline.tools.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.newfile import new_file
 from msgspec import UNSET
 
 WORLD: Final = "world"
 TRANSFORMS: Final = "/tf"
-# Greatest rate of A's own transform between poses: a viewer needs no more.
-ATTITUDE_SPACING_NS: Final = S_NS // 20
 KEPT_FRAMES: Final = 256
 DISTORTION_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "kannala_brandt"}
-R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # A's attitude until it is known: level, looking north.
 R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 # The path is written in pieces of this length, so that it can be watched as it grows.
@@ -54,26 +52,21 @@ class FoxgloveTranslation:
         self._fox = schemas
         self._tracked = set(tracked)
         self._paths: dict[tuple[str, str], list[Track]] = {}
-        self._infos: dict[str, NodeInfo] = {}
         self._frames: dict[str, deque[Candidates]] = {}
-        self._depth_m: dict[str, float] = {}
-        self._attitude_ns: dict[str, int] = {}
-        self._base: str | None = None
+        self._camera = BaseCamera()
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
         """Yield the messages before the dive's first: A level at the origin. base: A's id."""
-        self._infos.update(infos)
-        self._base = base
+        self._camera.infos.update(infos)
+        self._camera.base = base
         if base is not None:
             yield TRANSFORMS, at_ns, self._transform(WORLD, f"{base}_camera", np.zeros(3), R_ENU_LEVEL, at_ns)
 
     def messages(self, envelope: Envelope) -> Iterator[tuple[str, int, Any]]:
         """Yield (topic, stamp_ns, Foxglove message) for one of ours."""
         message = envelope.message
-        if isinstance(message, NodeInfo):
-            self._infos[message.node] = message
-        elif isinstance(message, Depth):
-            self._depth_m[message.node] = message.depth_m
+        if isinstance(message, NodeInfo | Depth):
+            self._camera.take(message)
         elif isinstance(message, Attitude):
             yield from self._attitude(message)
         elif isinstance(message, CompressedImage):
@@ -88,22 +81,14 @@ class FoxgloveTranslation:
 
     def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
         node, stamp_ns = attitude.node, attitude.stamp_ns
-        info = self._infos.get(node)
-        before_ns = self._attitude_ns.get(node)
-        if node != self._base or info is None:
-            return
-        if before_ns is not None and 0 <= stamp_ns - before_ns < ATTITUDE_SPACING_NS:
-            return
-        self._attitude_ns[node] = stamp_ns
-        R_ned_body, R_body_camera = quat_to_matrix(np.array((attitude.q_ned_body_xyzw, info.q_body_camera_xyzw)))
-        R_ned_camera = R_ned_body @ R_body_camera
-        origin_m = np.array([0.0, 0.0, -self._depth_m.get(node, 0.0)])
-        transform = self._transform(WORLD, f"{node}_camera", origin_m, R_ENU_NED @ R_ned_camera, stamp_ns)
-        yield TRANSFORMS, stamp_ns, transform
+        R = self._camera.orientation(attitude)
+        if R is not None:
+            position_m = self._camera.position_m(node)
+            yield TRANSFORMS, stamp_ns, self._transform(WORLD, f"{node}_camera", position_m, R, stamp_ns)
 
     def _image(self, node: str, image: CompressedImage) -> Iterator[tuple[str, int, Any]]:
         stamp_ns = image.stamp_ns
-        info = self._infos.get(node)
+        info = self._camera.infos.get(node)
         if info is not None:
             yield f"/{node}/camera/calibration", stamp_ns, self._calibration(info, stamp_ns)
         picture = self._fox.CompressedImage(
@@ -178,8 +163,7 @@ class FoxgloveTranslation:
         fox, first = self._fox, piece[0]
         known = [one.t_ned_m for one in piece if one.t_ned_m is not UNSET]
         if len(known) == len(piece):
-            above_m = np.array([0.0, 0.0, -self._depth_m.get(first.node_a, 0.0)])
-            frame, points_m = WORLD, np.array(known) @ R_ENU_NED.T + above_m
+            frame, points_m = WORLD, np.array(known) @ R_ENU_NED.T + self._camera.position_m(first.node_a)
         else:
             frame, points_m = f"{first.node_a}_camera", np.array([one.t_a_b_m for one in piece])
         line = fox.LinePrimitive(

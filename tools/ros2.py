@@ -24,6 +24,7 @@ from buddyline.protocol.security import ROS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE, TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.client import client_config
+from buddyline.tools.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
@@ -38,10 +39,8 @@ NODE_NAME: Final = "buddyline"
 QOS: Final = "::,10:,:,:,,"
 # builtin_interfaces/Time counts seconds in 32 bits, with a sign.
 END_OF_ROS_TIME_NS: Final = 2**31 * S_NS
-TRANSFORM_SPACING_NS: Final = S_NS // 20
 # After a track has been silent for this time, poses give B's transform again.
 TRACK_SILENT_NS: Final = S_NS
-R_ENU_NED: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # Between forward, left, up and forward, right, down: the matrix is its own inverse.
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 # Variance of a field that was not measured: large, so that filters ignore the field.
@@ -72,29 +71,26 @@ class Translation:
 
     def __init__(self, types: dict[str, Any]) -> None:
         self._types = types
-        self._infos: dict[str, NodeInfo] = {}
-        self._depth_m: dict[str, float] = {}
-        self._transform_ns: dict[str, int] = {}
+        self._camera = BaseCamera()
         self._tracked_ns: dict[tuple[str, str], int] = {}
-        self._base: str | None = None
 
     def messages(self, message: Message) -> Iterator[RosMessage]:
         """Yield the ROS messages for one of our messages; raise MessageError where ROS cannot say its time."""
         if isinstance(message, Attitude | Depth | RelativePose | Track) and message.stamp_ns >= END_OF_ROS_TIME_NS:
             raise MessageError(f"stamp_ns {message.stamp_ns}: the time of ROS 2 ends in 2038")
         if isinstance(message, NodeInfo):
-            self._infos[message.node] = message
+            self._camera.take(message)
         elif isinstance(message, Attitude):
             yield self._imu(message)
             yield from self._camera_in_map(message)
         elif isinstance(message, Depth):
-            self._depth_m[message.node] = message.depth_m
+            self._camera.take(message)
             yield self._depth(message)
         elif isinstance(message, RelativePose):
-            self._base = message.node_a
+            self._camera.base = message.node_a
             yield from self._pose(message)
         elif isinstance(message, Track):
-            self._base = message.node_a
+            self._camera.base = message.node_a
             yield from self._track(message)
 
     def _imu(self, attitude: Attitude) -> RosMessage:
@@ -116,17 +112,10 @@ class Translation:
 
     def _camera_in_map(self, attitude: Attitude) -> Iterator[RosMessage]:
         """Yield the transform of A's camera. B's follows from the pose, because a frame has only one parent."""
-        node, stamp_ns = attitude.node, attitude.stamp_ns
-        info, before_ns = self._infos.get(node), self._transform_ns.get(node)
-        if node != self._base or info is None:
-            return
-        if before_ns is not None and 0 <= stamp_ns - before_ns < TRANSFORM_SPACING_NS:
-            return
-        self._transform_ns[node] = stamp_ns
-        R_ned_body, R_body_camera = quat_to_matrix(np.array((attitude.q_ned_body_xyzw, info.q_body_camera_xyzw)))
-        R_ned_camera = R_ned_body @ R_body_camera
-        above_m = (0.0, 0.0, -self._depth_m.get(node, 0.0))
-        yield self._transform(stamp_ns, MAP, f"{name_of(node)}_camera", above_m, R_ENU_NED @ R_ned_camera)
+        R = self._camera.orientation(attitude)
+        if R is not None:
+            x, y, z = self._camera.position_m(attitude.node).tolist()
+            yield self._transform(attitude.stamp_ns, MAP, f"{name_of(attitude.node)}_camera", (x, y, z), R)
 
     def _depth(self, depth: Depth) -> RosMessage:
         variances = np.full(6, UNKNOWN_VARIANCE)
