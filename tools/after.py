@@ -136,22 +136,22 @@ def _solve(outing: Outing, folder: Path) -> int:
 
 def _clock_offset_s(logs: list[str]) -> float | None:
     """Return B's clock minus A's by the nodes' beacons, or else by how they moved; None where neither tells."""
-    for words in (["calibrate", "clock", *logs, "--json"], ["align", *logs, "--json"]):
+    for command in ("calibrate clock", "align"):
         said = io.StringIO()
         try:
             with redirect_stdout(said):
-                _command(words)
-            found = json.loads(said.getvalue())
-        except (BuddylineError, json.JSONDecodeError) as error:
-            log.info("clocks: `%s` does not tell: %s", words[0], error)
+                status = _command([*command.split(), *logs, "--json"])
+        except BuddylineError as error:
+            log.info("clocks: `%s` does not tell: %s", command, error)
             continue
+        if status != 0:
+            continue
+        found = json.loads(said.getvalue())
         # Beacons of before and after the dive: the middle is what the whole dive is off by.
-        offsets = found.get("offsets") or [one for pair in found.get("pairs", []) for one in pair["offsets"]] or [found]
-        known = [one["offset_s"] for one in offsets if "offset_s" in one]
-        if known:
-            offset_s = float(sum(known) / len(known))
-            log.info("clocks: B's is %+.2f ms from A's, by `%s`", 1e3 * offset_s, " ".join(words[:2]))
-            return offset_s
+        estimates = [one for pair in found.get("pairs", []) for one in pair["offsets"]] or [found]
+        offset_s = float(sum(one["offset_s"] for one in estimates) / len(estimates))
+        log.info("clocks: B's is %+.2f ms from A's, by `%s`", 1e3 * offset_s, command)
+        return offset_s
     log.warning("clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set")
     return None
 
