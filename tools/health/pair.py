@@ -53,7 +53,7 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
 def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
     """Return the findings from a node's status: its problem (since since_ns), temperature, supply, battery and clock.
 
-    What is a problem of supply, battery and load, the node's own `problem` says; here is what deserves a warning.
+    The node's own `problem` already names problems of supply, battery and load: here are their warnings alone.
     """
     said = []
     if status.problem:

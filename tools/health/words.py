@@ -42,7 +42,7 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
     "duplicate": ("candidates came twice", "make sure that no two nodes have the same id"),
 }
 
-
+# What a node has lowered to save power or to cool down, by its status's `load`.
 LOADS: Final = {"no_pictures": "load lowered: no pictures", "half_rate": "load lowered: no pictures, half the rate"}
 
 
