@@ -1,4 +1,4 @@
-"""One inertial unit made of several chips: body frame, recovery, and rejection of impossible readings."""
+"""Inertial units as boards of one or more chips: body frame, recovery, and rejection of impossible readings."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class Magnetometer(Protocol):
         ...
 
 
-class Lsm303dL3gd20h:
-    """The two motion chips of the MinIMU-9 v3; their axes are parallel on the board."""
+class MotionChipPair:
+    """LSM303D and L3GD20H, the motion chips of the MinIMU-9 v3; their axes are parallel on the board."""
 
     def __init__(self, lsm303d: Lsm303d, l3gd20h: L3gd20h) -> None:
         self._lsm303d = lsm303d
@@ -102,8 +102,8 @@ class SoughtLis3mdl:
         return self._chip.read_mag()
 
 
-class ChipImu:
-    """Several chips as one device in the body frame.
+class ImuBoard:
+    """The chips of one board as one device in the body frame.
 
     R_body_chip: (3, 3), maps the board's axes to the body's (x forward, y right, z down). After any failure
     the chips are identified and set up again before the next reading counts, because a chip sleeps after a
@@ -214,7 +214,7 @@ class ChipImu:
         self._mag_problem = str(error)
 
 
-class MinImu9V3(ChipImu):
+class MinImu9V3(ImuBoard):
     """Pololu MinIMU-9 v3: LSM303D and L3GD20H."""
 
     @classmethod
@@ -223,11 +223,11 @@ class MinImu9V3(ChipImu):
         lsm303d, l3gd20h = Lsm303d.find(bus), L3gd20h.find(bus)
         if lsm303d is None or l3gd20h is None:
             return None
-        return cls(name, Lsm303dL3gd20h(lsm303d, l3gd20h), lsm303d, R_body_chip, clock)
+        return cls(name, MotionChipPair(lsm303d, l3gd20h), lsm303d, R_body_chip, clock)
 
 
-class Lsm6dsImu(ChipImu):
-    """An LSM6DS chip, with a LIS3MDL beside it where MAGNETOMETER is set."""
+class Lsm6dsBoard(ImuBoard):
+    """A board with an LSM6DS chip, and with a LIS3MDL where MAGNETOMETER is set."""
 
     CHIP: type[Lsm6ds] = Lsm6ds
     MAGNETOMETER = True
@@ -241,20 +241,20 @@ class Lsm6dsImu(ChipImu):
         return cls(name, motion, SoughtLis3mdl(bus) if cls.MAGNETOMETER else None, R_body_chip, clock)
 
 
-class MinImu9V5(Lsm6dsImu):
+class MinImu9V5(Lsm6dsBoard):
     """Pololu MinIMU-9 v5: LSM6DS33 and LIS3MDL."""
 
     CHIP = Lsm6ds33
 
 
-class MinImu9V6(Lsm6dsImu):
+class MinImu9V6(Lsm6dsBoard):
     """Pololu MinIMU-9 v6, and other boards with an LSM6DSO and a LIS3MDL on parallel axes."""
 
     CHIP = Lsm6dso
 
 
-class Lsm6dsAlone(Lsm6dsImu):
-    """An LSM6DS33 or LSM6DSO without a magnetometer: no heading."""
+class Lsm6dsOnlyBoard(Lsm6dsBoard):
+    """A board with an LSM6DS33 or LSM6DSO and no magnetometer: no heading."""
 
     MAGNETOMETER = False
 

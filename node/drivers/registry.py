@@ -23,7 +23,7 @@ IMUS: Final[Mapping[str, str]] = {
     "minimu9_v3": "buddyline.node.drivers.imu:MinImu9V3",
     "minimu9_v5": "buddyline.node.drivers.imu:MinImu9V5",
     "minimu9_v6": "buddyline.node.drivers.imu:MinImu9V6",
-    "lsm6ds": "buddyline.node.drivers.imu:Lsm6dsAlone",
+    "lsm6ds": "buddyline.node.drivers.imu:Lsm6dsOnlyBoard",
 }
 
 # `auto` never chooses a board without a magnetometer: one that does not answer would be taken for a missing one.

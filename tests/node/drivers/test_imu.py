@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from buddyline.node.drivers import l3gd20h, lis3mdl, lsm6ds, lsm303d
 from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.imu import Lsm6dsAlone, MinImu9V3, MinImu9V5, MinImu9V6
+from buddyline.node.drivers.imu import Lsm6dsOnlyBoard, MinImu9V3, MinImu9V5, MinImu9V6
 from buddyline.node.drivers.ms5837 import Ms5837
 from buddyline.node.drivers.registry import open_depth, open_imu
 from buddyline.node.drivers.samples import DeviceError
@@ -324,7 +324,7 @@ def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sk
 
 
 @pytest.mark.parametrize(
-    ("cls", "name"), [(MinImu9V3, "v3"), (MinImu9V5, "v5"), (MinImu9V6, "v6"), (Lsm6dsAlone, "six")]
+    ("cls", "name"), [(MinImu9V3, "v3"), (MinImu9V5, "v5"), (MinImu9V6, "v6"), (Lsm6dsOnlyBoard, "six")]
 )
 def test_find_returns_none_on_an_empty_bus(cls, name, bus, clock):
     assert cls.find(name, bus, np.eye(3), clock) is None
