@@ -82,7 +82,7 @@ COMMANDS: Final = (
     ),
     Command(
         "doctor",
-        "check what is forgotten before a dive, and say what to do about it",
+        "check all that a dive needs, and say what to do about each problem",
         ("doctor --config a.toml", "doctor", "doctor --config a.toml --json"),
         "tools.doctor.command",
     ),

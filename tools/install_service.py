@@ -63,10 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("service", choices=tuple(AFTER), help="which unit to write: buddyline-<service>.service")
     parser.add_argument("--config", metavar="FILE.toml", help="its configuration; a node must have one")
     parser.add_argument(
-        "--run-as", metavar="USER", help="default: the user who called sudo; needs access to camera and I2C bus only"
+        "--run-as", metavar="USER", help="who runs the service; default: who called sudo. The unit adds the groups"
     )
     parser.add_argument("--print", action="store_true", help="show the unit, write nothing")
-    parser.add_argument("--user", action="store_true", help="a unit of your own (systemctl --user), not hardened")
+    parser.add_argument("--user", action="store_true", help="write a unit of your own (systemctl --user), not hardened")
     parser.add_argument("--root", metavar="DIR", help="write below this directory, such as a mounted card")
     parser.add_argument("--force", action="store_true", help="replace a unit that has other contents")
 

@@ -19,9 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "2 the configuration cannot be used."
     )
     parser.add_argument(
-        "--config", metavar="FILE.toml", help="a node's configuration, or a client's; default: this machine and the bus"
+        "--config",
+        metavar="FILE.toml",
+        help="a node's configuration: its devices are checked too; or a client's: its hub",
     )
-    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, in place of the configured one")
+    parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, as tcp/host:7447; replaces the configured one")
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
 
 

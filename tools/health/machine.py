@@ -42,7 +42,7 @@ def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: boo
     """
     worst: Level = "problem" if stamps else "warning"
     if error:
-        return Finding("clock", worst, error, "see node/README.md: chrony on two Pis")
+        return Finding("clock", worst, error, "see node/README.md, Synchronise the clocks")
     if tracking is None:
         if timesyncd:
             return Finding("clock", "warning", "set by systemd-timesyncd, to milliseconds", "apt install chrony")
