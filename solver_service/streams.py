@@ -50,17 +50,12 @@ def size_bytes(frame: Candidates) -> int:
 
 
 class FrameWindow:
-    """A node's frames, sorted by stamp. Beyond a minute or MAX_FRAME_BYTES the oldest are dropped; `evicted` counts."""
+    """A node's frames, sorted by stamp. Beyond a minute or MAX_FRAME_BYTES the oldest are dropped."""
 
     def __init__(self) -> None:
-        self.evicted = 0
         self.bytes = 0
         self._stamps: list[int] = []
         self._frames: list[tuple[Candidates, int | None]] = []
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-        return len(self._frames)
 
     def add(self, frame: Candidates, receive_ns: int | None) -> None:
         """Take a frame; frames may come in any order."""
@@ -71,7 +66,6 @@ class FrameWindow:
         while self.bytes > MAX_FRAME_BYTES or self._stamps[0] < self._stamps[-1] - KEPT_NS:
             self.bytes -= size_bytes(self._frames[0][0])
             del self._stamps[0], self._frames[0]
-            self.evicted += 1
 
     def between(self, start_ns: int, end_ns: int) -> list[Candidates]:
         """Return the frames from start_ns to end_ns, both included."""

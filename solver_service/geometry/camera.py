@@ -61,11 +61,6 @@ class Camera:
         """Give the unit bearings (N, 3) of distorted pixels (N, 2)."""
         return self.rays(pixels)[0]
 
-    @cached_property
-    def size_px(self) -> Floats:
-        """Width and height (2, 1)."""
-        return np.array(((self.width_px,), (self.height_px,)), dtype=np.float64)
-
     @property
     def area_px2(self) -> float:
         """The picture's area."""
@@ -93,7 +88,7 @@ class Camera:
         grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         with np.errstate(all="ignore"):
             _, px2_per_sr = self.frames(grid)
-            angle = float(np.nansum(self.width_px * self.height_px / (columns * rows) / px2_per_sr))
+            angle = float(np.nansum(self.area_px2 / (columns * rows) / px2_per_sr))
         return angle if 0.0 < angle < 13.0 else 1.0
 
     def _pinhole_frames(self, distorted: Floats) -> tuple[Floats, Floats]:

@@ -72,13 +72,10 @@ class Spans:
 class ClosedForm:
     """What the closed form says of K hypotheses.
 
-    u: (2, 3, K) bearings of the other bar's middle from one's own. range_m: (2, K) l_A and l_B.
-    twist_rad: (2, K) tau_A and tau_B; twist_gap_rad: (K,) the difference, within +-pi. T_a_b: K poses.
+    range_m: (2, K) l_A and l_B. twist_gap_rad: (K,) tau_A - tau_B, within +-pi. T_a_b: K poses.
     """
 
-    u: Floats
     range_m: Floats
-    twist_rad: Floats
     twist_gap_rad: Floats
     T_a_b: SE3
 
@@ -137,9 +134,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
         solved = _pose(u, span, slant, _angles(spans.chord), bars, mean_twist=False)
     from_bar = [SE3(turn.T, np.zeros(3)) for turn in turns]
     return ClosedForm(
-        u=turns.swapaxes(1, 2) @ solved.u,
         range_m=solved.range_m,
-        twist_rad=solved.twist_rad,
         twist_gap_rad=solved.twist_gap_rad,
         T_a_b=from_bar[0] @ solved.T_a_b @ from_bar[1].inverse(),
     )
@@ -147,7 +142,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
 
 def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
     """Solve K hypotheses between the bar frames."""
-    # What tells only how to move the bearings need not be split as finely.
+    # Where the bars are not centred, the first split only tells how to move the bearings: one round is enough.
     angles = _angles(spans.chord)
     u, span = _split(spans, angles[0], split_rounds if bars.centred else 1)
     if not bars.centred:
@@ -211,7 +206,7 @@ def _pose(
     if not bars.centred:
         middle_a_m, middle_b_m = bars.middle_m[:, :, 0]
         t = t + middle_a_m - R @ middle_b_m
-    return ClosedForm(u, range_m, twist, twist_gap, SE3(R, t))
+    return ClosedForm(range_m, twist_gap, SE3(R, t))
 
 
 def _from_middles(ends: Floats, u: Floats, span: Floats, angles: tuple[Floats, Floats], bars: Bars) -> Floats:

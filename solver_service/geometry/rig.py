@@ -60,18 +60,6 @@ class Rig:
         return np.array((x, y, np.cross(x, y)))
 
     @cached_property
-    def in_bar_frame(self) -> Rig:
-        """The same rig in its bar frame. Its camera still gives bearings in the camera frame."""
-        turn = self.R_bar_camera
-        return Rig(
-            camera=self.camera,
-            lights_m=self.lights_m @ turn.T,
-            R_body_camera=self.R_body_camera @ turn.T,
-            depth_port_m=turn @ self.depth_port_m,
-            declination_rad=self.declination_rad,
-        )
-
-    @cached_property
     def usable(self) -> bool:
         """Whether the lights are finite and apart."""
         return bool(np.isfinite(self.lights_m).all()) and self.length_m >= 1e-3
@@ -81,7 +69,7 @@ class Rig:
 class RigPair:
     """What follows from two rigs together; arrays hold A's value first.
 
-    rigs: as given. in_bar_frames: the same. R_bar_camera (2, 3, 3). lights_m (2, 2, 3), middle_m (2, 3): bar frames.
+    rigs: as given. R_bar_camera (2, 3, 3). lights_m (2, 2, 3), middle_m (2, 3): bar frames.
     port_m (2, 3): bar frames. lights_in_camera_m, port_in_camera_m: camera frames. length_m (2,): of the bars. size_px
     (2, 2): width and height of the pictures. solid_angle_sr (2,): of the pictures. offset_m: of both bars' middles from
     their cameras, together. gap_per_bearing_m2: half the sum of the bars' lengths^-2, the variance of a gap over that
@@ -89,7 +77,6 @@ class RigPair:
     """
 
     rigs: tuple[Rig, Rig]
-    in_bar_frames: tuple[Rig, Rig]
     R_bar_camera: Floats
     lights_m: Floats
     lights_in_camera_m: Floats
@@ -144,15 +131,14 @@ class RigPair:
 def pair_of(rig_a: Rig, rig_b: Rig) -> RigPair:
     """Give what two rigs have together, once for each two."""
     rigs = rig_a, rig_b
-    in_bar_frames = rig_a.in_bar_frame, rig_b.in_bar_frame
+    lights_m = np.array([rig.lights_m @ rig.R_bar_camera.T for rig in rigs])
     return RigPair(
         rigs=rigs,
-        in_bar_frames=in_bar_frames,
         R_bar_camera=np.array([rig.R_bar_camera for rig in rigs]),
-        lights_m=np.array([rig.lights_m for rig in in_bar_frames]),
+        lights_m=lights_m,
         lights_in_camera_m=np.array([rig.lights_m for rig in rigs]),
-        middle_m=np.array([rig.middle_m for rig in in_bar_frames]),
-        port_m=np.array([rig.depth_port_m for rig in in_bar_frames]),
+        middle_m=(lights_m[:, 0] + lights_m[:, 1]) / 2.0,
+        port_m=np.array([rig.R_bar_camera @ rig.depth_port_m for rig in rigs]),
         port_in_camera_m=np.array([rig.depth_port_m for rig in rigs]),
         length_m=np.array([rig.length_m for rig in rigs]),
         size_px=np.array([(rig.camera.width_px, rig.camera.height_px) for rig in rigs], dtype=np.float64),

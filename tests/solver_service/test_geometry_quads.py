@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.batch import Batch
-from buddyline.solver_service.geometry.closed_form import closed_form
+from buddyline.solver_service.geometry.closed_form import Bars, Spans, solve_exact
 from buddyline.solver_service.geometry.observation import Observation, Settings
 from buddyline.solver_service.geometry.quads import join
 
@@ -27,13 +27,10 @@ def test_every_combination_within_both_gates_is_found(rigs, count, triggers):
         a, b, swap = (grid.ravel() for grid in np.meshgrid(of_a, of_b, (False, True), indexing="ij"))
         (of_first, of_second), bearings = pairs.ends, batch.candidates.bearing
         first, second = np.where(swap, of_second[b], of_first[b]), np.where(swap, of_first[b], of_second[b])
-        bar_frames = batch.rigs.in_bar_frames
+        left = np.stack((bearings[:, of_first[a]], bearings[:, first]))
+        right = np.stack((bearings[:, of_second[a]], bearings[:, second]))
         with np.errstate(all="ignore"):
-            solved = closed_form(
-                np.stack((bearings[:, of_first[a]], bearings[:, first])),
-                np.stack((bearings[:, of_second[a]], bearings[:, second])),
-                *bar_frames,
-            )
+            solved = solve_exact(Spans.of(np.stack((left, right))), Bars.of(batch.rigs))
             gap = np.log(solved.range_m[0] / solved.range_m[1])
             gate = GATE * np.sqrt(pairs.variance[a] + pairs.variance[b])
             within = (np.abs(gap) < gate) & (np.abs(solved.twist_gap_rad) < gate)
