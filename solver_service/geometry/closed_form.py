@@ -116,9 +116,10 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
     "paper" splits alpha in half, "paper_midpoint" takes the middle of the two images on the plane z = 1,
     "paper_literal" the latter and the angle to the optical axis for beta, as the paper's text has them.
     """
-    turns = np.array((rig_a.R_bar_camera, rig_b.R_bar_camera))
+    pair = pair_of(rig_a, rig_b)
+    turns = pair.R_bar_camera
     spans = Spans.of(turns @ np.array((left, right)))
-    bars = Bars.of(pair_of(rig_a, rig_b))
+    bars = Bars.of(pair)
     if variant == "exact":
         solved = solve_exact(spans, bars)
     else:
@@ -132,12 +133,7 @@ def closed_form(left: Floats, right: Floats, rig_a: Rig, rig_b: Rig, variant: Va
         span = spans.w - u * dot(u, spans.w)[:, None]
         span /= np.sqrt(dot(span, span))[:, None]
         solved = _pose(u, span, slant, _angles(spans.chord), bars, mean_twist=False)
-    from_bar = [SE3(turn.T, np.zeros(3)) for turn in turns]
-    return ClosedForm(
-        range_m=solved.range_m,
-        twist_gap_rad=solved.twist_gap_rad,
-        T_a_b=from_bar[0] @ solved.T_a_b @ from_bar[1].inverse(),
-    )
+    return ClosedForm(solved.range_m, solved.twist_gap_rad, pair.between_cameras(solved.T_a_b))
 
 
 def solve_exact(spans: Spans, bars: Bars, *, split_rounds: int = _ROUNDS, offset_rounds: int = _ROUNDS) -> ClosedForm:
