@@ -51,12 +51,13 @@ def read_three_lights(batch: Batch, wanted: NDArray[np.bool_]) -> Read:
     guesses = guess(batch, wanted)
     seen, settings = batch.candidates, batch.settings
     trigger, lights = guesses.trigger, guesses.lights
-    refined = _refined(batch, guesses)
+    across = _across(batch.sensors.R_ned_camera[trigger, 0, 2])
+    refined = _refined(batch, guesses, across)
     T_a_b = refined.T_a_b.retract(refined.solved.step)
     range2 = inner(T_a_b.t_m, T_a_b.t_m)
     sound = refined.sound & (refined.solved.chi2 < _FITS_CHI2)
     sound &= (range2 > settings.range_min_m**2) & (range2 < settings.range_max_m**2)
-    log_ratio, turn, log_heading, turn_variance, lone_odds = _log_ratio(batch, guesses, T_a_b, refined)
+    log_ratio, turn, log_heading, turn_variance, lone_odds = _log_ratio(batch, guesses, across, T_a_b, refined)
     sound &= np.isfinite(refined.solved.covariance.sum((1, 2)) + log_ratio)
     none, range_m = np.zeros(len(trigger)), np.sqrt(range2)
     starts = starts_of(np.bincount(trigger, minlength=batch.triggers))
@@ -93,8 +94,8 @@ def log_fit(solved: Solved) -> Floats:
     return fit
 
 
-def _refined(batch: Batch, guesses: Guesses) -> Refined:
-    """Fit the three lights with tilt and depth."""
+def _refined(batch: Batch, guesses: Guesses, across: Floats) -> Refined:
+    """Fit the three lights with tilt and depth; across: as `_sensor_rows` takes it."""
     seen, rigs = batch.candidates, batch.rigs
     lights, T_a_b = guesses.lights, rigs.between_cameras(guesses.T_a_b)
     absent = lights < 0
@@ -106,8 +107,6 @@ def _refined(batch: Batch, guesses: Guesses) -> Refined:
     frames = seen.frames[lights]
     frames[absent] = 0.0
     frames[absent, 0] = (q / np.sqrt(inner(q, q))[..., None])[absent]
-
-    across = _across(batch.sensors.R_ned_camera[guesses.trigger, 0, 2])
 
     def rows_at(T_a_b: SE3, chosen: Index) -> tuple[Floats, Floats]:
         of_lights, depth = light_rows(T_a_b, frames[chosen], lights_m)
@@ -152,12 +151,12 @@ def _across(down: Floats) -> Floats:
 
 
 def _log_ratio(
-    batch: Batch, guesses: Guesses, T_a_b: SE3, refined: Refined
+    batch: Batch, guesses: Guesses, across: Floats, T_a_b: SE3, refined: Refined
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Give the log likelihood ratio against chance (K,), but for the fit.
+    """Give the log likelihood ratio against chance (K,), without the fit.
 
-    And as in Poses the turn against the headings, what it counts for, and its variance; and the odds that the lone
-    light is another lamp.
+    After it turn, log_heading and turn_variance as in Poses, and lone_odds as in Readings. across: as `_sensor_rows`
+    takes it.
     """
     settings, seen, rigs, sensors = batch.settings, batch.candidates, batch.rigs, batch.sensors
     trigger, lights = guesses.trigger, guesses.lights
@@ -171,7 +170,6 @@ def _log_ratio(
         both_seen, np.log(np.maximum(counts - 1, 1) / rigs.area_px2), 0.0
     )
     sigma_px = np.where(lights < 0, 1.0, seen.sigma_px[lights])
-    across = _across(sensors.R_ned_camera[trigger, 0, 2])
     _, sigma = _sensor_rows(batch, trigger, across, refined.T_a_b)
     total = prior - chance.sum(1) - 2.0 * np.log(sigma_px).sum(1) - np.log(sigma)
     # Nine residuals and six unknowns leave three factors of a normal density.
@@ -192,7 +190,7 @@ def _log_ratio(
 
 
 def _others_per_sr(batch: Batch, guesses: Guesses) -> Floats:
-    """Give how dense candidates that look as much like a light as the lone one stand in its picture, itself counted."""
+    """Give how many candidates per sr of the lone light's picture look as much like a light; it counts as one."""
     seen = batch.candidates
     seen_in = guesses.lights.reshape(-1, 2, 2)
     node = (seen_in >= 0).all(2).argmin(1)
