@@ -18,6 +18,11 @@ WARM_UP_NS: Final = 10 * S_NS
 LIVE_WITHIN_NS: Final = 600 * S_NS
 
 
+def is_in_order(outcome: Outcome) -> bool:
+    """Return whether an outcome shows that all earlier triggers were answered; one that came `late` does not."""
+    return not (isinstance(outcome, Rejected) and outcome.reason == "late")
+
+
 class Answered:
     """Withholds outcomes that were published before, for all pairs. said: the last published outcomes of each pair."""
 
@@ -63,8 +68,7 @@ class AnsweredPair:
     """
 
     def __init__(self, said: Iterable[Outcome] = ()) -> None:
-        # Outcomes `late` are out of order: they do not show that earlier triggers were answered.
-        in_order = [one for one in said if not (isinstance(one, Rejected) and one.reason == "late")]
+        in_order = [one for one in said if is_in_order(one)]
         self._up_to: int | None = max((one.trigger for one in in_order), default=None)
         self._up_to_ns = max((one.stamp_ns for one in in_order), default=0)
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)

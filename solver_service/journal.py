@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from buddyline.protocol.messages import Message, Rejected, RelativePose
+from buddyline.protocol.messages import Message, Rejected
 from buddyline.protocol.statusfile import runtime_directory
-from buddyline.solver_service.answered import Outcome
+from buddyline.solver_service.answered import Outcome, is_in_order
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +66,7 @@ class Journal:
         """Note the outcomes among messages that were published."""
         lines = []
         for message in messages:
-            # Outcomes `late` are out of order, and show nothing of earlier triggers.
-            if isinstance(message, Outcome) and not (isinstance(message, Rejected) and message.reason == "late"):
+            if isinstance(message, Outcome) and is_in_order(message):
                 pair = message.node_a, message.node_b
                 self._last[pair] = _line(message)
                 lines.append(self._last[pair])
@@ -106,5 +105,5 @@ class Journal:
         self._file, self._bytes = file, len(text)
 
 
-def _line(outcome: RelativePose | Rejected) -> bytes:
+def _line(outcome: Outcome) -> bytes:
     return f"{outcome.node_a} {outcome.node_b} {outcome.trigger} {outcome.stamp_ns} {END}\n".encode()

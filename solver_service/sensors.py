@@ -75,7 +75,7 @@ class SampleStream(Generic[S]):
 
     def add(self, sample: S) -> None:
         """Take one sample; samples may come in any order."""
-        verdict = self._jump.judge(sample.stamp_ns, self._stamps[-1] if self._stamps else None)
+        verdict = self._jump.judge(sample.stamp_ns, self.newest_ns)
         if verdict == "drop":
             return
         if verdict == "restart":

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose
+from buddyline.protocol.messages import Candidates, Message
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, Topic, key_of
@@ -186,8 +186,8 @@ def _newest_of(held: Iterable[Outcome], kept: Iterable[Outcome]) -> list[Outcome
     return known + [one for one in kept if (one.node_a, one.node_b) not in pairs]
 
 
-def _said_before(bus: Bus) -> list[RelativePose | Rejected]:
+def _said_before(bus: Bus) -> list[Outcome]:
     """Return the last outcome of each pair that earlier solvers have published, as kept by the hub."""
     refusals = Refusals("solver, of what the hub holds")
     held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]
-    return [one.message for one in held if one and isinstance(one.message, RelativePose | Rejected)]
+    return [one.message for one in held if one and isinstance(one.message, Outcome)]
