@@ -17,25 +17,38 @@ core's profile. The result depends on `growth`; the uncertainty of `growth` is p
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.node.detect.lights import Lights
+from buddyline.node.detect.detection import CLIPPED, FOCAL_PX
+from buddyline.node.detect.lights import VEIL, Lights
 from buddyline.node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 from numpy.typing import NDArray
 
 _RINGS = 16
 _SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)
-_CLIPPED = 249.0
-_FOCAL_OF_MODEL_PX = 904.0
 _ROBUST_SD = 3.0
 
+# The model. The growth d ln w / d ln rho of a flat profile, for a core of 12 px in clear water; how much less it is in
+# veiled water, and for a core e times as large; its 1 sd. Then the `steepness` of the module's docstring.
+_GROWTH, _GROWTH_VEIL, _GROWTH_SIZE, _GROWTH_SD = 0.78, 0.55, 0.52, 0.35
+_STEEPNESS: Final = 0.75
+_STEEP_MAX: Final = 6.0
+# The rings, in radii of the core. The outermost is at least so many px from the centre.
+_INNER, _OUTER, _OUTER_MIN_PX = 0.6, 2.2, 11.0
+# Noise of a sample in grey levels, and of the model in the logarithm of the brightness, 1 sd.
+_NOISE, _MODEL_NOISE = 2.0, 0.12
+# Neighbouring samples are correlated: they hold less information than as many independent samples, by this factor.
+_INFLATION: Final = 8.0
+# The prior, 1 sd: the distance from the core's centre to the source, as a share of its radius (and half a pixel); the
+# lean.
+_CORE_SHARE, _LEAN_SD = 0.3, 3.0
+
 # The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
-# kept for tuning), those of the border by maximum likelihood. They are a little larger than those errors, because
-# other waters will differ. Larger ones for long and hidden cores explain their errors better, and let glows whose lamp
-# is hidden pass for lights that fit.
+# kept for tuning); those of the border by maximum likelihood. They are a little larger than those errors, because
+# other waters will differ. Larger terms for long and half-hidden cores would fit those errors better. But then the
+# solver takes the glow of a hidden lamp for a light that fits.
 _FLOOR_PX: Final = 0.045
 # Share of the core's radius: the rim of the clipped core is not a perfect circle.
 _RIM_SHARE: Final = 0.008
@@ -46,28 +59,12 @@ _GROWTH_SCALE: Final = 0.45
 _MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
 # Share of the core's radius, per unit of elongation above 1: a long core is partly hidden, or two lights merge in it.
 _ELONGATED_SHARE: Final = 0.15
+# For a light that shows only its scattered glow.
 _SCATTERED_PX: Final = 2.0
-# Where the border cuts a light: px, and share of the core's radius. It counts from this many radii plus px inward.
+# For a light that the border cuts: px, and share of the core's radius. Both fall to 0 at _CUT_RADII core radii plus
+# _CUT_FROM_PX from the border.
 _CUT_PX, _CUT_SHARE = 0.33, 0.15
 _CUT_RADII, _CUT_FROM_PX = 1.2, 4.0
-
-
-MODEL: Mapping[str, float] = {
-    "growth": 0.78,
-    "growth_veil": 0.55,
-    "growth_size": 0.52,
-    "growth_sd": 0.35,
-    "steepness": 0.75,
-    "inner": 0.6,
-    "outer": 2.2,
-    "outer_min_px": 11.0,
-    "noise": 2.0,
-    "model_noise": 0.12,
-    "core_share": 0.3,
-    "inflation": 8.0,
-    "lean_sd": 3.0,
-    "steep_max": 6.0,
-}
 
 
 @dataclass(slots=True, eq=False)
@@ -79,14 +76,12 @@ class Centres:
     lean: Floats
 
 
-def locate_sources(
-    image: NDArray[np.uint8], lights: Lights, focal_px: float, model: Mapping[str, float] = MODEL
-) -> Centres:
+def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) -> Centres:
     """Locate the sources of N lights in a BGR (H, W, 3) or grey (H, W) picture of focal length focal_px."""
     start_px, radius_px, guess_px = lights.centre_px, lights.core_px, lights.guess_px
-    prior_px2 = (model["core_share"] * radius_px + 0.5) ** 2
-    growth = _growth(radius_px * (_FOCAL_OF_MODEL_PX / focal_px), lights.ground, model)
-    equations = _Equations(image, lights, growth, model)
+    prior_px2 = (_CORE_SHARE * radius_px + 0.5) ** 2
+    growth = _growth(radius_px * (FOCAL_PX / focal_px), lights.ground)
+    equations = _Equations(image, lights, growth)
     step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px)
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px
@@ -97,13 +92,12 @@ def locate_sources(
     own_px2 = _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
     variance_px2 = np.where(holds, own_px2, prior_px2)
     variance_px2 += (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2
-    cut = np.maximum(
-        1.0 - _to_border(start_px + share[:, None] * moved, image) / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0
-    )
+    centre_px = start_px + share[:, None] * moved
+    cut = np.maximum(1.0 - _to_border(centre_px, image) / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0)
     variance_px2 += cut * _CUT_PX**2 + (_CUT_SHARE * cut * radius_px) ** 2
     in_doubt = share * (_MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped)
     variance_px2 += 0.5 * in_doubt * in_doubt * moved_px2
-    return Centres(start_px + share[:, None] * moved, np.sqrt(variance_px2), lean * holds[:, None])
+    return Centres(centre_px, np.sqrt(variance_px2), lean * holds[:, None])
 
 
 def _to_border(centre_px: Floats, image: NDArray[np.uint8]) -> Floats:
@@ -112,16 +106,14 @@ def _to_border(centre_px: Floats, image: NDArray[np.uint8]) -> Floats:
     return np.asarray(np.maximum(np.minimum(centre_px + np.float32(0.5), far_px - centre_px).min(axis=1), 0.0))
 
 
-def _growth(radius_px: Floats, ground: Floats, model: Mapping[str, float]) -> Floats:
+def _growth(radius_px: Floats, ground: Floats) -> Floats:
     """Return the growth d ln w / d ln rho of a flat profile, (N,): smaller in veiled water and for large discs.
 
-    radius_px: (N,), scaled to a focal length of 904 px. ground: (N,), grey levels. A veil (bright ground in the weakest
-    channel) shows turbid water: light scattered far from the beam hides the core. Large discs are mostly glow already.
+    radius_px: (N,), scaled to the focal length FOCAL_PX. ground: (N,), grey levels. A veil (bright ground in the
+    weakest channel) shows turbid water: light scattered far from the beam hides the core. Large discs are mostly glow.
     """
-    veil = np.minimum(ground / 40.0, 1.0)
-    growth = (
-        model["growth"] - model["growth_veil"] * veil - model["growth_size"] * np.log(np.maximum(radius_px, 3.0) / 12.0)
-    )
+    veil = np.minimum(ground / VEIL, 1.0)
+    growth = _GROWTH - _GROWTH_VEIL * veil - _GROWTH_SIZE * np.log(np.maximum(radius_px, 3.0) / 12.0)
     return np.asarray(growth, np.float32)
 
 
@@ -139,19 +131,18 @@ class _Equations:
     M: number of rings without the innermost and the outermost. These two serve only for the slope of the profile.
     """
 
-    def __init__(self, image: NDArray[np.uint8], lights: Lights, growth: Floats, model: Mapping[str, float]) -> None:
-        self._model = model
+    def __init__(self, image: NDArray[np.uint8], lights: Lights, growth: Floats) -> None:
         core_px = lights.core_px
         radius = geometric_radii(
-            np.maximum(model["inner"] * core_px, 0.7),
-            np.maximum(model["outer"] * core_px, model["outer_min_px"]),
+            np.maximum(_INNER * core_px, 0.7),
+            np.maximum(_OUTER * core_px, _OUTER_MIN_PX),
             _SHARES,
         )
         log_step = np.log(radius[:, -1:] / radius[:, :1]) / np.float32(_RINGS - 1)
         rings = sample_rings(image, lights.guess_px, radius)
         level = _one_channel(rings.pixels, lights.weakest)
         above = level - lights.ground[:, None, None]
-        usable = (level < _CLIPPED) & (above > 3.0 * model["noise"])
+        usable = (level < CLIPPED) & (above > 3.0 * _NOISE)
         if rings.inside is not None:
             usable &= rings.inside
         np.maximum(above, 1.0, out=above)
@@ -165,15 +156,15 @@ class _Equations:
         seen = self._seen.astype(np.float32)
         falling = difference / (np.maximum(count, 1.0) * (-2.0 * log_step)) * seen
         self._shift = falling / radius[:, 1:-1]
-        plain = np.where(self._seen, np.minimum(np.maximum(falling, 0.0), model["steep_max"]), 1.0)
-        self._growth = growth[:, None] + model["steepness"] * plain
+        plain = np.where(self._seen, np.minimum(np.maximum(falling, 0.0), _STEEP_MAX), 1.0)
+        self._growth = growth[:, None] + _STEEPNESS * plain
         self._log_step = log_step
         self.solvable = np.add.reduce(seen, axis=1) >= 4.0
-        noise = model["noise"] / above
+        noise = _NOISE / above
         # For each sample: its weight, and its weight times y.
         self._weighted = np.empty((*seen.shape, 2, RAYS), np.float32)
         weight = self._weighted[:, :, 0]
-        np.divide(used * seen[:, :, None], noise * noise + model["model_noise"] ** 2, out=weight)
+        np.divide(used * seen[:, :, None], noise * noise + _MODEL_NOISE**2, out=weight)
         np.multiply(weight, self._y, out=self._weighted[:, :, 1])
 
     def solve(self, prior_px2: Floats, prior_px: Floats) -> tuple[Floats, Floats, Floats]:
@@ -186,7 +177,7 @@ class _Equations:
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2
         prior[:, 0, 0] = prior[:, 1, 1] = information
-        prior[:, 2, 2] = prior[:, 3, 3] = 1.0 / self._model["lean_sd"] ** 2
+        prior[:, 2, 2] = prior[:, 3, 3] = 1.0 / _LEAN_SD**2
         prior[:, :2, 4] = information[:, None] * prior_px
         rows = self._rows()
         x, mean = self._least_squares(rows[:1], prior)
@@ -211,8 +202,8 @@ class _Equations:
         s: slope of the profile, -Y0'. w: the glow's share, from d ln w / d ln rho integrated along the rings; it is 1
         at the outermost usable ring. The first axis: the expected growth, 1 sd less, 1 sd more.
         """
-        sd = self._model["growth_sd"]
-        growth = np.maximum(self._growth + np.array([[[0.0]], [[-sd]], [[sd]]], np.float32), -0.3)
+        assumed = np.array([[[0.0]], [[-_GROWTH_SD]], [[_GROWTH_SD]]], np.float32)
+        growth = np.maximum(self._growth + assumed, -0.3)
         log_share = (growth.reshape(-1, growth.shape[2]) @ _TRAPEZOIDS).reshape(growth.shape)
         log_share *= self._log_step
         last = np.where(self._seen, log_share, np.float32(-1e9)).max(axis=-1, keepdims=True)
@@ -235,8 +226,7 @@ class _Equations:
         sums = (self._weighted.reshape(n * m, 2 * RAYS) @ _SUMS).reshape(n, m, 10)
         means = sums[..., 1:4] / np.maximum(sums[..., :1], 1e-6)
         spread = sums[..., 4:].reshape(n, m, 3, 2) - sums[..., 1:4, None] * means[..., None, :2]
-        # Neighbouring samples are correlated: they hold less information than as many independent samples.
-        products = (rows @ spread.reshape(n, m, 6)).reshape(len(rows), n, 30) * (1.0 / self._model["inflation"])
+        products = (rows @ spread.reshape(n, m, 6)).reshape(len(rows), n, 30) * (1.0 / _INFLATION)
         system = np.repeat(prior[None], len(rows), axis=0)
         system[..., :5] += products.take(_SYSTEM, axis=-1)
         return np.linalg.solve(system[..., :4], system[..., 4:]), means[..., 2]

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 
 LIKELY: Final = 0.5
 """From this score on, a candidate is likely a lamp: the score is a probability."""
+CLIPPED: Final = 249.0
+"""From this grey level on, a pixel counts as clipped: JPEG leaves clipped pixels a little below 255."""
+FOCAL_PX: Final = 904.0
+"""Focal length for which the detectors' lengths in px are given: that of the default rig, with pictures 820 px wide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,7 @@ def is_likely(blob: Blob) -> bool:
 
 def focal_of(width_px: int) -> float:
     """Return the focal length, px, of a camera of unknown calibration: 49 degrees across, as of the default rig."""
-    return 904.0 / 820.0 * width_px
+    return FOCAL_PX / 820.0 * width_px
 
 
 @runtime_checkable

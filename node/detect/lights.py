@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+from buddyline.node.detect.detection import CLIPPED
 from buddyline.node.detect.proposals import CLEAR, Proposals
 from buddyline.node.detect.rings import (
     MEAN,
@@ -21,7 +22,6 @@ from numpy.typing import NDArray
 _ALWAYS_MEASURED, _MAX_MEASURED = 8, 24
 _CORE_RINGS: Final = 7
 _WEAKEST_FROM_PX: Final = 3.0
-_CLIPPED: Final = 249.0
 _LEVELS: Final = np.array([0.9, 0.7, 0.5, 0.3], np.float32)
 _CORE, _HALF = 1, 2
 _UNCLIPPED, _UNCLIPPED_OVER = 240.0, 40.0
@@ -82,7 +82,7 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
     level[0] = luminance(rings.pixels)
     if colour:
         level[1] = weakest_channel(rings.pixels)
-    peak = np.minimum(level[:, :, :_CORE_RINGS].max(axis=(2, 3)), _CLIPPED)
+    peak = np.minimum(level[:, :, :_CORE_RINGS].max(axis=(2, 3)), CLIPPED)
     ground = _low(level[:, :, -4:], 0.2)
     if colour:
         np.minimum(ground[1], water, out=ground[1])

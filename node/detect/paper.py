@@ -12,7 +12,7 @@ from typing import Final
 
 import cv2
 import numpy as np
-from buddyline.node.detect.detection import Detection, check_image, focal_of
+from buddyline.node.detect.detection import FOCAL_PX, Detection, check_image, focal_of
 from buddyline.protocol.messages import MAX_BLOBS, Blob
 from numpy.typing import NDArray
 
@@ -25,13 +25,12 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "day_reef": {"value_min": 160, "saturation_max": 150, "close_px": 9, "area_min_px": 1},
     }
 )
-"""One set of thresholds for each site, as in the paper. Sizes in px at a focal length of 904 px.
+"""One set of thresholds for each site, as in the paper. Sizes in px at the focal length FOCAL_PX.
 
 Found by `tune --method paper` on 80 pictures of each water: 40 of this project's simulator (seed 77), 40 rendered by
 another program. What is reported is measured on other pictures.
 """
 
-_FOCAL_OF_PRESETS_PX: Final = 904.0
 _DARK_MEDIAN: Final = 40.0
 _TURBID_MEDIAN_SHARE: Final = 0.8
 
@@ -56,7 +55,7 @@ class PaperDetector:
         value = np.asarray(hsv[:, :, 2], np.uint8)
         site = self._environment if self._environment != "auto" else _choose_site(value)
         preset = {**PRESETS[site], **self._overrides}
-        scale = (self._focal_px or focal_of(image.shape[1])) / _FOCAL_OF_PRESETS_PX
+        scale = (self._focal_px or focal_of(image.shape[1])) / FOCAL_PX
 
         mask = cv2.inRange(hsv, (0, 0, preset["value_min"]), (180, preset["saturation_max"], 255))
         side = 2 * int(preset["close_px"] * scale / 2) + 1
@@ -87,7 +86,7 @@ def _brighter_end(
     """Put the light at the brighter end of the region's rotated rectangle: the centroid of its brightest pixels.
 
     contour: (N, 2) px. value: (H, W), HSV's V. mask: (H, W), 255 where a pixel passed the thresholds. scale: focal
-    length over 904 px.
+    length over FOCAL_PX.
     """
     u0, v0 = contour.min(axis=0)
     u1, v1 = contour.max(axis=0) + 1

@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
-from buddyline.node.detect.detection import focal_of
+from buddyline.node.detect.detection import CLIPPED, focal_of
 from numpy.typing import NDArray
 
 _OCTAVES = 5
@@ -30,7 +30,6 @@ _WINDOW = 5
 """Side of the window around a place, in px of its octave. The place is the maximum of its window."""
 _BRIGHT = 0.5
 """Share of a place's contrast: pixels no further than this below the place's level belong to its light."""
-_CLIPPED = 249.0
 _ACROSS = np.arange(_WINDOW)
 _ROW, _COLUMN = np.divmod(np.arange(_WINDOW**2), _WINDOW)
 _MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.float32)
@@ -263,7 +262,7 @@ def _settle(
 
     level: (N, window), row by row; peak, contrast: (N,), of the places. Results in px of the octave.
     """
-    peak = np.minimum(peak, _CLIPPED)
+    peak = np.minimum(peak, CLIPPED)
     bright = np.minimum(level, peak[:, None]) - (peak - _BRIGHT * contrast)[:, None]
     area = (bright >= 0.0) @ _MOMENTS[:, 0]
     moments = np.maximum(bright, 1e-3) @ _MOMENTS

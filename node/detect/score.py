@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from buddyline.node.detect.detection import FOCAL_PX
 from buddyline.node.detect.lights import Lights
 from buddyline.node.detect.rings import Floats
 from numpy.typing import NDArray
 
 WEIGHTS: Final = Path(__file__).with_name("score.toml")
-FOCAL_PX: Final = 904.0
-"""Focal length for which sizes in px are compared."""
 LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     "stands_out": (-1.0, 3.5),
     "texture": (-0.7, 2.0),

@@ -76,10 +76,8 @@ class SourceDetector:
         self._finder.load(image)
         self._contrast_min = self._values["contrast_min"] or self._adapt()
         if image.shape != self._shape:
-            self._shape, self._near = (
-                image.shape,
-                RegionFinder(self._focal_of(image), self._finder.base_step_px, self._masks),
-            )
+            self._shape = image.shape
+            self._near = RegionFinder(self._focal_of(image), self._finder.base_step_px, self._masks)
         self._water = water_level(image)
         proposals = self._finder.find(self._contrast_min, self._values["clutter_gain"], self._layout(image))
         self._texture = texture(proposals.outstanding)
