@@ -4,3 +4,4 @@ from typing import Final
 
 DETECTORS: Final = ("source", "paper")
 PRESETS: Final = ("auto", "cavern", "night_reef", "lake", "basin", "day_reef")
+"""Environments of the `paper` detector: it has thresholds for each. Other detectors adapt to the water."""

@@ -59,10 +59,11 @@ class ExposureConfig(Config, frozen=True, kw_only=True):
 
 
 class DetectorConfig(Config, frozen=True, kw_only=True):
-    """[detector]: method, environment, and single values that override a preset.
+    """[detector]: method, and single values that replace its own.
 
-    guided: look first where the solver, or the last pictures, expect the lights. masks: polygons of the picture that
-    are never searched; corners [u, v] as shares of its width and height, two for a rectangle.
+    environment: selects the thresholds of the `paper` method; the others adapt to the water. guided: look first where
+    the solver, or the last pictures, expect the lights. masks: polygons of the picture that are never searched; corners
+    [u, v] as shares of its width and height, two for a rectangle.
     """
 
     method: str = "source"

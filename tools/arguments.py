@@ -50,7 +50,9 @@ def _two_nodes(parser: argparse.ArgumentParser) -> None:
 
 
 def _detector(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--environment", default="auto", help="for dives of pictures; default: auto")
+    parser.add_argument(
+        "--environment", default="auto", help="for dives of pictures, with --detector paper; default: auto"
+    )
     parser.add_argument("--detector", default="source", help="for dives of pictures; default: source")
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import cv2
 import msgspec
-from buddyline.node.detect import METHODS, Detection, make_detector
+from buddyline.node.choices import DETECTORS
+from buddyline.node.detect import Detection, make_detector
 from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
@@ -31,7 +32,7 @@ from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
-DEFAULT_METHOD = METHODS[0]
+DEFAULT_METHOD = DETECTORS[0]
 FOLDER_PERIOD_NS = 100_000_000
 # Topics that are copied: all but earlier candidates and the solver's results.
 DERIVED_FROM = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CANDIDATES)

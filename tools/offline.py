@@ -98,7 +98,8 @@ def solve_logs(
 ) -> SolvedDive:
     """Solve a stored dive; the pictures of a node without candidates are detected first.
 
-    infos: calibrations in place of the logs' own. environment: of the detector. The others as in solve_messages.
+    infos: calibrations in place of the logs' own. environment: changes nothing for the default
+    detector. The others as in solve_messages.
     """
     with Dive([Path(log) for log in logs]) as dive:
         found = list(_messages(dive, environment, dict(infos or {})))

@@ -23,14 +23,10 @@ from buddyline.node.detect.detection import (
 from buddyline.node.detect.masks import Corners, MaskedDetector, Masks
 from buddyline.protocol.errors import BuddylineError
 
-METHODS: Final = DETECTORS
-ENVIRONMENTS: Final = PRESETS
 GROUP: Final = "buddyline.detectors"
 
 __all__ = [
-    "ENVIRONMENTS",
     "GROUP",
-    "METHODS",
     "Detection",
     "Detector",
     "GuidedDetector",
@@ -44,14 +40,14 @@ __all__ = [
 def values_of(method: str, environment: str = "auto") -> Mapping[str, float]:
     """Return the values of a detector that can be overridden, as they are by default.
 
-    Raises BuddylineError for an unknown method or environment. Only `paper` has values for each environment, and with
-    `auto` takes one of these; the others adapt to each picture, and take any environment alike.
+    environment: it selects values of `paper` only (`auto`: those of the night reef). The other detectors adapt to each
+    picture, and have the same values in every environment. Raises BuddylineError for an unknown method or environment.
     """
-    known = _known_environment(environment)
+    if environment not in PRESETS:
+        raise BuddylineError(f"environment {environment!r}: choose one of {', '.join(PRESETS)}")
     if method == "paper":
-        return paper.PRESETS["night_reef" if known == "auto" else known]
-    values: Mapping[str, float] = _factory(method).VALUES
-    return values
+        return paper.PRESETS["night_reef" if environment == "auto" else environment]
+    return _factory(method).VALUES
 
 
 def make_detector(
@@ -63,10 +59,11 @@ def make_detector(
 ) -> Detector:
     """Make the detector of one camera.
 
-    overrides: replace values of the detector, under the names that `values_of` returns. focal_px: of the pictures, for
-    the size of lamps in them; without it, each picture counts as one of 49 degrees across. masks:
-    parts of the picture that are never searched, see Masks. Raises BuddylineError for an unknown method, environment or
-    name, for a negative or non-finite value, and for a mask outside of the picture.
+    environment: of `paper` only; `auto` chooses its thresholds for each picture. overrides: replace values of the
+    detector, under the names that `values_of` returns. focal_px: of the pictures, for the size of lamps in them; if it
+    is None, each picture counts as one of 49 degrees across. masks: parts of the picture that are never searched, see
+    Masks. Raises BuddylineError for an unknown method, environment or name, for a negative or non-finite value, and for
+    a mask outside of the picture.
     """
     names = values_of(method, environment)
     for name, value in (overrides or {}).items():
@@ -86,19 +83,13 @@ def make_detector(
     return plain if hidden is None else MaskedDetector(plain, hidden)
 
 
-def _known_environment(name: str) -> str:
-    if name not in ENVIRONMENTS:
-        raise BuddylineError(f"environment {name!r}: choose one of {', '.join(ENVIRONMENTS)}")
-    return name
-
-
 def _factory(method: str) -> DetectorFactory:
     """Return what makes the detector of this name, of this project or of another distribution."""
     if method == "source":
         return source.SourceDetector
-    outside = {point.name: point for point in entry_points(group=GROUP) if point.name not in METHODS}
+    outside = {point.name: point for point in entry_points(group=GROUP) if point.name not in DETECTORS}
     if method not in outside:
-        raise BuddylineError(f"detector method {method!r}: choose one of {', '.join((*METHODS, *outside))}")
+        raise BuddylineError(f"detector method {method!r}: choose one of {', '.join((*DETECTORS, *outside))}")
     return _loaded(outside[method])
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from buddyline.node.detect import ENVIRONMENTS, METHODS, ImageError, make_detector
+from buddyline.node.choices import DETECTORS, PRESETS
+from buddyline.node.detect import ImageError, make_detector
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.world import World
 from buddyline.protocol.errors import BuddylineError
@@ -11,7 +12,7 @@ from tests.node.rendered import lamp_picture
 
 
 @pytest.mark.parametrize(
-    ("method", "environment"), [("source", "auto"), *(("paper", environment) for environment in ENVIRONMENTS)]
+    ("method", "environment"), [("source", "auto"), *(("paper", environment) for environment in PRESETS)]
 )
 def test_a_plain_lamp_is_found_first_in_every_environment(method, environment):
     image = lamp_picture([(300.3, 120.6)], seed=3)
@@ -22,7 +23,7 @@ def test_a_plain_lamp_is_found_first_in_every_environment(method, environment):
     assert 0 <= blob.score <= 1
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DETECTORS)
 @pytest.mark.parametrize(
     "image",
     [
@@ -38,7 +39,7 @@ def test_an_empty_picture_gives_no_candidates(method, image):
     assert make_detector(method).detect(image) == []
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DETECTORS)
 def test_an_all_white_picture_gives_no_likely_light(method):
     found = make_detector(method).detect(np.full((120, 160, 3), 255, np.uint8))
     assert all(d.blob.score < 0.5 for d in found)
@@ -49,13 +50,13 @@ def test_an_all_white_picture_gives_no_likely_light(method):
     [np.zeros((4, 4), np.uint16), np.zeros((4, 4, 4), np.uint8), np.zeros((0, 4), np.uint8), None],
     ids=["16 bit", "four channels", "empty", "not decoded"],
 )
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DETECTORS)
 def test_an_unusable_picture_is_refused_by_name(method, image):
     with pytest.raises(ImageError, match="picture: "):
         make_detector(method).detect(image)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DETECTORS)
 def test_candidates_lie_inside_a_picture_full_of_noise(method):
     image = np.random.default_rng(5).integers(0, 256, (90, 130, 3)).astype(np.uint8)
     for d in make_detector(method).detect(image):

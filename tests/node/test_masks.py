@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from buddyline.node.choices import DETECTORS
 from buddyline.node.config import DetectorConfig
-from buddyline.node.detect import METHODS, GuidedDetector, Region, make_detector
+from buddyline.node.detect import GuidedDetector, Region, make_detector
 from buddyline.node.detect.masks import Masks
 from buddyline.protocol.errors import BuddylineError
 
@@ -18,7 +19,7 @@ def found_at(detections, place):
     return [d for d in detections if np.hypot(d.blob.u_px - place[0], d.blob.v_px - place[1]) < 3.0]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", DETECTORS)
 def test_a_masked_lamp_is_not_found_and_the_other_is(method):
     picture = lamp_picture(LAMPS, size=SIZE)
     plain = make_detector(method).detect(picture)

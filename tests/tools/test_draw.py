@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from buddyline.node.detect import METHODS, make_detector
+from buddyline.node.choices import DETECTORS
+from buddyline.node.detect import make_detector
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.draw import figures
 from buddyline.tools.draw.marks import mark_candidates, mark_lights, marked_svg
@@ -20,7 +21,7 @@ from tests.tools.watched import at, image
 
 
 class TestMarks:
-    @pytest.mark.parametrize("method", METHODS)
+    @pytest.mark.parametrize("method", DETECTORS)
     @pytest.mark.parametrize("grey", [False, True])
     def test_candidates_are_marked_on_a_copy(self, method: str, grey: bool) -> None:
         picture = lamp_picture([(80.0, 60.0)], size=(160, 120), seed=1)

@@ -20,7 +20,8 @@ from typing import Any, Final, TypeAlias
 
 import cv2
 import numpy as np
-from buddyline.node.detect import METHODS, GuidedDetector, Region, make_detector
+from buddyline.node.choices import DETECTORS
+from buddyline.node.detect import GuidedDetector, Region, make_detector
 from buddyline.node.detect.detection import is_likely
 from buddyline.node.guide import FLOOR, SIGMAS
 from buddyline.protocol.errors import BuddylineError
@@ -33,7 +34,7 @@ from numpy.typing import NDArray
 Pictures: TypeAlias = list[NDArray[np.uint8]]
 Finder: TypeAlias = Callable[[NDArray[np.uint8]], object]
 
-OURS: Final = METHODS[0]
+OURS: Final = DETECTORS[0]
 WIDTHS_PX: Final = (820, 1640)
 ASPECT: Final = 616 / 820
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
@@ -194,7 +195,7 @@ def _finders() -> dict[str, Finder]:
     """Return the finders, each with its default settings."""
     aruco = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
     blobs = cv2.SimpleBlobDetector.create()
-    finders: dict[str, Finder] = {method: make_detector(method).detect for method in METHODS}
+    finders: dict[str, Finder] = {method: make_detector(method).detect for method in DETECTORS}
     return finders | {"cv2.aruco 36h11": aruco.detectMarkers, "SimpleBlob": blobs.detect}
 
 
