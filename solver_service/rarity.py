@@ -1,7 +1,7 @@
 """How rarely all four lights are found: where they hardly ever are, what looks like all four is likely chance.
 
-A dead or hidden lamp leaves no trigger with four lights. Over a dive of thousands of triggers chance lights, another
-diver's lamp among them, then fit in some: each trigger for itself cannot tell.
+With a dead or hidden lamp no trigger shows four lights. In a dive of thousands of triggers, false lights such as
+another diver's lamp still fit in some. A single trigger cannot tell.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from buddyline.solver_service.geometry.fix import Fix, NoFix
 
 # What was found so many triggers ago counts e times less.
 MEMORY: Final = 300.0
-# Before the first trigger: so many with four lights, and without.
+# Both counts before the first trigger.
 START: Final = 0.5
-# Other lamps come back in picture after picture, as even chance does not: the odds count with this power.
+# Another lamp stays in view from picture to picture, unlike evenly scattered candidates: the odds count to this power.
 PERSISTENCE: Final = 2.0
 # Triggers that say nothing of the lamps.
 SILENT: Final = ("too_few_candidates", "degenerate", "out_of_range")
@@ -32,7 +32,7 @@ class Rarity:
 
     @property
     def factor(self) -> float:
-        """By how much chance is likelier, against four lights, than where they are mostly found; 1 or more."""
+        """How many times rarer four lights are taken to be than where they are mostly found; 1 or more."""
         return float(max(self._other / self._full, 1.0) ** PERSISTENCE)
 
     def take(self, found: Fix | NoFix) -> None:

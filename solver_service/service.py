@@ -121,7 +121,7 @@ class SolverService(Service):
                 self._handle(message)
 
     def watch(self, name: str, alive: bool) -> None:
-        """Note that a node has started or ended; of however many, the next tick reports once."""
+        """Note that a node has started or ended; the next tick reports all of them at once."""
         with self._lock:
             self._news |= self.core.health.saw_process(name, alive)
 

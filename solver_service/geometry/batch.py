@@ -31,7 +31,7 @@ class Batch:
 
     @property
     def triggers(self) -> int:
-        """How many."""
+        """Number of triggers."""
         return self.candidates.triggers
 
     @property

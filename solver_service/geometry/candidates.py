@@ -17,11 +17,11 @@ from buddyline.solver_service.geometry.rotation import Floats, Indices
 _MAX_CANDIDATES: Final = 64
 # No detector finds a light's centre better than this.
 _MIN_SIGMA_PX: Final = 0.05
-# A score is the probability of a lamp, fitted to pictures (node/detect/score.toml): its log odds count, at most 3
-# either way, because no fit knows every water.
-_SCORE_WEIGHT: Final = 1.0
-_LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(3.0))
-# The instant of the pose is the mean of both stamps: half their difference before the one, and after the other.
+# A score is the probability of a lamp, fitted to pictures (node/detect/score.toml): its log odds count, at most this
+# much either way, because no fit knows every water.
+_MOST_LOG_ODDS: Final = 3.0
+_LEAST_SCORE: Final = 1.0 / (1.0 + math.exp(_MOST_LOG_ODDS))
+# The pose is for the mean of both stamps: half their difference, A's minus B's, is added for A and taken off for B.
 _LATER: Final[Floats] = np.array([[1.0], [-1.0]])
 
 
@@ -29,13 +29,13 @@ _LATER: Final[Floats] = np.array([[1.0], [-1.0]])
 class CandidateBearings:
     """The usable candidates of T triggers, N in all: by trigger, A's picture before B's.
 
-    triggers: T. counts: (T, 2) how many in A's and in B's picture. in_whole: (T, 2) the same with those elsewhere in
-    pictures of which only parts were searched: as many as chance has to choose from.
-    image: (N,) the picture that each is in: 2 * trigger, plus one for B's. starts: (2 T + 1,) where each
-    picture's candidates begin. index: (N,) into the view. table: (7, N) the bearing in the bar frame, the place over
-    the picture's width and height, the bearing's variance, rad^2 per axis, and the square of the radius of a disc of
-    its area, rad^2. frames: (N, 3, 3) bearing and both tangents, px per rad over sigma_px, camera frame. sigma_px (N,).
-    dt_s: (N,) after the instant that the pose is for, the mean of both stamps. log_score, log_area: (N,).
+    triggers: T. counts: (T, 2) how many in A's and in B's picture. in_whole: (T, 2) the same with those outside the
+    searched parts of a picture, because chance picks from all. image: (N,) the picture that each is in: 2 * trigger,
+    plus one for B's. starts: (2 T + 1,) where each picture's candidates begin. index: (N,) into the view. table: (7, N)
+    the bearing in the bar frame, the place over the picture's width and height, the bearing's variance, rad^2 per axis,
+    and the square of the radius of a disc of its area, rad^2. frames: (N, 3, 3) bearing and both tangents, px per rad
+    over sigma_px, camera frame. sigma_px (N,). dt_s: (N,) after the instant that the pose is for, the mean of both
+    stamps. log_score, log_area: (N,).
     """
 
     triggers: int
@@ -126,14 +126,15 @@ def _frames(pixels: Floats, node: Indices, rigs: RigPair) -> tuple[Floats, Float
 
 
 def _log_score(score: Floats, image: Indices, counts: Indices, elsewhere: Indices) -> Floats:
-    """Turn scores into log likelihood ratios, one on each picture's average; an unknown score, 0.5, is no evidence.
+    """Turn scores into log likelihood ratios; an unknown score, 0.5, is no evidence.
 
-    Those elsewhere in a picture count as the least likely: likely ones are in the parts that were searched.
+    The ratios of each picture's candidates average one. Those outside the searched parts count as the least likely,
+    because likely ones are searched for.
     """
     if (score == 0.5).all():
         return np.zeros(len(score))
-    odds = np.minimum(np.maximum(score, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
-    weight = _SCORE_WEIGHT * np.log(odds / (1.0 - odds))
-    total = np.bincount(image, np.exp(weight), minlength=len(counts)) + elsewhere * math.exp(-3.0 * _SCORE_WEIGHT)
-    balanced: Floats = weight - np.log(total / np.maximum(counts + elsewhere, 1))[image]
+    bounded = np.minimum(np.maximum(score, _LEAST_SCORE), 1.0 - _LEAST_SCORE)
+    log_odds = np.log(bounded / (1.0 - bounded))
+    total = np.bincount(image, np.exp(log_odds), minlength=len(counts)) + elsewhere * math.exp(-_MOST_LOG_ODDS)
+    balanced: Floats = log_odds - np.log(total / np.maximum(counts + elsewhere, 1))[image]
     return balanced

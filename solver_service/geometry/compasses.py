@@ -1,10 +1,10 @@
 """Heading as a check of its own: can two compasses, and how far they may disagree, explain a pose?
 
 Two nodes that look at a third party's two lights from equal range get a pose that passes range, twist, tilt and depth.
-It has them face each other. Their compasses tell the true angle theta between their lines of sight: against such a pose
-they are 180 degrees less theta off, whatever the fields of view. A compass is also off by its bias; which is which
-follows from how far a compass may be off, and from what earlier poses have told of it. Without earlier poses a third
-party's bar that is seen from more than 80 degrees apart cannot be told from a compass beside steel.
+In that pose they face each other. By their compasses their lines of sight are theta apart, so the headings are 180
+degrees minus theta off the pose, whatever the fields of view. A compass that is biased gives a gap too. Which of the
+two it is follows from how large a bias may be, and from what earlier poses have told of it. Without earlier poses a
+third party's bar that is seen from more than 80 degrees apart cannot be told from a compass beside steel.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ MOST_CHANGED_RAD: Final = math.radians(60.0)
 
 @dataclass(frozen=True, slots=True)
 class HeadingGap:
-    """How a pose stands to both headings.
+    """How a pose compares with both headings.
 
-    gap_rad: to be added to B's heading for both to agree with the pose. variance: of it by the pose, rad^2. agrees:
-    whether the compasses' noise explains it, after what is learned of them. contradicts: whether nothing does.
+    gap_rad: what to add to B's heading so that both agree with the pose. variance: the pose's part in the gap's
+    variance, rad^2. agrees: whether noise explains the gap, alone or about the bias that was learned. contradicts:
+    whether no likely bias explains it either.
     """
 
     gap_rad: float
@@ -41,7 +42,7 @@ class HeadingGap:
 def compare_headings(
     gap_rad: float, variance: float, sensors_variance: float, learned: Heading | None, *, follows: bool
 ) -> HeadingGap:
-    """Judge a gap; sensors_variance: of both headings' difference, rad^2; follows: earlier poses foretell this one."""
+    """Judge a gap; sensors_variance: of both headings' difference, rad^2; follows: earlier poses predict this one."""
     agrees = gap_rad * gap_rad < AGREES * (sensors_variance + variance)
     changed = False
     if learned is not None:

@@ -28,7 +28,8 @@ GROSS_SCALE: Final = 5.0
 # Log densities of no, one and two gaps at zero: of their noise, and of gross errors.
 _LOG_USUAL: Final = math.log(1.0 - GROSS_PROBABILITY)
 _LOG_GROSS: Final = [math.log(GROSS_PROBABILITY / GROSS_SCALE**gaps) for gaps in range(3)]
-# How often one light is missing, to being seen, and the other where one is; and chance alone, to all four being seen.
+# Odds, against all four lights being seen: of one missing (and again of the node's other one, where one is), and of
+# chance alone.
 MISSING_ODDS: Final = 0.2
 CHANCE_ODDS: Final = 0.3
 # Predicted from the other three, a light's position has four times its own variance.
@@ -37,11 +38,11 @@ _PREDICTED_VARIANCE: Final = 4.0
 PITCH_SPREAD: Final = 1.1
 HEADING_SPREAD: Final = 1.5
 DEPTH_SPREAD_M: Final = 6.0
-# Of tilt, heading and depth: a sensor that contradicts the pictures is broken this often, a heading more often, as
-# steel stands beside it. It then says anything: what it may say (rad^2, rad, m) is as wide as this.
+# How often tilt, heading and depth are broken; a heading most often, by steel beside it. A broken one may say anything
+# within this width (rad^2, rad, m).
 _BROKEN: Final = np.array([[1e-5], [0.15], [0.02]])
 _ANYTHING: Final = np.array([[2.0], [2.0 * math.pi], [DEPTH_SPREAD_M]])
-# The density of a right one at chi^2 of 0, times its sds, and of a broken one; both over chance's.
+# The density of a right sensor at chi^2 of 0, times its sds, and of a broken one; both over chance's.
 _OVER_CHANCE: Final = np.array([[PITCH_SPREAD / (2.0 * math.pi)], [HEADING_SPREAD], [DEPTH_SPREAD_M]])
 _RIGHT: Final = _OVER_CHANCE * (1.0 - _BROKEN) / np.sqrt([[1.0], [2.0 * math.pi], [2.0 * math.pi]])
 _WRONG: Final = _OVER_CHANCE * _BROKEN / _ANYTHING
@@ -57,8 +58,8 @@ AGREES: Final = 20.0
 class Support:
     """What the sensors say of K poses.
 
-    log_ratio: (K,) of all together. turn: (3, K) against both headings. log_each, chi2: (3, K) of tilt, of heading and
-    of depth; 0 where one may not speak.
+    log_ratio: (K,) of all together. turn: (3, K) as `turn_of`'s. log_each, chi2: (3, K) of tilt, of heading and of
+    depth; 0 where one may not speak.
     """
 
     log_ratio: Floats

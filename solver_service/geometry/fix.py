@@ -17,8 +17,8 @@ class Fix:
     covariance: (6, 6), position in A's camera frame, then the small rotation w with R_true = exp(w) R_a_b, in
     A's camera frame. pair_a: indices into view A of B's (left, right) light, -1 where it was not seen; pair_b
     likewise. chi2: of the picture coordinates, two degrees of freedom. probability: against chance and others.
-    heading: against both headings, None without attitudes. all_four: the probability that the candidates are all four
-    lights, by this trigger alone.
+    heading: how the pose compares with both headings, None without attitudes. all_four: the probability that the
+    candidates are all four lights, by this trigger alone.
     """
 
     T_a_b: SE3

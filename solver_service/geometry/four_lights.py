@@ -28,13 +28,13 @@ from buddyline.solver_service.geometry.rotation import Floats, Index, Indices, i
 from buddyline.solver_service.geometry.se3 import SE3
 from numpy.typing import NDArray
 
-# So many of the best are refined; what lies further below the best (log ratio) does not matter, even if the past
-# speaks for it.
+# At most this many of the best are refined, and none whose log ratio is further below the best one's: the past cannot
+# make up for that.
 _REFINED: Final = 8
 _NEGLIGIBLE: Final = 16.0
-# What the refinement does not have to be spared: two rounds leave less than the noise.
+# Two rounds leave an error below the noise, and the refinement removes it.
 _SPLIT_ROUNDS: Final = 2
-# Bars whose middle is nearer to the camera than this, relative to their length, need but one round.
+# Bars whose middle is nearer to the camera than this, relative to their length, need only one round.
 _SMALL_OFFSET: Final = 0.02
 
 
@@ -42,8 +42,8 @@ _SMALL_OFFSET: Final = 0.02
 class FourLights:
     """The quads of T triggers, of which the best are read.
 
-    why: where a trigger has no quad. by_method: their poses by the closed form that is to be
-    published, None where the refined ones are.
+    why: the reason, where a trigger has no reading. by_method: the readings' poses by the closed form that the settings
+    name; None where the refined poses are published.
     """
 
     read: Read

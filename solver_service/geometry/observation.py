@@ -55,7 +55,7 @@ class View:
 
     @property
     def score(self) -> Floats:
-        """How much each looks like a light (N,), 0 to 1; NaN: unknown."""
+        """Probability that each is a lamp (N,); NaN: unknown."""
         return self.table[:, 3]
 
     @property
@@ -104,9 +104,9 @@ class Prior:
 
 @dataclass(frozen=True)
 class Heading:
-    """What is to be added to B's heading for both to agree, as earlier poses have it, and its variance, rad^2.
+    """What to add to B's heading so that both headings agree with the earlier poses.
 
-    The variance is that of the present headings' difference, their own noise included.
+    variance: of the present headings' difference about it, their own noise included, rad^2.
     """
 
     offset_rad: float

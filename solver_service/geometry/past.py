@@ -19,9 +19,9 @@ from buddyline.solver_service.geometry.sensors import off_rad
 
 # Nobody knows a moving diver to less than a millimetre and a milliradian.
 _LEAST_KNOWN: Final = 1e-6 * np.eye(6)
-# A prediction from earlier fixes is wrong this often. Where it is right, the pose that it foretells gains this much
-# at most (log), and a pose beside it less: with one bound for all poses near it, a false light close to the right
-# one gained as much as that.
+# A prediction from earlier fixes is wrong this often. Where it is right, the predicted pose gains this much at most
+# (log), and a pose beside it less: with one bound for all poses near it, a false light close to the right one would
+# gain as much as the right one.
 _PRIOR_WRONG: Final = 0.15
 _MAX_LOG_PRIOR: Final = 7.0
 # A matrix (9,) times this: half its antisymmetric part as a vector, and its trace.

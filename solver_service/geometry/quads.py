@@ -36,9 +36,9 @@ _LEAST_ALIKE: Final = -1.0
 # The log ratio of both densities where two areas are equal, and what it loses per square of their log ratio.
 _LOG_ALIKE: Final = math.log(_ANY_LOG_AREA / _LIKE_LOG_AREA)
 _LOG_ALIKE_SLOPE: Final = 0.5 * (_LIKE_LOG_AREA**-2 - _ANY_LOG_AREA**-2)
-# Of so many combinations of pairs the gates are widened for gross errors; beyond, chance hides the right one.
+# Up to this many combinations of pairs, the gates are widened for gross errors; beyond, chance hides the right one.
 _MAX_WIDE: Final = 60_000
-# Of so few combinations of pairs of a trigger each is looked at: that costs less than sorting.
+# Up to this many combinations of pairs in a trigger, each is looked at: that costs less than sorting.
 _FEW: Final = 2000
 # Gravity across the line of sight (product of both) below which both readings of left and right are weighed.
 _UNDECIDED: Final = 0.3

@@ -29,12 +29,11 @@ class Readings:
 
     lights: (M, 4) places in the views of B's left and right in A's picture, A's left and right in B's; -1: not seen.
     refined: their poses, without the motion. dt_s: (M, n) of each residual after the instant that the pose is for.
-    log_ratio: (M,) against chance, without what
-    the residuals and the past say. tilt_chi2, depth_chi2: (M,) of the sensors. gap_chi2: (M,) of the gaps that may
-    speak, by the closed form. range_m: (M, 2) by A's bar and by B's, twist_gap_rad (M,); both by the closed form.
-    clutter: (M,) candidates that chance puts in the place of one of the lights, per variance of its position, 0 where
-    all would be missed. lone_odds: (M,) that the only light of a node is another lamp, without the past; 0 where both
-    are seen.
+    log_ratio: (M,) against chance, without what the residuals and the past say. tilt_chi2, depth_chi2: (M,) of the
+    sensors. gap_chi2: (M,) of the gaps that may speak, by the closed form. range_m: (M, 2) by A's bar and by B's,
+    twist_gap_rad (M,); both by the closed form. clutter: (M,) candidates that chance puts into the variance of the
+    lights' positions; 0 for three lights and where a gap may not speak. lone_odds: (M,) that the only light of a node
+    is another lamp, without the past; 0 where both are seen.
     """
 
     lights: Indices

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 _MAX_STEPS: Final = 12
 # A step this small, relative to the range and in rad, leaves less than its square.
 _SMALL: Final = 5e-4
-# What a step may leave of the noise, as chi^2 after it shows that.
+# The error that a step may leave, as a share of the noise; the noise is estimated by chi^2 after the step.
 _LEFT: Final = 0.01
 # A combination of coordinates that the picture determines this much worse than each alone is not determined.
 _UNDETERMINED: Final = 1e10
@@ -104,7 +104,7 @@ def least_squares(rows: Floats, covariance: Floats | None = None) -> Solved:
 
 
 def _is_large(solved: Solved, t: Floats) -> NDArray[np.bool_]:
-    """Tell which steps leave what matters; t: (K, 3) before them."""
+    """Tell which steps leave an error that matters; t: (K, 3) before them."""
     moved = np.abs(solved.step)
     moved[:, :3] /= np.sqrt(inner(t, t))[:, None]
     size = np.maximum.reduce(moved, 1)
@@ -145,7 +145,7 @@ def light_rows(T_a_b: SE3, frames: Floats, lights_m: Floats) -> tuple[Floats, Fl
 def at_one_instant(rows: Floats, dt_s: Floats, skew_sign: Floats, motion: Motion) -> Solved:
     """Solve again for what is known of the motion between the sightings, by the same linearization.
 
-    dt_s: (K, n) of each residual. skew_sign: (n,) half of the clocks' disagreement moves it so.
+    dt_s: (K, n) of each residual. skew_sign: (n,) which way half of the clocks' disagreement moves it in time.
     """
     J = rows[:, :, :6]
     by_rate = J * dt_s[:, :, None]

@@ -27,7 +27,7 @@ _MATRIX_OF_PRODUCTS[3, :3] = 2.0 * _CROSS
 _MATRIX_OF_PRODUCTS.shape = (16, 9)
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
-# Up to so many rotations, Python's numbers are faster than arrays.
+# Up to this many rotations, Python's numbers are faster than arrays.
 _FEW: Final = 8
 _FEWER: Final = 4
 

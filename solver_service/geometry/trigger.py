@@ -61,7 +61,7 @@ _THREE_PROBABILITY: Final = 0.98
 _FOLLOWED_PROBABILITY: Final = 0.999
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
 _GROSS_CHI2: Final = 11.3
-# A position that is known to this share of the range (1 sd) is no wrong one.
+# Where a position is known better than this share of the range (1 sd), a false light does not make it wrong.
 _SURE_POSITION: Final = 0.02
 # What is this much less likely widens no covariance.
 _NEGLIGIBLE: Final = 1e-6
@@ -95,8 +95,8 @@ def _silent() -> np.errstate:
 class _Batched:
     """The readings of T triggers.
 
-    oriented: whether both attitudes are known. three_told: where they and the depths make three lights tell a pose;
-    tried: (T,) where those have been asked for.
+    oriented: whether both attitudes are known. three_told: whether three lights can give a pose. tried: (T,) whether
+    three lights have been read.
     """
 
     batch: Batch

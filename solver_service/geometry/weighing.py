@@ -16,7 +16,7 @@ from buddyline.solver_service.geometry.rotation import Floats, Indices
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.three_lights import UNCHECKED, log_fit
 
-# So many of the best are weighed against each other; what lies further below the best (log ratio) does not matter.
+# At most this many of the best are weighed against each other, and none whose log ratio is further below the best's.
 _CHOSEN: Final = 6
 _NEGLIGIBLE: Final = 16.0
 # Which residuals a later clock of B moves, and where to: A's picture of B's lights, B's of A's, then the sensors.
@@ -29,8 +29,8 @@ class Weighed:
 
     covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound. log_prior: (M,)
     the prediction's part in it, log_past (M,) all that the past says. log_false: (M,) log odds that a false candidate
-    stands in for one of four lights. others: the likelihood ratios of all that is not
-    here, together. sources: the readings that each is one of, and its place there.
+    stands in for one of four lights. others: the sum of the likelihood ratios of all that is not here. sources: the
+    readings that each is one of, and its place there.
     """
 
     T_a_b: SE3

@@ -45,7 +45,7 @@ def test_four_lights_are_rare_only_after_many_triggers_without():
     assert rarity.factor < 1e5
 
 
-@pytest.mark.parametrize("reason", ["too_few_candidates", "degenerate"])
+@pytest.mark.parametrize("reason", ["too_few_candidates", "degenerate", "out_of_range"])
 def test_triggers_that_say_nothing_of_the_lamps_do_not_count(reason):
     rarity = Rarity()
     for _ in range(100):
