@@ -6,10 +6,10 @@ from typing import Final
 
 from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.samples import BatterySample
+from buddyline.node.drivers.ti_chip import TiChip, decode_signed
 
 # 9.6.1, address pointer register.
 CONVERSION: Final = 0x00
-CONFIG: Final = 0x01
 
 # 9.6.3: input against ground (MUX 1xx), +-4.096 V (PGA 001), continuous (MODE 0), 128 samples a second (DR 100),
 # no comparator (COMP_QUE 11). After a reset: 0x8583.
@@ -23,36 +23,24 @@ FULL_SCALE: Final = 0x7FFF
 
 def decode_conversion_v(word: int) -> float:
     """Return the voltage at the input of the conversion register (9.6.2): two's complement."""
-    return ((word ^ 0x8000) - 0x8000) * LSB_V
+    return decode_signed(word) * LSB_V
 
 
-class Ads1115:
+class Ads1115(TiChip):
     """One input of the chip. divider: battery's voltage over the input's; the input takes no more than the supply's."""
 
-    def __init__(self, bus: I2cBus, address: int, channel: int, divider: float) -> None:
-        self._bus = bus
-        self._address = address
-        self._divider = divider
-        self._setting = SETTING | channel << INPUT_SHIFT
+    NAME = "ADS1115"
+    CONFIGURATION = 0x01
+    STATUS_BITS = STATUS_BIT
 
-    def start(self) -> None:
-        """Write the settings and read them back."""
-        self._bus.write(self._address, CONFIG, *self._setting.to_bytes(2, "big"))
-        self._check()
+    def __init__(self, bus: I2cBus, address: int, channel: int, divider: float) -> None:
+        super().__init__(bus, address, SETTING | channel << INPUT_SHIFT)
+        self._divider = divider
 
     def read(self) -> BatterySample:
         """Return the newest conversion; raise DeviceError if the chip does not answer, has reset, or is over range."""
-        self._check()
+        self._check_setting()
         word = self._word(CONVERSION)
         if word == FULL_SCALE:
             raise self._bus.error(self._address, CONVERSION, "ADS1115 is over its range of 4.096 V: check the divider")
         return BatterySample(decode_conversion_v(word) * self._divider)
-
-    def _check(self) -> None:
-        found = self._word(CONFIG) & ~STATUS_BIT
-        if found != self._setting:
-            what = f"ADS1115 has 0x{found:04x} in place of 0x{self._setting:04x}: it has reset, or is another chip"
-            raise self._bus.error(self._address, CONFIG, what)
-
-    def _word(self, register: int) -> int:
-        return int.from_bytes(self._bus.read(self._address, register, 2), "big")

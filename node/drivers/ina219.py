@@ -6,9 +6,9 @@ from typing import Final
 
 from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.samples import BatterySample
+from buddyline.node.drivers.ti_chip import TiChip, decode_signed
 
 # 8.6.1, register addresses.
-CONFIGURATION: Final = 0x00
 SHUNT_VOLTAGE: Final = 0x01
 BUS_VOLTAGE: Final = 0x02
 
@@ -25,34 +25,22 @@ def decode_bus_voltage_v(word: int) -> float:
 
 def decode_shunt_voltage_v(word: int) -> float:
     """Return the voltage of the shunt-voltage register: two's complement."""
-    return ((word ^ 0x8000) - 0x8000) * SHUNT_LSB_V
+    return decode_signed(word) * SHUNT_LSB_V
 
 
-class Ina219:
+class Ina219(TiChip):
     """The chip between battery and node. shunt_ohm: of its shunt; the breakout boards have 0.1 Ohm."""
 
-    def __init__(self, bus: I2cBus, address: int, shunt_ohm: float) -> None:
-        self._bus = bus
-        self._address = address
-        self._shunt_ohm = shunt_ohm
+    NAME = "INA219"
+    CONFIGURATION = 0x00
 
-    def start(self) -> None:
-        """Write the settings and read them back."""
-        self._bus.write(self._address, CONFIGURATION, *SETTING.to_bytes(2, "big"))
-        self._check()
+    def __init__(self, bus: I2cBus, address: int, shunt_ohm: float) -> None:
+        super().__init__(bus, address, SETTING)
+        self._shunt_ohm = shunt_ohm
 
     def read(self) -> BatterySample:
         """Return the newest means; raise DeviceError if the chip does not answer, or has reset."""
-        self._check()
+        self._check_setting()
         voltage_v = decode_bus_voltage_v(self._word(BUS_VOLTAGE))
         current_a = decode_shunt_voltage_v(self._word(SHUNT_VOLTAGE)) / self._shunt_ohm
         return BatterySample(voltage_v, current_a)
-
-    def _check(self) -> None:
-        found = self._word(CONFIGURATION)
-        if found != SETTING:
-            what = f"INA219 has 0x{found:04x} in place of 0x{SETTING:04x}: it has reset, or is another chip"
-            raise self._bus.error(self._address, CONFIGURATION, what)
-
-    def _word(self, register: int) -> int:
-        return int.from_bytes(self._bus.read(self._address, register, 2), "big")
