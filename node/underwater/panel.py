@@ -14,7 +14,7 @@ from buddyline.node.config import NodeConfig
 from buddyline.node.underwater.codes import PanelAction
 from buddyline.node.underwater.machine import PanelInput, PanelState, step
 from buddyline.node.underwater.pins import PanelPins
-from buddyline.protocol.clock import Clock
+from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.messages import Mark, Message, NodeStatus
 from buddyline.protocol.topics import CANDIDATES
 from msgspec import UNSET
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 PERIOD_S: Final = 0.02
 # The status comes once a second. Without it the node is stuck, and the lamp must not tell that all is well.
-STATUS_WITHIN_S: Final = 5.0
+STATUS_WITHIN_NS: Final = 5 * S_NS
 COMMAND_WITHIN_S: Final = 10.0
 # Two lights are a node's.
 LIGHTS: Final = 2
@@ -46,7 +46,8 @@ class Panel:
         self._state = PanelState()
         self._view = PanelInput(booting=True)
         self._leak = False
-        self._status_s: float | None = None
+        self._has_news = False
+        self._news_ns: int | None = None
         self._refused = ""
 
     @property
@@ -76,7 +77,7 @@ class Panel:
             timeless=bool(timeless),
             sees_other=status.lights_seen is not UNSET and status.lights_seen >= LIGHTS,
         )
-        self._status_s = time.monotonic()
+        self._has_news = True
 
     def run(self, stop: threading.Event) -> None:
         """Read and drive the pins until stop is set."""
@@ -91,7 +92,9 @@ class Panel:
         wet = None if pins.leak is None else pins.leak.read()
         # A probe that cannot be read keeps its last word; that it cannot is a fault of its own.
         self._leak = self._leak if wet is None else wet
-        silent = self._status_s is not None and time.monotonic() - self._status_s > STATUS_WITHIN_S
+        if self._has_news:
+            self._has_news, self._news_ns = False, now_ns
+        silent = self._news_ns is not None and now_ns - self._news_ns > STATUS_WITHIN_NS
         given = replace(
             view,
             pressed=None if pins.button is None else pins.button.read(),

@@ -50,6 +50,7 @@ class Rig:
         self.sent = []
         self.panel = Panel(config, ManualClock(7), self.sent.append, PanelPins(config.panel, self.factory))
         self.now_ns = 0
+        self.news = None  # status and problems, which the node shows again and again
 
     def pin(self, number):
         return self.factory.pin(number)
@@ -59,6 +60,8 @@ class Rig:
         shown = set()
         for _ in range(max(round(seconds * S_NS / TURN_NS), 1)):
             self.now_ns += TURN_NS
+            if self.news is not None:
+                self.panel.show(*self.news)
             self.panel.turn(self.now_ns)
             shown |= {number for number in (LAMP, BUZZER, LIGHTS) if self.pin(number).state}
         return shown
@@ -140,16 +143,17 @@ def flashes(rig, seconds=3.0):
      (status(), ["depth: no answer"], 15), (status(candidates_hz=0.0), [], 0)],
 )  # fmt: skip
 def test_the_lamp_follows_the_nodes_status(rig, shown, problems, count):
-    rig.panel.show(shown, problems)
+    rig.news = (shown, problems)
     rig.run(0.1)
     assert flashes(rig, 60.0) == pytest.approx(20 * count, abs=1)
 
 
-def test_a_node_whose_status_stops_shows_a_fault(rig, monkeypatch):
-    rig.panel.show(status(), [])
+def test_a_node_whose_status_stops_shows_a_fault(rig):
+    rig.news = (status(), [])
     rig.run(0.1)
-    monkeypatch.setattr("buddyline.node.underwater.panel.STATUS_WITHIN_S", -1.0)
-    rig.run(0.1)
+    rig.news = None
+    assert flashes(rig) == 1
+    rig.run(2.0)
     assert flashes(rig) == 15
 
 
