@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from buddyline.node.geomagnetism import EarthField, earth_field
+import numpy as np
+from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration, earth_field
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.messages import ArTag, CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
 from buddyline.protocol.security import Tls
@@ -90,6 +91,11 @@ class SensorsConfig(Config, frozen=True, kw_only=True):
     water_density_kgpm3: Positive = 997.0
     magnetometer_offset_t: Vector3 = (0.0, 0.0, 0.0)
     magnetometer_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    @property
+    def magnetometer_calibration(self) -> MagnetometerCalibration:
+        """The calibration of the magnetometer; one that changes nothing where none is configured."""
+        return MagnetometerCalibration(np.array(self.magnetometer_offset_t), np.array(self.magnetometer_matrix))
 
 
 class CalibrationConfig(Config, frozen=True, kw_only=True):

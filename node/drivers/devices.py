@@ -16,7 +16,6 @@ from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_imu
 from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
-from buddyline.node.geomagnetism import MagnetometerCalibration
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import Depth, Imu, Message, Vector3
 from msgspec import UNSET
@@ -224,9 +223,7 @@ def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSour
     """
     sensors = config.sensors
     check_names(sensors.imu, sensors.depth)
-    calibration = MagnetometerCalibration(
-        np.array(sensors.magnetometer_offset_t), np.array(sensors.magnetometer_matrix)
-    )
+    calibration = sensors.magnetometer_calibration
     x, y, z, w = sensors.mount_xyzw
     R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]))
     sources: list[ImuSource | DepthSource] = []

@@ -115,8 +115,10 @@ def together(tasks: dict[str, Check], ends_s: float) -> list[Finding]:
         result = done.get(name)
         if result is None:
             findings.append(Finding(name, "problem", "gave no answer in time", "it hangs: check cables, then reboot"))
+        elif isinstance(result, BuddylineError):
+            findings.append(Finding(name, "problem", str(result)))
         elif isinstance(result, Exception):
-            advice = "" if isinstance(result, BuddylineError) else "this is a fault of the program: please report it"
+            advice = "this is a fault of the program: please report it"
             findings.append(Finding(name, "problem", f"{type(result).__name__}: {result}", advice))
         else:
             findings += result

@@ -137,7 +137,7 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
     given = [message for messages in heard.values() for message in messages if isinstance(message, Imu)]
     chips = sensors.name == "i2c" and sensors.imu != "none"
     compass = judge.magnetometer(
-        calibrated=any(sensors.magnetometer_offset_t),
+        calibrated=not sensors.magnetometer_calibration.is_none,
         chips=chips,
         heard=any(message.mag_t is not UNSET for message in given),
     )
