@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from buddyline.node.config import PanelConfig
@@ -92,23 +93,18 @@ class PanelPins:
         def pin(name: str, number: int | None, opens: Callable[[int], Any]) -> GpioPin | None:
             return None if number is None else GpioPin(name, number, opens)
 
-        def pulled_up(number: int) -> Any:
+        def contact(number: int, *, pull_up: bool) -> Any:
             from gpiozero import DigitalInputDevice
 
-            return DigitalInputDevice(number, pull_up=True, pin_factory=factory)
-
-        def pulled_down(number: int) -> Any:
-            from gpiozero import DigitalInputDevice
-
-            return DigitalInputDevice(number, pull_up=False, pin_factory=factory)
+            return DigitalInputDevice(number, pull_up=pull_up, pin_factory=factory)
 
         def output(number: int) -> Any:
             from gpiozero import DigitalOutputDevice
 
             return DigitalOutputDevice(number, pin_factory=factory)
 
-        self.button = pin("button", config.button_pin, pulled_up)
-        self.leak = pin("leak", config.leak_pin, pulled_down)
+        self.button = pin("button", config.button_pin, partial(contact, pull_up=True))
+        self.leak = pin("leak", config.leak_pin, partial(contact, pull_up=False))
         self.lamp = pin("lamp", config.lamp_pin, output)
         self.buzzer = pin("buzzer", config.buzzer_pin, output)
         self.lights = pin("lights", config.lights_pin, output)
