@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import sys
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,6 @@ from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.node.pipeline import Pipeline
-from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import Envelope, envelope_of
 from buddyline.protocol.errors import BuddylineError
@@ -137,57 +137,30 @@ def _detect_pictures(args: argparse.Namespace) -> int:
         )
     files: list[Path] = []
     for name in args.inputs:
-        path = Path(name)
-        if not path.exists():
-            raise BuddylineError(f"{name}: no such picture, folder or dive log")
-        found = picture_files(path)
+        found = picture_files(Path(name))
         if not found:
             raise BuddylineError(f"{name}: holds no pictures")
         files += found
     detector = make_detector(args.method, args.environment, masks=_given_masks(args.mask))
+    pipeline = Pipeline("picture", f"detect-{args.method}", FOLDER_PERIOD_NS, detector)
     skipped = 0
     with Progress("detect", len(files)) as progress:
         for i, file in enumerate(files):
             progress.show(i, file.name)
             try:
                 picture = decode_picture(file.read_bytes(), str(file))
-                detections = detector.detect(picture)
             except (PictureError, OSError) as error:
                 skipped += 1
                 losses.report([str(error)])
                 continue
-            height, width = picture.shape[:2]
-            stamp_ns = i * FOLDER_PERIOD_NS
-            print(
-                _line(
-                    Candidates(
-                        node="picture",
-                        stamp_ns=stamp_ns,
-                        trigger=trigger_index(stamp_ns, FOLDER_PERIOD_NS),
-                        seq=i,
-                        boot=f"detect-{args.method}",
-                        width_px=width,
-                        height_px=height,
-                        blobs=[d.blob for d in detections[:64]],
-                        truncated=max(len(detections) - 64, 0),
-                    ),
-                    str(file),
-                )
-            )
+            candidates = pipeline.candidates(Frame(picture, i * FOLDER_PERIOD_NS))
+            if candidates is not None:
+                print(f'{{"file":{json.dumps(str(file))},{encode(candidates).decode()[1:]}')
             if args.draw:
-                write_picture(Path(args.draw), file.stem, mark_candidates(picture, detections))
+                write_picture(Path(args.draw), file.stem, mark_candidates(picture, pipeline.detections))
     if skipped:
         log.warning("%d of %d pictures skipped", skipped, len(files))
     return 1 if skipped == len(files) else 0
-
-
-def _line(message: Candidates, file: str = "") -> str:
-    text = encode(message).decode()
-    if not file:
-        return text
-    import json
-
-    return f'{{"file":{json.dumps(file)},{text[1:]}'
 
 
 def _detect_dive(args: argparse.Namespace, paths: list[str]) -> int:

@@ -233,8 +233,6 @@ def _dive_pictures(paths: Sequence[str], known: Mapping[tuple[str, int], Points]
 def _files(inputs: Sequence[str]) -> list[Path]:
     files: list[Path] = []
     for name in inputs:
-        if not Path(name).exists():
-            raise BuddylineError(f"{name}: no such picture, folder or dive log")
         files += picture_files(Path(name))
     return files
 

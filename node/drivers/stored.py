@@ -69,7 +69,9 @@ def decode_picture(data: bytes, name: str) -> NDArray[np.uint8]:
 
 
 def picture_files(path: Path) -> list[Path]:
-    """Return the pictures of a folder, or a single one, by name."""
+    """Return the pictures of a folder, or a single one, by name; raise PictureError where there is neither."""
+    if not path.exists():
+        raise PictureError(f"{path}: no such picture, folder or dive log")
     if path.is_dir():
         return sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
     return [path]

@@ -23,14 +23,12 @@ LEAST_FIXES: Final = 5
 
 
 def pictures(paths: list[str], node: str | None) -> Iterator[tuple[str, NDArray[np.uint8]]]:
-    """Yield (name, picture) from pictures, folders and dive logs; raise BuddylineError for any other path."""
+    """Yield (name, picture) from pictures, folders and dive logs; raise BuddylineError for anything else."""
     for text in paths:
         path = Path(text)
         if path.suffix == ".mcap":
             yield from _dive_pictures(path, node)
             continue
-        if not path.exists():
-            raise BuddylineError(f"{path}: no such picture, folder or dive log")
         for file in picture_files(path):
             yield str(file), decode_picture(file.read_bytes(), str(file))
 
