@@ -16,9 +16,11 @@ LAMPS: Final = 2
 CLIPPED: Final = 250
 CORE_SHARE: Final = 0.5
 CORE_PX: Final = (1.5, 24.0)
+"""A core is measured within this share of the candidate's radius, but at least and at most so many px."""
 BRIGHTEST: Final = 0.9
 """A core's light is this quantile of its pixels: a hot pixel or a glint is not a core."""
 SPARSE: Final = 8
+"""Of the whole picture, one pixel in this many is measured, along rows and columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,9 @@ class SceneLight:
 
 
 def choose_lamps(blobs: Sequence[Blob], expected: int = 0) -> list[Blob]:
-    """Return the candidates that are taken for the other node's lamps.
+    """Return the candidates that are taken for the other node's lamps: the expected ones, else the likeliest two.
 
-    expected: so many of the first are where the solver expects these lamps; then only those. Else the likeliest two.
+    expected: how many of the first candidates are where the solver expects these lamps.
     """
     return [blob for blob in blobs[: expected or LAMPS] if is_likely(blob)]
 
@@ -70,7 +72,7 @@ def _brightest(levels: NDArray[np.uint8]) -> int:
 
 
 def measure_scene(image: NDArray[np.uint8], linear: NDArray[np.float64]) -> SceneLight:
-    """Measure a picture as a whole, by every SPARSE-th pixel of every SPARSE-th row."""
+    """Measure a picture as a whole."""
     some = image[::SPARSE, ::SPARSE]
     levels = some if some.ndim == 2 else some.max(axis=2)
     return SceneLight(float(linear[levels].mean()), float((levels >= CLIPPED).mean()))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 GREY_LEVELS: Final = 256
 FIRST_LAMPS: Final = 0.5
 FIRST_SCENE: Final = 8.0
-"""Amounts of the first frames, before any has been seen: of lamps a few metres away, and of a lit scene."""
+"""Amounts, ms, of the first frames, before any has been seen: for lamps a few metres away, and for a lit scene."""
 _SRGB_KNEE: Final = 0.04045
 
 
@@ -56,10 +56,10 @@ def inverse_tone_curve(knots: Sequence[float]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class ExposureRange:
-    """What a camera can be asked for, and how its grey levels tell light.
+    """Which exposures a camera can be asked for, and the light of its grey levels.
 
-    line_ns: exposure times are whole numbers of it (0: any time). linear: (256,), the light of each grey level, as a
-    share of what clips. It need only rise; where it is not exact, the loop settles elsewhere, and settles.
+    line_ns: exposure times are multiples of it (0: any time). linear: (256,), the light of each grey level, as a share
+    of what clips. It must rise. Where it is not exact, the loop settles at another exposure, but it settles.
     """
 
     shortest_ns: int
@@ -84,7 +84,7 @@ class ExposureRange:
         return ExposurePlan(self.exposure(FIRST_LAMPS), self.exposure(FIRST_SCENE))
 
     def within(self, longest_ns: int, gain_max: float) -> ExposureRange:
-        """Return what of it is within these bounds."""
+        """Return this range, limited to these bounds."""
         longest_ns = max(min(self.longest_ns, longest_ns), self.shortest_ns)
         return replace(self, longest_ns=longest_ns, gain_max=max(min(self.gain_max, gain_max), self.gain_min))
 
@@ -113,7 +113,7 @@ class ExposureRange:
 class ExposurePlan:
     """The exposures of the triggers to come: most for the lamps, every context_every-th for the scene (0: none).
 
-    Both nodes of a pair have their context frames at the same triggers, so that one trigger suffers and not two.
+    Both nodes of a pair have their context frames at the same triggers: then one trigger is worse than others, not two.
     """
 
     lamps: Exposure

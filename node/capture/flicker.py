@@ -15,15 +15,15 @@ COMPARABLE: Final = 2.0
 """Exposures further apart are not compared: a tone curve that is not quite known would show as a swing."""
 NEAR_PX: Final = 60.0
 TRIPLES: Final = (20, 60)
-"""Judged from so many comparisons on, by so many at most."""
+"""At least so many comparisons are judged, and at most so many, the last ones."""
 SWING: Final = 0.12
 """A lamp that turns in a swell changes its light by less than this from the mean of the frames before and after."""
 
 
 class FlickerWatch:
-    """Compares each core's light, for each ms of exposure, with the mean of the frames before and after.
+    """Compares each core's light per ms of exposure with the mean of the frames before and after.
 
-    Pulses at a whole multiple of the frame rate look alike in all frames, and are not noticed.
+    Pulses at a whole multiple of the frame rate look the same in all frames: they are not noticed.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class FlickerWatch:
 
     @property
     def swing(self) -> float | None:
-        """Median of how far a core's light is from its neighbours in time, as a share of it; None at first."""
+        """Median difference between a core's light and that of the frames around it, as a share; None at first."""
         return median(self._swings) if len(self._swings) >= TRIPLES[0] else None
 
     @property

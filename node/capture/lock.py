@@ -1,9 +1,9 @@
 """The loop that locks a node's exposure to the other node's lamps: a state machine without a camera or a clock.
 
-A core that is not clipped tells its light for each ms of exposure, whichever exposure its frame had. So the exposure
-that is wanted follows from one frame, and the delay of a camera's controls cannot make the loop hunt. A clipped core
-tells only that less is wanted. So the exposure goes down in rungs, frame by frame, without waiting for an answer, and
-jumps to the right one at the first frame that is not clipped.
+A core that is not clipped tells its light per ms of exposure, whichever exposure its frame had. So one frame tells
+the exposure that is wanted, and the delay of a camera's controls cannot make the loop hunt. A clipped core tells only
+that less is wanted. So the exposure goes down in rungs, frame by frame, without waiting for an answer. It jumps to the
+right one at the first frame that is not clipped.
 """
 
 from __future__ import annotations
@@ -22,21 +22,32 @@ State: TypeAlias = Literal["search", "descend", "locked"]
 TARGET: Final = 0.6
 """Light of the brighter lamp's core, as a share of what clips: a lamp that turns brighter by 0.7 EV is not clipped."""
 RUNG: Final = 4.0
+"""Ratio of one amount to the next where lamps are searched for, or clipped."""
 RUNGS_AHEAD: Final = 3
+"""A descent asks for so many rungs less than the last clipped frame at most: the answers are still to come."""
 STILL_BRIGHT: Final = 2
 """So many clipped frames one after the other begin a descent: one alone may be a diver's strobe."""
 REMEMBERED: Final = 8
+"""The exposure follows what the last so many frames wanted."""
 DEAD_BAND: Final = 1.3
+"""A locked exposure changes only where the wanted one differs by more than this ratio."""
 RISE: Final = 1.25
+"""A locked exposure rises by at most this ratio from frame to frame; it falls at once."""
 NEAR: Final = 1.5
+"""Two exposures within this ratio count as the same."""
 LOST: Final = 5
+"""After so many frames without a lamp, at the exposure that was asked for, the search begins."""
 SCENE_MEAN: Final = 0.15
+"""Mean light of a well exposed context frame, as a share of what clips."""
 SCENE_CLIPPED: Final = (0.0015, 0.005)
+"""Share of clipped pixels above which the scene's exposure does not rise, and above which it falls."""
 SCENE_STEP: Final = 1.4
+"""The scene's exposure changes by at most this ratio from one context frame to the next."""
 SCENE_DEAD_BAND: Final = 1.3
 STILL_HIDDEN: Final = 2
 """So many context frames one after the other must show a lamp that the lamps' frames do not."""
 FLOOR_BELOW_SCENE: Final = 8.0
+"""The floor, the least exposure that keeps a hidden lamp visible, is at most the scene's divided by this."""
 FLOOR_TRIED: Final = 30
 """A floor that hides nothing is given up after so many context frames: what was hidden may be gone."""
 
@@ -57,8 +68,8 @@ class Metering:
 class ExposureLock:
     """Says with which exposures to go on, after each frame.
 
-    state: `search` (no lamp seen: every amount from the last good one up to the scene's by turns), `descend` (lamps
-    are clipped: down by rungs) or `locked`. plan: the exposures of the triggers to come.
+    state: `search` (no lamp is seen: the amount rises by rungs from the last good one to the scene's, again and again),
+    `descend` (lamps are clipped: it falls by rungs) or `locked`. plan: the exposures of the triggers to come.
     """
 
     def __init__(
@@ -102,7 +113,7 @@ class ExposureLock:
         return min(max(amount, self._range.least), self._range.most)
 
     def _asked(self, metering: Metering) -> bool:
-        """Return whether a frame had about the exposure that is asked for: others are older, or of the scene."""
+        """Return whether a frame had about the exposure that is asked for now; others are older, or of the scene."""
         ratio = metering.exposure.amount / self.plan.lamps.amount
         return 1 / NEAR <= ratio <= NEAR
 

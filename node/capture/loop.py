@@ -48,8 +48,8 @@ class ExposureLoop:
     def update(self, frame: Frame, candidates: Candidates, expected: int = 0) -> ExposurePlan:
         """Take a frame and its candidates; return the plan from now on.
 
-        expected: so many of the first candidates are where the solver expects the other node's lamps. A frame that does
-        not say its exposure is ignored.
+        expected: how many of the first candidates are where the solver expects the other node's lamps. A frame that
+        does not say its exposure is ignored.
         """
         if frame.exposure is None:
             return self.plan

@@ -1,4 +1,4 @@
-"""Exposures asked for in time: a camera's controls take some frames, and only a frame's metadata tell what it had."""
+"""Exposures asked for ahead of time: a camera's controls act some frames later, and only metadata tell when."""
 
 from __future__ import annotations
 
@@ -10,20 +10,26 @@ from buddyline.node.capture.exposure import Exposure, ExposurePlan, ExposureRang
 from buddyline.protocol.clock import trigger_index
 
 FIRST_DELAY: Final = 9
+"""Frames of delay, before it is learnt."""
 DELAYS: Final = range(1, 25)
 REMEMBERED: Final = 32
+"""What was asked for is kept for so many frames."""
 VOTES: Final = 12
+"""The delay is the most frequent one of the last so many changes of exposure."""
 SAME: Final = 1.05
+"""A frame had what was asked for if both exposures are within this ratio."""
 CHANGED: Final = 1.5
+"""Only a change by more than this ratio from one frame to the next tells the delay."""
 TYPICAL_OF: Final = 15
+"""The usual exposure time is the median over so many frames."""
 
 
 class PlannedExposures:
     """The exposure control of a free-running camera: says what to ask for with each frame that is given back.
 
-    range: what the camera can be asked for. synced: whether the frames' phase is kept together with another camera's,
-    by libcamera. delay_frames: from asking to a frame that has it, learnt from frames that
-    had what was asked for. It decides only which frame is the scene's.
+    range: what the camera can be asked for. synced: whether libcamera keeps the frames in phase with another camera's.
+    delay_frames: from asking for an exposure to the frame that has it, learnt from frames that had what was asked for.
+    It decides only which frame is the scene's.
     """
 
     def __init__(
@@ -61,9 +67,9 @@ class PlannedExposures:
         self._plan = plan
 
     def steady_ns(self, stamp_ns: int, exposure: Exposure) -> int:
-        """Return the stamp that a frame would have with the usual exposure time: what a lock of the phase goes by.
+        """Return the stamp that a frame would have with the usual exposure time: the phase is locked by it.
 
-        Where another camera keeps the phase, nothing is known of its exposures: then it is when the row is read out.
+        Where another camera keeps the phase, nothing is known of its exposures. Then it is the row's readout.
         """
         if self._synced:
             return stamp_ns + exposure.time_ns // 2
@@ -71,7 +77,7 @@ class PlannedExposures:
         return stamp_ns + (exposure.time_ns - round(median(self._times_ns))) // 2
 
     def next(self, steady_ns: int, exposure: Exposure) -> Exposure | None:
-        """Take a frame's steady time and what it had; return what to ask for as it is given back, None: as before."""
+        """Take a frame's steady stamp and exposure; return what to ask for as it is given back, None: as before."""
         number = self._number(steady_ns)
         self._learn(number, exposure)
         ahead_ns = steady_ns + self.delay_frames * self._frame_period_ns

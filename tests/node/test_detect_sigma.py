@@ -1,4 +1,8 @@
-"""The sigma of located lights against their errors, in the dives of another renderer, whose figures were looked at."""
+"""The sigma of located lights against their errors, in the sample dives, which another renderer made.
+
+No term of sigma is fitted to these dives. But the choice between fits was made by their poses, so they are a guard
+against a worse sigma, and no independent proof of a good one.
+"""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +21,7 @@ pytestmark = pytest.mark.skipif(not DIVES.exists(), reason="needs the sample div
 
 
 class Found(NamedTuple):
-    """Squared error over variance, of 2 degrees of freedom; radius of the light; distance from the border; range."""
+    """A light that a candidate is within 1 % of the width of. square: its squared error over the variance per axis."""
 
     square: float
     radius_px: float
@@ -58,7 +62,7 @@ def found():
 
 
 def beyond(lights):
-    """Return the share of lights whose error is beyond 3 sigma (99.73 % within, in two dimensions)."""
+    """Return the share of lights whose error is beyond the circle that should hold 99.73 % (3 sigma in 1D)."""
     assert len(lights) > 20
     return np.mean([light.square > 11.83 for light in lights])
 
