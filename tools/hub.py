@@ -102,7 +102,8 @@ def _follow_file(service: Service, hub: Hub, path: str, config: HubConfig) -> No
     """Take the lists of who is admitted whenever the configuration changes; one that is not valid changes nothing."""
     from buddyline.protocol.access import access_rules
 
-    before = _state_of(path)
+    # The first look reads the file again: it may have changed since `config` was read.
+    before: tuple[int, int] | None = None
     while not service.stop.wait(LOOK_S):
         now = _state_of(path)
         if now == before:
@@ -122,7 +123,7 @@ def _follow_file(service: Service, hub: Hub, path: str, config: HubConfig) -> No
 
 
 def _state_of(path: str) -> tuple[int, int] | None:
-    """Return what changes when a file is written; None where it cannot be seen."""
+    """Return a file's time and size, which change when it is written; None if it is not there."""
     try:
         found = os.stat(path)
     except OSError:
