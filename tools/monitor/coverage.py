@@ -11,7 +11,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.tools.health.words import duration_words, reason_words
 
 BINS: Final = 600
-TRACK_LEGEND: Final = "green: the track covers; yellow: in part; red: too uncertain; grey: no track"
+TRACK_LEGEND: Final = "green: a good track; yellow: partly; red: too uncertain; grey: no track"
 LEGEND: Final = "green: poses; yellow: some triggers without; red: most without; grey: nothing to solve"
 CSS: Final = (
     ".strip{position:relative}.strip img{width:100%;height:22px;display:block;image-rendering:pixelated;"

@@ -149,12 +149,12 @@ def _maps(summary: Summary) -> str:
     plan = inline_svg(dive_figures.plan(summary.points, summary.tracks), "plan")
     profile = inline_svg(dive_figures.profile(summary.points, summary.tracks, depths_a), "profile")
     said = (
-        "Dots: poses. Line: the track, with 95 % ellipses now and then"
+        "Dots: poses. Line: the track, with some 95 % ellipses"
         if summary.tracks
         else "Line: poses; the log holds no track of this pair"
     )
     by_compass = any(known(point.estimate, "sigma_azimuth_rad") for point in summary.tracks)
-    compass = ", the compass's error in them" if by_compass else ""
+    compass = ", which contain the compass's error" if by_compass else ""
     return f'<div class="two">{plan}{profile}</div><p class="dim">{said}{compass}.</p>'
 
 
