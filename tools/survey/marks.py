@@ -52,8 +52,10 @@ def of_table(path: Path) -> list[HandMark]:
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             text = file.read()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is not UTF-8 text: {error}") from error
     # Spreadsheets write semicolons or tabs where a comma is the decimal point.
     head = text.partition("\n")[0]
     delimiter = max(",;\t", key=head.count)
