@@ -138,9 +138,11 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
     tides: list[int] = []
     fit = _GaugeFit(readings, _Unknowns(readings, tides))
     for dive in sorted(set(readings.dive.tolist())):
+        if _revisited(readings, dive) < LEAST_STATIONS:
+            continue
         with_tide = _GaugeFit(readings, _Unknowns(readings, [*tides, dive]))
         possible = abs(with_tide.shared[with_tide.unknowns.tide[dive]]) < 3 * TIDE_M_PER_S
-        if possible and _revisited(readings, dive) >= LEAST_STATIONS and fit.chi2 - with_tide.chi2 > SHOWN_CHI2:
+        if possible and fit.chi2 - with_tide.chi2 > SHOWN_CHI2:
             tides, fit = [*tides, dive], with_tide
     corrected = {key: float(value) for key, value in zip(readings.legs, fit.corrected_m, strict=True)}
     both = {
