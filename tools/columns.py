@@ -252,7 +252,7 @@ class DiveColumns:
         if pair is None:
             if len(self.pairs) > 1:
                 listed = ", ".join("/".join(one) for one in self.pairs)
-                raise BuddylineError(f"{self._name}: holds pairs {listed}; choose one: pair=({self.pairs[0]!r})")
+                raise BuddylineError(f"{self._name}: holds pairs {listed}; choose one: pair={self.pairs[0]!r}")
             pair = self.pairs[0] if self.pairs else ("", "")
         elif pair not in self.pairs:
             raise BuddylineError(f"{self._name}: holds nothing of pair {'/'.join(pair)}")
