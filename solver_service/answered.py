@@ -14,8 +14,8 @@ Outcome = RelativePose | Rejected
 MAX_WITHHELD: Final = 8192
 # Longer than a prediction is valid, and longer than the solver waits for a sensor.
 WARM_UP_NS: Final = 10 * S_NS
-# Only one dive is live at a time. Stored dives may have the same triggers again.
-LIVE_WITHIN_NS: Final = 600 * S_NS
+# An answer this near to the present is of the live dive, of which there is one. A stored dive may come again.
+THIS_DIVE_NS: Final = 600 * S_NS
 
 
 def is_in_order(outcome: Outcome) -> bool:
@@ -83,7 +83,7 @@ class AnsweredPair:
 
     def is_over(self, stamp_ns: int, now_ns: int) -> bool:
         """Return whether the dive is live, and was answered to WARM_UP_NS after stamp_ns or later."""
-        live = self._up_to is not None and abs(now_ns - self._up_to_ns) < LIVE_WITHIN_NS
+        live = self._up_to is not None and abs(now_ns - self._up_to_ns) < THIS_DIVE_NS
         return live and stamp_ns < self._up_to_ns - WARM_UP_NS
 
     def saw_new_frame(self, trigger: int) -> list[Outcome]:
