@@ -14,10 +14,10 @@ WORDS: Final[dict[LoadLevel, str]] = {
     "no_pictures": "no pictures are recorded or shown",
     "half_rate": "no pictures are recorded or shown, and every second trigger is left out",
 }
-# The firmware slows a Pi down at 80 degrees. Each step is taken this early, and taken back so much lower.
+# The firmware slows a Pi down at 80 degrees. The load is lowered from these temperatures on, and raised this far below.
 STEPS_DEGC: Final = (74.0, 77.0)
 BACK_DEGC: Final = 6.0
-# The firmware's bits of now that ask for each step. A weak supply alone, often a thin cable, costs pictures only.
+# The firmware's present bits that cause each step. A weak supply alone, often a thin cable, costs pictures only.
 STEPS_BITS: Final = (POWER_NOW, SLOWED_NOW)
 # A sealed housing's processor takes some ten seconds to follow its load, and minutes to cool.
 LOWER_AFTER_S: Final = 15.0
@@ -26,7 +26,7 @@ RAISE_AFTER_S: Final = 120.0
 
 @dataclass(frozen=True, slots=True)
 class NodeLoad:
-    """level: what the node does. since_s: when it came to that. calm_s: since when less would not be needed."""
+    """level: what the node does. since_s: when it was set. calm_s: since when nothing asks for it; None: needed."""
 
     level: LoadLevel = "full"
     since_s: float = float("-inf")

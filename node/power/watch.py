@@ -125,7 +125,7 @@ class PowerWatch:
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong, in words: what needs the diver's answer. tools/health has what deserves a warning."""
+        """What is wrong and needs the diver to act, in words. What deserves a warning is judged in tools/health."""
         found, bits, fields = [], self._bits or 0, self.status_fields()
         if bits & UNDERVOLTAGE_NOW:
             found.append("power: undervoltage now")

@@ -81,7 +81,7 @@ HOLDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What the lamp tells of: the node's own status, and what the diver has asked for."""
+    """What decides the lamp: the node's own status, and what the diver has asked for."""
 
     leak: bool = False
     ending: bool = False

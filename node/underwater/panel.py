@@ -25,7 +25,7 @@ PERIOD_S: Final = 0.02
 # The status comes once a second. Without it the node is stuck, and the lamp must not tell that all is well.
 STATUS_WITHIN_NS: Final = 5 * S_NS
 COMMAND_WITHIN_S: Final = 10.0
-# Two lights are a node's.
+# A node has two lights.
 LIGHTS: Final = 2
 
 
@@ -90,7 +90,7 @@ class Panel:
         """Read the inputs, take one step, drive the outputs. now_ns: of the monotonic clock."""
         pins, view = self._pins, self._view
         wet = None if pins.leak is None else pins.leak.read()
-        # A probe that cannot be read keeps its last word; that it cannot is a fault of its own.
+        # A probe that cannot be read keeps its last state; the failure is a problem of its own.
         self._leak = self._leak if wet is None else wet
         if self._has_news:
             self._has_news, self._news_ns = False, now_ns
@@ -126,7 +126,7 @@ class Panel:
                 self._state = replace(self._state, ending=False)
 
     def _shut_down(self) -> str:
-        """Run the configured command; return why that failed, "" if it did not. What it ends closes the log itself."""
+        """Run the configured command; return why that failed, "" if it did not. The node's end closes the log."""
         command = self._config.shutdown_command
         if not command:
             return "shut down: panel.shutdown_command is empty"

@@ -37,7 +37,6 @@ GAUGE_S: Final = 0.3
 
 def check_camera(config: NodeConfig) -> list[Finding]:
     """Open the camera, take a few frames, and look for lights in them."""
-    info: NodeInfo | None = None
     try:
         camera = open_camera(config, SystemClock())
     except BuddylineError as error:
@@ -107,6 +106,7 @@ def _take_frames(
 
 
 def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...] | None) -> Finding:
+    info = own
     if config.calibration is not None:
         info = config.node_info(0, "", "", 0)
     elif own is not None and own.node != config.node:
@@ -114,8 +114,6 @@ def _calibration(config: NodeConfig, own: NodeInfo | None, shape: tuple[int, ...
         return Finding("calibration", "problem", text, "take that node's pictures, or its name")
     elif own is None and config.camera.name == "simulated":
         return Finding("calibration", "skipped", "comes with the simulated camera")
-    else:
-        info = own  # type: ignore[assignment]
     return judge.calibration(config.calibration, info, shape)
 
 
