@@ -40,7 +40,7 @@ from buddyline.solver_service.track.output import TrackRow
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# A sensor this far behind the frames has stopped: the track goes on without it.
+# A sensor this far behind the newest outcome has stopped: the track goes on without it.
 STOPPED_NS: Final = S_NS
 # For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
 EXPECT_VALID_NS: Final = S_NS // 2
@@ -56,7 +56,7 @@ class TrackSettings:
 
 
 class PairTracker:
-    """Follows a pair. The past up to a trigger is taken once its outcome is known; what comes later is left out."""
+    """Follows a pair. Messages up to a trigger's time enter the estimator once the trigger's outcome is known."""
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
         self._filter: TrackFilter | None = None

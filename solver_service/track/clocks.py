@@ -6,21 +6,19 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.track.dive import TOLD_CLOCK_S, NodeRecord, in_order, smooth
+from buddyline.solver_service.track.dive import TOLD_CLOCK_S, Records, in_order, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.state import CLOCK
 
-Records: TypeAlias = tuple[NodeRecord, NodeRecord]
-
-# A track tells the offset of a stretch as well as of a dive, where it is not much shorter than this.
+# A stretch of about this length: on a much shorter one a track estimates the offset worse than over a dive.
 STRETCH_NS: Final = 60 * S_NS
 MIN_FIXES: Final = 20
-# Quartz clocks drift apart by less than twice this, 1 sd; what a dive tells worse is not told.
+# A drift whose sigma is not below this is not given: quartz clocks drift apart by less than twice as much.
 DRIFT_TOLD: Final = 20e-6
 
 

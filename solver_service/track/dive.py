@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, combinations
-from typing import Final, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
@@ -23,30 +23,34 @@ from buddyline.solver_service.track.state import CLOCK, NAV
 from buddyline.solver_service.track.stepping import PassGuide
 from buddyline.solver_service.track.trail import Trail
 
-# By how much the first pass may err in the clocks' offset beside its own sigma, 1 sd.
+# The clocks' offset in the last pass, 1 sd: what the first pass has left beside its own sigma; and where a node has no
+# inertial unit, so that no pass estimates it.
 CLOCK_LEFT_S: Final = 0.003
 CLOCK_WITHOUT_S: Final = 0.003
+# A pass that finds the offset off by as much is repeated with it, CLOCK_ROUNDS passes at most; where a node has no
+# inertial unit, only from MOST_LEFT_S on. Where the last pass still finds MOST_LEFT_S there is no track.
 NEAR_CLOCK_S: Final = 0.005
-FAR_CLOCK_S: Final = 0.06
+MOST_LEFT_S: Final = 0.06
+CLOCK_ROUNDS: Final = 4
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
-# An offset is told where it is told better than this, and another one where it is so many of its sigmas off.
+# An offset is believed where its sigma is below this; it differs from the assumed one where it is so many sigmas off.
 TOLD_CLOCK_S: Final = 0.008
 TOLD_SIGMAS: Final = 6.0
-CLOCK_ROUNDS: Final = 4
-# Offsets that are tried where none is told and the tracks fall to pieces: a pass finds one that is 0.3 s off. Pieces
-# whose clocks differ by so much are of wrong clocks.
+# Offsets that are tried where tracks fall to pieces; a pass finds one up to 0.3 s from each. Tracks fall to pieces where
+# their offsets differ by so many s, and so many sigmas.
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
 HEAD_NS: Final = 90 * S_NS
-# Further off, and a node without an inertial unit gets no track: the offset it seems to have is itself off by a tenth.
+# Further off, there is no track where a node has no inertial unit: the offset that is found is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
 # A dive is fed in pieces of this length, each further than the filter is brought: samples are needed ahead of it.
 PIECE_NS: Final = 10 * S_NS
 MARGIN_NS: Final = S_NS
 _BEGINNING_NS, _END_NS = -(2**62), 2**62
 Stamped = TypeVar("Stamped", AttitudeSeen, DepthSeen, FixSeen, FrameSeen)
+Records: TypeAlias = tuple["NodeRecord", "NodeRecord"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +127,13 @@ def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
         track.add_frame(node, frame)
 
 
-def _empty_filter(records: tuple[NodeRecord, NodeRecord], clock_ns: int, clock_sigma_s: float) -> TrackFilter:
+def _empty_filter(records: Records, clock_ns: int, clock_sigma_s: float) -> TrackFilter:
     track = TrackFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=clock_sigma_s)
     track.clock_ns = clock_ns
     return track
 
 
-def pass_over(track: TrackFilter, records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen]) -> None:
+def pass_over(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) -> None:
     """Bring a filter through a dive, fed piece by piece, so that it holds a minute of samples at a time."""
     frames_ns = np.array([frame.stamp_ns for record in records for frame in record.frames], dtype=np.int64)
     start_ns = _BEGINNING_NS
@@ -143,14 +147,12 @@ def pass_over(track: TrackFilter, records: tuple[NodeRecord, NodeRecord], fixes:
         start_ns = end_ns
 
 
-def smooth(
-    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0
-) -> Smoothed:
+def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
     records, fixes = (in_order(records[0]), in_order(records[1])), sorted(fixes, key=_stamp_of)
     told_ns = clock_ns
     if fixes and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS:
-        # What the dive's beginning tells of the clocks saves the whole dive another round.
+        # The dive's beginning gives the clocks' offset, so that the whole dive needs no other round.
         head_ns = fixes[0].stamp_ns - S_NS, fixes[0].stamp_ns + HEAD_NS
         head = records[0].between(*head_ns), records[1].between(*head_ns)
         clock_ns = _first_pass(head, _between(fixes, *head_ns), clock_ns, CLOCK_TRIES_S)[2]
@@ -161,16 +163,16 @@ def smooth(
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
-    far = in_pieces(parts) or clock_off_by(parts[-1], FAR_CLOCK_S)
+    far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
     if far or (without and abs(off_s) > FAR_WITHOUT_S):
         said = f"{first.both}: their clocks seem some {off_s:.2f} s apart, which cannot be told well enough: no track"
         return Smoothed([], clock_ns * 1e-9, math.inf, [*first.problems, said])
     if without:
-        # Without a gyro the clocks' offset cannot be told from the turning, nor lights be decided by it again.
+        # Without a gyro the offset cannot be told from the turning: no second pass from what this one has learned.
         only = _empty_filter(records, told_ns, CLOCK_WITHOUT_S)
         pass_over(only, records, fixes)
         return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
-    # B's stamps are moved by what the first pass found, so that the second is linear in what is left.
+    # B's stamps are moved by the offset that the first pass found: for what is left the second is linear.
     learned = parts[-1]
     shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < TOLD_CLOCK_S**2 else 0.0
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
@@ -197,7 +199,7 @@ def smooth(
     return _smoothed(second, parts_of(second), outputs_ns)
 
 
-def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Path, since_s: float) -> Path | None:
+def _path_before(records: Records, clock_ns: int, path: Path, since_s: float) -> Path | None:
     """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
     track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=CLOCK_S)
     track.clock_ns = clock_ns
@@ -216,7 +218,7 @@ def _path_before(records: tuple[NodeRecord, NodeRecord], clock_ns: int, path: Pa
 
 
 def _first_pass(
-    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int, tries_s: Sequence[float] = ()
+    records: Records, fixes: Sequence[FixSeen], clock_ns: int, tries_s: Sequence[float] = ()
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Give a filter that has passed over a dive, its tracks, and how far B's clock was believed ahead.
 
@@ -232,7 +234,7 @@ def _first_pass(
 
 
 def in_pieces(parts: Sequence[Estimate]) -> bool:
-    """Whether tracks replace each other and do not agree on the clocks: they are far apart, by more than was tried."""
+    """Whether a dive's tracks disagree on the clocks' offset: it is further off than a pass can find."""
     told = [(part.state.clock_s, float(part.covariance[CLOCK, CLOCK])) for part in parts]
     return any(
         abs(one_s - other_s) > max(PIECES_S, PIECES_SIGMAS * math.sqrt(one_variance + other_variance))
@@ -240,23 +242,21 @@ def in_pieces(parts: Sequence[Estimate]) -> bool:
     )
 
 
-def _rounds(
-    records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen], clock_ns: int
-) -> tuple[TrackFilter, list[Estimate], int]:
-    """Pass over a dive again and again: an offset makes a pass non-linear, so that it tells one that is too small."""
+def _rounds(records: Records, fixes: Sequence[FixSeen], clock_ns: int) -> tuple[TrackFilter, list[Estimate], int]:
+    """Pass over a dive until the offset is settled: a pass whose clocks are off finds too small an offset."""
     for left in reversed(range(CLOCK_ROUNDS)):
         first = _empty_filter(records, clock_ns, CLOCK_S)
         pass_over(first, records, fixes)
         parts = parts_of(first)
         without = any(any(part.without) for part in parts)
-        if not left or not parts or not clock_off_by(parts[-1], FAR_CLOCK_S if without else NEAR_CLOCK_S):
+        if not left or not parts or not clock_off_by(parts[-1], MOST_LEFT_S if without else NEAR_CLOCK_S):
             break
         clock_ns += round(parts[-1].state.clock_s * 1e9)
     return first, parts, clock_ns
 
 
 def clock_off_by(part: Estimate, limit_s: float) -> bool:
-    """Whether a track tells clocks that are as far apart: one at rest tells little, and less than it believes."""
+    """Whether a track's clocks are limit_s and TOLD_SIGMAS off: at rest, its sigma is too small for fewer."""
     sigma_s = math.sqrt(part.covariance[CLOCK, CLOCK])
     return abs(part.state.clock_s) >= max(limit_s, TOLD_SIGMAS * sigma_s)
 
@@ -275,7 +275,7 @@ def in_order(record: NodeRecord) -> NodeRecord:
     )
 
 
-def last_ns(records: tuple[NodeRecord, NodeRecord]) -> int:
+def last_ns(records: Records) -> int:
     """Give a stamp well after all that was recorded."""
     stamps = [0]
     for record in records:

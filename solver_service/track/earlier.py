@@ -13,7 +13,7 @@ from buddyline.solver_service.track.smoother import Path, smoothed
 from buddyline.solver_service.track.start import broad_start
 from buddyline.solver_service.track.trail import Step
 
-# Backward for no longer than this: what inertial units alone tell is no good beyond.
+# Backward for no longer than this: by inertial units alone the state is too uncertain beyond.
 EARLIER_S: Final = 10.0
 
 

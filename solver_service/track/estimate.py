@@ -12,6 +12,7 @@ from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.state import MOVING, State
 from buddyline.solver_service.track.trail import Chosen, Trail
 
+# A challenger that has not replaced the track after so long is dropped.
 CHALLENGE_S: Final = 4.0
 
 
@@ -19,19 +20,24 @@ CHALLENGE_S: Final = 4.0
 class Estimate:
     """One hypothesis of where the nodes are, and how well it has explained the pictures since its start.
 
-    shaking: how much the units are shaken in their mounts, as learned from the lights' residuals; shaken (3, MOVING,
-    MOVING): how much of the moving errors' covariance is of that.
-    evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main estimate's, at the start.
+    The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
+    learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
+    without: which nodes have no inertial unit now. attitude_s, depth_s: when attitudes and depths were last used.
 
-    agreed_s: when a fix last agreed with it; inf where none ever bore on it. agreed: how many did.
-
-    detection (2, 2): by observer and light, how likely the light is found where it is in the picture. last_seen (2,):
+    The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
+    light_s: when a light was last used; trigger: time, observer and light of those of the last trigger. bars: how many
+    pictures showed both lights; told_by: how many of each node showed any. missed: in how many of each node's last
+    pictures, on end, a light should be and none was used. unseen_by: a node that has shown no light yet.
 
-    missed: of how many pictures of each node on end, in which lights should be, none was used.
-    fit: log likelihood of the lights used.
-    course: its evidence over time; used: the lights of each picture, by stamp and node: both while it is not confirmed.
-    given: the lights to use, where that is decided already.
+    How well it fits: evidence: log odds over clutter; evidence_by: of each node's pictures. baseline: the main
+    estimate's at the start. surprise, told: chi^2 of the lights used, and of how many residuals. fit: their log
+    likelihood. agreed_s: when a fix last agreed with it, inf where none did; agreed: how many did.
+
+    Its life: searched: it started without a fix. skip_s: pictures within this after start_s made it, and tell nothing
+    new. patience_s: how long it may stay unconfirmed. end_s: later pictures are not its own. course: the evidence over
+    time, used: the lights of each picture, by node and stamp; both while it is not confirmed. given: the lights to use
+    where that is decided.
     """
 
     t_s: float

@@ -21,36 +21,41 @@ from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TOGETHER_S
 
-# Log odds by which a track must explain its pictures better than clutter, or a challenger better than the track.
+# Log odds by which an estimate must explain its pictures better than clutter to be confirmed, and a challenger better
+# than the track to replace it. Each node's pictures alone must give at least MUTUAL.
 CONFIRMED: Final = 25.0
 REPLACED: Final = 20.0
-REFUTED: Final = 40.0
 MUTUAL: Final = 7.0
+# An estimate is dropped where another leads it by more than REFUTED, or its own log odds fall below GIVEN_UP.
+REFUTED: Final = 40.0
+GIVEN_UP: Final = -15.0
+# A start without a fix is confirmed after so many pictures with both lights, and so many of each node with a light: for
+# a second another's lamp fits in place of a hidden one, until the motion contradicts.
 BARS: Final = 4
-# Another's lamp stands in place of a hidden one for a second, before the motion tells.
 TOLD: Final = 12
-# So many fixes must agree with what starts from one of them, to confirm it, and to replace a confirmed track.
+# So many fixes must agree with a start from one of them, to confirm it, and to replace a confirmed track by it.
 FIXES_TO_CONFIRM: Final = 2
 FIXES_TO_REPLACE: Final = 3
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
-GIVEN_UP: Final = -15.0
-# A confirmed track is given up when no light has told of it for so long and its place is this share of the range off.
+# A confirmed track ends when no light was used for so long, and its position's sigma exceeds this share of the range,
+# a range above LOST_RANGE_M counted as that.
 LOST_S: Final = 3.0
 LOST_SHARE: Final = 0.3
 LOST_RANGE_M: Final = 10.0
 # What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a start is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
-# chi^2 (6 degrees of freedom) beyond which a fix contradicts: a chance of 1e-5.
+# A fix contradicts beyond this chi^2 of 6 degrees of freedom, an attitude beyond it of 3: chances of 1e-5 and 3e-7.
 CONTRADICTS: Final = 33.0
 REFUSED_TO_SAY: Final = 10
-# Clocks further apart than this: the filter is not linear in them, and what it tells meanwhile is not honest.
+# With clocks further apart than this, and by so many sigmas, the live filter is far from linear and its covariance too
+# small: it gives no rows until APART_S later.
 FAR_CLOCK_S: Final = 0.1
 APART_S: Final = 20.0
 FAR_SIGMAS: Final = 6.0
 # Longest step, without a picture, over which a track tells its present state.
 BRIDGED_S: Final = 1.0
-# What is older than this is dropped: the noise of slow sensors is learned from so much.
+# Messages older than this are dropped. The noise of slow sensors is learned from so much.
 MEMORY_S: Final = 30.0
 
 
@@ -199,9 +204,9 @@ class TrackFilter(TrackPool):
         return estimate
 
     def _faces(self, state: State, P: Floats, seen: AttitudeSeen) -> bool:
-        """Whether B's attitude in a state is one that its message allows, its compass off by iron at worst.
+        """Whether B's attitude by a fix agrees with its message, whose compass iron may deflect.
 
-        Two nodes that both look at a third's bar fit each other's lights, but not each other's headings.
+        Two nodes that both look at a third node's bar can make a fix, but their headings contradict it.
         """
         y, H = anchors.attitude_residual(state, 1, self.level_camera(1, seen))
         noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
@@ -231,7 +236,7 @@ class TrackFilter(TrackPool):
             range_m = float(np.linalg.norm(main.state.r_m))
             sigma_m = math.sqrt(float(np.trace(main.covariance[:3, :3])))
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
-                # Nothing is told of it any more: another start is as good.
+                # It knows no more than a new start would.
                 main.end_s = main.light_s + 1.0
                 main.steps.drop_after(main.end_s)
                 self.finished.append(main)
@@ -291,19 +296,18 @@ class TrackFilter(TrackPool):
 
     @staticmethod
     def _is_whole(estimate: Estimate, fixes: int, bars: float) -> bool:
-        """Whether enough has been seen of an estimate: by chance, or another's lamp, a single fix may be wrong.
+        """Whether enough speaks for an estimate beside its log odds.
 
-        A start without a fix may be of chance lights: whole bars, and lights in both pictures, are no chance; who sees
-        a third's bar alone is in front of nobody. fixes, bars: how many must agree with what starts from a fix.
+        A start from a fix needs so many fixes that agree, or so many pictures with both lights (bars) and of each node:
+        a single fix may be wrong, by chance or by another's lamp. A start without a fix may be of false candidates, or
+        of a third node's bar: it needs pictures with both lights, and of both nodes.
         """
-        if not estimate.searched and estimate.agreed >= fixes:
-            return True
         if estimate.searched:
             return estimate.bars >= BARS and min(estimate.told_by) >= TOLD
-        return estimate.bars >= bars and min(estimate.told_by) >= bars
+        return estimate.agreed >= fixes or min(estimate.bars, *estimate.told_by) >= bars
 
     def _again(self, estimate: Estimate) -> Estimate:
-        """Give an estimate as it is to be followed from now on."""
+        """Give an estimate as it is to be followed once confirmed: replayed, if it started without a fix."""
         if not estimate.searched or any(estimate.without):
             return estimate
         return self._replayed(estimate)

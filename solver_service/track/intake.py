@@ -19,6 +19,7 @@ from buddyline.solver_service.track.units import clipped, fault_of
 CHECK_EVERY_S: Final = 2.0
 REJECTED_TO_SAY: Final = 10
 LEAST_SIGMA_RAD: Final = 1e-3
+# Taken for roll, pitch and yaw where a message states a sigma below LEAST_SIGMA_RAD, which no attitude filter reaches.
 UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
 # No fix's numbers, in m, rad and their squares, are as large.
 BEYOND: Final = 1e4

@@ -15,7 +15,7 @@ from buddyline.solver_service.track.state import CLOCK, NAV, State
 # The errors that move a light in a picture: NAV of them, and the clock's; and their part of a covariance.
 COLUMNS: Final = np.array((*range(NAV), CLOCK))
 BLOCK: Final = np.ix_(COLUMNS, COLUMNS)
-# After a step of Newton's method as small, the next is nothing.
+# Newton's method ends with a step below this: the next would be its square.
 SMALL_PX: Final = 1e-4
 
 

@@ -25,13 +25,13 @@ SEARCH_BESIDE_S: Final = 2.0
 SEARCH_AFTER_S: Final = 3.0
 SEARCH_PATIENCE_S: Final = 8.0
 MAX_TENTATIVE: Final = 24
-# So many pictures on end without a light, while the other node's have some: a track may be a wrong one.
+# A track is perhaps wrong where so many pictures of one node on end show no light, while the other's do.
 ONE_SIDED: Final = 30
-# For how long pictures are kept, and longer for what is followed.
+# Pictures are kept for so long, and since the start of each estimate without a fix that is followed: for its replay.
 SIGHTS_S: Final = 2.0
 # The noise of the lights that a start is made of: one in thirty is off by many pixels.
 START_PX: Final = 2.5
-# How little a replay believes of the state that it starts from: a share of the range, rad, and the sigmas learned.
+# A replay starts with these sigmas: a share of the range, rad, or so many of the learned sigmas where that is more.
 REPLAY_SHARE: Final = 0.1
 REPLAY_RAD: Final = 0.15
 REPLAY_SIGMAS: Final = 3.0

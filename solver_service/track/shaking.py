@@ -25,7 +25,7 @@ SHOVE_MPS: Final = 5e-3
 FIRST: Final = 0.5
 LEAST: Final = np.log(np.array((5e-5, 5e-5, 5e-4)) ** 2)
 MOST: Final = np.log(np.array((0.03, 0.03, 0.3)) ** 2)
-# A picture's say is halved after 200 more, some ten seconds: shaking comes and goes.
+# A picture's weight is halved after 200 more, which two nodes take in 10 s at 10 Hz: shaking comes and goes.
 KEPT: Final = 0.5 ** (1.0 / 200.0)
 LONGEST_STEP: Final = 0.5
 # One residual's chi^2 counts at most so much: gross errors are no shaking.

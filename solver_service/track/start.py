@@ -40,7 +40,8 @@ DELAY_TOLD_S: Final = 0.001
 DELAY_UNTOLD_S: Final = 0.004
 CLOCK_S: Final = 0.1
 DEPTH_OFFSET_M: Final = 0.2
-# A later pass starts as if nothing were known but roughly where: its lights tell the rest.
+# A later pass starts with BROAD_SIGMAS of what an earlier one has left, at least LEAST_BROAD in each error, and no more
+# than the first two: the lights count anew.
 BROAD_R_M: Final = 0.5
 BROAD_TURN_RAD: Final = 0.15
 BROAD_SIGMAS: Final = 4.0

@@ -291,7 +291,7 @@ class TrackSteps(TrackIntake):
         before = estimate.covariance
         error, estimate.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
         estimate.state = estimate.state.plus(error)
-        # Depth and attitudes take little of what shaking adds: it is not worth their time.
+        # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:
             moving = H[:, :MOVING]
             estimate.shaking = estimate.shaking.taught(y, S_inverse, moving[:, :NAV], estimate.shaken[:, :NAV, :NAV])
@@ -309,6 +309,7 @@ class TrackSteps(TrackIntake):
             return
         estimate.depth_s = time_s
         y, H = anchors.depth_residual(estimate.state, b.depth_m - a.depth_m, t_s - 0.5 * (time_a + time_b), self._ports)
+        # Between the two messages a diver may rise or sink, by some 0.3 m/s.
         noise = a.sigma_m**2 + b.sigma_m**2 + (0.3 * (time_a - time_b)) ** 2 + 1e-6
         variance = float((H @ estimate.covariance @ H.T)[0, 0]) + noise
         if y[0] ** 2 < 16.0 * variance:

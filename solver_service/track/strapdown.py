@@ -76,8 +76,7 @@ class Increment:
     R: its attitude at the end. dv_mps, dp_m (3,): its velocity gained, and its way gained over moving on unaccelerated
     (gravity left in: it cancels between the nodes). jacobian (9, SIZE): of attitude (left), dv, dp by the node's own
     attitude at the start and constants. gap_s: how much of the time no sample covers. rate_radps (3,): the turn rate
-    at the end. without: whether there is no unit at all,
-    so that the gyro's bias is the turn rate, its sign turned.
+    at the end. without: whether there is no unit at all: the gyro's bias is then minus the turn rate.
     """
 
     R: Floats
