@@ -37,8 +37,8 @@ LEAST_EARLIER_S: Final = 0.15
 # An offset is believed where its sigma is below this; it differs from the assumed one where it is so many sigmas off.
 TOLD_CLOCK_S: Final = 0.008
 TOLD_SIGMAS: Final = 6.0
-# Offsets that are tried where tracks fall to pieces; a pass finds one up to 0.3 s from each. Tracks fall to pieces where
-# their offsets differ by so many s, and so many sigmas.
+# Offsets that are tried where tracks fall to pieces; a pass finds one up to 0.3 s from each. Pieces are tracks whose
+# offsets differ by so many s, and so many sigmas.
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
