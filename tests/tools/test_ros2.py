@@ -205,10 +205,10 @@ def test_a_secured_hub_lets_the_bridge_publish_for_ros_and_nobody_else(store: An
     from buddyline.protocol.access import access_rules
     from buddyline.protocol.zenoh_bus import open_hub, open_session
 
-    from tests.tools.identities import make_keys, tls
+    from tests.tools.identities import make_keys, tls, tls_endpoint
 
     keys = make_keys(tmp_path, "a")
-    endpoint = free_endpoint().replace("tcp/", "tls/")
+    endpoint = tls_endpoint()
     came: list[str] = []
     enough = threading.Event()
 
