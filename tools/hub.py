@@ -95,7 +95,8 @@ def run(args: argparse.Namespace) -> int:
         if access is not None:
             service.spawn("access", lambda: _follow_file(service, hub, args.config, config))
         service.wait(args.seconds)
-    return service.join()
+        # The thread that may open the hub's session again ends before the hub closes.
+        return service.join()
 
 
 def _follow_file(service: Service, hub: Hub, path: str, config: HubConfig) -> None:
