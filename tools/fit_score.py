@@ -1,6 +1,6 @@
 """`buddyline tune --fit`: fit the detector's score to the simulator's pictures, and to pictures without any lamp.
 
-The simulator knows where every lamp is. It draws five waters, with and without what fools the detector, at several
+The simulator knows where every lamp is. It draws five waters, with and without decoys, at several
 exposures and resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are added.
 """
 
@@ -184,23 +184,24 @@ def run(folders: Sequence[str], pictures: Iterable[NDArray[np.uint8]], note: str
     with Progress("fit", scenes + len(HELD_OUT) * len(ENVIRONMENTS)) as progress:
         samples = [*simulated(SEEDS, progress), *without_lamps(pictures)]
         held_out = list(simulated(HELD_OUT, progress, scenes))
-    sys.stdout.write(described(fit(samples), samples, held_out, [*folders, note]))
+    sys.stdout.write(described(fit(samples), samples, held_out, folders, note))
     return 0
 
 
-def described(weights: Floats, samples: Sequence[Sample], held_out: Sequence[Sample], real: Sequence[str]) -> str:
-    """Return the weights as TOML, with where they come from and how well they are calibrated.
+def described(
+    weights: Floats, samples: Sequence[Sample], held_out: Sequence[Sample], folders: Sequence[str], note: str
+) -> str:
+    """Return the weights as TOML, with their provenance and how well they are calibrated.
 
-    real: names of the real pictures, and what they are.
+    folders: of the real pictures. note: what these are.
     """
     count = Counter(sample.source for sample in samples)
-    *folders, note = real
     lines = [
         "# Written by `buddyline tune --fit`. score.py says what the features are.",
         "",
         "[provenance]",
         f'simulator = "seeds {SEEDS.start} to {SEEDS.stop - 1} in each water, {VIEWS} pictures each"',
-        f"real_pictures_without_lamps = {json.dumps(folders)}",
+        f"real_pictures_without_lamps = {json.dumps(list(folders))}",
         f"note = {json.dumps(note)}",
         f"candidates = {sum(len(sample.lamp) for sample in samples)}",
         f"lamps = {sum(int(sample.lamp.sum()) for sample in samples)}",

@@ -29,6 +29,7 @@ from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
 from buddyline.tools import fit_score, losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
+from buddyline.tools.measure.pictures import spread
 from buddyline.tools.newfile import new_folder, write_picture
 from buddyline.tools.progress import Progress
 from buddyline.tools.still import Rectangle, still_parts
@@ -182,7 +183,7 @@ def load_pictures(inputs: Sequence[str], truth: str | None, limit: int) -> tuple
     if dives:
         pictures = list(_dive_pictures(dives, known, limit))
     else:
-        pictures = [Picture(str(file), pixels, NO_LIGHTS) for file, pixels in _readable(_spread(_files(inputs), limit))]
+        pictures = [Picture(str(file), pixels, NO_LIGHTS) for file, pixels in _readable(spread(_files(inputs), limit))]
     if not pictures:
         raise BuddylineError("no pictures " + ("with truth " if known else "") + f"in {', '.join(inputs)}")
     if known:
@@ -221,7 +222,7 @@ def _dive_pictures(paths: Sequence[str], known: Mapping[tuple[str, int], Points]
             trigger = trigger_index(image.stamp_ns, infos[node].trigger_period_ns) if node in infos else 0
             if not known or (node, trigger) in known:
                 listed.append((node, trigger, image.data))
-        for node, trigger, data in _spread(listed, limit):
+        for node, trigger, data in spread(listed, limit):
             name = f"{node}_{trigger}"
             try:
                 focal_px = infos[node].camera.fx_px if node in infos else None
@@ -244,10 +245,6 @@ def _readable(files: Iterable[Path]) -> Iterator[tuple[Path, NDArray[np.uint8]]]
             yield file, decode_picture(file.read_bytes(), str(file))
         except (PictureError, OSError) as error:
             losses.report([str(error)])
-
-
-def _spread(items: list[Any], limit: int) -> list[Any]:
-    return [items[round(i)] for i in np.linspace(0, len(items) - 1, min(limit, len(items)))]
 
 
 def _write(

@@ -215,7 +215,10 @@ def _pictures(source: str, width_px: int, count: int, stops: float) -> Pictures:
     """Return colour pictures of this width, from a dive, or rendered of an environment so far below its exposure."""
     height_px = round(width_px * ASPECT)
     if source.endswith(".mcap"):
-        return spread((_in_colour(picture, width_px, height_px) for picture in stored_pictures(source)), count, source)
+        stored = [_in_colour(picture, width_px, height_px) for picture in stored_pictures(source)]
+        if not stored:
+            raise BuddylineError(f"{source}: holds no pictures")
+        return spread(stored, count)
     from buddyline.node.sim.sensor import scene_exposure
 
     world = simulated_world(source, SEED, width_px, height_px)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from buddyline.node.drivers.stored import decode_picture
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from buddyline.node.sim.world import World
+
+Item = TypeVar("Item")
 
 
 def stored_pictures(path: Path | str) -> Iterator[NDArray[np.uint8]]:
@@ -45,9 +47,6 @@ def views(world: World, count: int, step_s: float) -> Iterator[tuple[str, int]]:
         yield nodes[i % 2], world.scenario.start_ns + round((1.0 + step_s * i) * S_NS)
 
 
-def spread(pictures: Iterator[NDArray[np.uint8]], count: int, source: str) -> list[NDArray[np.uint8]]:
-    """Return at most count pictures, evenly spread; raise BuddylineError if there are none."""
-    found = list(pictures)
-    if not found:
-        raise BuddylineError(f"{source}: holds no pictures")
-    return [found[round(i)] for i in np.linspace(0, len(found) - 1, min(count, len(found)))]
+def spread(items: Sequence[Item], count: int) -> list[Item]:
+    """Return at most count of some pictures, or of what names them, evenly spread."""
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, min(count, len(items)))]

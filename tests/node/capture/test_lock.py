@@ -179,7 +179,7 @@ def test_the_scenes_exposure_follows_the_scene():
 
 
 def test_context_frames_are_those_of_the_same_triggers_in_all_nodes():
-    plan = Eye(0.3).run(100) and Eye(0.3).lock.plan
+    plan = Eye(0.3).lock.plan
     assert [k for k in range(100, 200) if plan.at(k) is plan.scene] == [100, 120, 140, 160, 180]
 
 
