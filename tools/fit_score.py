@@ -1,7 +1,7 @@
 """`buddyline tune --fit`: fit the detector's score to the simulator's pictures, and to pictures without any lamp.
 
-The simulator knows where every lamp is. It draws five waters, with and without decoys, at several
-exposures and resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are added.
+The simulator knows where every lamp is. It draws five waters, with and without decoys, at several exposures and
+resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are added.
 """
 
 from __future__ import annotations

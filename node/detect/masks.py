@@ -18,7 +18,7 @@ _WIDEST_PX: Final = 1024
 
 
 class Masks:
-    """Some polygons. Their corners (u, v) are shares of the picture's width and height; two are a rectangle's."""
+    """Polygons. Corners (u, v) are shares of the picture's width and height; two corners give a rectangle."""
 
     def __init__(self, polygons: Sequence[Corners]) -> None:
         """Raise BuddylineError for a polygon of one corner, or with a corner outside of the picture."""
@@ -68,7 +68,7 @@ def unmasked(found: list[Detection], masks: Masks | None, shape: tuple[int, ...]
 
 
 class MaskedDetector:
-    """A detector that knows no masks, without what they hide."""
+    """Another detector without masks of its own; candidates that a mask hides are left out."""
 
     def __init__(self, detector: Detector, masks: Masks) -> None:
         self._detector = detector

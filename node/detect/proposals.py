@@ -36,7 +36,7 @@ _MOMENTS = np.stack([np.ones(_WINDOW**2), _COLUMN, _ROW], axis=1).astype(np.floa
 
 
 Layout: TypeAlias = Callable[[NDArray[np.float64], NDArray[np.float32]], tuple[NDArray[np.bool_], NDArray[np.float64]]]
-"""Which places of a loaded picture count, and where the part that each is in begins in the whole picture, (N, 2) px.
+"""Returns which places of a loaded picture count, (N,), and what to add to get them in the whole picture, (N, 2) px.
 
 Its arguments: the places' centres (N, 2), px of the loaded picture, and their octaves' steps (N,), px."""
 
@@ -145,7 +145,7 @@ class ProposalFinder:
         """Find the most outstanding places of the loaded picture, 16 by default, or up to 64 that clearly stand out.
 
         A place needs a contrast of contrast_min grey levels plus clutter_gain times the mean contrast of its
-        neighbourhood. layout: which places count, and where they are; None for all of a whole picture.
+        neighbourhood. layout: see Layout; None where all places of a whole picture count.
         """
         below: NDArray[np.uint8] | None = None
         for i, octave in reversed(list(enumerate(self._octaves))):

@@ -19,7 +19,7 @@ SIDES: Final = (48, 64, 80, 96, 112, 128, 160, 192, 240)
 MARGIN: Final = 8
 # No light is proposed by a coarser octave, except one that fills a quarter of the picture.
 LARGEST_OCTAVE: Final = 3
-# By so much the octaves' limits are lower than a light's radius.
+# An octave may propose a light if its pixels are at most so many times as large as the light's radius.
 REACH: Final = 1.2
 # Tiles that cover more than this share of the picture save too little.
 MOST_COVERED: Final = 0.5
@@ -31,7 +31,7 @@ AT_LEAST: Final = 3
 class _Tile:
     """A square of the picture around a region. origin_px: (u, v) of its first pixel.
 
-    cut: whether what the region's places depend on goes on beyond the picture's upper or lower edge.
+    cut: whether the pixels that the region's places depend on reach beyond the picture's upper or lower edge.
     """
 
     region: Region
@@ -70,7 +70,7 @@ class RegionFinder:
         if len(regions) * side_px * side_px > MOST_COVERED * height * width:
             return None
         tiles = [self._tile(region, side_px, aligned_px, width, height) for region in regions]
-        # In a mosaic one tile's edge is another's, and not the picture's.
+        # In a mosaic, a tile's upper and lower edge are not the picture's, but other tiles follow there.
         mosaics = [[tile] for tile in tiles] if any(tile.cut for tile in tiles) else [tiles]
         found = []
         for group in mosaics:
@@ -95,16 +95,16 @@ class RegionFinder:
         return region.radius_px + (MARGIN << self._octave(region)) * self._step_px
 
     def _octave(self, region: Region) -> int:
-        """Return the coarsest octave that proposes a light of a region's size: its pixels are at most its radius.
+        """Return the coarsest octave that proposes the light of a region: its pixels are about as large as its radius.
 
-        A light whose radius is just below a power of two may be proposed by the next octave: it then stands out as
-        much there, and its centre comes out a few hundredths of a pixel elsewhere.
+        The whole picture's search may propose the light from the next coarser octave, if it stands out as much there.
+        The two centres then differ by a few hundredths of a pixel.
         """
         return min(int(math.log2(max(REACH * region.light_px / self._step_px, 1.0))), LARGEST_OCTAVE)
 
 
 class _Mosaic:
-    """Tiles of a picture, one below the other, searched as one picture: each search costs much, whatever its size."""
+    """Tiles of a picture, one below the other, searched as one picture: the cost of a search is mostly fixed."""
 
     def __init__(self, finder: ProposalFinder, side_px: int, masks: Masks | None) -> None:
         self._finder = finder
@@ -128,7 +128,7 @@ class _Mosaic:
         for i, tile in enumerate(tiles):
             u, v = tile.origin_px
             self._pixels[i * side_px : (i + 1) * side_px] = image[v : v + side_px, u : u + side_px]
-        # Where each tile begins, less where it begins in the mosaic.
+        # A place in the mosaic plus its tile's origin is the place in the picture.
         origin = np.array([tile.origin_px for tile in tiles], np.float64)
         origin[:, 1] -= np.arange(len(tiles)) * side_px
         centre = np.array([tile.region.centre_px for tile in tiles]) - origin

@@ -46,8 +46,8 @@ class Examined(NamedTuple):
 class SourceDetector:
     """The default detector. It adapts to the noise of this picture and those before.
 
-    Among VALUES, contrast_min is the least contrast of a place, in grey levels (0: it follows the picture's noise), and
-    clutter_gain the share of its neighbourhood's mean contrast by which a place's contrast must exceed that.
+    A place needs the contrast contrast_min, in grey levels (0: it follows the picture's noise), plus clutter_gain times
+    the mean contrast of its neighbourhood.
     """
 
     VALUES: ClassVar[Mapping[str, float]] = MappingProxyType({"contrast_min": 0.0, "clutter_gain": 2.0})
