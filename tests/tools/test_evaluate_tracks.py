@@ -1,9 +1,12 @@
 """The figures of a track: coverage, wrong samples, honesty, inside and outside gaps."""
 
+import math
+
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import NodePose, Track, Truth
+from buddyline.tools.evaluation.rotation import conjugate, multiply, rotation_vector
 from buddyline.tools.evaluation.tracks import covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, ned_of_camera
 from msgspec.structs import replace
@@ -52,6 +55,47 @@ def test_a_true_covariance_gives_a_nees_of_its_degrees_of_freedom():
     assert figures.wrong == 0
     assert figures.nees3.mean == pytest.approx(3.0, rel=0.1)
     assert figures.rotation_rad.median == pytest.approx(0.0, abs=1e-12)
+
+
+def swum(stamp_ns):
+    """Return T_a_b of a swell of 10 cm and .2 rad in two seconds, on the way with 1 m/s."""
+    seconds = stamp_ns / S_NS
+    angle = 0.1 * math.sin(math.pi * seconds)
+    t_m = (0.1 * math.sin(math.pi * seconds), 0.0, 4.0 + seconds)
+    return t_m, (0.0, math.cos(angle), math.sin(angle), 0.0)
+
+
+def truth_of_swell(stamp_ns, **more):
+    t_m, q_xyzw = swum(stamp_ns)
+    return Truth(stamp_ns=stamp_ns, t_a_b_m=t_m, q_a_b_xyzw=q_xyzw, **more)
+
+
+def test_truth_at_five_a_second_is_known_between_to_a_millimetre():
+    between = TruthTrack([truth_of_swell(k * S_NS // 5) for k in range(20)])
+    for stamp_ns in range(0, 19 * S_NS // 5, 7_654_321):
+        t_m, q_xyzw = between.interpolated(stamp_ns)
+        true_m, true_q = swum(stamp_ns)
+        # At the ends there is a sample less.
+        within_m = 1e-3 if S_NS // 5 <= stamp_ns <= 18 * S_NS // 5 else 4e-3
+        assert t_m == pytest.approx(np.array(true_m), abs=within_m)
+        turn = rotation_vector(multiply(q_xyzw, conjugate(np.array(true_q))))
+        assert np.linalg.norm(turn) < 2 * within_m
+
+
+def test_a_gap_in_the_truth_is_not_bridged():
+    stamps_ns = [0, S_NS // 5, 2 * S_NS // 5, 2 * S_NS, 11 * S_NS // 5, 12 * S_NS // 5]
+    broken = TruthTrack([truth_of_swell(stamp) for stamp in stamps_ns])
+    assert broken.interpolated(S_NS) is None
+    t_m, _ = broken.interpolated(S_NS // 3)
+    assert t_m == pytest.approx(np.array(swum(S_NS // 3)[0]), abs=4e-3)
+
+
+def test_the_truth_of_a_trigger_is_moved_to_when_its_pictures_were_taken():
+    known = TruthTrack([truth_of_swell(k * S_NS // 5, trigger=k) for k in range(20)])
+    late_ns = 2 * S_NS + 5_000_000
+    assert known.at(late_ns, 10)[0] == pytest.approx(np.array(swum(late_ns)[0]), abs=1e-3)
+    # With clocks that differ by more, the trigger's number tells which truth it is.
+    assert known.at(2 * S_NS + 150_000_000, 10)[0] == pytest.approx(np.array(swum(2 * S_NS)[0]), abs=1e-9)
 
 
 def test_errors_in_gaps_are_separate_and_wrong_needs_sigma_and_range():

@@ -46,9 +46,7 @@ def rotation_vector(q_xyzw: Floats) -> Floats:
     return q[..., :3] * scale
 
 
-def interpolate(q0_xyzw: Floats, q1_xyzw: Floats, share: float) -> Floats:
-    """Return the rotation (4,) at the share 0-1 of the shorter rotation from q0 to q1."""
-    step = rotation_vector(multiply(q1_xyzw, conjugate(q0_xyzw))) * share
-    half = 0.5 * float(np.linalg.norm(step))
-    turn = np.append(0.5 * np.sinc(half / np.pi) * step, np.cos(half))
-    return multiply(turn, q0_xyzw)
+def from_rotation_vector(w_rad: Floats) -> Floats:
+    """Return exp(w) (4,) of a rotation vector (3,), rad."""
+    half = 0.5 * float(np.linalg.norm(w_rad))
+    return np.append(0.5 * np.sinc(half / np.pi) * w_rad, np.cos(half))
