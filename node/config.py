@@ -8,9 +8,19 @@ from typing import Annotated, Literal
 import numpy as np
 from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration, earth_field
 from buddyline.protocol.config import Config, ConfigError, load_config
-from buddyline.protocol.messages import ArTag, CameraModel, NodeId, NodeInfo, Positive, Quaternion, Vector3
+from buddyline.protocol.messages import (
+    ArTag,
+    CameraModel,
+    FixedPlace,
+    NodeId,
+    NodeInfo,
+    Positive,
+    Quaternion,
+    Role,
+    Vector3,
+)
 from buddyline.protocol.security import Tls
-from msgspec import UNSET, Meta, field
+from msgspec import UNSET, Meta, UnsetType, field
 from msgspec.structs import replace
 
 # By BCM number, as on the 40-pin header; 0 and 1 are the HAT's memory.
@@ -156,6 +166,27 @@ class PanelConfig(Config, frozen=True, kw_only=True):
         return {name: number for name in names if (number := getattr(self, name)) is not None}
 
 
+class FixedConfig(Config, frozen=True, kw_only=True):
+    """[fixed]: a node that stands still, such as one on a tripod: its place and attitude in the frame of a net.
+
+    p_m: of the camera's centre, north-east-down; q_xyzw: camera to north-east-down. sigma_m, sigma_rad: how well both
+    are known, 1 sd of each axis. `buddyline net init` writes this table out of a short dive.
+    """
+
+    net: NodeId = "main"
+    p_m: Vector3
+    q_xyzw: Quaternion
+    sigma_m: Annotated[float, Meta(ge=0)] = 0.003
+    sigma_rad: Annotated[float, Meta(ge=0)] = 0.002
+
+    @property
+    def place(self) -> FixedPlace:
+        """The place as NodeInfo carries it; raises ValueError for a quaternion that is none."""
+        return FixedPlace(
+            net=self.net, p_m=self.p_m, q_xyzw=self.q_xyzw, sigma_m=self.sigma_m, sigma_rad=self.sigma_rad
+        )
+
+
 class PowerConfig(Config, frozen=True, kw_only=True):
     """[power]: the battery gauge on sensors.i2c_bus, and what is left out when the node gets hot.
 
@@ -196,9 +227,14 @@ class SimulationConfig(Config, frozen=True, kw_only=True):
 
 
 class NodeConfig(Config, frozen=True, kw_only=True):
-    """A whole node. status_file: its health report; "": in the runtime directory (protocol/statusfile.py)."""
+    """A whole node. status_file: its health report; "": in the runtime directory (protocol/statusfile.py).
+
+    role: "camera" for a node without lamps. (A node of lamps alone runs no program: its NodeInfo comes from a file.)
+    """
 
     node: NodeId
+    role: Literal["full", "camera"] = "full"
+    fixed: FixedConfig | None = None
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
     tls: Tls | None = None
@@ -287,12 +323,27 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             tags=calibration.tags or UNSET,
         )
 
+    def in_net(self, info: NodeInfo) -> NodeInfo:
+        """Return a NodeInfo with the configured role and place, where they are not the usual ones."""
+        role: Role | UnsetType = info.role if self.role == "full" else self.role
+        return replace(info, role=role, fixed=info.fixed if self.fixed is None else self.fixed.place)
+
+    def check_fixed(self) -> None:
+        """Raise ConfigError for a place that is none."""
+        if self.fixed is None:
+            return
+        try:
+            _ = self.fixed.place
+        except ValueError as error:
+            raise ConfigError(f"fixed.{error}") from error
+
 
 def load_node_config(path: Path | str) -> NodeConfig:
     """Read a node's TOML file; raise ConfigError naming file, field and value."""
     config = load_config(path, NodeConfig)
     try:
         config.check_pins()
+        config.check_fixed()
         config.power.check()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -134,10 +134,11 @@ class NodeService(Service):
     def _info(self) -> NodeInfo:
         own = self.camera.info()
         if own is None or self.config.calibration is not None:
-            return self.config.node_info(self.clock.now_ns(), self._software, self._sha256, self.camera.row_time_ns)
+            row_time_ns = self.camera.row_time_ns
+            own = self.config.node_info(self.clock.now_ns(), self._software, self._sha256, row_time_ns)
         if own.node != self.config.node:
             raise ConfigError(f"node {self.config.node}: the camera's pictures are those of node {own.node}")
-        return own
+        return self.config.in_net(own)
 
     def _log_metadata(self) -> dict[str, str]:
         """Return what is needed to understand a log later, with the whole configuration."""

@@ -41,7 +41,7 @@ def access_rules(nodes: Iterable[str], namespace: str = "", shut_out: Iterable[s
     policies: list[dict[str, object]] = [{"rules": ["ask", "hear"], "subjects": clients}]
     for name, keys, alive in [
         *((node_name(node), [_short(topic, node) for topic in _OF_NODES], f"node/{node}") for node in nodes),
-        (SOLVER, ["pair/*/*/*", _short(EXPECT, "*")], "solver"),
+        (SOLVER, ["pair/*/*/*", "net/*/*", _short(EXPECT, "*")], "solver"),
         (VIEWER, [], "viewer"),
         (SURVEYOR, ["node/*/mark"], "surveyor"),
         (

@@ -39,6 +39,7 @@ Reason: TypeAlias = Literal[
     "other_lights",
 ]
 TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
+Role: TypeAlias = Literal["full", "lights", "camera"]
 
 
 def _check_unit(field: str, q_xyzw: Quaternion) -> None:
@@ -91,13 +92,33 @@ class ArTag(Struct, frozen=True, kw_only=True):
             raise ValueError("corners_m: two corners less than 1 mm apart")
 
 
+class FixedPlace(Struct, frozen=True, kw_only=True):
+    """Where a node stands still: T_net_camera in the net's frame, which is north-east-down.
+
+    p_m: of the camera's centre; q_xyzw: camera to net. sigma_m, sigma_rad: how well both are known, 1 sd of each axis.
+    """
+
+    net: NodeId = "main"
+    p_m: Vector3
+    q_xyzw: Quaternion
+    sigma_m: NonNegative = 0.003
+    sigma_rad: NonNegative = 0.002
+
+    def __post_init__(self) -> None:
+        """Check the place and the quaternion's norm."""
+        _check_finite("p_m", self.p_m)
+        _check_unit("q_xyzw", self.q_xyzw)
+
+
 class NodeInfo(Message, frozen=True, kw_only=True):
     """Calibration and identity of a node.
 
     light_left_m, light_right_m, depth_port_m: in the node's camera frame. sigma_px: candidate noise, 1 sd.
     row_time_ns: 0 for a global shutter. q_body_camera_xyzw: camera to body. declination_rad: 0 where headings
     are magnetic. tags: AR tags on the node, for comparison only. imu_m: place of the inertial unit in the camera
-    frame. imu_delay_ns: stamp of an inertial sample minus its true time.
+    frame. imu_delay_ns: stamp of an inertial sample minus its true time. role: "lights" has two lamps and no camera,
+    "camera" a camera and no lamps (its light_left_m and light_right_m, or its camera, are then not used). fixed: for a
+    node that stands still.
     """
 
     node: NodeId
@@ -118,6 +139,18 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     tags: list[ArTag] | UnsetType = UNSET
     imu_m: Vector3 | UnsetType = UNSET
     imu_delay_ns: int | UnsetType = UNSET
+    role: Role | UnsetType = UNSET
+    fixed: FixedPlace | UnsetType = UNSET
+
+    @property
+    def has_camera(self) -> bool:
+        """Whether the node sees others; without a role it does."""
+        return self.role != "lights"
+
+    @property
+    def has_lights(self) -> bool:
+        """Whether others can see the node's lamps; without a role they can."""
+        return self.role != "camera"
 
     def __post_init__(self) -> None:
         """Check the mount's quaternion and that the two lights are apart."""

@@ -156,6 +156,18 @@ TRACK_LAG: Final = Topic(
     "track_lag", "buddyline/pair/{a}/{b}/track_lag", messages.Track, 20.0, "data", stale_s=3.0, solved=True
 )
 TRUTH: Final = Topic("truth", "buddyline/pair/{a}/{b}/truth", messages.Truth, 10.0, "data_low")
+NET_POSE: Final = Topic(
+    "net_pose",
+    "buddyline/net/{net}/{node}",
+    messages.NodePose,
+    20.0,
+    "interactive_high",
+    express=True,
+    stale_s=1.0,
+    retained=True,
+    solved=True,
+)
+# After NET_POSE, because topic_of returns the first topic of a schema.
 NET_TRUTH: Final = Topic("net_truth", "buddyline/net/{net}/truth/{node}", messages.NodePose, 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(
     "solver_status",
@@ -186,6 +198,7 @@ TOPICS: Final = (
     TRACK,
     TRACK_LAG,
     TRUTH,
+    NET_POSE,
     NET_TRUTH,
     SOLVER_STATUS,
 )

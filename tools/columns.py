@@ -22,6 +22,7 @@ from buddyline.protocol.messages import (
     Imu,
     Message,
     NodeInfo,
+    NodePose,
     Rejected,
     RelativePose,
     Track,
@@ -35,6 +36,8 @@ from buddyline.protocol.topics import (
     IMAGE,
     IMU,
     INFO,
+    NET_POSE,
+    NET_TRUTH,
     POSE,
     REJECTED,
     TRACK,
@@ -136,6 +139,20 @@ class TruthColumns(Columns):
 
 
 @dataclass(frozen=True, eq=False)
+class NodePoseColumns(Columns):
+    """A node's poses in the frame of a net, camera to net: p_m, v_mps (n, 3), q_xyzw (n, 4), age_s (n,).
+
+    covariance (n, 6, 6): position (m), then the small rotation w (rad) with R_true = exp(w) R, both in the net's frame.
+    """
+
+    p_m: Floats
+    q_xyzw: Floats
+    v_mps: Floats
+    covariance: Floats
+    age_s: Floats
+
+
+@dataclass(frozen=True, eq=False)
 class RejectionColumns(Columns):
     """Triggers without a pose: trigger, reason (one word), detail (n,)."""
 
@@ -228,6 +245,14 @@ class DiveColumns:
         """Return the true poses; pair: needed if there are several."""
         return columns_of(TruthColumns, self._of_pair(TRUTH, Truth, pair))
 
+    def node_poses(self, node: str, net: str = "main") -> NodePoseColumns:
+        """Return a node's poses in a net's frame; none where the dive was solved as a pair."""
+        return columns_of(NodePoseColumns, self._read(NET_POSE, NodePose, (net, node)))
+
+    def node_truth(self, node: str, net: str = "main") -> NodePoseColumns:
+        """Return a node's true poses, in north-east-down."""
+        return columns_of(NodePoseColumns, self._read(NET_TRUTH, NodePose, (net, node)))
+
     def rejections(self, pair: Pair | None = None) -> RejectionColumns:
         """Return the triggers without a pose; pair: needed if there are several."""
         return rejection_columns(self._of_pair(REJECTED, Rejected, pair))
@@ -282,10 +307,22 @@ class DiveColumns:
         return ", ".join(map(str, self._logs))
 
 
-_THREE = ("t_a_b_m", "t_ned_m", "sigma_ned_m", "v_a_b_mps", "sigma_rad", "accel_mps2", "gyro_radps", "mag_t")
+_THREE = (
+    "t_a_b_m",
+    "p_m",
+    "v_mps",
+    "t_ned_m",
+    "sigma_ned_m",
+    "v_a_b_mps",
+    "sigma_rad",
+    "accel_mps2",
+    "gyro_radps",
+    "mag_t",
+)
 # The shape of a column's values by its name; the others are single values.
 _SHAPES = dict.fromkeys(_THREE, (3,)) | {
     "q_a_b_xyzw": (4,),
+    "q_xyzw": (4,),
     "q_ned_body_xyzw": (4,),
     "covariance": (6, 6),
     "v_covariance": (3, 3),

@@ -20,6 +20,8 @@ _INFO = m.NodeInfo(
     light_right_m=(0.4, 0.0, 0.0),
     sigma_px=0.7,
     trigger_period_ns=PERIOD_NS,
+    role="full",
+    fixed=m.FixedPlace(p_m=(0.0, 0.0, 3.0), q_xyzw=_UNIT),
 )
 
 
@@ -101,6 +103,17 @@ SOUND: tuple[m.Message, ...] = (
         checks=["range"],
         skew_ns=0,
         azimuth_rad=0.1,
+    ),
+    m.NodePose(
+        **_NODE,
+        net="main",
+        p_m=(1.0, 2.0, 3.0),
+        q_xyzw=_UNIT,
+        v_mps=(0.0, 0.0, 0.0),
+        covariance=[0.0] * 36,
+        fixed=False,
+        mode="filter",
+        age_s=0.1,
     ),
     m.Rejected(**_PAIR, trigger=3, reason="ambiguous", detail="two poses"),
     m.Truth(stamp_ns=STAMP_NS, t_a_b_m=(0.0, 0.0, 5.0), q_a_b_xyzw=_UNIT),

@@ -1,7 +1,7 @@
 """A node's configuration: what of its calibration goes into NodeInfo, and what is refused."""
 
 import pytest
-from buddyline.node.config import CalibrationConfig, CameraConfig, NodeConfig, load_node_config
+from buddyline.node.config import CalibrationConfig, CameraConfig, FixedConfig, NodeConfig, load_node_config
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.messages import CameraModel, NodeInfo
@@ -48,4 +48,30 @@ def test_an_absurd_place_or_delay_is_refused_with_its_name(tmp_path, line):
     example = (REPOSITORY / "node/examples/pi.toml").read_text()
     path.write_text(example.replace("sigma_px = 0.7", f"sigma_px = 0.7\n{line}"))
     with pytest.raises(ConfigError, match=line.split()[0]):
+        load_node_config(path)
+
+
+def test_role_and_fixed_place_go_into_node_info():
+    plain = config(CAMERA, 1640, 1232)
+    info = plain.node_info(1, "", "", 0)
+    assert (plain.in_net(info).role, plain.in_net(info).fixed) == (UNSET, UNSET)
+    fixed = FixedConfig(p_m=(1.0, 2.0, 3.0), q_xyzw=(0.5, 0.5, 0.5, 0.5), sigma_m=0.01)
+    info = decode(encode(replace(plain, role="camera", fixed=fixed).in_net(info)), NodeInfo)
+    assert (info.role, info.has_lights, info.has_camera) == ("camera", False, True)
+    assert (info.fixed.net, info.fixed.p_m, info.fixed.sigma_m) == ("main", (1.0, 2.0, 3.0), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.9]", r"a\.toml: fixed\.q_xyzw: norm"),
+        ("p_m = [0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]", "fixed.p_m"),
+        ("q_xyzw = [0.5, 0.5, 0.5, 0.5]", "p_m"),
+        ("p_m = [0.0, 0.0, 1.0]\nq_xyzw = [0.5, 0.5, 0.5, 0.5]\nnet = 'Main'", "fixed.net"),
+    ],
+)
+def test_a_place_that_is_none_is_refused_with_its_name(tmp_path, table, named):
+    path = tmp_path / "a.toml"
+    path.write_text(f"node = 'a'\n[fixed]\n{table}\n")
+    with pytest.raises(ConfigError, match=named):
         load_node_config(path)

@@ -46,6 +46,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
             (b, [(topics.CANDIDATES, "a"), (topics.POSE, "a", "b")], (topics.CANDIDATES, "b")),
             (solver, [(topics.CANDIDATES, "a")], (topics.POSE, "a", "b")),
             (solver, [], (topics.EXPECT, "b")),
+            (solver, [(topics.NET_TRUTH, "main", "a")], (topics.NET_POSE, "main", "a")),
             (surveyor, [(topics.CANDIDATES, "a"), (topics.INFO, "a"), (topics.TRUTH, "a", "b")], (topics.MARK, "a")),
             (player, [(topics.POSE, "a", "b"), (topics.EXPECT, "a")], (topics.TRUTH, "a", "b")),
         ):
@@ -62,6 +63,7 @@ def test_each_role_publishes_only_its_own_keys_and_all_read(keys: Path) -> None:
             bus.declare_alive(name)
             alive.wait_for_key(f"{name} True")
         said = [
+            "buddyline/net/main/a",
             "buddyline/node/a/depth",
             "buddyline/node/a/mark",
             "buddyline/node/b/candidates",

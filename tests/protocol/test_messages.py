@@ -82,6 +82,9 @@ def dumps(message: object) -> bytes:
         (NodeInfo, INFO, {"camera": dict(CAMERA, distortion=[0.0] * 4)}, "distortion"),
         (NodeInfo, INFO, {"light_left_m": [0.44, 0.0, 0.0]}, "light_left_m"),
         (NodeInfo, INFO, {"trigger_period_ns": 0}, "trigger_period_ns"),
+        (NodeInfo, INFO, {"role": "tripod"}, "role"),
+        (NodeInfo, INFO, {"fixed": {"p_m": [0.0, 0.0, 1.0], "q_xyzw": [0.0, 0.0, 0.0, 1.1]}}, "fixed"),
+        (NodeInfo, INFO, {"fixed": {"p_m": [0.0, math.nan, 1.0], "q_xyzw": [0.0, 0.0, 0.0, 1.0]}}, "p_m"),
     ],
 )
 def test_an_invalid_field_is_refused_and_named(schema, sound, change, named):
