@@ -63,7 +63,10 @@ def connect(
 
 
 class ZenohPublisher(Publisher):
-    """A Publisher over Zenoh. declare: declares it in its session; returns None while the session is not open."""
+    """A Publisher over Zenoh. declare: declares it in its session; returns None while the session is not open.
+
+    answer_in: the session in which a plain `get` is answered with the last message; None: it is not answered here.
+    """
 
     def __init__(
         self,
@@ -71,9 +74,12 @@ class ZenohPublisher(Publisher):
         topic: Topic,
         key: str,
         cap: RateCap,
+        answer_in: zenoh.Session | None = None,
     ) -> None:
         super().__init__(topic, key, cap)
         self._declare = declare
+        self._last: bytes | None = None
+        self._answers = None if answer_in is None else answer_in.declare_queryable(key, self._answer)
         # A publisher cannot be undeclared while another thread, such as a device's, is in its put.
         self._lock = threading.Lock()
         self._publisher = declare()
@@ -86,15 +92,23 @@ class ZenohPublisher(Publisher):
             if self._publisher is None:
                 return False
             self._publisher.put(payload)
+            self._last = payload
         return True
 
+    def _answer(self, query: zenoh.Query) -> None:
+        # Without the lock: `close` holds it while it waits for the answers that are under way.
+        last = self._last
+        if last is not None:
+            query.reply(self.key, last, encoding=self.topic.encoding)
+
     def close(self) -> None:
-        """Stop publishing; the cache is dropped."""
+        """Stop publishing and answering; the cache is dropped."""
         with self._lock:
             if not self._closed:
                 self._closed = True
-                if self._publisher is not None:
-                    self._publisher.undeclare()  # type: ignore[no-untyped-call]
+                for declared in (self._publisher, self._answers):
+                    if declared is not None:
+                        declared.undeclare()  # type: ignore[no-untyped-call]
 
 
 class ZenohBus(Bus):
@@ -134,7 +148,9 @@ class ZenohBus(Bus):
                 **settings,
             )
 
-        wrapped = ZenohPublisher(declare, topic, key, RateCap(max_rate_hz, self.clock))
+        # What the hub retains is answered by the hub.
+        answer_in = self._session if topic.latest_only and not topic.retained else None
+        wrapped = ZenohPublisher(declare, topic, key, RateCap(max_rate_hz, self.clock), answer_in)
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
@@ -36,7 +37,7 @@ class Retained:
                 # Clients may have a namespace, which comes before the key; the hub itself has none.
                 key_expr = f"**/{topic.key_any()}"
                 session.declare_subscriber(key_expr, self._keep)
-                session.declare_queryable(key_expr, self._answer)
+                session.declare_queryable(key_expr, partial(self._answer, zenoh.KeyExpr(key_expr)))
 
     def _keep(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT or len(sample.payload) > MAX_RETAINED_BYTES:
@@ -46,11 +47,12 @@ class Retained:
             if key in self._samples or len(self._samples) < MAX_RETAINED:
                 self._samples[key] = sample
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def _answer(self, topic: zenoh.KeyExpr, query: zenoh.Query) -> None:
+        # A query over several topics comes once for each of them.
         with self._lock:
             samples = list(self._samples.values())
         for sample in samples:
-            if query.key_expr.intersects(sample.key_expr):
+            if topic.includes(sample.key_expr) and query.key_expr.intersects(sample.key_expr):
                 query.reply(sample.key_expr, sample.payload, encoding=sample.encoding)
 
 
