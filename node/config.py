@@ -217,13 +217,18 @@ class PowerConfig(Config, frozen=True, kw_only=True):
 
 
 class SimulationConfig(Config, frozen=True, kw_only=True):
-    """[simulation]: the world of the simulated camera and sensors; the same for both nodes."""
+    """[simulation]: the world of the simulated camera and sensors; the same for all nodes.
+
+    more_nodes: further nodes. fixed_nodes: which of all stand still.
+    """
 
     environment: str = "cavern"
     seed: Annotated[int, Meta(ge=0)] = 1
     start_ns: Annotated[int, Meta(ge=0)] = 1_764_000_000_000_000_000
     node_a: NodeId = "a"
     node_b: NodeId = "b"
+    more_nodes: list[NodeId] = field(default_factory=list)
+    fixed_nodes: list[NodeId] = field(default_factory=list)
 
 
 class NodeConfig(Config, frozen=True, kw_only=True):

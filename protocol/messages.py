@@ -489,17 +489,21 @@ class Truth(Message, frozen=True, kw_only=True):
 
 
 class TrueLight(Struct, frozen=True, kw_only=True):
-    """The true place of one light of the other node in a picture. merged: both lights' clipped cores overlap."""
+    """The true place of one light of another node in a picture. merged: both lights' clipped cores overlap.
+
+    node: whose light it is, where there are more than two nodes.
+    """
 
     name: Literal["left", "right"]
     u_px: float
     v_px: float
     visible: bool
     merged: bool
+    node: NodeId | UnsetType = UNSET
 
 
 class LightTruth(Message, frozen=True, kw_only=True):
-    """The true places of the other node's lights in this node's picture."""
+    """The true places of the other nodes' lights in this node's picture."""
 
     node: NodeId
     stamp_ns: StampNs

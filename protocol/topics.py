@@ -167,7 +167,7 @@ NET_POSE: Final = Topic(
     retained=True,
     solved=True,
 )
-# After NET_POSE, because topic_of returns the first topic of a schema.
+# After NET_POSE, because topic_of returns the first topic of a schema (and this one for the mode `truth`).
 NET_TRUTH: Final = Topic("net_truth", "buddyline/net/{net}/truth/{node}", messages.NodePose, 10.0, "data_low")
 SOLVER_STATUS: Final = Topic(
     "solver_status",
@@ -233,9 +233,11 @@ def parse_key(key: str) -> tuple[Topic, tuple[str, ...]] | None:
 
 
 def topic_of(message: Message) -> Topic:
-    """Return the topic of a message by its type, and of a Track by its mode."""
+    """Return the topic of a message by its type, and of a Track or a NodePose by its mode."""
     if isinstance(message, messages.Track) and message.mode == "lag":
         return TRACK_LAG
+    if isinstance(message, messages.NodePose) and message.mode == "truth":
+        return NET_TRUTH
     for topic in TOPICS:
         if topic.schema is type(message):
             return topic

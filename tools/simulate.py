@@ -1,4 +1,4 @@
-"""`buddyline simulate`: a dive log of two simulated nodes, with the truth in it."""
+"""`buddyline simulate`: a dive log of two or more simulated nodes, with the truth in it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import math
 import sys
 from dataclasses import asdict, fields
+from string import ascii_lowercase
 
 from buddyline.node.sim.scenario import (
     DECOYS,
@@ -17,6 +18,7 @@ from buddyline.node.sim.scenario import (
     Scenario,
 )
 from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
@@ -55,6 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     world.add_argument(
         "--baseline", type=float, default=scenario.baseline_a_m, metavar="M", help="default: %(default)s"
     )
+    world.add_argument(
+        "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...: above 2 in two groups; default: %(default)s"
+    )
+    world.add_argument(
+        "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
+    )
     world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
     world.add_argument("--tags", action="store_true", help="two AR tags on each node, for comparison")
     world.add_argument("--undisturbed", action="store_true", help="no diver looks away, nothing passes before a light")
@@ -89,6 +97,8 @@ def run(args: argparse.Namespace) -> int:
         environment=args.environment,
         seed=args.seed,
         start_ns=START_NS,
+        more_nodes=more_nodes(args.nodes),
+        fixed_nodes=tuple(args.fixed),
         width_px=args.width,
         height_px=round(args.width * ASPECT),
         row_time_ns=round(args.row_time_us * 1000),
@@ -131,6 +141,13 @@ def run(args: argparse.Namespace) -> int:
         count = writer.count
     print(f"{args.output}: {plan.seconds:g} s of {scenario.environment}, {count} messages", file=sys.stderr)
     return 0
+
+
+def more_nodes(count: int) -> tuple[str, ...]:
+    """Return the names of the nodes beside a and b: c, d, ...; raise BuddylineError for a count out of range."""
+    if not 2 <= count <= len(ascii_lowercase):
+        raise BuddylineError(f"--nodes {count}: give 2 to {len(ascii_lowercase)}")
+    return tuple(ascii_lowercase[2:count])
 
 
 def _differing(scenario: Scenario) -> dict[str, object]:

@@ -14,7 +14,7 @@ from buddyline.protocol.messages import MAX_BLOBS, Blob
 def visible(scene: Scene, index: int, view: SceneView, lamp: Lamp) -> bool:
     """Return whether a lamp is inside the picture, not hidden, and bright enough to be seen.
 
-    index: of the observer, A (0) or B (1).
+    index: of the observer.
     """
     u, v = lamp.pixel
     scenario, camera = scene.scenario, scene.rigs[index].camera

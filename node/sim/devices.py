@@ -32,6 +32,8 @@ def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> 
         start_ns=simulation.start_ns,
         node_a=simulation.node_a,
         node_b=simulation.node_b,
+        more_nodes=tuple(simulation.more_nodes),
+        fixed_nodes=tuple(simulation.fixed_nodes),
         width_px=width_px,
         height_px=height_px,
     )
@@ -112,10 +114,10 @@ class SimulatedSensor:
 
 def open_camera(config: NodeConfig, clock: Clock) -> SimulatedCamera:
     """Open the simulated camera."""
-    if config.node not in (config.simulation.node_a, config.simulation.node_b):
-        raise ConfigError(
-            f"node = {config.node!r}: simulation knows {config.simulation.node_a!r} and {config.simulation.node_b!r}"
-        )
+    simulation = config.simulation
+    known = (simulation.node_a, simulation.node_b, *simulation.more_nodes)
+    if config.node not in known:
+        raise ConfigError(f"node = {config.node!r}: simulation knows {', '.join(map(repr, known))}")
     return SimulatedCamera(config, clock)
 
 

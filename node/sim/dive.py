@@ -1,10 +1,11 @@
-"""A simulated dive as messages in time order: what two nodes would log, and the truth."""
+"""A simulated dive as messages in time order: what the nodes would log, and the truth."""
 
 from __future__ import annotations
 
 import heapq
 import math
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from typing import Final, TypeAlias
 
 import cv2
@@ -38,7 +39,7 @@ def messages(world: World, plan: DivePlan) -> Iterator[Entry]:
     """Yield all messages of a dive in order of time; the same world and plan give the same dive."""
     start_ns = world.scenario.start_ns
     end_ns = start_ns + math.ceil(plan.seconds * S_NS)
-    nodes = (world.scenario.node_a, world.scenario.node_b)
+    nodes = world.scenario.nodes
     for node in nodes:
         yield start_ns, topics.INFO.key(node), world.info(node, start_ns, plan.period_ns)
     streams: list[Iterator[Entry]] = [_truth(world, plan, end_ns)]
@@ -65,11 +66,12 @@ def _triggers(world: World, plan: DivePlan, end_ns: int) -> Iterator[int]:
 
 def _truth(world: World, plan: DivePlan, end_ns: int) -> Iterator[Entry]:
     """Yield the truth at the nominal instant of every trigger, also where its frames are lost."""
-    nodes = (world.scenario.node_a, world.scenario.node_b)
-    key = topics.TRUTH.key(*nodes)
+    nodes = world.scenario.nodes
+    pairs = list(combinations(nodes, 2))
     for trigger in _triggers(world, plan, end_ns):
         stamp_ns = trigger * plan.period_ns
-        yield stamp_ns, key, world.truth(stamp_ns, trigger)
+        for pair in pairs:
+            yield stamp_ns, topics.TRUTH.key(*pair), world.truth(stamp_ns, trigger, pair)
         for node in nodes:
             yield stamp_ns, topics.NET_TRUTH.key(NET, node), world.node_truth(node, stamp_ns, NET)
 

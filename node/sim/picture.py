@@ -82,7 +82,7 @@ class Painter:
         side = next((i for i, light in enumerate(view.lights) if light is lamp), None)
         if self._flicker is None or side is None:
             return None
-        return self._flicker.rows(side, t_s, exposure or self._scene_exposure)
+        return self._flicker.rows(side % 2, t_s, exposure or self._scene_exposure)
 
     def _matters(self, lamp: Lamp) -> bool:
         """Return whether a lamp is in the picture, or near enough to light the water in it."""

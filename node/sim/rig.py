@@ -34,7 +34,7 @@ class SimulatedRig:
 
 
 def build(scenario: Scenario, index: int) -> SimulatedRig:
-    """Return the rig of A (0) or B (1): lights toed out by 3 to 8 degrees, a few millimetres off the bar."""
+    """Return the rig of a node: lights toed out by 3 to 8 degrees, a few millimetres off the bar."""
     rng = generator(scenario.seed, "rig", index)
     half_m = scenario.baseline_m(index) / 2
     lights_m = np.array([[-half_m, 0.0, 0.0], [half_m, 0.0, 0.0]])

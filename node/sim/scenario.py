@@ -75,11 +75,13 @@ WATERS: Final[dict[str, Water]] = {
 
 @dataclass(frozen=True)
 class Scenario:
-    """Two nodes in some water: the complete description of a simulated dive.
+    """Nodes in some water: the complete description of a simulated dive.
 
-    start_ns: epoch of t = 0. camera_a, camera_b: None for the default pinhole. rig_sigma_m: 1 sd of the lights'
-    distance from the ideal bar (NodeInfo has their true places). range_max_m: 0 for the environment's own.
-    sigma_px: noise of synthetic candidates. gross_share: share of them with a gross error, gross_px (1 sd per axis).
+    more_nodes: further nodes; with them, or with fixed nodes, the nodes move as two groups that face each other.
+    fixed_nodes: which stand still. start_ns: epoch of t = 0. camera_a, camera_b: None for the default pinhole; further
+    nodes have A's and B's cameras and baselines by turns. rig_sigma_m: 1 sd of the lights' distance from the ideal bar
+    (NodeInfo has their true places). range_max_m: 0 for the environment's own. sigma_px: noise of synthetic
+    candidates. gross_share: share of them with a gross error, gross_px (1 sd per axis).
     miss_share: share of lights that give no candidate. false_lights: false candidates in each picture.
     other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
@@ -96,6 +98,8 @@ class Scenario:
     start_ns: int = 0
     node_a: str = "a"
     node_b: str = "b"
+    more_nodes: tuple[str, ...] = ()
+    fixed_nodes: tuple[str, ...] = ()
     width_px: int = 820
     height_px: int = 616
     camera_a: CameraModel | None = None
@@ -126,10 +130,16 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Raise BuddylineError, naming the field, for what cannot be simulated."""
-        check_node_id(self.node_a)
-        check_node_id(self.node_b)
+        for node in self.nodes:
+            check_node_id(node)
         if self.node_a == self.node_b:
             raise BuddylineError(f"node_b: {self.node_b!r} is also node_a; the nodes need different names")
+        for i, node in enumerate(self.more_nodes):
+            if node in self.nodes[: 2 + i]:
+                raise BuddylineError(f"more_nodes: {node!r} is there already; the nodes need different names")
+        for node in self.fixed_nodes:
+            if node not in self.nodes:
+                raise BuddylineError(f"fixed_nodes: {node!r} is none of {', '.join(self.nodes)}")
         for name, known in (
             ("environment", ENVIRONMENTS),
             ("trajectory", TRAJECTORIES),
@@ -137,7 +147,7 @@ class Scenario:
         ):
             if getattr(self, name) not in known:
                 raise BuddylineError(f"{name}: {getattr(self, name)!r} is none of {', '.join(known)}")
-        lamps = [f"{node}.{side}" for node in (self.node_a, self.node_b) for side in ("left", "right")]
+        lamps = [f"{node}.{side}" for node in self.nodes for side in ("left", "right")]
         for lamp in self.dead_lamps:
             if lamp not in lamps:
                 raise BuddylineError(f"dead_lamps: {lamp!r} is none of {', '.join(lamps)}")
@@ -154,6 +164,16 @@ class Scenario:
             raise BuddylineError(f"range_max_m: {self.far_m} is below range_min_m, {self.range_min_m}")
 
     @property
+    def nodes(self) -> tuple[str, ...]:
+        """All nodes, A and B first."""
+        return (self.node_a, self.node_b, *self.more_nodes)
+
+    @property
+    def is_team(self) -> bool:
+        """Whether the nodes move as two groups, not as a pair."""
+        return bool(self.more_nodes or self.fixed_nodes)
+
+    @property
     def water(self) -> Water:
         """Optics of the environment."""
         return WATERS[self.environment]
@@ -164,14 +184,15 @@ class Scenario:
         return self.range_max_m or max(self.water.range_max_m, self.range_min_m)
 
     def index(self, node: str) -> int:
-        """Return 0 for A, 1 for B."""
-        if node not in (self.node_a, self.node_b):
-            raise BuddylineError(f"node {node!r} is not simulated: {self.node_a} and {self.node_b} are")
-        return int(node == self.node_b)
+        """Return 0 for A, 1 for B, and so on."""
+        if node not in self.nodes:
+            *first, last = self.nodes
+            raise BuddylineError(f"node {node!r} is not simulated: {', '.join(first)} and {last} are")
+        return self.nodes.index(node)
 
     def camera(self, index: int) -> CameraModel:
-        """Return the camera of A (0) or B (1)."""
-        own = (self.camera_a, self.camera_b)[index]
+        """Return the camera of a node; further nodes have A's and B's by turns."""
+        own = (self.camera_a, self.camera_b)[index % 2]
         if own is not None:
             return own
         # Imported here: commands name the environments in their help, which must not take the time to load numpy.
@@ -180,8 +201,8 @@ class Scenario:
         return pinhole(self.width_px, self.height_px)
 
     def baseline_m(self, index: int) -> float:
-        """Return the baseline of A (0) or B (1), metres."""
-        return (self.baseline_a_m, self.baseline_b_m)[index]
+        """Return the baseline of a node, metres; further nodes have A's and B's by turns."""
+        return (self.baseline_a_m, self.baseline_b_m)[index % 2]
 
 
 _LOWEST: Final = {

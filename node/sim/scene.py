@@ -14,7 +14,8 @@ from buddyline.node.sim.rig import LEFT, R_BODY_CAMERA, RIGHT, SimulatedRig, bea
 from buddyline.node.sim.rotation import Matrix, Vector
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.tags import SeenTag
-from buddyline.node.sim.trajectory import PairMotion, Placement
+from buddyline.node.sim.team import TeamMotion
+from buddyline.node.sim.trajectory import Motion, PairMotion, Placement
 
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0
@@ -76,10 +77,13 @@ class Passer:
 
 @dataclass(frozen=True)
 class SceneView:
-    """All that one camera sees at one time. lights: the other node's left and right. others: lamps and reflections."""
+    """All that one camera sees at one time.
+
+    lights: the left and right of each other node, in the nodes' order. others: lamps of other divers and reflections.
+    """
 
     placement: Placement
-    lights: tuple[Lamp, Lamp]
+    lights: tuple[Lamp, ...]
     others: tuple[Lamp, ...]
     passers: tuple[Passer, ...]
     tags: tuple[SeenTag, ...] = ()
@@ -93,18 +97,23 @@ class SceneView:
         """Return whether a passing thing covers a pixel."""
         return any(passer.hides(pixel) for passer in self.passers)
 
+    @property
+    def bars(self) -> list[tuple[Lamp, Lamp]]:
+        """The left and right light of each other node."""
+        return list(zip(self.lights[::2], self.lights[1::2], strict=True))
+
 
 class Scene:
-    """Both rigs, other divers, the surface, and passing things. Times in seconds since the start."""
+    """All rigs, other divers, the surface, and passing things. Times in seconds since the start."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.motion = PairMotion(scenario)
-        nodes = scenario.node_a, scenario.node_b
+        self.motion: Motion = TeamMotion(scenario) if scenario.is_team else PairMotion(scenario)
+        nodes = scenario.nodes
         self._dead = {
             (i, s) for i, node in enumerate(nodes) for s in (LEFT, RIGHT) if _named(node, s) in scenario.dead_lamps
         }
-        self.rigs: tuple[SimulatedRig, SimulatedRig] = (build(scenario, 0), build(scenario, 1))
+        self.rigs: list[SimulatedRig] = [build(scenario, index) for index in range(len(nodes))]
         rng = generator(scenario.seed, "divers")
         self._divers = [_Diver(scenario, rng) for _ in range(scenario.other_lamps)]
         # The picture, the candidates and the truth of a frame need the same view.
@@ -112,27 +121,33 @@ class Scene:
         self._ripple = [[Sway(rng, 0.4, 3.0) for _ in range(2)] for _ in range(2)]
 
     def _view(self, index: int, t_s: float) -> SceneView:
-        """Return what A (0) or B (1) sees at t_s; each light's pixel is the one at its own row's exposure."""
+        """Return what a node sees at t_s; each light's pixel is the one at its own row's exposure."""
         placement = self.motion.placement(index, t_s)
-        lights = tuple(self._light(index, placement, side, t_s) for side in (LEFT, RIGHT))
+        lights = tuple(
+            self._light(index, placement, other, side, t_s) for other in self.others(index) for side in (LEFT, RIGHT)
+        )
         other_a_b = self.motion.placement(0, t_s), self.motion.placement(1, t_s)
         sources = [diver.source(other_a_b, t_s) for diver in self._divers]
         if self.scenario.water.surface > 0:
-            sources += [self._reflection(1 - index, side, t_s) for side in (LEFT, RIGHT)]
+            sources += [self._reflection(other, side, t_s) for other in self.others(index) for side in (LEFT, RIGHT)]
         if self.scenario.strobe_s > 0 and t_s % self.scenario.strobe_s < STROBE_SHOWS_S:
             sources.append(self._strobe(other_a_b))
         others = tuple(self._seen(index, placement, source) for source in sources)
         seen_tags = self._tags(index, placement, t_s) if self.scenario.tags else ()
-        return SceneView(placement, (lights[0], lights[1]), others, self._passers(index, t_s, lights), seen_tags)
+        return SceneView(placement, lights, others, self._passers(index, t_s, lights), seen_tags)
 
-    def _light(self, index: int, placement: Placement, side: int, t_s: float) -> Lamp:
-        lamp = self._seen(index, placement, self._source(1 - index, side, t_s))
+    def others(self, index: int) -> list[int]:
+        """Return the indices of all other nodes."""
+        return [other for other in range(len(self.rigs)) if other != index]
+
+    def _light(self, index: int, placement: Placement, other: int, side: int, t_s: float) -> Lamp:
+        lamp = self._seen(index, placement, self._source(other, side, t_s))
         row_time_ns = self.scenario.row_time_ns
         if row_time_ns == 0 or math.isnan(lamp.pixel[1]):
             return lamp
         for _ in range(2):
             row_s = t_s + self.row_delay_s(float(lamp.pixel[1]))
-            lamp = self._seen(index, self.motion.placement(index, row_s), self._source(1 - index, side, row_s))
+            lamp = self._seen(index, self.motion.placement(index, row_s), self._source(other, side, row_s))
         return lamp
 
     def row_delay_s(self, v_px: float) -> float:
@@ -140,7 +155,7 @@ class Scene:
         return (v_px - (self.scenario.height_px - 1) / 2) * self.scenario.row_time_ns * 1e-9
 
     def _source(self, index: int, side: int, t_s: float) -> LightSource:
-        """Return one light of node A (0) or B (1)."""
+        """Return one light of a node."""
         placement, rig = self.motion.placement(index, t_s), self.rigs[index]
         R_ned_camera = placement.R_ned_body @ R_BODY_CAMERA
         return LightSource(
@@ -170,21 +185,24 @@ class Scene:
         return LightSource(position_m, np.array([0.0, 0.0, 1.0]), STROBE_INTENSITY, 2.0)
 
     def _seen(self, index: int, placement: Placement, source: LightSource) -> Lamp:
-        """Return a lamp as A (0) or B (1) sees it."""
+        """Return a lamp as a node sees it."""
         R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
         position_m = R_camera_ned @ (source.position_ned_m - placement.position_ned_m)
         pixel = project(position_m[None], self.rigs[index].camera)[0]
         return Lamp(position_m, R_camera_ned @ source.aim_ned, pixel, source.intensity, source.beam_rad, source.stretch)
 
     def _tags(self, index: int, placement: Placement, t_s: float) -> tuple[SeenTag, ...]:
-        """Return the other node's tags, lit by the sun and by the observer's lights."""
-        water, rig, other = self.scenario.water, self.rigs[index], self.motion.placement(1 - index, t_s)
+        """Return the other nodes' tags, lit by the sun and by the observer's lights."""
+        return tuple(tag for other in self.others(index) for tag in self._tags_of(other, index, placement, t_s))
+
+    def _tags_of(self, carrier: int, index: int, placement: Placement, t_s: float) -> list[SeenTag]:
+        water, rig, other = self.scenario.water, self.rigs[index], self.motion.placement(carrier, t_s)
         R_camera_ned = (placement.R_ned_body @ R_BODY_CAMERA).T
         R_camera_other = R_camera_ned @ other.R_ned_body @ R_BODY_CAMERA
         t_camera_other_m = R_camera_ned @ (other.position_ned_m - placement.position_ned_m)
         k = np.array(water.absorption_per_m) + np.array(water.scattering_per_m)
         seen = []
-        for tag in tags.layout(1 - index):
+        for tag in tags.layout(carrier):
             corners_m = tags.board(tag.corners_m) @ R_camera_other.T + t_camera_other_m
             pixels = project(corners_m, rig.camera)
             if np.isnan(pixels).any():
@@ -199,7 +217,7 @@ class Scene:
             through = np.exp(-k * np.linalg.norm(centre_m))
             light = water.lamp_gain * lit + 1.2 * np.array(water.ambient)
             seen.append(SeenTag(tag.id, pixels, light, through))
-        return tuple(seen)
+        return seen
 
     def _passers(self, index: int, t_s: float, lights: tuple[Lamp, ...]) -> tuple[Passer, ...]:
         if not self.scenario.interruptions or self.scenario.trajectory == "rest":
@@ -207,7 +225,7 @@ class Scene:
         passing = _passing(self.scenario.seed, index, math.floor(t_s / PASSING_PERIOD_S))
         if passing is None or abs(t_s - passing.middle_s) > 1.5 * passing.covers_s:
             return ()
-        lamp = lights[passing.side]
+        lamp = lights[passing.side + 2 * (math.floor(t_s / PASSING_PERIOD_S) % (len(lights) // 2))]
         if np.isnan(lamp.pixel).any():
             return ()
         size_px = self.rigs[index].camera.fx_px * passing.size_m / (0.6 * lamp.range_m)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from buddyline.node.sim.randomness import generator
 from buddyline.node.sim.scenario import Scenario
-from buddyline.node.sim.scene import SceneView
+from buddyline.node.sim.scene import Lamp, SceneView
 from buddyline.protocol.messages import CameraModel
 from numpy.typing import NDArray
 
@@ -83,12 +83,12 @@ class Scenery:
         position_m = view.placement.position_ned_m[:2]
         for plane, tile, tile_m, colour in textured:
             self._add_texture(plane, position_m, tile, tile_m, colour)
-        self._add_body(view)
+        for left, right in view.bars:
+            self._add_body(left, right)
         cv2.resize(middle, self._size_px, dst=full, interpolation=cv2.INTER_LINEAR)
 
-    def _add_body(self, view: SceneView) -> None:
-        """Add the other node's bar and housing to the half-size picture; they show against sunlit water."""
-        left, right = view.lights
+    def _add_body(self, left: Lamp, right: Lamp) -> None:
+        """Add another node's bar and housing to the half-size picture; they show against sunlit water."""
         if min(left.position_m[2], right.position_m[2]) < 0.3 or np.isnan([left.pixel, right.pixel]).any():
             return
         range_m = (left.range_m + right.range_m) / 2

@@ -30,7 +30,7 @@ class SensorModel:
     def __init__(self, scenario: Scenario, scene: Scene, index: int) -> None:
         rng = generator(scenario.seed, "sensors", index)
         self._scenario, self._scene, self._index = scenario, scene, index
-        self._node = (scenario.node_a, scenario.node_b)[index]
+        self._node = scenario.nodes[index]
         yaw_sigma_rad = math.radians(rng.uniform(3, 5))
         self._sigma_rad = (TILT_SIGMA_RAD, TILT_SIGMA_RAD, yaw_sigma_rad)
         self._wander = [Sway(rng, 8.0, 40.0, 6), Sway(rng, 8.0, 40.0, 6), Sway(rng, 40.0, 400.0, 6)]

@@ -49,7 +49,7 @@ class SeenTag:
 
 
 def layout(index: int) -> tuple[Tag, ...]:
-    """Return the two tags of A (0) or B (1); they face along the camera's axis."""
+    """Return the two tags of a node; they face along the camera's axis."""
     corners_m = np.array([(0.5, -0.5, 0.0), (-0.5, -0.5, 0.0), (-0.5, 0.5, 0.0), (0.5, 0.5, 0.0)]) * SIDE_M
     return tuple(Tag(2 * index + i, corners_m + place_m) for i, place_m in enumerate(PLACES_M))
 

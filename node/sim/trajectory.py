@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from buddyline.node.sim import rotation
@@ -25,6 +26,14 @@ class Placement:
 
     R_ned_body: Matrix
     position_ned_m: Vector
+
+
+class Motion(Protocol):
+    """Where each node of a scenario is at any time."""
+
+    def placement(self, index: int, t_s: float) -> Placement:
+        """Return where a node is at t_s."""
+        ...
 
 
 class PairMotion:
@@ -92,7 +101,7 @@ class PairMotion:
         turn = 2 * math.pi * t_s / self._circle_s
         azimuth = 0.55 * across_rad * math.sin(turn + self._phases[1])
         elevation = up_rad * (0.45 * math.cos(turn + self._phases[1]) + 0.2 * self._elevation(t_s))
-        climb_m = _within(
+        climb_m = within(
             range_m * math.sin(elevation),
             water.depth_m - CLEARANCE_M,
             (water.floor_depth_m or math.inf) - water.depth_m - CLEARANCE_M,
@@ -110,12 +119,14 @@ class PairMotion:
         return Placement(R, offset + drift_m + [0.0, 0.0, water.depth_m])
 
     def _looking_away_rad(self, index: int, t_s: float) -> float:
-        if not self._scenario.interruptions:
-            return 0.0
-        window = math.floor(t_s / LOOK_AWAY_PERIOD_S)
-        begin_s, length_s, angle_rad = _look_away(self._scenario.seed, index, window)
-        inside = (t_s - begin_s) / length_s
-        return angle_rad * math.sin(math.pi * inside) ** 2 if 0 < inside < 1 else 0.0
+        return look_away_rad(self._scenario.seed, index, t_s) if self._scenario.interruptions else 0.0
+
+
+def look_away_rad(seed: int, index: int, t_s: float) -> float:
+    """Return by how much a node looks away at t_s."""
+    begin_s, length_s, angle_rad = _look_away(seed, index, math.floor(t_s / LOOK_AWAY_PERIOD_S))
+    inside = (t_s - begin_s) / length_s
+    return angle_rad * math.sin(math.pi * inside) ** 2 if 0 < inside < 1 else 0.0
 
 
 @lru_cache(maxsize=64)
@@ -136,7 +147,7 @@ def _soft_positive(angle_rad: float) -> float:
     return scale * math.log1p(math.exp(angle_rad / scale)) if angle_rad < 30 * scale else angle_rad
 
 
-def _within(climb_m: float, up_m: float, down_m: float) -> float:
+def within(climb_m: float, up_m: float, down_m: float) -> float:
     """Keep a climb between up_m and -down_m by a smooth function; inf for no limit."""
     room_m = up_m if climb_m > 0 else down_m
     return climb_m if math.isinf(room_m) else room_m * math.tanh(climb_m / room_m)

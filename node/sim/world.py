@@ -1,4 +1,4 @@
-"""The simulated world of two nodes: a function of (scenario, node, time).
+"""The simulated world of nodes: a function of (scenario, node, time).
 
 Two processes with the same Scenario see the same world, at any time and in any order.
 Stamps are on the given node's own clock (B's is off by Scenario.clock_offset_ns). Stamps of the truth are on A's.
@@ -25,6 +25,7 @@ from buddyline.protocol.messages import (
     Attitude,
     Candidates,
     Depth,
+    FixedPlace,
     Imu,
     LightTruth,
     NodeInfo,
@@ -41,12 +42,12 @@ SOFTWARE = "buddyline simulator"
 
 
 class World:
-    """Two nodes in water, as their cameras and sensors see each other."""
+    """Nodes in water, as their cameras and sensors see each other."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self._scene = Scene(scenario)
-        self._sensors = [SensorModel(scenario, self._scene, i) for i in range(2)]
+        self._sensors = [SensorModel(scenario, self._scene, i) for i in range(len(scenario.nodes))]
         self._painters: dict[int, Painter] = {}
 
     def info(self, node: str, stamp_ns: int, trigger_period_ns: int) -> NodeInfo:
@@ -70,7 +71,13 @@ class World:
             software=SOFTWARE,
             tags=carried or UNSET,
             imu_m=_triple(self._sensors[index].unit.stated_lever_m),
+            fixed=self._place(node, stamp_ns) if node in s.fixed_nodes else UNSET,
         )
+
+    def _place(self, node: str, stamp_ns: int) -> FixedPlace:
+        """Return where a fixed node stands, surveyed without an error."""
+        R, position_m = self.T_ned_camera(node, stamp_ns)
+        return FixedPlace(p_m=_triple(position_m), q_xyzw=rotation.to_quaternion(R), sigma_m=1e-4, sigma_rad=1e-4)
 
     def T_ned_camera(self, node: str, stamp_ns: int) -> tuple[Matrix, Vector]:
         """Return R (3, 3) and t (3,), metres: from a node's camera frame to NED, with its origin at the surface."""
@@ -78,10 +85,10 @@ class World:
         placement = self._scene.motion.placement(index, self._seconds(index, stamp_ns))
         return placement.R_ned_body @ R_BODY_CAMERA, placement.position_ned_m
 
-    def truth(self, stamp_ns: int, trigger: int) -> Truth:
-        """Return the true T_a_b at stamp_ns on A's clock."""
+    def truth(self, stamp_ns: int, trigger: int, pair: tuple[str, str] | None = None) -> Truth:
+        """Return a pair's true T_a_b at stamp_ns on A's clock; pair: None for the first two nodes."""
         t_s = self._seconds(0, stamp_ns)
-        a, b = (self._scene.motion.placement(i, t_s) for i in range(2))
+        a, b = (self._scene.motion.placement(self.scenario.index(n), t_s) for n in pair or self.scenario.nodes[:2])
         R_camera_a_ned = (a.R_ned_body @ R_BODY_CAMERA).T
         t_a_b_m = R_camera_a_ned @ (b.position_ned_m - a.position_ned_m)
         R_a_b = R_camera_a_ned @ b.R_ned_body @ R_BODY_CAMERA
@@ -104,31 +111,34 @@ class World:
             q_xyzw=rotation.to_quaternion(now.R_ned_body @ R_BODY_CAMERA),
             v_mps=_triple((after.position_ned_m - before.position_ned_m) / (2 * STEP_S)),
             covariance=[0.0] * 36,
-            fixed=False,
+            fixed=node in self.scenario.fixed_nodes,
             mode="truth",
             age_s=0.0,
         )
 
     def light_truth(self, node: str, stamp_ns: int, trigger: int) -> LightTruth:
-        """Return the true places of the other node's lights in the picture taken at stamp_ns.
+        """Return the true places of the other nodes' lights in the picture taken at stamp_ns.
 
         A light without a projection, such as one behind the camera, is left out.
         """
         index = self.scenario.index(node)
         view = self._scene.view(index, self._seconds(index, stamp_ns))
-        merged = self._merged(index, *view.lights)
         names: tuple[Literal["left", "right"], Literal["left", "right"]] = ("left", "right")
-        lights = [
-            TrueLight(
-                name=name,
-                u_px=float(lamp.pixel[0]),
-                v_px=float(lamp.pixel[1]),
-                visible=candidates.visible(self._scene, index, view, lamp),
-                merged=merged,
-            )
-            for name, lamp in zip(names, view.lights, strict=True)
-            if not np.isnan(lamp.pixel).any()
-        ]
+        lights = []
+        for other, bar in zip(self._scene.others(index), view.bars, strict=True):
+            merged = self._merged(index, *bar)
+            lights += [
+                TrueLight(
+                    name=name,
+                    u_px=float(lamp.pixel[0]),
+                    v_px=float(lamp.pixel[1]),
+                    visible=candidates.visible(self._scene, index, view, lamp),
+                    merged=merged,
+                    node=self.scenario.nodes[other] if len(self.scenario.nodes) > 2 else UNSET,
+                )
+                for name, lamp in zip(names, bar, strict=True)
+                if not np.isnan(lamp.pixel).any()
+            ]
         return LightTruth(node=node, stamp_ns=stamp_ns, trigger=trigger, lights=lights)
 
     def lamps(self, node: str, stamp_ns: int) -> list[tuple[float, float, bool]]:

@@ -2,8 +2,9 @@
 
 import pytest
 from buddyline.protocol.divelog import DiveLogReader
-from buddyline.protocol.messages import Candidates, CompressedImage, NodeInfo, Truth
+from buddyline.protocol.messages import Candidates, CompressedImage, LightTruth, NodeInfo, NodePose, Truth
 from buddyline.tools.cli import main
+from msgspec import UNSET
 
 
 def _simulated(path, *words):
@@ -33,6 +34,20 @@ def test_the_same_arguments_give_the_same_file_and_another_seed_another(tmp_path
     assert files[0] == files[1] != files[2]
 
 
+def test_four_nodes_one_of_them_fixed(tmp_path):
+    _, found = _simulated(tmp_path / "d.mcap", "--nodes", "4", "--fixed", "c")
+    infos = {message.node: message for message in found if isinstance(message, NodeInfo)}
+    assert sorted(infos) == ["a", "b", "c", "d"]
+    assert [node for node, info in infos.items() if info.fixed is not UNSET] == ["c"]
+    assert sum(isinstance(message, Truth) for message in found) == 14 * 6
+    truths = {node: [m for m in found if isinstance(m, NodePose) and m.node == node] for node in infos}
+    assert {m.p_m for m in truths["c"]} == {infos["c"].fixed.p_m}
+    assert {m.q_xyzw for m in truths["c"]} == {infos["c"].fixed.q_xyzw}
+    assert all(len({m.p_m for m in truths[node]}) == 14 and not truths[node][0].fixed for node in "abd")
+    lights = [light for m in found if isinstance(m, LightTruth) and m.node == "a" for light in m.lights]
+    assert {light.node for light in lights if light.visible} == {"b", "d"}
+
+
 def test_pictures_are_as_wide_as_asked_for(tmp_path):
     _, found = _simulated(tmp_path / "d.mcap", "--images", "--width", "200", "--rate", "4")
     infos = [message for message in found if isinstance(message, NodeInfo)]
@@ -46,6 +61,8 @@ def test_pictures_are_as_wide_as_asked_for(tmp_path):
     [
         (["--range-min", "9", "--range-max", "3"], "range_max_m"),
         (["--seconds", "0"], "seconds"),
+        (["--nodes", "1"], "--nodes 1"),
+        (["--nodes", "3", "--fixed", "d"], "fixed_nodes: 'd'"),
         (["--rate", "0"], "rate_hz"),
         (["--baseline", "-1"], "baseline"),
         (["--width", "1"], "width_px"),

@@ -11,6 +11,7 @@ import numpy as np
 from buddyline.protocol.messages import CameraModel, Candidates, LightTruth, NodeInfo, RelativePose
 from buddyline.tools.evaluation.rotation import Floats, conjugate, rotate
 from buddyline.tools.evaluation.truth import TruthTrack
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 NAMES: Final = ("left", "right")
@@ -101,10 +102,13 @@ def _projected(
         yield frame, TrueLights(pixels[i], inside[i], marked=False, range_m=float(np.linalg.norm(t[i])))
 
 
-def _marked(truth: LightTruth, track: TruthTrack) -> TrueLights:
+def _marked(truth: LightTruth, track: TruthTrack, other: str) -> TrueLights:
+    """Return the lights of the node `other`; a light that names no node is of it."""
     pixels = np.full((2, 2), np.nan)
     visible = np.zeros(2, dtype=bool)
     for light in truth.lights:
+        if light.node is not UNSET and light.node != other:
+            continue
         side = NAMES.index(light.name)
         pixels[side] = light.u_px, light.v_px
         visible[side] = light.visible
@@ -121,7 +125,12 @@ def true_lights(
     track: TruthTrack,
 ) -> dict[tuple[str, int], TrueLights]:
     """Return the true lights by node and trigger: from LightTruth, or projected for a node without it."""
-    lights = {(truth.node, truth.trigger): _marked(truth, track) for truth in light_truths if truth.node in nodes}
+    others = {nodes[0]: nodes[1], nodes[1]: nodes[0]}
+    lights = {
+        (truth.node, truth.trigger): _marked(truth, track, others[truth.node])
+        for truth in light_truths
+        if truth.node in nodes
+    }
     marked = {node for node, _ in lights}
     if not all(node in infos for node in nodes):
         return lights
