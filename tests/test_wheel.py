@@ -82,6 +82,8 @@ def test_commands_work_beside_folders_of_the_same_names(installed, crowded):
     for words in (
         ("--help",),
         ("simulate", "dive.mcap", "--seconds", "3"),
+        ("sample",),
+        ("solve", "sample.mcap", "-o", "solved.mcap"),
         ("solve", "dive.mcap", "-o", "poses.mcap"),
         ("export", "poses.mcap", "--format", "tum"),
     ):

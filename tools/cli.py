@@ -63,6 +63,7 @@ COMMANDS: Final = (
         "run a hub, two simulated nodes and the solver on this machine, and watch the poses",
         ("demo", "demo --environment lake --seconds 30"),
     ),
+    Command("sample", "write a small dive, to try the other commands on", ("sample", "sample dive.mcap")),
     Command(
         "init",
         "write a commented configuration of a node, a hub or a solver to start from",

@@ -1,7 +1,8 @@
-"""Make the golden dives again: `python -m tests.golden.make FOLDER`.
+"""Make the golden dives and the sample dive again: `python -m tests.golden.make FOLDER`.
 
-The dives in tests/data/golden are the reference, not this program: another OpenCV compresses pictures differently, and
-the simulator may change. Run it to add a dive, and commit that dive alone.
+FOLDER/sample.mcap is what `buddyline sample` gives, and lies as tools/sample.mcap. The dives in tests/data/golden are
+the reference, not this program: another OpenCV compresses pictures differently, and the simulator may change. Run it to
+add a dive, and commit that dive alone.
 """
 
 import argparse
@@ -72,9 +73,26 @@ def leapfrog(path: Path) -> None:
                 writer.write_message(message)
 
 
+def sample(path: Path) -> None:
+    """Write 30 s of a cavern: candidates of its pictures at 5 Hz, and each node's pictures every two seconds."""
+    pictures, found = path.with_name("pictures.mcap"), path.with_name("found.mcap")
+    entries = simulate(pictures, "--environment cavern --seconds 30 --rate 5 --images --exposure auto --imu --seed 8")
+    if main(["detect", str(pictures), "-o", str(found)]) != 0:
+        raise SystemExit(f"{path}: detect failed")
+    candidates = [entry for entry in read_log(found) if entry.topic == "candidates"]
+    pictures.unlink()
+    found.unlink()
+    start_ns = entries[0].log_time_ns
+    kept = [
+        entry for entry in entries if entry.topic != "image" or (entry.log_time_ns - start_ns) % (2 * S_NS) < S_NS // 10
+    ]
+    write_log(path, sorted(kept + candidates, key=lambda entry: entry.log_time_ns))
+
+
 def make(folder: Path) -> None:
-    """Write all golden dives into a folder."""
+    """Write all golden dives, and the sample dive, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
+    sample(folder / "sample.mcap")
     simulate(folder / "cavern.mcap", "--environment cavern --seconds 14 --seed 3")
     inertial = folder / "cavern_inertial.mcap"
     entries = simulate(inertial, "--environment cavern --seconds 6 --seed 12 --imu --inertial poor --others 1")

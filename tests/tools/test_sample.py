@@ -1,0 +1,34 @@
+"""The sample dive: what the tutorial does with it works, and gives what it says."""
+
+from __future__ import annotations
+
+import buddyline
+import pytest
+from buddyline.tools.cli import main
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_sample_is_solved_reported_and_right(here, capsys):
+    assert main(["sample"]) == 0
+    assert "buddyline solve sample.mcap" in capsys.readouterr().out
+    assert main(["solve", "sample.mcap", "-o", "poses.mcap"]) == 0
+    assert main(["report", "poses.mcap", "-o", "report.html"]) == 0
+    assert "<svg" in (here / "report.html").read_text()
+    assert main(["evaluate", "poses.mcap"]) == 0
+    told = capsys.readouterr().out
+    assert "wrong poses (position off by more than 10% of the range): 0 of" in told
+    assert "track (smooth): covers 100.0 %" in told
+    dive = buddyline.open_dive("sample.mcap")
+    assert len(dive.depths("a")) > 100
+
+
+def test_a_file_is_never_overwritten(here, capsys):
+    (here / "sample.mcap").write_text("mine")
+    assert main(["sample"]) == 2
+    assert "exists" in capsys.readouterr().err
+    assert (here / "sample.mcap").read_text() == "mine"
