@@ -166,6 +166,15 @@ COMMANDS: Final = (
         ("ros2", "ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
     ),
     Command(
+        "bridge",
+        "say where a vehicle is to an autopilot (MAVLink), a chart plotter (NMEA 0183) or a program (HTTP)",
+        (
+            "bridge --vehicle b --mavlink 192.168.2.2:14660",
+            "bridge --vehicle b --place 47.12,9.65 --nmea 127.0.0.1:10110 --http 127.0.0.1:8082",
+        ),
+        "tools.bridge.command",
+    ),
+    Command(
         "artag",
         "find poses from AR tags in a dive's pictures, to compare the lights with",
         ("simulate dive.mcap --images --tags", "artag dive.mcap -o tags.mcap"),

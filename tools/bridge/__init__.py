@@ -1,0 +1,1 @@
+"""Say where a vehicle is to other programs: autopilots by MAVLink, chart plotters by NMEA 0183, anyone by HTTP."""
