@@ -142,7 +142,7 @@ def solve(
     pair: tuple[str, str] | None = None,
     method: str = "refined",
     checks: Sequence[str] = ALL_CHECKS,
-    clock_offset_s: float = 0.0,
+    clock_offset_s: float | None = None,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
     track: str = "smooth",
@@ -150,9 +150,10 @@ def solve(
 ) -> SolvedDive:
     """Solve a stored dive in memory, as `buddyline solve` does; pictures are detected first where need be.
 
-    pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's.
-    environment: of the detector. infos: node id to the calibration to use in place of the logs' own. track: the fused
-    estimate, "smooth" over the whole dive, "lag" or "filter" as live, "none" to save the time; track_hz: its rows.
+    pair: (a, b) of T_a_b; may be left out where the dive has two nodes. clock_offset_s: B's clock minus A's;
+    None: what the nodes' beacons tell. environment: of the detector. infos: node id to the calibration to use in place
+    of the logs' own. track: the fused estimate, "smooth" over the whole dive, "lag" or "filter" as live, "none" to save
+    the time; track_hz: its rows.
     """
     from buddyline.tools.offline import solve_logs
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.node.chrony import ChronyError, Tracking, read_tracking
-from buddyline.protocol.clock import Clock
+from buddyline.node.time_base import NodeClock
 from buddyline.protocol.envelope import Refusals
-from buddyline.protocol.messages import MAX_HEARD, ClockBeacon, HeardClock
+from buddyline.protocol.messages import MAX_HEARD, ClockBeacon, ClockSet, HeardClock
 from buddyline.protocol.topics import CLOCK
 
 if TYPE_CHECKING:
@@ -51,18 +51,22 @@ class Beacons:
             while len(self._heard) > MAX_HEARD:
                 self._heard.pop(next(iter(self._heard)))
 
-    def beacon(self, clock: Clock, now_s: float) -> ClockBeacon:
+    def beacon(self, clock: NodeClock, now_s: float) -> ClockBeacon:
         """Return the next beacon, stamped now; send it at once."""
         with self._lock:
             heard = [one for heard_s, one in self._heard.values() if now_s - heard_s <= HEARD_FOR_S]
-        return ClockBeacon(node=self._node, stamp_ns=clock.now_ns(), boot=self._boot, heard=heard)
+        stamp_ns, raw_ns = clock.reading()
+        return ClockBeacon(node=self._node, stamp_ns=stamp_ns, boot=self._boot, heard=heard, raw_ns=raw_ns)
 
 
 class ClockSync:
-    """Keeps chrony's figures for the node's status, and exchanges beacons while there is a bus."""
+    """Keeps chrony's figures for the node's status, sends beacons, and follows a clock that is set."""
 
-    def __init__(self, node: str, boot: str, clock: Clock, read: Callable[[], Tracking | None] = read_tracking) -> None:
+    def __init__(
+        self, node: str, boot: str, clock: NodeClock, read: Callable[[], Tracking | None] = read_tracking
+    ) -> None:
         self.problem = ""
+        self._node, self._boot = node, boot
         self._beacons = Beacons(node, boot)
         self._clock = clock
         self._read = read
@@ -87,14 +91,17 @@ class ClockSync:
             self._fields, self.problem = fields, problem
             stop.wait(CHRONY_EVERY_S)
 
-    def exchange(self, bus: Bus, outlet: Outlet, stop: threading.Event) -> None:
-        """Send beacons and receive the others' until stop is set."""
+    def listen(self, bus: Bus) -> None:
+        """Receive the others' beacons from now on; the bus closes the subscription when it is closed."""
         # Without history: the travel time of an old beacon is not known.
-        subscription = bus.subscribe(
-            CLOCK.key_any(), lambda received: self._beacons.hear(received, time.monotonic()), history=False
-        )
-        try:
-            while not stop.wait(1.0 / CLOCK.rate_hz):
-                outlet.send(self._beacons.beacon(self._clock, time.monotonic()))
-        finally:
-            subscription.close()
+        bus.subscribe(CLOCK.key_any(), lambda received: self._beacons.hear(received, time.monotonic()), history=False)
+
+    def send_beacons(self, outlet: Outlet, stop: threading.Event) -> None:
+        """Send beacons until stop is set; without a bus they are in the log only, and tell how the clock was slewed."""
+        while not stop.wait(1.0 / CLOCK.rate_hz):
+            moved_ns = self._clock.follow()
+            if moved_ns:
+                outlet.send(
+                    ClockSet(node=self._node, stamp_ns=self._clock.now_ns(), boot=self._boot, moved_ns=moved_ns)
+                )
+            outlet.send(self._beacons.beacon(self._clock, time.monotonic()))

@@ -11,6 +11,7 @@ from buddyline.node.clock_sync import ClockSync
 from buddyline.node.config import NodeConfig
 from buddyline.node.guide import Guide
 from buddyline.node.outlet import Outlet
+from buddyline.protocol.clock import Clock
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
 from buddyline.protocol.topics import EXPECT
@@ -30,8 +31,11 @@ class HubConnection:
     "" if they do, and while no hub answers.
     """
 
-    def __init__(self, config: NodeConfig, outlet: Outlet, clock_sync: ClockSync, guide: Guide | None) -> None:
+    def __init__(
+        self, config: NodeConfig, outlet: Outlet, clock: Clock, clock_sync: ClockSync, guide: Guide | None
+    ) -> None:
         self.problem = ""
+        self._clock = clock
         self._config = config
         self._outlet = outlet
         self._clock_sync = clock_sync
@@ -60,7 +64,8 @@ class HubConnection:
                 # Without history: an old expectation says nothing of the next picture.
                 bus.subscribe(EXPECT.key(config.node), self._guide.hear, history=False)
                 bus.watch_alive(self._guide.saw_process)
-            self._clock_sync.exchange(bus, self._outlet, stop)
+            self._clock_sync.listen(bus)
+            stop.wait()
             self._outlet.disconnect()
 
     def _open(self, stop: threading.Event) -> Bus | None:
@@ -75,6 +80,7 @@ class HubConnection:
                 bus = connect(
                     config.connect,
                     namespace=config.namespace or None,
+                    clock=self._clock,
                     stop=stop,
                     on_wait=lambda text: log.info("node %s: %s; recording meanwhile", config.node, text),
                     tls=config.tls,

@@ -19,7 +19,6 @@ from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
 from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.clock_sync import ClockSync
-from buddyline.node.clock_watch import ClockWatch
 from buddyline.node.config import NodeConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.detect.detection import is_likely
@@ -31,8 +30,9 @@ from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
 from buddyline.node.power.watch import PowerWatch
+from buddyline.node.time_base import NodeClock, wait_for_time
 from buddyline.node.underwater.panel import Panel
-from buddyline.protocol.clock import S_NS, Clock, SystemClock
+from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.config import ConfigError, config_sha256
 from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import Candidates, NodeInfo, NodeStatus
@@ -59,13 +59,13 @@ class NodeService(Service):
     def __init__(
         self,
         config: NodeConfig,
-        clock: Clock | None = None,
+        clock: NodeClock | None = None,
         camera: Callable[[NodeConfig, Clock], CameraDevice] = open_camera,
         sensors: Callable[[NodeConfig, Clock], list[Source]] = open_sensors,
     ) -> None:
         super().__init__(f"node {config.node}", StatusFile.of(f"node-{config.node}", config.status_file))
         self.config = config
-        self.clock = clock or SystemClock()
+        self.clock = clock or NodeClock()
         self._open_camera, self._open_sensors = camera, sensors
         self.boot = uuid.uuid4().hex[:12]
         self.drops: Counter[str] = Counter()
@@ -81,17 +81,19 @@ class NodeService(Service):
         self._watched = config.camera.name != "stored" and config.rate_hz >= 1.0
         self._detect_s: deque[float] = deque(maxlen=100)
         self._lights_seen: deque[int] = deque(maxlen=10)
-        self._frames: deque[Frame] = deque()
+        self._frames: deque[tuple[Frame, int]] = deque()
         self._frame_ready = threading.Condition()
         self._capturing = True
         self._sent_before: Counter[str] = Counter()
         self._status_s = self._started_s
-        self._clock_watch = ClockWatch(self.clock.now_ns)
         self._clock_sync = ClockSync(config.node, self.boot, self.clock)
         self._guide = Guide(config.node) if config.detector.guided else None
 
     def open(self) -> None:
         """Open devices and log; raise BuddylineError for what waiting cannot mend. An absent camera is awaited."""
+        if self.config.camera.name not in ("simulated", "stored"):
+            wait_for_time(self.stop)
+            self.clock.start()
         self.camera: CameraDevice = self._open_or_await_camera()
         self.sources: list[Source] = self._open_sensors(self.config, self.clock)
         info = self._info()
@@ -116,7 +118,7 @@ class NodeService(Service):
         self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
-        self._hub = HubConnection(self.config, self.outlet, self._clock_sync, self._guide)
+        self._hub = HubConnection(self.config, self.outlet, self.clock, self._clock_sync, self._guide)
         self.outlet.send(info)
 
     def _open_or_await_camera(self) -> CameraDevice:
@@ -166,7 +168,8 @@ class NodeService(Service):
         for source in self.sources:
             self.spawn(source.name, lambda source=source: self._read(source))  # type: ignore[misc]
         self.spawn("status", self._report)
-        self.spawn("clock", lambda: self._clock_sync.follow_chrony(self.stop))
+        self.spawn("chrony", lambda: self._clock_sync.follow_chrony(self.stop))
+        self.spawn("clock", lambda: self._clock_sync.send_beacons(self.outlet, self.stop))
         self.spawn("bus", lambda: self._hub.run(self.stop, lambda error: self.fail("bus", error)))
         self.spawn("power", lambda: self._power.run(self.stop))
         self.spawn("panel", lambda: self._panel.run(self.stop))
@@ -217,7 +220,7 @@ class NodeService(Service):
                 if self._watched:
                     self.heartbeat()
                 with self._frame_ready:
-                    self._frames.append(frame)
+                    self._frames.append((frame, self.clock.steps))
                     while len(self._frames) > FRAME_QUEUE:
                         self._frames.popleft()
                         self.drops["frame"] += 1
@@ -239,7 +242,11 @@ class NodeService(Service):
                     self.heartbeat()
                 if not self._frames:
                     return
-                frame = self._frames.popleft()
+                frame, steps = self._frames.popleft()
+            if steps != self.clock.steps:
+                # Its stamp is of the clock before it was set.
+                self.drops["clock_set"] += 1
+                continue
             if self._power.skips(frame.stamp_ns):
                 self._seen_s = time.monotonic()
                 continue
@@ -278,7 +285,6 @@ class NodeService(Service):
         report_s = time.monotonic() + REPORT_S
         while not self.stop.wait(LOOK_S):
             self.heartbeat()
-            self._clock_watch.look()
             if time.monotonic() >= report_s:
                 report_s += REPORT_S
                 self.status_message = status = self.status()
@@ -362,8 +368,8 @@ class NodeService(Service):
         if self._clock_sync.problem and self.config.camera.name != "simulated":
             problems.append(f"clock: {self._clock_sync.problem}")
         problems += self._panel.problems + self._power.problems
-        if self._clock_watch.problem:
-            problems.append(self._clock_watch.problem)
+        if self.clock.problem:
+            problems.append(self.clock.problem)
         if self.recorder.error is not None:
             problems.append(f"log: {self.recorder.error}; kept in memory, tried again")
         if self.recorder.dropped:

@@ -293,12 +293,26 @@ class ClockBeacon(Message, frozen=True, kw_only=True):
     """The time at which a node sent this beacon, and the times at which it received the others' newest beacons.
 
     The beacons of two nodes hold the four timestamps of a ping, which give the clock offset and the round trip.
+    raw_ns: CLOCK_MONOTONIC_RAW at stamp_ns, which nothing sets or slews.
     """
 
     node: NodeId
     stamp_ns: StampNs
     boot: str
     heard: Annotated[list[HeardClock], Meta(max_length=MAX_HEARD)]
+    raw_ns: Count | UnsetType = UNSET
+
+
+class ClockSet(Message, frozen=True, kw_only=True):
+    """A node's clock was set: stamps before this message in its log are moved_ns less than the same clock's now.
+
+    stamp_ns: the instant, by the clock as it is now.
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    boot: str
+    moved_ns: int
 
 
 class FoxgloveTime(Struct, frozen=True, kw_only=True):

@@ -115,6 +115,7 @@ NODE_STATUS: Final = Topic(
 CLOCK: Final = Topic(
     "clock", "buddyline/node/{node}/clock", messages.ClockBeacon, 4.0, "interactive_high", express=True
 )
+CLOCK_SET: Final = Topic("clock_set", "buddyline/node/{node}/clock_set", messages.ClockSet, 0.0, "data")
 LIGHT_TRUTH: Final = Topic("light_truth", "buddyline/node/{node}/light_truth", messages.LightTruth, 10.0, "data_low")
 MARK: Final = Topic("mark", "buddyline/node/{node}/mark", messages.Mark, 0.0, "data")
 POSE: Final = Topic(
@@ -190,6 +191,7 @@ TOPICS: Final = (
     IMAGE,
     NODE_STATUS,
     CLOCK,
+    CLOCK_SET,
     LIGHT_TRUTH,
     MARK,
     POSE,

@@ -13,6 +13,7 @@ from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.messages import Attitude, Candidates, Depth, Imu, Message, NodeInfo, RelativePose, SolverStatus
+from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.pair_core import PairCore, PairId
@@ -34,8 +35,8 @@ MAX_NODES: Final = 16
 class SolverCore:
     """Solves each trigger of each pair once.
 
-    chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clock_offsets_ns:
-    each node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
+    chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
+    node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
     estimate the clock offset of each pair. track: the tracks to make; None for no track. unused: number of messages of
     each node that is in no pair. Work on several pairs, such as a network of all nodes, belongs here, after the pairs
     have settled.
@@ -45,7 +46,7 @@ class SolverCore:
         self,
         settings: Settings,
         chosen: Sequence[PairId] | None = None,
-        clock_offsets_ns: Mapping[str, int] | None = None,
+        clocks: Mapping[str, ClockCurve] | None = None,
         *,
         align: bool = False,
         track: TrackSettings | None = None,
@@ -56,7 +57,7 @@ class SolverCore:
         self.health = Health()
         self.unused: Counter[str] = Counter()
         self._chosen = chosen
-        self._clock_offsets_ns = clock_offsets_ns or {}
+        self._clocks = clocks or {}
         self._align = align
         self._track = track
         self._pairs_of: dict[str, list[PairCore]] = {}
@@ -206,7 +207,8 @@ class SolverCore:
         return pair
 
     def _on_common_clock(self, message: NodeMessage, stream: NodeStream) -> NodeMessage:
-        offset_ns = self._clock_offsets_ns.get(stream.node)
+        curve = self._clocks.get(stream.node)
+        offset_ns = curve.offset_ns(message.stamp_ns) if curve is not None else 0
         if not offset_ns:
             return message
         stamp_ns = max(message.stamp_ns - offset_ns, 0)

@@ -20,6 +20,9 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import parse_key
+from buddyline.tools.clock_curves import LEAST_OFFSET_S, beacon_curves
+from buddyline.tools.clock_sets import ClockSets
+from buddyline.tools.dives import Dive
 from buddyline.tools.losses import collected
 from buddyline.tools.losses import report as report_losses
 
@@ -27,8 +30,6 @@ log = logging.getLogger(__name__)
 
 # Logs that overlap, or are this close, are of one dive: a node may have been started again.
 SAME_DIVE_S: Final = 120.0
-# A smaller offset of the clocks moves a light by less than its noise, whatever its sigma.
-LEAST_OFFSET_S: Final = 0.001
 
 
 @dataclass
@@ -101,8 +102,9 @@ def outings(logs: list[Path]) -> list[Outing]:
         with reader:
             keys = [parse_key(key) for key in reader.keys]
             nodes = {ids[0] for topic, ids in filter(None, keys) if topic.name in ("candidates", "image")}
-            if reader.start_ns is not None and reader.end_ns is not None and nodes:
-                spans.append((reader.start_ns, reader.end_ns, path, nodes))
+            start_ns, end_ns = ClockSets([reader]).span_ns(reader)
+            if start_ns is not None and end_ns is not None and nodes:
+                spans.append((start_ns, end_ns, path, nodes))
     found: list[Outing] = []
     for start_ns, end_ns, path, nodes in sorted(spans, key=lambda span: span[0]):
         if not found or start_ns > found[-1].end_ns + SAME_DIVE_S * S_NS:
@@ -117,9 +119,7 @@ def _solve(outing: Outing, folder: Path) -> int:
     logs, solved = [str(path) for path in outing.logs], folder / "solved.mcap"
     words = ["solve", *logs, "-o", str(solved)]
     if len(outing.nodes) == 2:
-        offset_s = _clock_offset_s(logs)
-        if offset_s is not None and abs(offset_s) > LEAST_OFFSET_S:
-            words += ["--clock-offset", f"{offset_s:.5f}"]
+        words += _clock_words(logs, folder / "clocks.json")
     status = _command(words)
     if not solved.exists():
         return 1
@@ -134,26 +134,33 @@ def _solve(outing: Outing, folder: Path) -> int:
     return status
 
 
-def _clock_offset_s(logs: list[str]) -> float | None:
-    """Return B's clock minus A's by the nodes' beacons, or else by how they moved; None where neither tells."""
-    for command in ("calibrate clock", "align"):
-        said = io.StringIO()
-        try:
-            with redirect_stdout(said):
-                status = _command([*command.split(), *logs, "--json"])
-        except BuddylineError as error:
-            log.info("clocks: `%s` does not tell: %s", command, error)
-            continue
-        if status != 0:
-            continue
-        found = json.loads(said.getvalue())
-        # Beacons of before and after the dive: the middle is what the whole dive is off by.
-        estimates = [one for pair in found.get("pairs", []) for one in pair["offsets"]] or [found]
-        offset_s = float(sum(one["offset_s"] for one in estimates) / len(estimates))
-        log.info("clocks: B's is %+.2f ms from A's, by `%s`", 1e3 * offset_s, command)
-        return offset_s
-    log.warning("clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set")
-    return None
+def _clock_words(logs: list[str], file: Path) -> list[str]:
+    """Return what to tell `solve` of the clocks: nothing where beacons tell them at both ends of the dive.
+
+    Else offset and drift, as the dive itself tells them, are written to file.
+    """
+    with Dive(logs) as dive:
+        beacons = beacon_curves(dive, dive.nodes("candidates", "image"))
+    if beacons and beacons[0].covers:
+        return []
+    said = io.StringIO()
+    try:
+        with redirect_stdout(said):
+            status = _command(["align", *logs, "--json"])
+    except BuddylineError as error:
+        log.info("clocks: `align` does not tell: %s", error)
+        status = 2
+    if status == 0:
+        told = json.loads(said.getvalue())
+        drift = "" if told.get("drift") is None else f", gaining {1e6 * told['drift']:+.1f} us a second"
+        log.info("clocks: %s's is %+.2f ms from %s's%s, by `align`", told["node_b"], 1e3 * told["offset_s"],
+                 told["node_a"], drift)  # fmt: skip
+        if abs(told["offset_s"]) > LEAST_OFFSET_S or drift:
+            file.write_text(said.getvalue())
+            return ["--clocks", str(file)]
+    elif not beacons:
+        log.warning("clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set")
+    return []
 
 
 def _command(words: list[str]) -> int:

@@ -8,9 +8,9 @@ import logging
 from dataclasses import asdict
 from typing import Final
 
-from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.alignment import ClockOffset
+from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.track.clocks import Clocks
@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
             f"the clock of {node_b} is {found.offset_s * 1e3:+.2f} ms from that of {node_a} "
             f"(1 sd {found.sigma_s * 1e3:.2f} ms, {found.fixes} fixes)\n"
             f"{_drift_text(found)}\n"
-            f"solve with it: buddyline solve ... --clock-offset {found.offset_s:.4f}"
+            f"{_solve_text(found)}"
         )
     return 0
 
@@ -62,14 +62,20 @@ def _drift_text(found: Clocks | ClockOffset) -> str:
     return f"the drift is not told: the dive would tell it within {found.drift_sigma * 1e6:.0f} us a second, 1 sd"
 
 
+def _solve_text(found: Clocks | ClockOffset) -> str:
+    if isinstance(found, Clocks) and found.drift is not None:
+        return "solve with both: buddyline align ... --json > clocks.json; buddyline solve ... --clocks clocks.json"
+    return f"solve with it: buddyline solve ... --clock-offset {found.offset_s:.4f}"
+
+
 def _pass(
     dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
 ) -> Clocks | ClockOffset | None:
     settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
-    offsets_ns = {pair[1]: round(offset_s * S_NS)}
+    clocks = {pair[1]: ClockCurve.constant(offset_s)}
     # The track finds any offset in one pass; later ones are by gaps.
     track = track_settings("smooth", 1.0) if number == 1 else None
-    core = SolverCore(settings, [pair], offsets_ns, align=True, track=track)
+    core = SolverCore(settings, [pair], clocks, align=True, track=track)
     for envelope in messages_of(dive, args, dive.infos(), *pair, doing=f"align, pass {number}"):
         core.handle(envelope.message)
     found = core.pairs[pair].clocks()

@@ -153,9 +153,14 @@ def solve(parser: argparse.ArgumentParser) -> None:
         metavar="NODE=FILE",
         help="a calibration instead of the log's: JSON or log",
     )
-    parser.add_argument(
-        "--clock-offset", type=float, default=0.0, metavar="S", help="B's clock minus A's, from `buddyline align`"
+    clocks = parser.add_mutually_exclusive_group()
+    clocks.add_argument(
+        "--clock-offset",
+        type=float,
+        metavar="S",
+        help="B's clock minus A's, from `buddyline align`; default: what the nodes' beacons tell; 0: none",
     )
+    clocks.add_argument("--clocks", metavar="FILE.json", help="offset and drift, from `buddyline align --json`")
     parser.add_argument(
         "--track",
         choices=TRACKS,

@@ -27,6 +27,7 @@ from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
 from buddyline.protocol.topics import INFO, TOPICS, parse_key
 from buddyline.tools import losses
+from buddyline.tools.clock_sets import ClockSets
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,7 @@ class Dive:
             with_content, self._left_out = _without_empty(with_pictures(_distinct(paths)))
             for path in with_content:
                 self.readers.append(self._stack.enter_context(DiveLogReader(path)))
+            self._clock_sets = ClockSets(self.readers)
             self._infos = self._first_infos()
         except BaseException:
             self.close()
@@ -80,7 +82,7 @@ class Dive:
     @cached_property
     def start_ns(self) -> int:
         """Log time of the first message; raises if no log has any."""
-        starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
+        starts = [start_ns for start_ns, _ in self._spans_ns if start_ns is not None]
         if not starts:
             raise BuddylineError(f"{self.name}: no message can be read")
         return min(starts)
@@ -88,12 +90,16 @@ class Dive:
     @cached_property
     def end_ns(self) -> int:
         """Log time of the last message."""
-        return max((reader.end_ns for reader in self.readers if reader.end_ns is not None), default=0)
+        return max((end_ns for _, end_ns in self._spans_ns if end_ns is not None), default=0)
+
+    @cached_property
+    def _spans_ns(self) -> list[tuple[int | None, int | None]]:
+        return [self._clock_sets.span_ns(reader) for reader in self.readers]
 
     @property
     def seconds(self) -> float:
         """From the first message to the last; 0 if there is none."""
-        starts = [reader.start_ns for reader in self.readers if reader.start_ns is not None]
+        starts = [start_ns for start_ns, _ in self._spans_ns if start_ns is not None]
         return (self.end_ns - min(starts)) / S_NS if starts else 0.0
 
     @property
@@ -164,11 +170,10 @@ class Dive:
     def _open(
         self, reader: DiveLogReader, wanted: Callable[[str], bool], since_ns: int | None, reading: _Pass
     ) -> Iterator[Envelope]:
-        for record in reader.records(wanted, since_ns):
-            try:
-                yield record.open()
-            except MessageError as error:
-                reading.refusals.setdefault(reader.path, Refusals()).note(record.key, error)
+        def refuse(key: str, error: MessageError) -> None:
+            reading.refusals.setdefault(reader.path, Refusals()).note(key, error)
+
+        return self._clock_sets.envelopes(reader, wanted, since_ns, refuse)
 
     def metadata(self) -> dict[str, str]:
         """Return the metadata of the logs; the first named log takes precedence."""

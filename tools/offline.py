@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
-from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Candidates,
@@ -19,8 +18,10 @@ from buddyline.protocol.messages import (
     Track,
 )
 from buddyline.solver_service.choices import CHECKS
+from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
+from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.columns import (
     Pair,
     PoseColumns,
@@ -51,15 +52,16 @@ def solve_messages(
     pair: Pair | None = None,
     method: str = "refined",
     checks: Sequence[str] = CHECKS,
-    clock_offset_s: float = 0.0,
+    clock_offset_s: float | None = None,
     track: str = "smooth",
     track_hz: float = 50.0,
+    clocks: Mapping[str, ClockCurve] | None = None,
 ) -> SolvedDive:
     """Solve a pair's messages (NodeInfo, Candidates, Imu, Attitude, Depth), in the order in which they were received.
 
-    pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. track:
-    "smooth", "lag", "filter" or "none". The results are those of `buddyline solve`. Raises BuddylineError if the
-    pair or its calibration is missing.
+    pair: may be left out where two nodes have candidates. clock_offset_s: B's clock minus A's. track: "smooth", "lag",
+    "filter" or "none". clocks: each node's clock over time, in place of clock_offset_s. The results are those of
+    `buddyline solve`. Raises BuddylineError if the pair or its calibration is missing.
     """
     taken = list(messages)
     chosen = _pair(sorted({message.node for message in taken if isinstance(message, Candidates)}), pair)
@@ -68,9 +70,9 @@ def solve_messages(
         if node not in known:
             raise BuddylineError(f"no NodeInfo of node {node}")
     settings = SolveConfig(method=method, checks=list(checks)).settings("solve_messages")
-    core = SolverCore(
-        settings, [chosen], {chosen[1]: round(clock_offset_s * S_NS)}, track=track_settings(track, track_hz)
-    )
+    if clocks is None:
+        clocks = {chosen[1]: ClockCurve.constant(clock_offset_s or 0.0)}
+    core = SolverCore(settings, [chosen], clocks, track=track_settings(track, track_hz))
     rest, outcomes = iter(taken), list[Message]()
     # A node's streams keep a minute of messages, so each batch spans less than that.
     while together := list(islice(rest, TOGETHER)):
@@ -90,7 +92,7 @@ def solve_logs(
     pair: Pair | None = None,
     method: str = "refined",
     checks: Sequence[str] = CHECKS,
-    clock_offset_s: float = 0.0,
+    clock_offset_s: float | None = None,
     environment: str = "auto",
     infos: Mapping[str, NodeInfo] | None = None,
     track: str = "smooth",
@@ -99,16 +101,17 @@ def solve_logs(
     """Solve a stored dive; the pictures of a node without candidates are detected first.
 
     infos: calibrations in place of the logs' own. environment: changes nothing for the default
-    detector. The others as in solve_messages.
+    detector. clock_offset_s: None for what the nodes' beacons tell. The others as in solve_messages.
     """
     with Dive([Path(log) for log in logs]) as dive:
         found = list(_messages(dive, environment, dict(infos or {})))
+        chosen = _pair(sorted({message.node for message in found if isinstance(message, Candidates)}), pair)
         return solve_messages(
             found,
-            pair=pair,
+            pair=chosen,
+            clocks=chosen_curves(dive, chosen, clock_offset_s, None),
             method=method,
             checks=checks,
-            clock_offset_s=clock_offset_s,
             track=track,
             track_hz=track_hz,
         )

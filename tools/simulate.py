@@ -73,6 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--false", type=int, default=scenario.false_lights, metavar="N", help="false ones a picture")
     faults.add_argument("--lost", type=float, default=plan.lost_share, metavar="SHARE", help="frames lost")
     faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
+    faults.add_argument("--clock-drift-ppm", type=float, default=0.0, metavar="PPM", help="and gaining")
     faults.add_argument("--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong")
     faults.add_argument(
         "--dead-lamp", action="append", default=[], metavar="NODE.SIDE", help="a dark lamp, such as b.left; repeatable"
@@ -115,6 +116,7 @@ def run(args: argparse.Namespace) -> int:
         tags=args.tags,
         interruptions=not args.undisturbed,
         clock_offset_ns=round(args.clock_offset_ms * MS_NS),
+        clock_drift=1e-6 * args.clock_drift_ppm,
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
         inertial=args.inertial,
         dead_lamps=tuple(args.dead_lamp),

@@ -23,6 +23,7 @@ from buddyline.protocol.topics import TRACK, check_node_id
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairCore, PairId
+from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 
@@ -43,12 +44,12 @@ def run(args: argparse.Namespace) -> int:
     with Dive(args.dives) as dive:
         nodes, infos = nodes_of(dive, args.nodes), dive.infos() | replaced
         nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
-        if args.clock_offset and len(nodes) > 2:
-            raise ConfigError(f"--clock-offset {args.clock_offset:g}: is of one pair; choose it with --nodes A B")
+        if len(nodes) > 2 and (args.clock_offset is not None or args.clocks is not None):
+            raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         core = SolverCore(
             settings,
             list(combinations(nodes, 2)),
-            {nodes[1]: round(args.clock_offset * 1e9)},
+            chosen_curves(dive, nodes, args.clock_offset, args.clocks),
             track=track_settings(args.track, args.track_hz),
         )
         began_s, tracks = time.monotonic(), defaultdict[PairId, Tracked](Tracked)

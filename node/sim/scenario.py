@@ -84,9 +84,10 @@ class Scenario:
     candidates. gross_share: share of them with a gross error, gross_px (1 sd per axis).
     miss_share: share of lights that give no candidate. false_lights: false candidates in each picture.
     other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
-    interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's.
-    magnetometer_off_rad: constant error of B's heading that its sigma does not include. inertial: quality of the
-    inertial units. dead_lamps: lights that are dark for the whole dive, such as "b.left".
+    interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's at
+    the start. clock_drift: what B's clock gains, s a second. magnetometer_off_rad: constant error of B's heading that
+    its sigma does not include. inertial: quality of the inertial units. dead_lamps: lights that are dark for the whole
+    dive, such as "b.left".
     pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
     in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
     strobe_s: time between the flashes of a third diver's strobe between the nodes; 0: none.
@@ -120,6 +121,7 @@ class Scenario:
     tags: bool = False
     interruptions: bool = True
     clock_offset_ns: int = 0
+    clock_drift: float = 0.0
     magnetometer_off_rad: float = 0.0
     inertial: InertialGrade = "good"
     dead_lamps: tuple[str, ...] = ()

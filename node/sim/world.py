@@ -195,8 +195,10 @@ class World:
 
     def _seconds(self, index: int, stamp_ns: int) -> float:
         """Return seconds since the start for a stamp on a node's clock."""
-        offset_ns = self.scenario.clock_offset_ns if index == 1 else 0
-        return (stamp_ns - offset_ns - self.scenario.start_ns) * 1e-9
+        if index == 0:
+            return (stamp_ns - self.scenario.start_ns) * 1e-9
+        own_s = (stamp_ns - self.scenario.clock_offset_ns - self.scenario.start_ns) * 1e-9
+        return own_s / (1.0 + self.scenario.clock_drift)
 
     def _merged(self, index: int, left: Lamp, right: Lamp) -> bool:
         """Return whether the clipped cores of two lights overlap."""

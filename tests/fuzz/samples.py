@@ -80,8 +80,12 @@ SOUND: tuple[m.Message, ...] = (
         load="no_pictures",
     ),
     m.ClockBeacon(
-        **_NODE, boot="x", heard=[m.HeardClock(node="b", boot="y", sent_ns=STAMP_NS, received_ns=STAMP_NS + 300_000)]
+        **_NODE,
+        boot="x",
+        heard=[m.HeardClock(node="b", boot="y", sent_ns=STAMP_NS, received_ns=STAMP_NS + 300_000)],
+        raw_ns=5_000_000_000,
     ),
+    m.ClockSet(**_NODE, boot="x", moved_ns=-1_000_000_000),
     m.LightTruth(**_NODE, trigger=3, lights=[m.TrueLight(name="left", u_px=1.0, v_px=2.0, visible=True, merged=False)]),
     m.Mark(**_NODE, name="12"),
     m.RelativePose(

@@ -6,18 +6,23 @@ import msgspec
 import pytest
 from buddyline.node.chrony import ChronyError, decode_tracking
 from buddyline.node.clock_sync import HEARD_FOR_S, Beacons, ClockSync
+from buddyline.node.time_base import NodeClock
 from buddyline.protocol.bus import Received
-from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import MAX_HEARD, ClockBeacon
+from buddyline.protocol.messages import MAX_HEARD, ClockBeacon, ClockSet
 from buddyline.protocol.topics import CLOCK
 
 from tests.node.test_chrony import FOLLOWS, LOST
 from tests.processes import PATIENCE_S
 
 NOW_NS = 1_764_000_000_000_000_000
+
+
+def clock_at(now_ns):
+    """A clock that stands still."""
+    return NodeClock(lambda: now_ns, lambda: 5_000_000_000, lambda: 7_000_000_000)
 
 
 def received(beacon, key=None, receive_ns=NOW_NS):
@@ -30,13 +35,13 @@ def of(node, stamp_ns, heard=()):
 
 def test_a_beacon_says_when_the_other_was_heard():
     a, b = Beacons("a", "boot_a"), Beacons("b", "boot_b")
-    first = a.beacon(ManualClock(NOW_NS), 0.0)
-    assert (first.node, first.stamp_ns, first.heard) == ("a", NOW_NS, [])
+    first = a.beacon(clock_at(NOW_NS), 0.0)
+    assert (first.node, first.stamp_ns, first.raw_ns, first.heard) == ("a", NOW_NS, 7_000_000_000, [])
     b.hear(received(first, receive_ns=NOW_NS + 5_000_300), 0.1)
-    answer = b.beacon(ManualClock(NOW_NS + 9_000_000), 0.2)
+    answer = b.beacon(clock_at(NOW_NS + 9_000_000), 0.2)
     (heard,) = answer.heard
     assert (heard.node, heard.boot, heard.sent_ns, heard.received_ns) == ("a", "boot_a", NOW_NS, NOW_NS + 5_000_300)
-    assert b.beacon(ManualClock(NOW_NS), 0.1 + HEARD_FOR_S + 0.01).heard == []
+    assert b.beacon(clock_at(NOW_NS), 0.1 + HEARD_FOR_S + 0.01).heard == []
 
 
 def test_own_forged_and_broken_beacons_are_ignored():
@@ -44,7 +49,7 @@ def test_own_forged_and_broken_beacons_are_ignored():
     a.hear(received(of("a", NOW_NS)), 0.0)
     a.hear(received(of("b", NOW_NS), key=CLOCK.key("c")), 0.0)
     a.hear(Received(CLOCK.key("b"), b"{}", NOW_NS, CLOCK.encoding), 0.0)
-    assert a.beacon(ManualClock(NOW_NS), 0.0).heard == []
+    assert a.beacon(clock_at(NOW_NS), 0.0).heard == []
     assert a.refusals.count == 2
 
 
@@ -52,7 +57,7 @@ def test_a_beacon_stays_valid_with_too_many_nodes():
     a = Beacons("a", "boot")
     for number in range(3 * MAX_HEARD):
         a.hear(received(of(f"n{number}", NOW_NS)), 0.0)
-    beacon = decode(encode(a.beacon(ManualClock(NOW_NS), 0.0)), ClockBeacon)
+    beacon = decode(encode(a.beacon(clock_at(NOW_NS), 0.0)), ClockBeacon)
     assert [heard.node for heard in beacon.heard] == [f"n{number}" for number in range(2 * MAX_HEARD, 3 * MAX_HEARD)]
     with pytest.raises(MessageError, match="heard"):
         encode(msgspec.structs.replace(beacon, heard=beacon.heard * 2))
@@ -75,12 +80,11 @@ def test_two_nodes_hear_each_other_over_a_bus():
     network, stop = LocalNetwork(), threading.Event()
     buses = [network.connect() for _ in "ab"]
     outlets = [Sent(bus, node) for bus, node in zip(buses, "ab", strict=True)]
-    threads = [
-        threading.Thread(
-            target=ClockSync(node, node, network.clock, lambda: None).exchange, args=(bus, outlet, stop), name=node
-        )
-        for bus, outlet, node in zip(buses, outlets, "ab", strict=True)
-    ]
+    threads = []
+    for bus, outlet, node in zip(buses, outlets, "ab", strict=True):
+        sync = ClockSync(node, node, NodeClock(network.clock.now_ns), lambda: None)
+        sync.listen(bus)
+        threads.append(threading.Thread(target=sync.send_beacons, args=(outlet, stop), name=node))
     for thread in threads:
         thread.start()
     try:
@@ -111,10 +115,27 @@ def test_chronys_figures_reach_the_status(answer, problem, fields):
             raise answer
         return None if answer is None else decode_tracking(answer)
 
-    sync = ClockSync("a", "x", ManualClock(NOW_NS), read)
+    sync = ClockSync("a", "x", clock_at(NOW_NS), read)
     sync.follow_chrony(stop)
     assert problem in sync.problem
     assert bool(problem) == bool(sync.problem)
     said = sync.status_fields()
     assert {name: said.get(name) for name in fields} == fields
     assert bool(fields) == bool(said)
+
+
+def test_a_clock_that_is_set_is_said_before_the_first_beacon_after_it():
+    wall, sent, stop = [NOW_NS], [], threading.Event()
+    clock = NodeClock(lambda: wall[0], lambda: 5_000_000_000, lambda: 7_000_000_000)
+
+    class Outlet:
+        def send(self, message):
+            sent.append(message)
+            wall[0] = NOW_NS + 36_000_000
+            if len(sent) == 3:
+                stop.set()
+
+    ClockSync("a", "x", clock, lambda: None).send_beacons(Outlet(), stop)
+    assert [type(message) for message in sent] == [ClockBeacon, ClockSet, ClockBeacon]
+    assert [message.stamp_ns for message in sent] == [NOW_NS, NOW_NS + 36_000_000, NOW_NS + 36_000_000]
+    assert sent[1].moved_ns == 36_000_000

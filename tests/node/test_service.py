@@ -27,7 +27,8 @@ from buddyline.node.devices import Frame
 from buddyline.node.drivers.samples import AbsentError
 from buddyline.node.images import Images, RateLimiter
 from buddyline.node.service import NodeService
-from buddyline.protocol.clock import MS_NS, S_NS, SystemClock
+from buddyline.node.time_base import NodeClock
+from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import NodeStatus
@@ -184,16 +185,13 @@ def test_a_read_only_disk_is_refused_at_the_start_in_one_line(tmp_path):
         assert not [line for line in process.lines if "Traceback" in line]
 
 
-class Settable(SystemClock):
+class Settable:
     """The machine's clock, as if it had been set."""
 
     shift_ns = 0
 
     def now_ns(self):
-        return super().now_ns() + self.shift_ns
-
-    def wait_until_ns(self, instant_ns, stop):
-        return super().wait_until_ns(instant_ns - self.shift_ns, stop)
+        return time.time_ns() + self.shift_ns
 
 
 @pytest.mark.parametrize("step_s", [1, -1])
@@ -207,7 +205,7 @@ def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, capl
         record=RecordConfig(directory=str(tmp_path), images_hz=5.0),
     )
     clock = Settable()
-    service = NodeService(config, clock)
+    service = NodeService(config, NodeClock(clock.now_ns))
     service.open()
     with caplog.at_level(logging.WARNING):
         try:
@@ -221,6 +219,9 @@ def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, capl
             assert service.close() == 0
     assert f"clock: was set by {step_s:+d}.0" in caplog.text or f"clock: was set by {step_s - 1:+d}.9" in caplog.text
     assert service.recorder.error is None
+    with DiveLogReader(service.recorder.path) as reader:
+        (said,) = [record.open().message for record in reader.records(lambda key: key.endswith("/clock_set"))]
+    assert said.moved_ns == pytest.approx(step_s * S_NS, abs=MS_NS)
 
 
 @pytest.mark.parametrize("step_ns", [-3600 * S_NS, -S_NS, 0, S_NS])

@@ -30,7 +30,13 @@ def moved(source, target, hours):
 def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     out = folders / "dive"
     assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(out)]) == 0
-    assert {path.name for path in out.iterdir()} == {"solved.mcap", "track.tum", "track.csv", "report.html"}
+    assert {path.name for path in out.iterdir()} == {
+        "clocks.json",
+        "solved.mcap",
+        "track.tum",
+        "track.csv",
+        "report.html",
+    }
     with DiveLogReader(out / "solved.mcap") as reader:
         assert {"buddyline/pair/a/b/pose", "buddyline/pair/a/b/track"} <= set(reader.keys)
     capsys.readouterr()

@@ -28,6 +28,8 @@ MIN_EXCHANGES: Final = 8
 QUICKEST_SIGMA_S: Final = 20e-6
 NEXT_FEW: Final = 3
 MIN_DRIFT_SPAN_S: Final = 5.0
+# At a turn rate of 0.5 rad/s a light moves by about a candidate's noise in this time.
+LIMIT_S: Final = 2e-3
 
 
 @dataclass(frozen=True, slots=True)

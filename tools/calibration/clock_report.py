@@ -16,7 +16,15 @@ from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
 from buddyline.protocol.topics import CLOCK, NODE_STATUS
-from buddyline.tools.calibration.clock import OffsetEstimate, OneWayTimes, drift_between, estimate, steps, windows
+from buddyline.tools.calibration.clock import (
+    LIMIT_S,
+    OffsetEstimate,
+    OneWayTimes,
+    drift_between,
+    estimate,
+    steps,
+    windows,
+)
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import open_bus_within
@@ -27,8 +35,6 @@ log = logging.getLogger(__name__)
 
 HUB_WITHIN_S: Final = 5.0
 SILENT_S: Final = 2.0
-# At a turn rate of 0.5 rad/s a light moves by about a candidate's noise in this time.
-LIMIT_S: Final = 2e-3
 
 
 @dataclass
@@ -162,13 +168,12 @@ def as_text(found: Iterable[Report], heard: Heard) -> str:
         said = [f": {_offset(last)}"]
         if first is not last:
             drift, sigma = drift_between(first, last)
-            middle_s = (first.offset_s + last.offset_s) / 2
             passed_s = (last.stamp_ns - first.stamp_ns) / S_NS
             said = [
                 f", before: {_offset(first)}",
                 f", after:  {_offset(last)}",
                 f": {1e6 * drift:+.3f} ppm +- {1e6 * sigma:.3f} over {passed_s:.0f} s;"
-                f" solve with --clock-offset {middle_s:.5f}, right within {1e3 * abs(last.offset_s - middle_s):.2f} ms",
+                " `solve` goes from one to the other",
             ]
         elif last.drift is not None and last.drift_sigma is not None:
             said.append(f": {1e6 * last.drift:+.1f} ppm +- {1e6 * last.drift_sigma:.1f}")
