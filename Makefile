@@ -12,7 +12,7 @@ PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off 
 # picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
 VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
-.PHONY: demo test coverage install names clean
+.PHONY: demo test coverage docs install names clean
 
 demo: .venv/.run
 	$(BIN)/buddyline demo $(ARGS)
@@ -27,6 +27,12 @@ test: .venv/.test names
 # Traced, everything takes half as long again: too slow for the viewer of the soak on a slow machine.
 coverage: .venv/.test
 	$(BIN)/pytest --cov --cov-report=term:skip-covered
+
+# The documents as a site in build/site; every link is checked.
+docs: .venv/.test
+	$(PIP_INSTALL) '$(call DOTTED,$(sort dev docs $(WANTED)))'
+	$(BIN)/python docs/site/make.py build/site
+	@echo "== build/site/index.html"
 
 # make install EXTRAS=keys,monitor: adds extras (pyproject.toml lists them) to what is installed.
 install: | .venv/bin/python

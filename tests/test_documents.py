@@ -18,7 +18,7 @@ from tests.processes import REPOSITORY
 DOCUMENTS = sorted(
     path
     for path in REPOSITORY.rglob("*.md")
-    if not {".venv", "build", "node_modules"} & set(path.relative_to(REPOSITORY).parts)
+    if not any(part.startswith(".") or part in ("build", "node_modules") for part in path.relative_to(REPOSITORY).parts)
 )
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 PROGRAM = re.compile(r"^(?:sudo |! |\S+ run )?(?:\.venv/bin/)?buddyline(?= |$)(.*)$")
@@ -96,6 +96,12 @@ def test_the_readme_links_to_every_other_document() -> None:
     linked = {target.partition("#")[0] for target in LINK.findall(readme)}
     assert {f"docs/{path.name}" for path in (REPOSITORY / "docs").glob("*.md")} <= linked
     assert {"CONTRIBUTING.md", "CHANGELOG.md", "node/README.md", "protocol/README.md"} <= linked
+
+
+def test_the_site_has_every_document() -> None:
+    pages = set(re.findall(r'"([\w/]+\.md)"', (REPOSITORY / "docs" / "site" / "make.py").read_text()))
+    there = {str(path.relative_to(REPOSITORY)) for path in DOCUMENTS if path.parent.name != "golden"}
+    assert there <= pages
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ say) the first counts, as does the first of two outcomes of a trigger. Unknown n
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -18,6 +18,7 @@ from buddyline.protocol.messages import (
     Attitude,
     Blob,
     Candidates,
+    CompressedImage,
     Depth,
     Imu,
     Message,
@@ -273,6 +274,29 @@ class DiveColumns:
         """Return a node's light candidates; of a dive of pictures there are none before `buddyline detect`."""
         return candidate_columns(self._of_node(CANDIDATES, Candidates, node))
 
+    def pictures(self, node: str) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield a node's recorded pictures: stamp_ns, and blue green red (H, W, 3) or grey (H, W), in the log's order.
+
+        A picture that cannot be decoded is left out, and named in losses.
+        """
+        from buddyline.node.drivers.stored import PictureError, decode_picture
+
+        self._check(node)
+        with Dive(self._logs) as dive:
+            for envelope in dive.messages(IMAGE.name):
+                message = envelope.message
+                if envelope.ids != (node,) or not isinstance(message, CompressedImage):
+                    continue
+                try:
+                    picture = decode_picture(
+                        message.data, f"{self._name}: picture of node {node} at {message.stamp_ns}"
+                    )
+                except PictureError as error:
+                    self.losses.append(str(error))
+                    continue
+                yield message.stamp_ns, picture
+            self._note(dive)
+
     def _of_pair(self, topic: Topic, schema: type[M], pair: Pair | None) -> list[M]:
         if pair is None:
             if len(self.pairs) > 1:
@@ -283,10 +307,13 @@ class DiveColumns:
             raise BuddylineError(f"{self._name}: holds nothing of pair {'/'.join(pair)}")
         return self._read(topic, schema, pair)
 
-    def _of_node(self, topic: Topic, schema: type[M], node: str) -> list[M]:
+    def _check(self, node: str) -> None:
         if node not in self.nodes:
             known = ", ".join(self.nodes) or "none"
             raise BuddylineError(f"{self._name}: holds nothing of node {node!r}; nodes: {known}")
+
+    def _of_node(self, topic: Topic, schema: type[M], node: str) -> list[M]:
+        self._check(node)
         return self._read(topic, schema, (node,))
 
     def _read(self, topic: Topic, schema: type[M], ids: tuple[str, ...]) -> list[M]:

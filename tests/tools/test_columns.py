@@ -214,3 +214,20 @@ def test_the_librarys_checks_match_the_solvers():
 
     assert buddyline.ALL_CHECKS == CHECKS
     assert (FOLDER / "cavern.outcomes.jsonl").exists()
+
+
+def test_pictures_of_a_node_are_arrays_and_a_damaged_one_is_named(tmp_path):
+    entries = read_log(DATA / "night_reef_pictures.mcap")
+    dive = buddyline.open_dive(DATA / "night_reef_pictures.mcap")
+    found = list(dive.pictures("a"))
+    assert len(found) == sum(entry.key == "buddyline/node/a/image" for entry in entries)
+    stamp_ns, picture = found[0]
+    assert picture.shape == (dive.infos["a"].height_px, 480, 3)
+    assert stamp_ns > 0
+    images = [entry for entry in entries if entry.key == "buddyline/node/a/image"]
+    spoilt = [one.saying(data="bm8gcGljdHVyZQ==") if one is images[0] else one for one in entries]
+    dive = buddyline.open_dive(write_log(tmp_path / "spoilt.mcap", spoilt))
+    assert len(list(dive.pictures("a"))) == len(found) - 1
+    assert "picture of node a at" in dive.losses[0]
+    with pytest.raises(buddyline.BuddylineError, match="nothing of node 'c'"):
+        next(dive.pictures("c"))

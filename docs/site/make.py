@@ -1,0 +1,91 @@
+"""Make the site of documents: `python docs/site/make.py SITE`. A link to a page that is not there is an error.
+
+The pages lie all over the repository, beside what they describe. They are gathered into SITE.pages, with a page of all
+commands that is made from their own help, and Sphinx makes SITE out of them.
+"""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Final
+
+from buddyline.tools.cli import COMMANDS
+
+REPOSITORY: Final = Path(__file__).resolve().parents[2]
+PAGES: Final = {
+    "Learn": ["docs/tutorial.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
+    "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "protocol/README.md"],
+    "Build and survey": ["node/README.md", "tools/survey/README.md"],
+    "Reference": ["commands", "docs/glossary.md"],
+    "How it works": ["docs/track.md", "docs/decisions.md"],
+    "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
+}
+LINK: Final = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
+
+
+def page_of(path: str) -> str:
+    """Return a document's page: `node/README.md` is `node.md`."""
+    return "index.md" if path == "README.md" else path.replace("/README.md", ".md").replace("/", "_").lower()
+
+
+def linked(text: str, source: str, pages: Path) -> str:
+    """Return a document with links to pages; pictures come along, and what is neither is named without a link.
+
+    Diagrams stay as text: what draws them in a browser would have to be fetched from elsewhere.
+    """
+    documents = {"README.md"} | {path for paths in PAGES.values() for path in paths}
+
+    def anew(match: re.Match[str]) -> str:
+        picture, words, target, anchor = match[1], match[2], match[3], match[4] or ""
+        if "://" in target:
+            return match[0]
+        path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+        if path in documents:
+            return f"[{words}]({page_of(path)}{anchor})"
+        if path.endswith((".png", ".svg", ".jpg")):
+            shutil.copy(REPOSITORY / path, pages / path.replace("/", "_"))
+            return f"{picture}[{words}]({path.replace('/', '_')})"
+        return f"{words} (`{path}`)"
+
+    return LINK.sub(anew, text.replace("```mermaid", "```text"))
+
+
+def commands() -> str:
+    """Return the page of all commands, each with its own help."""
+    os.environ["COLUMNS"] = "100"
+    said = ["# Commands\n\nAll are parts of one program, `buddyline`. What each says of itself:\n"]
+    said += [f"## buddyline {one.name}\n\n```text\n{one.parser().format_help()}```\n" for one in COMMANDS]
+    return "\n".join(said)
+
+
+def gather(pages: Path) -> None:
+    """Write all pages, and the list of them, into a new folder."""
+    pages.mkdir(parents=True)
+    for path in ["README.md", *(path for paths in PAGES.values() for path in paths if path != "commands")]:
+        text = linked((REPOSITORY / path).read_text(encoding="utf-8"), path, pages)
+        (pages / page_of(path)).write_text(text, encoding="utf-8")
+    (pages / "commands.md").write_text(commands(), encoding="utf-8")
+    with open(pages / "index.md", "a", encoding="utf-8") as index:
+        for caption, paths in PAGES.items():
+            names = "\n".join(page_of(path).removesuffix(".md") for path in paths)
+            index.write(f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{names}\n```\n")
+
+
+def main(site: Path) -> int:
+    """Make the site; return Sphinx's exit status."""
+    pages = site.with_name(f"{site.name}.pages")
+    for folder in (site, pages):
+        shutil.rmtree(folder, ignore_errors=True)
+    gather(pages)
+    sphinx = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet", "-b", "html"]
+    return subprocess.run([*sphinx, "-c", str(Path(__file__).parent), str(pages), str(site)], check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,72 @@
+"""docs/troubleshooting.md has an entry for each reason, finding and alarm that the programs know."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from buddyline.protocol.messages import Reason
+from buddyline.tools.health.words import REASONS
+
+from tests.processes import REPOSITORY
+
+PAGE = REPOSITORY / "docs" / "troubleshooting.md"
+
+
+def calls(folder: str, function: str) -> Iterator[ast.Call]:
+    """Yield the calls of a function in the modules of a folder."""
+    for path in sorted((REPOSITORY / folder).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == function:
+                yield node
+
+
+def findings() -> set[str]:
+    """Return the names of all findings: the first argument where it is a constant."""
+    found = set()
+    for folder in ("tools/health", "tools/doctor"):
+        for call in calls(folder, "Finding"):
+            if call.args and isinstance(call.args[0], ast.Constant):
+                found.add(str(call.args[0].value))
+    return found
+
+
+def alarms() -> set[str]:
+    """Return the checks of all survey alarms: texts that begin with `check: `."""
+    found = set()
+    for name in ("alarms", "derive"):
+        text = (REPOSITORY / "tools" / "survey" / f"{name}.py").read_text()
+        found |= set(re.findall(r'f?"([a-z]+): ', text))
+    return found
+
+
+def entries(page: Path = PAGE) -> set[str]:
+    """Return the words in code of the first column of all tables."""
+    rows = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    return {word for row in rows for word in re.findall(r"`([^`]+)`", row.split("|")[1])}
+
+
+def test_each_reason_of_a_rejection_has_an_entry() -> None:
+    assert set(get_args(Reason)) <= entries()
+    assert set(get_args(Reason)) == set(REASONS), "each is said in words on the screen as well"
+
+
+def test_each_finding_has_an_entry() -> None:
+    assert len(findings()) > 15
+    assert findings() <= entries()
+
+
+def test_each_alarm_of_a_survey_has_an_entry() -> None:
+    assert len(alarms()) > 5
+    assert alarms() <= entries() | {"ALARM"}
+
+
+@pytest.mark.parametrize("word", ["range_gap", "compass", "sights"])
+def test_a_missing_entry_would_be_found(word: str, tmp_path: Path) -> None:
+    shorter = tmp_path / "page.md"
+    shorter.write_text("".join(line for line in PAGE.read_text().splitlines(True) if f"`{word}`" not in line))
+    assert word not in entries(shorter)
