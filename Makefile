@@ -12,7 +12,7 @@ PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off 
 # picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
 VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
-.PHONY: demo test coverage docs install names clean
+.PHONY: demo test coverage docs release install names clean
 
 demo: .venv/.run
 	$(BIN)/buddyline demo $(ARGS)
@@ -33,6 +33,10 @@ docs: .venv/.test
 	$(PIP_INSTALL) '$(call DOTTED,$(sort dev docs $(WANTED)))'
 	$(BIN)/python docs/site/make.py build/site
 	@echo "== build/site/index.html"
+
+# What a tag releases, in dist: packages, notes, the list of all parts, hashes.
+release:
+	.ci/release
 
 # make install EXTRAS=keys,monitor: adds extras (pyproject.toml lists them) to what is installed.
 install: | .venv/bin/python
