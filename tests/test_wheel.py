@@ -1,41 +1,22 @@
 """What is installed from a wheel works alone: one import name, beside folders that are called as ours are."""
 
-import os
-import subprocess
 import sys
 import venv
 
 import pytest
 
 from tests.processes import REPOSITORY
+from tests.wheels import PIP, build, run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
-PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 FOLDERS = ("tools", "node", "protocol", "solver_service", "buddyline")
-
-
-def run(*words, cwd):
-    """Run a program without this repository on its path; return the finished process."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, cwd=cwd, env=environment)
 
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
     """A fresh environment with the wheel in it; the packages that we need are this one's."""
     folder = tmp_path_factory.mktemp("wheel")
-    # A copy: setuptools leaves its own folders beside the sources.
-    sources = folder / "sources"
-    listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=REPOSITORY)
-    for name in listed.stdout.split("\0"):
-        if name and not name.startswith("tests/") and (REPOSITORY / name).is_file():
-            (sources / name).parent.mkdir(parents=True, exist_ok=True)
-            (sources / name).write_bytes((REPOSITORY / name).read_bytes())
-    done = run(*PIP, "wheel", "--no-deps", "--quiet", "-w", folder, sources, cwd=folder)
-    if "Could not find a version that satisfies the requirement setuptools" in done.stderr:
-        pytest.skip("no wheel can be built: setuptools cannot be fetched from here")
-    assert done.returncode == 0, done.stderr
-    (wheel,) = folder.glob("buddyline-*.whl")
+    wheel = build(folder)
     environment = folder / "environment"
     venv.create(environment, with_pip=False)
     (packages,) = environment.glob("lib/python*/site-packages")

@@ -47,8 +47,13 @@ def track(dives: list[Path], output: Path, mode: str) -> tuple[int, list[Record]
     """Candidates and sensors -> track: exit status, and every tenth row of the track by time."""
     assert not output.exists(), output
     status, _ = run("solve", *dives, "-o", output, "--track", mode, "--track-hz", "20")
-    rows = [entry.message for entry in read_log(output) if entry.topic == "track"]
-    return status, [_row(row) for row in sorted(rows, key=lambda row: row["stamp_ns"])[::TRACK_STEP]]
+    return status, rows_of(output)
+
+
+def rows_of(log: Path) -> list[Record]:
+    """Return every tenth row of the track of a solved log by time."""
+    rows = [entry.message for entry in read_log(log) if entry.topic == "track"]
+    return [_row(row) for row in sorted(rows, key=lambda row: row["stamp_ns"])[::TRACK_STEP]]
 
 
 def outcomes_of(log: Path) -> list[Record]:

@@ -1,0 +1,34 @@
+"""Our wheel, built from the files that git knows."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.processes import REPOSITORY
+
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+
+
+def run(*words, cwd):
+    """Run a program without this repository on its path; return the finished process."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    return subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, cwd=cwd, env=environment)
+
+
+def build(folder):
+    """Build the wheel in a folder; skip where setuptools cannot be fetched."""
+    # A copy: setuptools leaves its own folders beside the sources.
+    sources = folder / "sources"
+    listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=REPOSITORY)
+    for name in listed.stdout.split("\0"):
+        if name and not name.startswith("tests/") and (REPOSITORY / name).is_file():
+            (sources / name).parent.mkdir(parents=True, exist_ok=True)
+            (sources / name).write_bytes((REPOSITORY / name).read_bytes())
+    done = run(*PIP, "wheel", "--no-deps", "--quiet", "-w", folder, sources, cwd=folder)
+    if "Could not find a version that satisfies the requirement setuptools" in done.stderr:
+        pytest.skip("no wheel can be built: setuptools cannot be fetched from here")
+    assert done.returncode == 0, done.stderr
+    (wheel,) = folder.glob("buddyline-*.whl")
+    return wheel
