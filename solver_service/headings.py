@@ -14,7 +14,9 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.compasses import MOST_APART_RAD
+from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.observation import Heading
+from buddyline.solver_service.witness import Witnesses
 
 # After this time without a pose the estimate is dropped: the bias may have changed.
 LIFETIME_NS: Final = 60 * S_NS
@@ -47,12 +49,28 @@ class HeadingOffset:
         self._variance = START_VARIANCE
         self._noise = START_NOISE
         self._count = 0
+        self._witnesses = Witnesses()
 
     def predict(self, stamp_ns: int) -> Heading | None:
         """Return the estimate at stamp_ns; None after too few poses, or if the last pose is later or too old."""
         if self._count < ENOUGH or not self._follows(stamp_ns):
             return None
         return Heading(self._offset_rad, self._predicted(stamp_ns) + self._noise)
+
+    def take(self, stamp_ns: int, found: Fix | NoFix) -> None:
+        """Take what became of a trigger."""
+        if isinstance(found, Fix):
+            if found.heading is not None and found.method != "three_lights":
+                if found.heading.agrees:
+                    self._witnesses.reset()
+                self.update(stamp_ns, found.heading.gap_rad, found.heading.variance)
+        elif not found.silent:
+            witnessed = self._witnesses.take(stamp_ns, found.contradiction)
+            if witnessed is not None:
+                self._witnesses.reset()
+                self._stamp_ns, self._count = stamp_ns, ENOUGH
+                self._offset_rad, self._variance = witnessed.offset_rad, DRIFT
+                self._noise = min(max(witnessed.scatter, LEAST_NOISE), MOST_NOISE)
 
     def update(self, stamp_ns: int, offset_rad: float, variance: float) -> None:
         """Take the offset that one pose gives, rad, and its variance from the pose alone, rad^2."""

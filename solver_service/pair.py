@@ -116,6 +116,7 @@ class PairSolver:
             learned = self._prior.predict(stamp_ns), self._headings.predict(stamp_ns)
             found = readings.decide(place, *learned, self._rarity.factor)
             self._rarity.take(found)
+            self._headings.take(stamp_ns, found)
             if isinstance(found, Fix):
                 self._remember(matched, found)
         except (ArithmeticError, ValueError) as error:
@@ -131,8 +132,6 @@ class PairSolver:
         if not math.isfinite(fix.T_a_b.t_m.sum() + fix.covariance.sum()):
             raise ValueError("the pose is not finite")
         self._prior.update(matched.stamp_ns, fix)
-        if fix.heading is not None and fix.method != "three_lights":
-            self._headings.update(matched.stamp_ns, fix.heading.gap_rad, fix.heading.variance)
         if self.alignment is not None:
             stamp_a_ns, stamp_b_ns = matched.frame_a.stamp_ns, matched.frame_b.stamp_ns
             infos, rigs = (matched.info_a, matched.info_b), (matched.rig_a, matched.rig_b)

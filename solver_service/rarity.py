@@ -16,8 +16,6 @@ MEMORY: Final = 300.0
 START: Final = 0.5
 # Another lamp stays in view from picture to picture, unlike evenly scattered candidates: the odds count to this power.
 PERSISTENCE: Final = 2.0
-# Triggers that say nothing of the lamps.
-SILENT: Final = ("too_few_candidates", "degenerate", "out_of_range")
 
 
 class Rarity:
@@ -37,7 +35,7 @@ class Rarity:
 
     def take(self, found: Fix | NoFix) -> None:
         """Count a trigger by how likely it shows all four lights, whatever came of it."""
-        if isinstance(found, NoFix) and found.reason in SILENT:
+        if isinstance(found, NoFix) and found.silent:
             return
         kept = 1.0 - 1.0 / MEMORY
         self._full = START + kept * (self._full - START) + found.all_four

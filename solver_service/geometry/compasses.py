@@ -2,9 +2,10 @@
 
 Two nodes that look at a third party's two lights from equal range get a pose that passes range, twist, tilt and depth.
 In that pose they face each other. By their compasses their lines of sight are theta apart, so the headings are 180
-degrees minus theta off the pose, whatever the fields of view. A compass that is biased gives a gap too. Which of the
-two it is follows from how large a bias may be, and from what earlier poses have told of it. Without earlier poses a
-third party's bar that is seen from more than 80 degrees apart cannot be told from a compass beside steel.
+degrees minus theta off the pose, whatever the fields of view. A compass beside steel gives a gap, too, and one trigger
+cannot tell which of the two it is. So a gap that neither noise nor what has been learned of the compasses explains
+contradicts the pose, until the motion has shown that the compasses are off (`witness.py`). A pose that follows from
+earlier ones needs no such witness: a diver passes by steel.
 """
 
 from __future__ import annotations
@@ -13,15 +14,14 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from buddyline.solver_service.geometry.evidence import AGREES
 from buddyline.solver_service.geometry.observation import Heading
 
 # Two compasses disagree by no more than this: one near steel points aside, not backwards. The rest of a quarter turn is
-# for the noise of a reading. Lines of sight within 80 degrees of each other are then never taken for opposite ones.
+# for the noise of a reading.
 MOST_APART_RAD: Final = math.radians(100.0)
-# What has been learned of both compasses changes by less than this until the next pose, unless the motion shows that
-# the pose is right.
-MOST_CHANGED_RAD: Final = math.radians(60.0)
+# Squared sigmas of a gap that noise explains. If one pose of four lights in a hundred is of a third's bar, and their
+# gaps are spread evenly, then one in twenty-five with this gap is.
+EXPLAINED_CHI2: Final = 9.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,24 +29,44 @@ class HeadingGap:
     """How a pose compares with both headings.
 
     gap_rad: what to add to B's heading so that both agree with the pose. variance: the pose's part in the gap's
-    variance, rad^2. agrees: whether noise explains the gap, alone or about the bias that was learned. contradicts:
-    whether no likely bias explains it either.
+    variance, rad^2. azimuth_rad: of the line of sight, by A's heading. agrees: whether noise explains the gap, alone or
+    about the bias that was learned. contradicts: whether it speaks against the pose.
     """
 
     gap_rad: float
     variance: float
+    azimuth_rad: float
     agrees: bool
     contradicts: bool
 
+    @property
+    def explicable(self) -> bool:
+        """Whether a compass beside steel could explain the gap."""
+        return abs(self.gap_rad) <= MOST_APART_RAD
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """A pose of four lights at range_m that both headings contradict, as a compass beside steel could."""
+
+    gap: HeadingGap
+    range_m: float
+
 
 def compare_headings(
-    gap_rad: float, variance: float, sensors_variance: float, learned: Heading | None, *, follows: bool
+    gap_rad: float,
+    variance: float,
+    azimuth_rad: float,
+    sensors_variance: float,
+    learned: Heading | None,
+    *,
+    follows: bool,
 ) -> HeadingGap:
     """Judge a gap; sensors_variance: of both headings' difference, rad^2; follows: earlier poses predict this one."""
-    agrees = gap_rad * gap_rad < AGREES * (sensors_variance + variance)
-    changed = False
+    off_rad, expected = gap_rad, sensors_variance + variance
     if learned is not None:
-        off_rad = abs(math.remainder(gap_rad - learned.offset_rad, 2.0 * math.pi))
-        agrees = agrees or off_rad * off_rad < AGREES * (learned.variance + variance)
-        changed = off_rad > MOST_CHANGED_RAD and not follows
-    return HeadingGap(gap_rad, variance, agrees, not agrees and (abs(gap_rad) > MOST_APART_RAD or changed))
+        off_rad = math.remainder(gap_rad - learned.offset_rad, 2.0 * math.pi)
+        expected = learned.variance + variance
+    agrees = off_rad * off_rad < EXPLAINED_CHI2 * expected
+    contradicts = not agrees and not (follows and abs(gap_rad) <= MOST_APART_RAD)
+    return HeadingGap(gap_rad, variance, azimuth_rad, agrees, contradicts)

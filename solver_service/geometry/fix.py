@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from buddyline.solver_service.geometry.compasses import HeadingGap
+from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap
 from buddyline.solver_service.geometry.observation import Reason
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.geometry.se3 import SE3
@@ -50,8 +50,17 @@ class Fix:
 
 @dataclass(frozen=True)
 class NoFix:
-    """Why there is no pose: detail is for a person. all_four: as in Fix."""
+    """Why there is no pose: detail is for a person. all_four: as in Fix.
+
+    contradiction: the pose that would be there but for both headings, where a compass may be off.
+    """
 
     reason: Reason
     detail: str
     all_four: float = 0.0
+    contradiction: Contradiction | None = None
+
+    @property
+    def silent(self) -> bool:
+        """Whether the trigger says nothing of the lamps."""
+        return self.reason in ("too_few_candidates", "degenerate", "out_of_range")

@@ -19,6 +19,7 @@ Reason: TypeAlias = Literal[
     "attitude",
     "depth",
     "heading",
+    "other_lights",
     "out_of_range",
     "ambiguous",
     "degenerate",
@@ -118,8 +119,9 @@ class Settings:
     """How triggers are solved.
 
     checks: what may speak for or against a hypothesis. min_probability: of the published pose, against chance and
-    every other. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the
-    prior knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
+    every other; min_oriented_probability: where both attitudes speak, and a right pose is mostly certain. gate_sigma:
+    both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior knows none (1 sd);
+    skew_sigma_s: how well the clocks agree (1 sd).
     """
 
     method: Method = "refined"
@@ -127,6 +129,7 @@ class Settings:
     range_min_m: float = 0.8
     range_max_m: float = 30.0
     min_probability: float = 0.9
+    min_oriented_probability: float = 0.99
     gate_sigma: float = 4.5
     speed_mps: float = 0.2
     turn_radps: float = 0.2
@@ -143,7 +146,8 @@ class Settings:
             raise ValueError(f"checks: {sorted(self.checks - CHECKS)} unknown, there are {sorted(CHECKS)}")
         if not 0.0 < self.range_min_m < self.range_max_m < math.inf:
             raise ValueError(f"range_min_m: {self.range_min_m:g}, range_max_m: {self.range_max_m:g}: not 0 < min < max")
-        if not 0.0 <= self.min_probability < 1.0:
-            raise ValueError(f"min_probability: {self.min_probability:g} is not in [0, 1)")
+        for name in ("min_probability", "min_oriented_probability"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"{name}: {getattr(self, name):g} is not in [0, 1)")
         if not 0.0 < self.gate_sigma < math.inf:
             raise ValueError(f"gate_sigma: {self.gate_sigma:g} is not positive")

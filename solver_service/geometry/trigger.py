@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.camera import Camera
-from buddyline.solver_service.geometry.compasses import HeadingGap, compare_headings
+from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
 from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT
 from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.four_lights import FourLights, read_four_lights
@@ -55,8 +55,8 @@ __all__ = [
 # Poses nearer than this, relative to the range, and turned by less than 0.1 rad (their trace) are one pose.
 _SAME_POSITION: Final = 0.04
 _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
-# Three lights have no gap to check them: they must be likelier than four, and more so when the motion prior decides
-# for or against them: it knows nothing of how a diver turns aside.
+# Three lights have no gap to check them, and the headings tell no better than this which of two lights a node sees.
+# They must be likelier where the motion prior decides for or against them: it knows nothing of how a diver turns aside.
 _THREE_PROBABILITY: Final = 0.98
 _FOLLOWED_PROBABILITY: Final = 0.999
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
@@ -173,15 +173,22 @@ class _Batched:
         if unsure or widened > 1.0:
             false_light = ratio * math.exp(weighed.log_false[k])
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
-        required = settings.min_probability
+        oriented = self.oriented[trigger] and "attitude" in settings.checks
+        required = settings.min_oriented_probability if oriented else settings.min_probability
         if short:
-            required = max(required, _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY)
+            required = _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY
         if probability >= required:
             covariance = widened * _spread(weighed, k, same)
             against = self._against_headings(trigger, weighed, k, covariance, learned)
             if against is not None and against.contradicts:
                 off_deg = math.degrees(abs(against.gap_rad))
-                return NoFix("heading", f"what agrees, at {range_m:.3g} m, is {off_deg:.0f} deg off both headings")
+                what = f"what agrees, at {range_m:.3g} m, is {off_deg:.0f} deg off both headings:"
+                if not against.explicable:
+                    return NoFix("other_lights", f"{what} a third's bar, seen by both")
+                why = "a third's bar, seen by both, or a compass that the motion has not yet shown to be off"
+                return NoFix(
+                    "heading", f"{what} {why}", contradiction=None if short else Contradiction(against, range_m)
+                )
             return self._fix(trigger, weighed, k, covariance, probability, against)
         tilt_chi2, depth_chi2 = float(readings.tilt_chi2[place]), float(readings.depth_chi2[place])
         what = f"the best of the hypotheses, at {range_m:.3g} m,"
@@ -210,7 +217,9 @@ class _Batched:
         R_ned_a, R_ned_b = sensors.R_ned_camera[trigger]
         gap_rad, variance = heading_offset(weighed.T_a_b[k], covariance, R_ned_a, R_ned_b)
         follows = bool(weighed.log_prior[k] > 0.0)
-        return compare_headings(gap_rad, variance, float(sensors.heading_variance[trigger]), learned, follows=follows)
+        north, east, _ = (R_ned_a @ weighed.T_a_b.t_m[k]).tolist()
+        stated = float(sensors.heading_variance[trigger])
+        return compare_headings(gap_rad, variance, math.atan2(east, north), stated, learned, follows=follows)
 
     def _checks(self, trigger: int, readings: Readings, place: int) -> tuple[str, ...]:
         """Name what speaks for the pose."""

@@ -111,10 +111,10 @@ def test_the_right_lights_among_many_false_ones_with_sensors():
     assert wrong <= 0.01
 
 
-def test_a_heading_that_is_a_quarter_turn_off_costs_little():
+def test_one_trigger_cannot_tell_a_heading_that_is_a_quarter_turn_off_from_a_thirds_bar():
     right, wrong = choices(4, 60, sensors=True, heading_error_rad=math.pi / 2)
-    assert right >= 0.9
-    assert wrong <= 0.02
+    assert right == 0.0
+    assert wrong == 0.0
 
 
 def test_a_stuck_depth_sensor_costs_little():
@@ -328,6 +328,7 @@ def test_side_by_side_the_lights_are_not_there():
         {"range_min_m": 0.0},
         {"range_max_m": 0.5},
         {"min_probability": 1.0},
+        {"min_oriented_probability": 1.0},
         {"gate_sigma": 0.0},
         {"range_max_m": math.inf},
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,8 @@ from buddyline.solver_service.track.output import TrackRow
 EPOCH_NS = 1_764_000_000_000_000_000
 GRAVITY = np.array((0.0, 0.0, 9.80665))
 R_BODY_CAMERA = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+# The lamps (M, 3) of others that a node may see at a time, in north-east-down.
+Lamps = Callable[[int, Floats], Floats]
 FOCAL_PX, WIDTH_PX, HEIGHT_PX = 900.0, 820, 616
 
 
@@ -85,7 +87,10 @@ class Motion:
     def attitudes(self, node: int, t: Floats) -> Floats:
         """R_ned_camera (N, 3, 3): toward the other, swaying."""
         toward = self.places(1 - node, t) - self.places(node, t)
-        yaw = np.arctan2(toward[:, 1], toward[:, 0])
+        return self._attitudes_toward(node, t, np.arctan2(toward[:, 1], toward[:, 0]))
+
+    def _attitudes_toward(self, node: int, t: Floats, yaw: Floats) -> Floats:
+        """R_ned_camera (N, 3, 3): toward yaw (N,), swaying."""
         angles = np.array((0.08, 0.07, 0.10)) * self._turn[node](t)
         if self._s.poor:
             angles = angles + 0.004 * self._shake[node](t)
@@ -97,10 +102,10 @@ class Motion:
         return turned
 
 
-def make(seed: int, setting: Setting) -> Dive:
-    """Make a dive."""
+def make(seed: int, setting: Setting, motion: Motion | None = None, lamps: Lamps | None = None) -> Dive:
+    """Make a dive; lamps: of others than the two nodes."""
     rng = np.random.default_rng((seed, 17))
-    motion = Motion(rng, setting)
+    motion = motion or Motion(rng, setting)
     camera = Camera("pinhole", WIDTH_PX, HEIGHT_PX, FOCAL_PX, FOCAL_PX, 409.5, 307.5)
     nodes = []
     units = []
@@ -113,7 +118,7 @@ def make(seed: int, setting: Setting) -> Dive:
         off = rotation_exp(rng.normal(0.0, np.radians(1.0), 3)) if setting.poor else np.eye(3)
         units.append((lever, off, rng.uniform(0.002, 0.006) if setting.poor else 0.0))
     triggers = np.arange(2, int(setting.seconds * setting.rate_hz)) / setting.rate_hz
-    frames = [_frames(rng, motion, nodes, node, triggers, setting) for node in (0, 1)]
+    frames = [_frames(rng, motion, nodes, node, triggers, setting, lamps) for node in (0, 1)]
     records = []
     for node in (0, 1):
         clock_s = setting.clock_s if node else 0.0
@@ -170,6 +175,7 @@ def _frames(
     node: int,
     triggers: Floats,
     setting: Setting,
+    lamps: Lamps | None,
 ) -> list[tuple[FrameSeen | None, Floats]]:
     """Each trigger's frame, and which of the other's lights are truly in it (2,); the lights' pixels come first."""
     hidden = rng.uniform(0.0, setting.seconds, (2, 2))
@@ -194,12 +200,22 @@ def _frames(
         noisy = true + rng.normal(0.0, 1.0, (2, 2)) * np.where(gross, 6.0, setting.sigma_px)[:, None]
         false = rng.uniform((0.0, 0.0), (WIDTH_PX - 1.0, HEIGHT_PX - 1.0), (rng.poisson(setting.false), 2))
         pixels = np.concatenate((noisy[inside], false))
+        if lamps is not None:
+            pixels = np.concatenate((pixels, _seen(rng, (lamps(node, at) - motion.places(node, at)[0]) @ R, setting)))
         if rng.uniform() < 0.02:
             out.append((None, inside))
             continue
         frame = FrameSeen(EPOCH_NS + round(t * 1e9), pixels, np.full(len(pixels), setting.sigma_px))
         out.append((frame, inside & ~gross))
     return out
+
+
+def _seen(rng: np.random.Generator, X: Floats, setting: Setting) -> Floats:
+    """Give the pixels of lamps X (M, 3) in the camera frame that are in the picture, with noise and misses."""
+    X = X[X[:, 2] > 0.3]
+    pixels = project(X) + rng.normal(0.0, setting.sigma_px, (len(X), 2))
+    inside = (pixels > 0.0).all(1) & (pixels < np.array((WIDTH_PX - 1, HEIGHT_PX - 1))).all(1)
+    return pixels[inside & (rng.uniform(size=len(X)) > 0.03)]
 
 
 def _fix(
