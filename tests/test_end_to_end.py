@@ -101,8 +101,14 @@ def test_demo_shows_poses_and_leaves_nothing_running(tmp_path):
         assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
     finally:
         demo.end()
-    logs = sorted(tmp_path.glob("*.mcap"))
-    assert [log.name[0] for log in logs] == ["a", "b"]
+    kept = [path.name.partition("-")[0] for path in sorted(tmp_path.glob("*.mcap"))]
+    assert kept == ["a", "b", "solved", "truth"]
+    assert [path.suffix for path in tmp_path.glob("report-*")] == [".html"]
+    solved, truth = (next(tmp_path.glob(f"{name}-*.mcap")) for name in ("solved", "truth"))
+    judged = buddyline("evaluate", solved, "--truth", truth)
+    assert judged.returncode == 0, judged.stderr
+    assert "wrong poses (position off by more than 10% of the range): 0 of" in judged.stdout
+    logs = sorted(tmp_path.glob("[ab]-*.mcap"))
     for log in logs:
         with DiveLogReader(log) as reader:
             names = {key.rpartition("/")[2] for key in reader.keys}

@@ -120,13 +120,13 @@ def _solve(outing: Outing, folder: Path) -> int:
     words = ["solve", *logs, "-o", str(solved)]
     if len(outing.nodes) == 2:
         words += _clock_words(logs, folder / "clocks.json")
-    status = _command(words)
+    status = run_command(words)
     if not solved.exists():
         return 1
     for kind, name in (("tum", "track.tum"), ("csv", "track.csv")):
-        status |= _command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
+        status |= run_command(["export", str(solved), "--format", kind, "-o", str(folder / name)])
     try:
-        status |= _command(["report", str(solved), "-o", str(folder / "report.html")])
+        status |= run_command(["report", str(solved), "-o", str(folder / "report.html")])
     except BuddylineError as error:
         # The report draws; without the extra for it everything else is there.
         log.warning("no report: %s", error)
@@ -146,7 +146,7 @@ def _clock_words(logs: list[str], file: Path) -> list[str]:
     said = io.StringIO()
     try:
         with redirect_stdout(said):
-            status = _command(["align", *logs, "--json"])
+            status = run_command(["align", *logs, "--json"])
     except BuddylineError as error:
         log.info("clocks: `align` does not tell: %s", error)
         status = 2
@@ -163,7 +163,7 @@ def _clock_words(logs: list[str], file: Path) -> list[str]:
     return []
 
 
-def _command(words: list[str]) -> int:
+def run_command(words: list[str]) -> int:
     """Run one command of this program; what it could not read is reported with all other losses."""
     from buddyline.tools.cli import COMMANDS
 

@@ -7,7 +7,8 @@ import statistics
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -17,14 +18,26 @@ from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.health import NO_LIGHT_S, stale_after_s
-from buddyline.protocol.messages import NodeStatus, Rejected, RelativePose, SolverStatus, Track, TrackMode, Truth
-from buddyline.protocol.topics import NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
+from buddyline.protocol.messages import (
+    Message,
+    NodeStatus,
+    Rejected,
+    RelativePose,
+    SolverStatus,
+    Track,
+    TrackMode,
+    Truth,
+)
+from buddyline.protocol.topics import NET_TRUTH, NODE_STATUS, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG, TRUTH
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
+from buddyline.tools.draw.above import ARROWS, from_above
 from buddyline.tools.estimate import Estimate, known, range_sigma_m, sigma_m
 from buddyline.tools.evaluation.poses import PoseErrors, differences, pose_errors
 from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack
+from buddyline.tools.health.words import REASONS
 from buddyline.tools.live import follow
+from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -33,6 +46,9 @@ RECENT_S: Final = 5.0
 # Interval at which the track is kept for the figures of the whole run; its errors change more slowly.
 TRACK_SPACING_NS: Final = S_NS // 5
 SHARE_SAMPLES: Final = 500
+# The view from above, and from which height of the terminal on the health of all is shown as well.
+LEAST_MAP_ROWS, MAP_ROWS, MAP_COLUMNS, MORE_ROWS = 4, 16, 72, 18
+CYAN, MAGENTA, YELLOW, PLAIN = "\x1b[36m", "\x1b[35m", "\x1b[33m", "\x1b[0m"
 
 
 class Dashboard:
@@ -61,6 +77,8 @@ class Dashboard:
         self._latencies_s: list[float] = []
         self._recent: deque[float] = deque()
         self._rejected: Counter[str] = Counter()
+        # Triggers with all four lights in view, and those of them with a pose.
+        self._in_view, self._solved_in_view = 0, 0
         self._last_rejected: Rejected | None = None
         self._nodes: dict[str, NodeStatus] = {}
         self._solver: SolverStatus | None = None
@@ -78,6 +96,7 @@ class Dashboard:
             if isinstance(message, RelativePose):
                 self._poses.append(message)
                 self._truths.append(self._world.truth(message.stamp_ns, message.trigger))
+                self._solved_in_view += self._count_in_view(message)
                 self._latencies_s.append((envelope.time_ns - message.stamp_ns) / S_NS)
                 self._recent.append(self._now_s())
                 while self._recent[0] < self._recent[-1] - RECENT_S:
@@ -86,11 +105,22 @@ class Dashboard:
                 self._take_track(message)
             elif isinstance(message, Rejected):
                 self._rejected[message.reason] += 1
+                self._count_in_view(message)
                 self._last_rejected = message
             elif isinstance(message, SolverStatus):
                 self._solver = message
             elif isinstance(message, NodeStatus):
                 self._nodes[message.node] = message
+
+    def truth(self, end_ns: int) -> Iterator[tuple[int, str, Message]]:
+        """Yield the truth of every trigger up to end_ns: stamp_ns, key, message."""
+        period_ns = round(self._period_s * S_NS)
+        start_ns = self._world.scenario.start_ns
+        for trigger in range(-(-start_ns // period_ns), end_ns // period_ns):
+            stamp_ns = trigger * period_ns
+            yield stamp_ns, TRUTH.key("a", "b"), self._world.truth(stamp_ns, trigger)
+            for node in ("a", "b"):
+                yield stamp_ns, NET_TRUTH.key("main", node), self._world.node_truth(node, stamp_ns, "main")
 
     def line(self) -> str:
         """Return the present state in one line, for a log."""
@@ -106,11 +136,40 @@ class Dashboard:
                 f"off {off_m * 1e3:6.1f} mm {turned_deg:5.2f} deg  {self._age(shown)}{self._shares()}  {end}"
             )
 
-    def screen(self) -> str:
-        """Return the present state as a screen of text that overwrites the last one."""
+    def screen(self, width: int, height: int, *, coloured: bool = False, arrows: str = ARROWS) -> str:
+        """Return the present state as a screen of text that overwrites the last one, from 60 x 14 characters on."""
         with self._lock:
-            lines = [self._title, "", *self._pose_lines(), "", *self._health_lines(), "", "Ctrl-C ends."]
-        return "\x1b[H\x1b[2J" + "\n".join(lines)
+            shown = self._shown()
+            told = self._pose_lines(shown)
+            for text in (self._shares(), self._reason_line()):
+                told += wrap(text, width - 1)
+            room = height - len(told) - 2
+            more = ["", *self._health_lines(), ""] if room >= MORE_ROWS else []
+            room -= len(more)
+            above = [] if shown is None else _from_above(shown, width, min(room, MAP_ROWS), arrows, coloured)
+            lines = [line[: width - 1].rstrip() for line in (*told, *more, "Ctrl-C ends.")]
+            troubled = coloured and shown is not None and self._age(shown)
+        if troubled:
+            lines[0] = f"{YELLOW}{lines[0]}{PLAIN}"
+        return "\x1b[H\x1b[2J" + "\n".join([self._title[: width - 1], *above, *lines])
+
+    def _count_in_view(self, outcome: RelativePose | Rejected) -> bool:
+        """Count a trigger's lights; return whether all four were in view, each by itself."""
+        seen = [
+            light
+            for node in ("a", "b")
+            for light in self._world.light_truth(node, outcome.stamp_ns, outcome.trigger).lights
+            if light.visible and not light.merged
+        ]
+        self._in_view += len(seen) == 4
+        return len(seen) == 4
+
+    def _reason_line(self) -> str:
+        """Return why the last trigger without a pose had none, and what to do, in words."""
+        if self._last_rejected is None:
+            return "no trigger without a pose so far"
+        meaning, advice = REASONS[self._last_rejected.reason]
+        return f"last without a pose: {meaning}" + (f"; {advice}" if advice else "")
 
     def _errors(self) -> PoseErrors:
         return pose_errors(self._poses, TruthTrack(self._truths), lambda _: None, None)
@@ -148,8 +207,12 @@ class Dashboard:
         tracks = self._tracks.get("filter", [])
         # A long run keeps only a part of its samples, which is enough for a share.
         covered = covered_share(tracks[:: 1 + len(tracks) // SHARE_SAMPLES], self._poses)
-        solved = self._solved_share()
-        return f"track {covered or 0.0:.0%} of the time, poses {solved or 0.0:.0%} of triggers"
+        said = f"track {covered or 0.0:.0%} of the time, poses {self._solved_share() or 0.0:.0%} of triggers"
+        share = self._solved_share_in_view()
+        return said if share is None else f"{said}, {share:.0%} with all lights in view"
+
+    def _solved_share_in_view(self) -> float | None:
+        return self._solved_in_view / self._in_view if self._in_view else None
 
     def _solved_share(self) -> float | None:
         total = len(self._poses) + sum(self._rejected.values())
@@ -165,36 +228,32 @@ class Dashboard:
             math.degrees(float(off.rotation_rad[0])),
         )
 
-    def _pose_lines(self) -> list[str]:
-        shown = self._shown()
+    def _pose_lines(self, shown: Estimate | None) -> list[str]:
         if shown is None:
             return ["no pose yet"]
         off_m, off_range_m, turned_deg = self._off(shown)
-        R = R_BODY_CAMERA @ quat_to_matrix(np.array(shown.q_a_b_xyzw)) @ R_BODY_CAMERA.T
-        roll, yaw = math.atan2(R[2, 1], R[2, 2]), math.atan2(R[1, 0], R[0, 0])
-        pitch = math.asin(min(max(-R[2, 0], -1.0), 1.0))
-        roll_deg, pitch_deg, yaw_deg = map(math.degrees, (roll, pitch, yaw))
-        lines = [
-            f"range        {shown.range_m:8.3f} m   (1 sd of the position: {sigma_m(shown) * 1e3:.1f} mm)",
-            f"direction    {_direction(shown)}",
-            f"B beside A   roll {roll_deg:+7.2f}  pitch {pitch_deg:+7.2f}  yaw {yaw_deg:+7.2f} deg",
-            f"against truth {off_m * 1e3:7.1f} mm off, range {off_range_m * 1e3:+.1f} mm, turned {turned_deg:.2f} deg",
-            f"from         {'the track  ' if isinstance(shown, Track) else ''}{self._age(shown)}",
+        roll_deg, pitch_deg, yaw_deg = (math.degrees(angle_rad) for angle_rad in _turned(shown))
+        lights = "   ".join(
+            f"{name} sees {status.lights_seen} lights"
+            for name, status in sorted(self._nodes.items())
+            if status.lights_seen is not UNSET
+        )
+        return [
+            f"range {shown.range_m:.3f} m, 1 sd {sigma_m(shown) * 1e3:.1f} mm   {self._age(shown)}",
+            _direction(shown),
+            f"B from A: roll {roll_deg:+.2f}  pitch {pitch_deg:+.2f}  yaw {yaw_deg:+.2f} deg   {lights}",
+            f"truth: {off_m * 1e3:.1f} mm off, range {off_range_m * 1e3:+.1f} mm, turned {turned_deg:.2f} deg",
         ]
-        if self._poses:
-            pose = self._poses[-1]
-            lines.append(f"checks       {', '.join(pose.checks)}   ({pose.method}, {pose.hypotheses} hypotheses)")
-        return lines
 
     def _health_lines(self) -> list[str]:
-        lines = [f"poses        {len(self._poses)} so far, {self._rate_hz():.1f} a second; {self._shares()}"]
+        lines = [f"poses        {len(self._poses)} so far, {self._rate_hz():.1f} a second"]
         if self._latencies_s:
             median_ms = statistics.median(self._latencies_s[-200:]) * 1e3
             lines.append(f"latency      {median_ms:.1f} ms from exposure to here")
         rejected = "  ".join(f"{reason} {count}" for reason, count in self._rejected.most_common())
         lines.append(f"no pose      {rejected or 'none'}")
         if self._last_rejected is not None:
-            lines.append(f"  last       {self._last_rejected.reason}: {self._last_rejected.detail}"[:110])
+            lines.append(f"  last       {self._last_rejected.reason}: {self._last_rejected.detail}")
         for name, status in sorted(self._nodes.items()):
             rates = "  ".join(f"{topic} {rate:.0f}/s" for topic, rate in status.rates_hz.items() if rate >= 0.5)
             lines.append(f"node {name}       {rates}   {status.problem or 'ok'}")
@@ -219,6 +278,7 @@ class Dashboard:
                 "poses": len(errors),
                 "rejected": dict(self._rejected),
                 "solved_share": self._solved_share(),
+                "solved_share_in_view": self._solved_share_in_view(),
                 "wrong_poses": int(errors.wrong.sum()),
                 "tracks": {
                     figures.mode: {
@@ -252,10 +312,12 @@ def summary_text(summary: dict[str, Any]) -> str:
     if not summary["poses"]:
         return f"no pose in {summary['seconds']:.0f} s; rejected: {summary['rejected'] or 'nothing'}"
     rejected = ", ".join(f"{reason} {count}" for reason, count in summary["rejected"].items()) or "none"
-    cpu = ", ".join(f"{name} {share:.0%}" for name, share in summary["cpu_share"].items())
+    cpu = ", ".join(f"{name} {used:.0%}" for name, used in summary["cpu_share"].items())
+    share = summary["solved_share_in_view"]
     lines = [
-        f"{summary['poses']} poses in {summary['seconds']:.0f} s, of {summary['solved_share']:.0%} of the triggers; "
-        f"without a pose: {rejected}",
+        f"{summary['poses']} poses in {summary['seconds']:.0f} s, of {summary['solved_share']:.0%} of the triggers"
+        + (f" ({share:.0%} of those with all four lights in view)" if share is not None else "")
+        + f"; without a pose: {rejected}",
         f"median error: position {summary['position_error_m'] * 1e3:.1f} mm, range "
         f"{summary['range_error_m'] * 1e3:.1f} mm, rotation {summary['rotation_error_deg']:.2f} deg; worst position "
         f"{summary['worst_position_error_m'] * 1e3:.0f} mm; "
@@ -282,6 +344,23 @@ def _degrees(angle_rad: float | None) -> float | None:
 
 def _median(values: np.ndarray[Any, np.dtype[np.float64]]) -> float | None:
     return float(np.median(values)) if len(values) else None
+
+
+def _turned(shown: Estimate) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of B's body in A's, rad."""
+    R = R_BODY_CAMERA @ quat_to_matrix(np.array(shown.q_a_b_xyzw)) @ R_BODY_CAMERA.T
+    pitch_rad = math.asin(min(max(-R[2, 0], -1.0), 1.0))
+    return math.atan2(R[2, 1], R[2, 2]), pitch_rad, math.atan2(R[1, 0], R[0, 0])
+
+
+def _from_above(shown: Estimate, width: int, rows: int, arrows: str, coloured: bool) -> list[str]:
+    """Return both divers from above, as A sees it; nothing where there is no room."""
+    if rows < LEAST_MAP_ROWS:
+        return []
+    right_m, _, forward_m = shown.t_a_b_m
+    names = (f"{CYAN}A{PLAIN}", f"{MAGENTA}B{PLAIN}") if coloured else ("A", "B")
+    columns = min(width - 1, MAP_COLUMNS)
+    return from_above(columns, rows, right_m, forward_m, _turned(shown)[2], arrows=arrows, names=names)
 
 
 def _direction(shown: Estimate) -> str:

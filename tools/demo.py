@@ -5,18 +5,24 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.node.sim.scenario import ENVIRONMENTS
+from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.service import Service
+from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
 
 if TYPE_CHECKING:
+    from buddyline.protocol.messages import Message
     from buddyline.tools.dashboard import Dashboard
     from buddyline.tools.measure.children import Child
 
@@ -31,7 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="triggers a second; default: 10")
-    parser.add_argument("--record", metavar="DIR", help="keep the nodes' dive logs here; default: they are removed")
+    parser.add_argument(
+        "--record",
+        metavar="DIR",
+        help="keep the nodes' dive logs here, the truth, and the solved dive with its report; default: nothing is kept",
+    )
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.add_argument("--monitor", action="store_true", help="watch it on the monitor's page, in the browser")
 
@@ -63,11 +73,13 @@ def run(args: argparse.Namespace) -> int:
     service = Service("demo")
     service.handle_signals()
     work = Path(tempfile.mkdtemp(prefix="buddyline-demo-"))
+    records = Path(args.record).resolve() if args.record else work
+    before = set(records.glob("*.mcap"))
     endpoint, start_ns = free_endpoint(), time.time_ns()
     children: list[Child] = []
     over = False
     try:
-        _start(children, args, work, endpoint, start_ns)
+        _start(children, args, work, records, endpoint, start_ns)
         service.spawn("processes", lambda: _watch(service, children))
         bus = open_bus(ClientConfig(connect=endpoint), service.stop, lambda _: None)
         if bus is None:
@@ -83,18 +95,21 @@ def run(args: argparse.Namespace) -> int:
         for name in end_all(children):
             log.warning("demo: %s did not end when asked; killed", name)
         shutil.rmtree(work, ignore_errors=True)
-    print(json.dumps(summary) if args.json else summary_text(summary))
+    print(json.dumps(summary) if args.json else summary_text(summary), flush=True)
     status = service.join()
+    if args.record:
+        _keep(sorted(set(records.glob("*.mcap")) - before), dashboard.truth(time.time_ns()))
     return 1 if over and not summary["poses"] else status
 
 
-def _start(children: list[Child], args: argparse.Namespace, work: Path, endpoint: str, start_ns: int) -> None:
+def _start(
+    children: list[Child], args: argparse.Namespace, work: Path, records: Path, endpoint: str, start_ns: int
+) -> None:
     """Start hub, nodes, solver and, where it is wanted, the monitor; nodes and solver end before the hub."""
     from buddyline.tools.measure.children import Child, free_port
 
     hub = Child("hub", "--listen", endpoint)
     try:
-        records = Path(args.record).resolve() if args.record else work
         for node in ("a", "b"):
             config = work / f"{node}.toml"
             config.write_text(
@@ -116,6 +131,33 @@ def _start(children: list[Child], args: argparse.Namespace, work: Path, endpoint
             log.info("demo: the page is http://127.0.0.1:%d", port)
     finally:
         children.append(hub)
+
+
+def _keep(logs: list[Path], truth: Iterable[tuple[int, str, Message]]) -> None:
+    """Write the truth beside the nodes' logs, solve them, and say what lies where."""
+    from buddyline.tools.after import run_command
+    from buddyline.tools.newfile import new_dive_log
+
+    if len(logs) < 2:
+        return
+    records, when = logs[0].parent, logs[0].stem.partition("-")[2]
+    true, solved, report = (
+        records / f"{name}-{when}.{suffix}"
+        for name, suffix in (("truth", "mcap"), ("solved", "mcap"), ("report", "html"))
+    )
+    with new_dive_log(true) as writer:
+        for stamp_ns, key, message in truth:
+            writer.write(key, encode(message), stamp_ns, stamp_ns)
+    with redirect_stdout(sys.stderr):
+        run_command(["solve", *map(str, logs), "-o", str(solved)])
+        try:
+            run_command(["report", str(solved), "-o", str(report)])
+        except BuddylineError as error:
+            log.info("demo: no report: %s", error)
+    log.info(
+        "demo: kept in %s: %s", records, ", ".join(path.name for path in (*logs, true, solved, report) if path.exists())
+    )
+    log.info("demo: its errors: buddyline evaluate %s --truth %s", solved, true)
 
 
 def _watch(service: Service, children: list[Child]) -> None:
@@ -142,8 +184,15 @@ def _show(service: Service, dashboard: Dashboard, seconds: float | None) -> bool
     """Show the state until the end; return True if the time was over, False if the demo was stopped."""
     ends_s = None if seconds is None else time.monotonic() + seconds
     interactive = sys.stderr.isatty()
+    coloured = "NO_COLOR" not in os.environ
+    arrows = ARROWS if "utf" in (sys.stderr.encoding or "").lower() else ASCII_ARROWS
     while not service.stop.wait(0.25 if interactive else 1.0):
-        print(dashboard.screen() if interactive else dashboard.line(), file=sys.stderr, flush=True)
+        size = shutil.get_terminal_size()
+        if interactive:
+            text = dashboard.screen(size.columns, size.lines, coloured=coloured, arrows=arrows)
+        else:
+            text = dashboard.line()
+        print(text, file=sys.stderr, flush=True)
         if ends_s is not None and time.monotonic() >= ends_s:
             return True
     return False

@@ -11,6 +11,7 @@ from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import key_of
 from buddyline.tools.dashboard import Dashboard, summary_text
+from buddyline.tools.draw.above import ASCII_ARROWS
 
 from tests.tools.evaluated import pose, rejection, track
 from tests.tools.watched import START_NS, at
@@ -59,7 +60,7 @@ def test_the_line_shows_the_track_with_its_sigma_and_how_long_it_saw_no_light():
     assert "off   20.0 mm" in line
     assert "no light for 1.2 s" in line
     assert "track 100% of the time, poses 35% of triggers" in line
-    assert "no light for 1.2 s" in watch.dashboard.screen()
+    assert "no light for 1.2 s" in watch.dashboard.screen(100, 40)
 
 
 def test_a_stale_track_is_replaced_by_the_last_pose_with_a_note():
@@ -68,15 +69,57 @@ def test_a_stale_track_is_replaced_by_the_last_pose_with_a_note():
     line = watch.dashboard.line()
     assert "off   40.0 mm" in line
     assert "no track, the last pose, STALE: 2.0 s old" in line
-    assert "no track, the last pose" in watch.dashboard.screen()
+    assert "no track, the last pose" in watch.dashboard.screen(80, 24)
 
 
 def test_a_track_without_poses_is_shown():
     watch = Watch()
     assert "no pose yet" in watch.dashboard.line()
-    assert "no pose yet" in watch.dashboard.screen()
+    assert "no pose yet" in watch.dashboard.screen(80, 24)
     watch.take(track(0, **estimate(0)))
     assert "off   20.0 mm" in watch.dashboard.line()
+
+
+@pytest.mark.parametrize("size", [(60, 14), (80, 24), (200, 60)])
+def test_the_screen_fits_its_terminal(size):
+    watch = running()
+    text = watch.dashboard.screen(*size)
+    assert text.startswith("\x1b[H\x1b[2J")
+    lines = text.removeprefix("\x1b[H\x1b[2J").split("\n")
+    assert len(lines) <= size[1]
+    assert all(len(line) < size[0] for line in lines)
+    assert "from above; a row is" in text
+    assert "range" in text
+    assert "last without a pose: " in text
+    assert ("latency" in text) == (size[1] > 24)
+
+
+def test_colours_are_left_out_where_nobody_wants_them():
+    watch = running()
+    plain = watch.dashboard.screen(80, 24, arrows=ASCII_ARROWS)
+    assert plain.count("\x1b") == 2
+    assert all(character.isascii() or character == "±" for character in plain)
+    coloured = watch.dashboard.screen(80, 24, coloured=True)
+    assert "\x1b[36mA" in coloured
+    assert "\x1b[33mrange" in coloured, "no light for a while: not all is well"
+
+
+def test_triggers_with_all_lights_in_view_are_counted_apart():
+    watch = running()
+    in_view = [
+        k
+        for k in range(31)
+        if all(
+            sum(light.visible and not light.merged for light in WORLD.light_truth(node, at(k), k).lights) == 2
+            for node in "ab"
+        )
+    ]
+    assert 0 < len(in_view) <= 31
+    with_pose = sum(k % 3 == 0 for k in in_view)
+    watch.now_s = 1.0
+    summary = watch.dashboard.summary({})
+    assert summary["solved_share_in_view"] == pytest.approx(with_pose / len(in_view))
+    assert "of those with all four lights in view" in summary_text(summary)
 
 
 def test_the_summary_has_the_track_s_errors_beside_the_poses():
