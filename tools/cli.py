@@ -82,6 +82,11 @@ COMMANDS: Final = (
         ("install-service node --config pi.toml", "install-service hub --print"),
     ),
     Command(
+        "image",
+        "make a fresh card with Raspberry Pi OS into a node",
+        ("image /media/me/bootfs --config a.toml --source URL --ssh-key ~/.ssh/id_ed25519.pub --gateway 192.168.2.1",),
+    ),
+    Command(
         "doctor",
         "check all that a dive needs, and say what to do about each problem",
         ("doctor --config a.toml", "doctor", "doctor --config a.toml --json"),

@@ -102,7 +102,7 @@ class Waited:
         ([LOST, LOST, FOLLOWS], "", 2, True),
         ([ChronyError("chronyd does not run"), FOLLOWS], "", 1, True),
         ([LOST], "1\n", 0, True),
-        ([LOST], "0\n", 41, False),
+        ([LOST], "0\n", 26, False),
         ([None], "", 0, True),
     ],
 )
