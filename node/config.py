@@ -41,6 +41,7 @@ class CameraConfig(Config, frozen=True, kw_only=True):
     """[camera]: its name and fixed settings. path: pictures of the `stored` camera.
 
     exposure_us: fixes the exposure, with this gain; without it, exposure and gain follow [exposure].
+    focus_dioptres: of a camera that has a focus; 0.5, two metres, is sharp from one metre to infinity.
     colour: of the Pi's camera. Luminance alone is a third of the memory; in caverns and lakes it loses lights.
     """
 
@@ -50,6 +51,7 @@ class CameraConfig(Config, frozen=True, kw_only=True):
     height_px: Annotated[int, Meta(ge=1, le=65535)] = 616
     exposure_us: Annotated[int, Meta(ge=1)] | None = None
     gain: Positive = 2.0
+    focus_dioptres: Annotated[float, Meta(ge=0, le=32)] = 0.5
     colour: bool = True
     sync: Literal["off", "server", "client"] = "off"
 

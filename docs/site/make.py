@@ -21,7 +21,7 @@ REPOSITORY: Final = Path(__file__).resolve().parents[2]
 PAGES: Final = {
     "Learn": ["docs/tutorial.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "protocol/README.md"],
-    "Build and survey": ["node/README.md", "tools/survey/README.md"],
+    "Build and survey": ["docs/build/README.md", "node/README.md", "tools/survey/README.md"],
     "Reference": ["commands", "docs/glossary.md"],
     "How it works": ["docs/track.md", "docs/decisions.md"],
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],

@@ -37,7 +37,6 @@ log = logging.getLogger(__name__)
 
 BUFFERS: Final = 6
 COLOUR_GAINS: Final = (2.0, 1.7)  # white light near 5500 K; the brightness that counts hardly depends on it
-FOCUS_DIOPTRES: Final = 0.5  # two metres: sharp from one to infinity
 
 EXPOSED_SHARE: Final = 0.95
 """Longest exposure, as a share of a frame's duration."""
@@ -233,7 +232,7 @@ class Picamera2Camera:
             "NoiseReductionMode": 0,
             "Sharpness": 0.0,
             "AfMode": 0,
-            "LensPosition": FOCUS_DIOPTRES,
+            "LensPosition": config.focus_dioptres,
         }
         controls |= {name: value for name, value in wanted.items() if name in known}
         if config.sync != "off":

@@ -110,8 +110,9 @@ def test_camera_module_3_gets_a_fixed_focus(sensor):
     seen = []
     sensor.alter_metadata = lambda metadata: seen.append(metadata["Active"])
     frames(make(sensor), 1)
-    assert seen[0]["AfMode"] == 0
-    assert seen[0]["LensPosition"] > 0
+    frames(make(sensor, CameraConfig(focus_dioptres=5.0)), 1)
+    assert {active["AfMode"] for active in seen} == {0}
+    assert {active["LensPosition"] for active in seen} == {0.5, 5.0}
 
 
 def test_a_global_shutter_has_no_row_time(sensor):
