@@ -27,19 +27,29 @@ REFUSED_RETRY_S: Final = 5.0
 class HubConnection:
     """Runs in a thread of its own, while the node records anyway.
 
-    guide: takes the solver's expectations; None: they are not used. problem: why hub and node do not accept each other;
-    "" if they do, and while no hub answers.
+    guide: takes the solver's expectations; None: they are not used.
     """
 
     def __init__(
         self, config: NodeConfig, outlet: Outlet, clock: Clock, clock_sync: ClockSync, guide: Guide | None
     ) -> None:
-        self.problem = ""
+        self._refusal = ""
+        self._bus: Bus | None = None
         self._clock = clock
         self._config = config
         self._outlet = outlet
         self._clock_sync = clock_sync
         self._guide = guide
+
+    @property
+    def problem(self) -> str:
+        """Why hub and node do not accept each other, or what a slow link leaves out; "" if nothing."""
+        return self._refusal or (self._bus.link_problem() if self._bus is not None else "")
+
+    @property
+    def shed(self) -> dict[str, int]:
+        """How many messages of each topic a slow link has left out; the log has them."""
+        return self._bus.shed if self._bus is not None else {}
 
     def run(self, stop: threading.Event, on_failure: Callable[[BaseException], None]) -> None:
         """Connect, and stay connected until stop is set. on_failure: takes an error of the bus's own threads.
@@ -59,6 +69,7 @@ class HubConnection:
                 )
             bus.declare_alive(f"node/{config.node}")
             self._outlet.connect(bus)
+            self._bus = bus
             log.info("node %s: connected to %s", config.node, config.connect)
             if self._guide is not None:
                 # Without history: an old expectation says nothing of the next picture.
@@ -86,11 +97,11 @@ class HubConnection:
                     tls=config.tls,
                 )
             except (SecurityError, RefusedError) as error:
-                if self.problem != str(error):
+                if self._refusal != str(error):
                     log.error("node %s: not on the bus: %s; recording meanwhile", config.node, error)
-                self.problem = str(error)
+                self._refusal = str(error)
                 stop.wait(REFUSED_RETRY_S)
             else:
-                self.problem = ""
+                self._refusal = ""
                 return bus
         return None

@@ -339,6 +339,7 @@ class NodeService(Service):
             "picture": self.pictures.dropped,
             "picture_file": self.pictures.deleted,
             "repeated_trigger": self.pipeline.repeated,
+            **{f"link_{topic}": count for topic, count in self._hub.shed.items()},
         }
 
     def _free_bytes(self) -> int | None:

@@ -158,6 +158,15 @@ class Bus(ABC):
     def is_alive(self, name: str) -> bool:
         """Return whether another process on this bus has declared name."""
 
+    @property
+    def shed(self) -> dict[str, int]:
+        """How many messages of each topic a slow link has left out."""
+        return {}
+
+    def link_problem(self) -> str:
+        """Return what a slow link leaves out, for people; "" if nothing."""
+        return ""
+
     def close(self) -> None:
         """Close publishers and subscriptions and leave the bus; a second call does nothing."""
         with self._lock:

@@ -112,6 +112,12 @@ class SampleSequence(Generic[S]):
         self._pass(publisher, number, sample)
         return None
 
+    def accept_copy(self, source: PublisherId, number: int, sample: S) -> None:
+        """Deliver a copy that has come by another way, if it is the next; its original comes too."""
+        publisher = self._publishers.get(source.owner, {}).get(source)
+        if publisher is not None and not publisher.open and number == publisher.due:
+            self._pass(publisher, number, sample)
+
     def heartbeat(self, source: PublisherId, last: int, *, newest_only: bool = False) -> Gap | None:
         """Take a heartbeat, which has the publisher's last number so far; return the gap that it shows, if any.
 

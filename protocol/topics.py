@@ -26,6 +26,10 @@ class Topic:
     missed). express: sent at once, not in batches. stale_s: age from which it is stale (0: never). retained: the hub
     keeps the newest message of each key, also after its sender is gone. solved: a result of the solver, which `solve`
     computes again from a stored dive. max_bytes: of a payload; a larger one is not sent, and no hub passes it on.
+
+    On a slow link. shed: the order in which it does without the topic: 1 first, 4 last, 0 never. keep_hz: up to this
+    rate it is sent anyway. prompt: what waits goes together with these messages; they are also sent as datagrams,
+    because a connection that has lost a packet stands still for a second.
     """
 
     name: str
@@ -39,6 +43,9 @@ class Topic:
     retained: bool = False
     solved: bool = False
     max_bytes: int = 64 * 1024
+    shed: int = 0
+    keep_hz: float = 0.0
+    prompt: bool = False
 
     def key(self, *ids: str) -> str:
         """Return the Zenoh key, which is also the MCAP topic. ids: a node's, a pair's two, or a net's and a node's."""
@@ -79,6 +86,7 @@ CANDIDATES: Final = Topic(
     "interactive_high",
     express=True,
     stale_s=1.0,
+    prompt=True,
 )
 # Older than stale_s an expectation says nothing of where a light is now.
 EXPECT: Final = Topic(
@@ -92,12 +100,28 @@ EXPECT: Final = Topic(
     stale_s=0.5,
     solved=True,
 )
-IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0)
+IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0, shed=2)
 ATTITUDE: Final = Topic(
-    "attitude", "buddyline/node/{node}/attitude", messages.Attitude, 100.0, "data_high", express=True, stale_s=2.0
+    "attitude",
+    "buddyline/node/{node}/attitude",
+    messages.Attitude,
+    100.0,
+    "data_high",
+    express=True,
+    stale_s=2.0,
+    shed=3,
+    keep_hz=5.0,
 )
 DEPTH: Final = Topic(
-    "depth", "buddyline/node/{node}/depth", messages.Depth, 20.0, "data_high", express=True, stale_s=2.0
+    "depth",
+    "buddyline/node/{node}/depth",
+    messages.Depth,
+    20.0,
+    "data_high",
+    express=True,
+    stale_s=2.0,
+    shed=3,
+    keep_hz=2.0,
 )
 # A full picture of a stored dive, in base64; a live preview is a twentieth of it.
 IMAGE: Final = Topic(
@@ -108,9 +132,18 @@ IMAGE: Final = Topic(
     "background",
     stale_s=3.0,
     max_bytes=4 * 1024 * 1024,
+    shed=1,
 )
 NODE_STATUS: Final = Topic(
-    "node_status", "buddyline/node/{node}/status", messages.NodeStatus, 1.0, "data_low", latest_only=True, stale_s=3.0
+    "node_status",
+    "buddyline/node/{node}/status",
+    messages.NodeStatus,
+    1.0,
+    "data_low",
+    latest_only=True,
+    stale_s=3.0,
+    shed=4,
+    keep_hz=0.5,
 )
 CLOCK: Final = Topic(
     "clock", "buddyline/node/{node}/clock", messages.ClockBeacon, 4.0, "interactive_high", express=True

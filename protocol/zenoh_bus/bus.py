@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -23,15 +24,19 @@ from buddyline.protocol.bus import (
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
+from buddyline.protocol.link_budget import LinkBudget
 from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
-from buddyline.protocol.zenoh_bus.session import BulkLink, config_of, open_client
+from buddyline.protocol.zenoh_bus.link import Link
+from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
 from buddyline.protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
 from buddyline.protocol.zenoh_bus.watchdog import Watchdog
 
-HEARTBEAT_S: Final = 0.25
+HEARTBEAT_S: Final = 2.0
+# Marks a copy, whose original comes by the reliable connection.
+COPY: Final = b"copy"
 
 _PRIORITIES: Final = {
     "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
@@ -59,12 +64,15 @@ def connect(
     """
     config = config_of(client_settings(endpoint, namespace, tls))
     session = open_client(config, endpoint, tls, stop, on_wait)
-    return None if session is None else ZenohBus(session, config, clock or SystemClock(), cache_s)
+    datagrams = config_of(client_settings(endpoint, namespace, tls, datagrams=True))
+    return None if session is None else ZenohBus(session, config, datagrams, clock or SystemClock(), cache_s)
 
 
 class ZenohPublisher(Publisher):
     """A Publisher over Zenoh. declare: declares it in its session; returns None while the session is not open.
 
+    budget: decides what a slow link carries. hurry: is called after each message of a prompt topic, with what its copy
+    says of its source.
     answer_in: the session in which a plain `get` is answered with the last message; None: it is not answered here.
     """
 
@@ -74,9 +82,14 @@ class ZenohPublisher(Publisher):
         topic: Topic,
         key: str,
         cap: RateCap,
+        budget: LinkBudget,
+        hurry: Callable[[bytes, zenoh.SourceInfo], None],
         answer_in: zenoh.Session | None = None,
     ) -> None:
         super().__init__(topic, key, cap)
+        self._budget = budget
+        self._hurry = hurry
+        self._count = 0
         self._declare = declare
         self._last: bytes | None = None
         self._answers = None if answer_in is None else answer_in.declare_queryable(key, self._answer)
@@ -85,6 +98,8 @@ class ZenohPublisher(Publisher):
         self._publisher = declare()
 
     def _send(self, payload: bytes) -> bool:
+        if not self._budget.admits(self.topic, len(payload), time.monotonic()):
+            return False
         with self._lock:
             if self._closed:
                 return False
@@ -93,6 +108,9 @@ class ZenohPublisher(Publisher):
                 return False
             self._publisher.put(payload)
             self._last = payload
+            if self.topic.prompt:
+                self._hurry(payload, zenoh.SourceInfo(self._publisher.id, self._count))
+                self._count += 1
         return True
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -114,13 +132,18 @@ class ZenohPublisher(Publisher):
 class ZenohBus(Bus):
     """A Bus over Zenoh; get one from connect()."""
 
-    def __init__(self, session: zenoh.Session, config: zenoh.Config, clock: Clock, cache_s: float) -> None:
+    def __init__(
+        self, session: zenoh.Session, config: zenoh.Config, datagrams: zenoh.Config, clock: Clock, cache_s: float
+    ) -> None:
         super().__init__(clock)
         self._session = session
-        self._bulk = BulkLink(config)
+        self._bulk = SecondLink(config)
+        self._datagrams = SecondLink(datagrams)
         self._cache_s = cache_s
         self._tokens: list[zenoh.LivelinessToken] = []
-        self._watchdog = Watchdog(session)
+        self._budget = LinkBudget()
+        self._link = Link(session, self._budget)
+        self._watchdog = Watchdog(session, self._link)
         # A thread inside Zenoh at the interpreter's end aborts the process, so the bus closes before that.
         atexit.register(self.close)
 
@@ -148,9 +171,17 @@ class ZenohBus(Bus):
                 **settings,
             )
 
+        def hurry(payload: bytes, source: zenoh.SourceInfo) -> None:
+            self._link.flush()
+            if self._budget.bytes_per_s is not None and self._link.is_long:
+                self._datagrams.open()
+                if self._datagrams.session is not None:
+                    self._datagrams.session.put(key, payload, source_info=source, attachment=COPY, **settings)
+
         # What the hub retains is answered by the hub.
         answer_in = self._session if topic.latest_only and not topic.retained else None
-        wrapped = ZenohPublisher(declare, topic, key, RateCap(max_rate_hz, self.clock), answer_in)
+        cap = RateCap(max_rate_hz, self.clock)
+        wrapped = ZenohPublisher(declare, topic, key, cap, self._budget, hurry, answer_in)
         with self._lock:
             self._publishers.append(wrapped)
         return wrapped
@@ -202,9 +233,21 @@ class ZenohBus(Bus):
         keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         return any(not key.endswith(f"/{own}") for key in keys)
 
+    @property
+    def shed(self) -> dict[str, int]:
+        """How many messages of each topic a slow link has left out."""
+        return dict(self._budget.shed)
+
+    def link_problem(self) -> str:
+        """Return what the link leaves out, for people; "" if nothing."""
+        return self._budget.words(time.monotonic())
+
     def _leave(self) -> None:
         atexit.unregister(self.close)
+        self._link.stop()
         self._watchdog.stop()
         self._session.close()  # type: ignore[no-untyped-call]
         self._watchdog.join()
+        self._link.join()
         self._bulk.close()
+        self._datagrams.close()

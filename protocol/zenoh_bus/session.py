@@ -100,10 +100,10 @@ def _try_open(config: zenoh.Config, stop: threading.Event) -> zenoh.Session | No
     return opened[0] if opened else None
 
 
-class BulkLink:
-    """A session for large messages only, opened on demand.
+class SecondLink:
+    """A second session of a client, opened on demand: for large messages, or for datagrams.
 
-    In a shared connection, a large message delays all messages that are queued after it.
+    In a shared connection, a large message delays all messages that are queued after it, and so does a lost packet.
     """
 
     def __init__(self, config: zenoh.Config) -> None:
@@ -117,7 +117,7 @@ class BulkLink:
         """Start to connect, without waiting; `session` is set when the hub has answered."""
         with self._lock:
             if self._thread is None and not self._stop.is_set():
-                self._thread = threading.Thread(target=self._run, name="bus bulk", daemon=True)
+                self._thread = threading.Thread(target=self._run, name="bus second", daemon=True)
                 self._thread.start()
 
     def close(self) -> None:

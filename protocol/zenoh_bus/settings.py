@@ -11,14 +11,16 @@ from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import TOPICS
 
 # lease, ms: a link that is silent for this time counts as dead. open_timeout, ms: how long a client waits for a hub
-# that accepts the connection but does not answer; Zenoh's default is ten seconds.
+# that accepts the connection but does not answer; a slow link needs seconds for its five round trips. compression: for
+# slow links; both ends must have it.
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "scouting/delay": 0,
     "transport/link/tx/lease": 3000,
     "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES + 65536,
-    "transport/unicast/open_timeout": 2000,
+    "transport/unicast/open_timeout": 6000,
+    "transport/unicast/compression/enabled": True,
     "transport/shared_memory/enabled": False,
 }
 
@@ -27,7 +29,7 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
     """Return the Zenoh settings of the one process that listens; access: `protocol.access.access_rules`."""
     settings = {
         "mode": "router",
-        "listen/endpoints": [check_endpoint(endpoint, tls)],
+        "listen/endpoints": [check_endpoint(endpoint, tls), datagram_endpoint(endpoint)],
         "connect/endpoints": [],
         **_COMMON,
         **_tls_settings(tls, "listen"),
@@ -57,18 +59,30 @@ def size_limits() -> list[dict[str, object]]:
     ]
 
 
-def client_settings(endpoint: str, namespace: str | None, tls: Tls | None = None) -> dict[str, object]:
-    """Return the Zenoh settings of a client: it connects to endpoint, reconnects after a failure, and never listens."""
+def client_settings(
+    endpoint: str, namespace: str | None, tls: Tls | None = None, *, datagrams: bool = False
+) -> dict[str, object]:
+    """Return the Zenoh settings of a client: it connects to endpoint, reconnects after a failure, and never listens.
+
+    datagrams: for a session that only sends, and whose messages may be lost.
+    """
+    stated = check_endpoint(endpoint, tls)
     settings = {
         "mode": "client",
         "listen/endpoints": [],
-        "connect/endpoints": [check_endpoint(endpoint, tls)],
+        "connect/endpoints": [datagram_endpoint(stated) if datagrams else stated],
         "connect/timeout_ms": 0,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5},
         **_COMMON,
         **_tls_settings(tls, "connect"),
     }
     return settings if namespace is None else {**settings, "namespace": namespace}
+
+
+def datagram_endpoint(endpoint: str) -> str:
+    """Return where the hub takes datagrams: the same port of UDP, secured by the same certificates (QUIC) if TCP is."""
+    scheme, _, address = endpoint.partition("/")
+    return f"quic/{address}?rel=0" if scheme == "tls" else f"udp/{address}"
 
 
 def _tls_settings(tls: Tls | None, side: str) -> dict[str, object]:

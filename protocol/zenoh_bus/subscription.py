@@ -95,6 +95,9 @@ class ZenohSubscription:
             return
         source = _source(sample)
         with self._lock:
+            if sample.attachment is not None:
+                self._sequence.accept_copy(source, _number(sample), sample)
+                return
             gap = self._sequence.accept(
                 source,
                 _number(sample),

@@ -1,34 +1,37 @@
-"""Find a connection that receives nothing, and cut it, so that Zenoh connects again."""
+"""Find a hub that no longer answers on a connection that lives, and cut that, so that Zenoh connects again."""
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from typing import Final
 
 import zenoh
-from buddyline.protocol.connection import cut_connection
 from buddyline.protocol.delivery import CLOSE_S
 from buddyline.protocol.zenoh_bus.alive import ALIVE
+from buddyline.protocol.zenoh_bus.link import Link
 
 # Longer than the lease, after which a silent link and its queries end by themselves. The second probe is for a machine
-# that was too busy during the first.
+# that was too busy during the first. On a slow link an answer may take its time, but something is received: only after
+# SLOW_S does such a link count as one whose hub hears nothing.
 PROBE_S: Final = 4.0
 PROBE_AGAIN_S: Final = 1.0
 PROBE_EVERY_S: Final = 2.0
+SLOW_S: Final = 30.0
 
 log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """Cuts a connection that receives nothing, so that Zenoh makes a new one.
+    """Cuts a connection over which the hub does not answer, so that Zenoh makes a new one.
 
-    Zenoh (1.10) gives up a connection that takes too long to open. If this happens after it has started to send and
-    before it has started to receive, half a connection stays: the hub sees no fault, and this end never receives.
+    Half a connection whose bytes nobody reads at this end is found by `Link`; this finds the others.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, link: Link) -> None:
         self._session = session
+        self._link = link
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bus watchdog", daemon=True)
         self._thread.start()
@@ -42,7 +45,8 @@ class Watchdog:
         self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
-        answered = just_cut = False
+        just_cut = False
+        answered_s = time.monotonic()
         while not self._stop.wait(PROBE_EVERY_S):
             try:
                 # The new connection may also be a half one. One that was just made is probed for a shorter time.
@@ -50,10 +54,12 @@ class Watchdog:
                 deaf = self._times_out(patience_s) and self._times_out(PROBE_AGAIN_S)
             except zenoh.ZError:
                 continue
-            # A hub that has never answered a probe does not support it: its connection is not cut.
-            answered = answered or not deaf
-            if deaf and answered:
+            now_s = time.monotonic()
+            if not deaf:
+                answered_s = now_s
+            elif not self._link.heard_within(PROBE_S) or now_s - answered_s > SLOW_S:
                 self._cut(patience_s + PROBE_AGAIN_S)
+                answered_s = now_s
             just_cut = deaf and not just_cut
 
     def _times_out(self, timeout_s: float) -> bool:
@@ -65,7 +71,8 @@ class Watchdog:
         return any(reply.err is not None for reply in list(replies))
 
     def _cut(self, unheard_s: float) -> None:
-        for link in self._session.info.links():
-            host, _, port = str(link.src).partition("/")[2].rpartition(":")
-            if cut_connection(host.strip("[]"), int(port)):
-                log.warning("nothing was received from the hub for %g s: connecting again", unheard_s)
+        connection = self._link.connection()
+        if connection is not None:
+            with connection:
+                if connection.cut():
+                    log.warning("the hub has not answered for %g s: connecting again", unheard_s)

@@ -17,10 +17,11 @@ from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.messages import Mark
 from buddyline.protocol.security import Tls
 from buddyline.protocol.zenoh_bus import open_hub
+from buddyline.protocol.zenoh_bus.bus import COPY
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
-from tests.processes import PATIENCE_S, Process, buddyline
+from tests.processes import PATIENCE_S, Process, buddyline, until
 from tests.protocol.inbox import Inbox
 from tests.tools.identities import at, copy_of, join, joined, make_keys, tls, tls_endpoint
 
@@ -139,6 +140,28 @@ def test_a_gap_is_filled_from_the_cache_under_the_access_rules(keys: Path) -> No
 def raw(endpoint: str, identity: Tls) -> zenoh.Session:
     """A client that says what it likes, with a certificate of its own."""
     return zenoh.open(config_of(client_settings(endpoint, None, identity)))
+
+
+def test_datagrams_have_the_same_identities_and_rules(keys: Path) -> None:
+    """A put by datagram arrives on the sender's own key, and on no other's."""
+    endpoint, inbox = tls_endpoint(), Inbox()
+    with (
+        open_hub(endpoint, tls=tls(keys, "hub"), access=access_rules(["a", "b"])),
+        joined(endpoint, keys, "viewer") as (viewer,),
+        zenoh.open(config_of(client_settings(endpoint, None, tls(keys, "node-a"), datagrams=True))) as session,
+    ):
+        viewer.subscribe(topics.EVERYTHING, inbox)
+        links = session.info.links()
+        assert [str(link.reliability) for link in links] == ["Reliability.BEST_EFFORT"]
+        until(lambda: _said(session, inbox))
+    assert {received.key for received in inbox.received} == {"buddyline/node/a/candidates"}
+
+
+def _said(session: zenoh.Session, inbox: Inbox) -> bool:
+    # The denied message goes first. A datagram may be lost: so both are said again.
+    for node in ("b", "a"):
+        session.put(f"buddyline/node/{node}/candidates", b"{}", attachment=COPY)
+    return bool(inbox.received)
 
 
 def source_of(session: zenoh.Session, key_expr: str, happen: Callable[[], object]) -> zenoh.SourceInfo:

@@ -229,3 +229,18 @@ def test_of_a_state_the_newest_alone_is_fetched() -> None:
     assert listener.close(gap, [7]) is None
     assert listener.numbers() == [7]
     assert listener.sequence.missed == 0
+
+
+def test_a_copy_is_delivered_only_as_the_next_and_its_original_then_is_not() -> None:
+    listener = Listener()
+    copy = listener.sequence.accept_copy
+    copy(A, 0, ("a", 0))
+    assert listener.numbers() == []
+    listener.accept(A, 0)
+    copy(A, 1, ("a", 1))
+    copy(A, 3, ("a", 3))
+    assert listener.numbers() == [0, 1]
+    for number in (1, 2, 3):
+        assert listener.accept(A, number) is None
+    copy(A, 3, ("a", 3))
+    assert listener.numbers() == [0, 1, 2, 3]

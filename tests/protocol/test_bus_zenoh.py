@@ -17,7 +17,7 @@ import pytest
 import zenoh
 from buddyline.protocol import topics
 from buddyline.protocol.bus import Bus
-from buddyline.protocol.connection import cut_connection
+from buddyline.protocol.connection import Connection
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
 from buddyline.protocol.zenoh_bus import hub as hub_module
@@ -293,7 +293,7 @@ def test_a_connection_that_receives_nothing_is_cut_and_made_again(
         publisher.put_bytes(b"0")
         inbox.wait_for(1)
         hub.send_signal(signal.SIGSTOP)
-        until(lambda: "nothing was received" in caplog.text)
+        until(lambda: "has not answered" in caplog.text)
         publisher.put_bytes(b"1")
         hub.send_signal(signal.SIGCONT)
         publisher.put_bytes(b"2")
@@ -305,13 +305,14 @@ def test_only_the_given_connection_is_cut() -> None:
         address = server.getsockname()
         with socket.create_connection(address) as first, socket.create_connection(address) as second:
             ends = [server.accept()[0] for _ in range(2)]
-            assert cut_connection(*first.getsockname())
+            with Connection.find(*first.getsockname()) as found:
+                assert found.cut()
             assert ends[0].recv(1) == b""
             second.sendall(b"x")
             assert ends[1].recv(1) == b"x"
             for end in ends:
                 end.close()
-        assert not cut_connection("127.0.0.1", 1)
+        assert Connection.find("127.0.0.1", 1) is None
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/net/tcp"), reason="needs /proc")
@@ -329,7 +330,7 @@ def test_only_the_hub_listens_and_zenoh_prints_nothing() -> None:
         )
         return json.loads(done.stdout)
 
-    assert sockets("hub") == [[[["tcp", "0100007F", port]], 0]]
+    assert sockets("hub") == [[[["tcp", "0100007F", port], ["udp", "0100007F", port]], 0]]
     with open_hub(endpoint):
         # Previews, and nothing else, have a link of their own.
         assert sockets("client") == [[[], 1], [[], 2]]

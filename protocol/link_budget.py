@@ -1,0 +1,139 @@
+"""How much a slow link can carry, and what is left out on it. No bus and no clock: both are passed in."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from typing import Final
+
+from buddyline.protocol.connection import TcpState
+from buddyline.protocol.topics import Topic
+
+# A link is full if so many bytes, more than a packet, wait in each observation of this time.
+FULL_BYTES: Final = 2048
+FULL_S: Final = 0.3
+# It is then given less than was sent, not again before the link can have reacted, and more again while nothing waits.
+AGAIN_S: Final = 1.0
+LESS: Final = 0.8
+MORE_PER_S: Final = 0.03
+# JSON is compressed on the way, how much so is not known: so many bytes of messages are in one that was acknowledged.
+MOST_PER_ACKED: Final = 1.5
+LEAST_PER_ACKED: Final = 0.8
+LEAST_BYTES_PER_S: Final = 1000.0
+# A limit that has left nothing out for so long is lifted.
+LIFT_S: Final = 20.0
+OBSERVED_S: Final = 2.0
+# Of a message besides its payload: headers of Zenoh, TLS, TCP and IP, and the acknowledgement.
+OVERHEAD_BYTES: Final = 100
+# By Topic.shed: a message is left out where the budget of a second is used up to this share of it.
+_RESERVES: Final = (-1.0, 0.9, 0.6, 0.3, 0.1)
+WORDS_S: Final = 10.0
+
+
+class LinkBudget:
+    """Decides which messages a link carries. Without congestion that is all of them. Safe to use from several threads.
+
+    What may be left out, and in which order, is in the table of topics (`shed`, `keep_hz`). shed: number of messages
+    left out, by topic.
+    """
+
+    def __init__(self) -> None:
+        self.shed: Counter[str] = Counter()
+        self._lock = threading.Lock()
+        self._limit: float | None = None
+        self._tokens = 0.0
+        self._tokens_s = 0.0
+        self._offered = 0.0
+        self._kept_s: dict[str, float] = {}
+        self._seen: deque[tuple[float, float, TcpState]] = deque()
+        self._clear_s = self._reduced_s = self._shed_s = float("-inf")
+        self._counted_s = 0.0
+        self._sent: Counter[str] = Counter()
+        self._left_out: Counter[str] = Counter()
+        self._words = ""
+
+    @property
+    def bytes_per_s(self) -> float | None:
+        """What the link is given, payloads and headers; None: no limit is known."""
+        return self._limit
+
+    def admits(self, topic: Topic, size_bytes: int, now_s: float) -> bool:
+        """Return whether to send a message of a topic; if so, count it as sent. now_s: monotonic."""
+        cost = float(size_bytes + OVERHEAD_BYTES)
+        with self._lock:
+            if self._limit is not None:
+                self._refill(now_s, self._limit)
+                if topic.shed and not self._keeps(topic, now_s) and self._tokens - cost < self._reserve(topic):
+                    self.shed[topic.name] += 1
+                    self._left_out[topic.name] += 1
+                    self._shed_s = now_s
+                    return False
+                self._tokens = max(self._tokens - cost, -self._limit)
+            self._offered += cost
+            self._sent[topic.name] += 1
+            return True
+
+    def observe(self, state: TcpState, now_s: float) -> None:
+        """Take the state of the connection, ten times a second; a new connection begins with `forget`."""
+        with self._lock:
+            self._seen.append((now_s, self._offered, state))
+            while now_s - self._seen[0][0] > OBSERVED_S:
+                self._seen.popleft()
+            if state.waiting < FULL_BYTES:
+                self._clear_s = now_s
+            if now_s - self._clear_s > FULL_S:
+                self._reduce(now_s)
+            elif self._limit is not None and now_s - self._reduced_s > AGAIN_S and len(self._seen) > 1:
+                self._limit *= 1.0 + MORE_PER_S * (now_s - self._seen[-2][0])
+                if now_s - max(self._shed_s, self._reduced_s) > LIFT_S:
+                    self._limit = None
+
+    def forget(self, now_s: float) -> None:
+        """Begin anew with another connection; the limit stays."""
+        with self._lock:
+            self._seen.clear()
+            self._clear_s = now_s
+
+    def words(self, now_s: float) -> str:
+        """Return what the link leaves out, for people; "" if nothing."""
+        with self._lock:
+            if now_s - self._counted_s > WORDS_S:
+                parts = [
+                    f"{name} {100 * self._sent[name] // (self._sent[name] + left_out)} %"
+                    for name, left_out in sorted(self._left_out.items())
+                ]
+                rate = "" if self._limit is None else f" of about {self._limit / 1000:.0f} kB/s"
+                self._words = f"slow link{rate}: sent of {', '.join(parts)}; the log has all" if parts else ""
+                self._sent.clear()
+                self._left_out.clear()
+                self._counted_s = now_s
+            return self._words
+
+    def _refill(self, now_s: float, limit: float) -> None:
+        self._tokens = min(self._tokens + (now_s - self._tokens_s) * limit, limit)
+        self._tokens_s = now_s
+
+    def _keeps(self, topic: Topic, now_s: float) -> bool:
+        """Return whether a message is among those of its topic that are always sent."""
+        if not topic.keep_hz or now_s - self._kept_s.get(topic.name, float("-inf")) < 1.0 / topic.keep_hz:
+            return False
+        self._kept_s[topic.name] = now_s
+        return True
+
+    def _reserve(self, topic: Topic) -> float:
+        return _RESERVES[topic.shed] * (self._limit or 0.0)
+
+    def _reduce(self, now_s: float) -> None:
+        begin_s, offered, state = self._seen[0]
+        span_s = now_s - begin_s
+        if now_s - self._reduced_s < AGAIN_S + 2.0 * state.min_rtt_s or span_s <= FULL_S:
+            return
+        offered_rate = (self._offered - offered) / span_s
+        acked_rate = (self._seen[-1][2].acked - state.acked) / span_s
+        limit = max(min(LESS * offered_rate, MOST_PER_ACKED * acked_rate), LEAST_PER_ACKED * acked_rate)
+        if self._limit is not None:
+            limit = min(limit, self._limit)
+        else:
+            self._tokens, self._tokens_s = 0.0, now_s
+        self._limit = max(limit, LEAST_BYTES_PER_S)
+        self._reduced_s = now_s

@@ -1,0 +1,114 @@
+"""Observe the connection to the hub: whether it is full, and whether anybody reads what arrives."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Final
+
+import zenoh
+from buddyline.protocol.connection import Connection
+from buddyline.protocol.delivery import CLOSE_S
+from buddyline.protocol.link_budget import LinkBudget
+
+LOOK_S: Final = 0.1
+# The connection is looked for at most this often.
+FIND_S: Final = 0.5
+# What the kernel takes ahead of what is sent: so much may a less urgent message delay an urgent one.
+AHEAD_BYTES: Final = 4096
+# Bytes that nobody has read for this time: longer than a busy machine leaves a thread without its turn.
+UNREAD_S: Final = 3.0
+
+# With a longer round trip, small messages go together. Each packet may be lost, and then holds up all later ones for
+# more than a round trip: fewer packets are worth a wait that is short beside it.
+LONG_RTT_S: Final = 0.05
+# Zenoh's own thread hands a message to the kernel within this time.
+HANDED_OVER_S: Final = 0.005
+
+log = logging.getLogger(__name__)
+
+
+class Link:
+    """The TCP connection of a session, observed by a thread of its own. Outside Linux nothing is observed.
+
+    budget: takes the observations. is_long: whether the round trip is long. Zenoh (1.10) gives up a connection that
+    takes too long to open; if this happens after it has started to send and before it has started to receive, half a
+    connection stays, whose bytes nobody reads. It is cut, and Zenoh makes a new one.
+    """
+
+    def __init__(self, session: zenoh.Session, budget: LinkBudget) -> None:
+        self._session = session
+        self._budget = budget
+        self._stop = threading.Event()
+        self._flush = threading.Event()
+        self.is_long = False
+        self._heard_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="bus link", daemon=True)
+        self._thread.start()
+
+    def heard_within(self, seconds: float) -> bool:
+        """Return whether Zenoh has read anything from the hub in this time."""
+        return time.monotonic() - self._heard_s < seconds
+
+    def flush(self) -> None:
+        """Send at once what waits to be sent together."""
+        self._flush.set()
+
+    def stop(self) -> None:
+        """Look no more. Then close the session, and call join()."""
+        self._stop.set()
+
+    def join(self) -> None:
+        """Wait for the thread's end."""
+        self._thread.join(CLOSE_S)
+
+    def _run(self) -> None:
+        while not self._stop.wait(FIND_S):
+            try:
+                connection = self.connection()
+            except zenoh.ZError:
+                continue
+            if connection is not None:
+                with connection:
+                    self._follow(connection)
+
+    def connection(self) -> Connection | None:
+        """Return the session's connection with the hub; None if there is none now."""
+        for link in self._session.info.links():
+            host, _, port = str(link.src).partition("/")[2].rpartition(":")
+            found = Connection.find(host.strip("[]"), int(port)) if port.isdecimal() else None
+            if found is not None:
+                return found
+        return None
+
+    def _follow(self, connection: Connection) -> None:
+        connection.hold_back(AHEAD_BYTES)
+        self.is_long = False
+        self._budget.forget(time.monotonic())
+        read, changed_s = -1, time.monotonic()
+        look_s = 0.0
+        while not self._stop.is_set():
+            if self._flush.wait(LOOK_S) and not self._stop.wait(HANDED_OVER_S):
+                self._flush.clear()
+                if self.is_long:
+                    connection.cork()
+            now_s = time.monotonic()
+            if now_s < look_s:
+                continue
+            look_s = now_s + LOOK_S
+            state = connection.state()
+            if state is None:
+                return
+            if state.min_rtt_s > LONG_RTT_S and not self.is_long:
+                connection.bear_losses()
+            self.is_long = state.min_rtt_s > LONG_RTT_S
+            self._budget.observe(state, now_s)
+            if state.received - state.unread != read or not state.unread:
+                if state.received - state.unread != read:
+                    self._heard_s = now_s
+                read, changed_s = state.received - state.unread, now_s
+            elif now_s - changed_s > UNREAD_S:
+                log.warning("nobody reads what the hub sends for %.1f s: connecting again", now_s - changed_s)
+                connection.cut()
+                return
