@@ -87,13 +87,19 @@ def fit(samples: Sequence[Sample]) -> Floats:
     return weights
 
 
-def calibration_error(samples: Sequence[Sample], weights: Floats) -> float:
-    """Return the mean distance between score and share of lamps over bins of the score, weighted by their numbers."""
-    likely = np.concatenate([probability(sample.found, weights) for sample in samples]).astype(float)
-    lamp = np.concatenate([sample.lamp for sample in samples])
+def calibration_error(likely: Floats, lamp: NDArray[np.bool_]) -> float:
+    """Return the mean distance between score and share of lamps over bins of the score, weighted by their numbers.
+
+    likely: (N,), scores of candidates. lamp: (N,), whether each is a lamp.
+    """
     which = np.digitize(likely, BINS[1:-1])
     apart = [abs(float((likely[which == k] - lamp[which == k]).sum())) for k in range(len(BINS) - 1)]
     return sum(apart) / len(likely)
+
+
+def _calibration_error(samples: Sequence[Sample], weights: Floats) -> float:
+    likely = np.concatenate([probability(sample.found, weights) for sample in samples]).astype(float)
+    return calibration_error(likely, np.concatenate([sample.lamp for sample in samples]))
 
 
 def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[Sample]:
@@ -212,7 +218,7 @@ def described(
         f"# Mean distance of score and share of lamps, on pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}.",
         "[calibration_error]",
         *(
-            f"{name} = {calibration_error([one for one in held_out if one.source == name], weights):.3f}"
+            f"{name} = {_calibration_error([one for one in held_out if one.source == name], weights):.3f}"
             for name in sorted({one.source for one in held_out})
         ),
         "",

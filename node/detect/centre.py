@@ -45,26 +45,27 @@ _INFLATION: Final = 8.0
 # lean.
 _CORE_SHARE, _LEAN_SD = 0.3, 3.0
 
-# The terms of sigma, fitted to the errors on rendered pictures of many waters (this project's simulator, and dives
-# kept for tuning); those of the border by maximum likelihood. They are a little larger than those errors, because
-# other waters will differ. Larger terms for long and half-hidden cores would fit those errors better. But then the
-# solver takes the glow of a hidden lamp for a light that fits.
-_FLOOR_PX: Final = 0.045
-# Share of the core's radius: the rim of the clipped core is not a perfect circle.
-_RIM_SHARE: Final = 0.008
-_NOISE_SCALE: Final = 0.155
-_GROWTH_SCALE: Final = 0.45
+# The terms of sigma, fitted by maximum likelihood to the errors in rendered pictures: this project's simulator at the
+# scene's exposure and at the lamps', as it is, as JPEG, and through a Bayer mosaic; and the dives kept for tuning.
+_FLOOR_PX: Final = 0.004
+# Scale of the least squares' own sigma, where it is multiplied by the misfit of the model. The second is for lights
+# with a clipped core: the samples around it are far from the source.
+_MISFIT_SCALE, _MISFIT_SCALE_CLIPPED = 0.5, 0.9
+_GROWTH_SCALE: Final = 1.4
 # Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
 # core, whose estimate is less certain.
-_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.28, 0.7
-# Share of the core's radius, per unit of elongation above 1: a long core is partly hidden, or two lights merge in it.
-_ELONGATED_SHARE: Final = 0.15
+_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.12, 0.43
+# Px per unit of elongation above the first value: a long core is partly hidden, or two lights merge in it.
+_LONG_FROM, _LONG_PX = 1.2, 3.0
 # For a light that shows only its scattered glow.
 _SCATTERED_PX: Final = 2.0
 # For a light that the border cuts: px, and share of the core's radius. Both fall to 0 at _CUT_RADII core radii plus
 # _CUT_FROM_PX from the border.
 _CUT_PX, _CUT_SHARE = 0.33, 0.15
 _CUT_RADII, _CUT_FROM_PX = 1.2, 4.0
+# The middle of an outline that the border cuts is at least this share of its depth inside of the border, or the light
+# may be outside of the picture: then it may be anywhere within about this share of the depth.
+_OUTSIDE_FROM, _OUTSIDE_SHARE = 0.3, 0.5
 
 
 @dataclass(slots=True, eq=False)
@@ -82,19 +83,22 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) ->
     prior_px2 = (_CORE_SHARE * radius_px + 0.5) ** 2
     growth = _growth(radius_px * (FOCAL_PX / focal_px), lights.ground)
     equations = _Equations(image, lights, growth)
-    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px)
+    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px, lights.unclipped)
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px
     square = moved * moved
     moved_px2 = square[:, 0] + square[:, 1]
     holds = equations.solvable & (moved_px2 <= (radius_px + 3.0) ** 2)
     share = holds * (1.0 - lights.scattered)
-    own_px2 = _FLOOR_PX**2 + (_RIM_SHARE * radius_px) ** 2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
+    own_px2 = _FLOOR_PX**2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
     variance_px2 = np.where(holds, own_px2, prior_px2)
-    variance_px2 += (_ELONGATED_SHARE * radius_px * (lights.core_elongation - 1.0)) ** 2
+    variance_px2 += (_LONG_PX * np.maximum(lights.core_elongation - _LONG_FROM, 0.0)) ** 2
     centre_px = start_px + share[:, None] * moved
-    cut = np.maximum(1.0 - _to_border(centre_px, image) / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0)
+    inside_px = _to_border(centre_px, image)
+    cut = np.maximum(1.0 - inside_px / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0)
     variance_px2 += cut * _CUT_PX**2 + (_CUT_SHARE * cut * radius_px) ** 2
+    if lights.border_px.any():
+        variance_px2 += _outside_px(inside_px, *lights.border_px.T) ** 2
     in_doubt = share * (_MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped)
     variance_px2 += 0.5 * in_doubt * in_doubt * moved_px2
     return Centres(centre_px, np.sqrt(variance_px2), lean * holds[:, None])
@@ -104,6 +108,16 @@ def _to_border(centre_px: Floats, image: NDArray[np.uint8]) -> Floats:
     """Return the distance of places (N, 2) from the picture's nearest border, (N,), px; 0 outside."""
     far_px = np.array(image.shape[1::-1], np.float32) - np.float32(0.5)
     return np.asarray(np.maximum(np.minimum(centre_px + np.float32(0.5), far_px - centre_px).min(axis=1), 0.0))
+
+
+def _outside_px(inside_px: Floats, middle_px: Floats, depth_px: Floats) -> Floats:
+    """Return how far sources (N,) may be from where they were found, because they may be outside of the picture, px.
+
+    inside_px: (N,), from the border to where they were found. middle_px, depth_px: (N,), see Lights.border_px.
+    """
+    doubt = np.minimum(np.maximum(1.0 - middle_px / np.maximum(_OUTSIDE_FROM * depth_px, 1e-6), 0.0), 1.0)
+    away_px = np.maximum(inside_px - middle_px, 0.0)
+    return np.where(doubt * depth_px > 0.0, np.hypot(_OUTSIDE_SHARE * doubt * depth_px, away_px), 0.0)
 
 
 def _growth(radius_px: Floats, ground: Floats) -> Floats:
@@ -164,15 +178,19 @@ class _Equations:
         # For each sample: its weight, and its weight times y.
         self._weighted = np.empty((*seen.shape, 2, RAYS), np.float32)
         weight = self._weighted[:, :, 0]
-        np.divide(used * seen[:, :, None], noise * noise + _MODEL_NOISE**2, out=weight)
+        used *= seen[:, :, None]
+        self._samples = np.maximum(np.add.reduce(used, axis=(1, 2)), 1.0)
+        np.divide(used, noise * noise + _MODEL_NOISE**2, out=weight)
         np.multiply(weight, self._y, out=self._weighted[:, :, 1])
 
-    def solve(self, prior_px2: Floats, prior_px: Floats) -> tuple[Floats, Floats, Floats]:
+    def solve(self, prior_px2: Floats, prior_px: Floats, unclipped: Floats) -> tuple[Floats, Floats, Floats]:
         """Solve for the step to the source (N, 2), the lean (N, 2) and the step's variance (N,) per axis.
 
         The prior on the step has the mean prior_px (N, 2) and the variance prior_px2 (N,); the prior on the lean has
         the mean 0. The equations are solved twice: samples that the first solution does not explain (an obstacle,
-        another light) have less weight in the second. The variance contains the uncertainty of the growth.
+        another light) have less weight in the second. The variance is that of the least squares times the misfit, which
+        is the mean squared residual over the variance that was assumed: noise, JPEG and other lights show in it. The
+        uncertainty of the growth is added. unclipped: (N,), as in Lights.
         """
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2
@@ -187,12 +205,14 @@ class _Equations:
         residual = self._y - (expected.reshape(-1, 3) @ _PLANE).reshape(self._y.shape)
         robust = self._weighted[:, :, 0] * residual
         robust *= residual
+        misfit = np.add.reduce(robust, axis=(1, 2)) / self._samples
         robust *= 1.0 / _ROBUST_SD**2
         robust += 1.0
         self._weighted /= robust[:, :, None]
         x, _ = self._least_squares(rows, prior)
         apart = x[2, :, :2, 0] - x[1, :, :2, 0]
-        variance = _NOISE_SCALE**2 * (x[0, :, 0, 1] + x[0, :, 1, 2])
+        scale = _MISFIT_SCALE_CLIPPED + (_MISFIT_SCALE - _MISFIT_SCALE_CLIPPED) * unclipped
+        variance = scale * scale * misfit * (x[0, :, 0, 1] + x[0, :, 1, 2])
         variance += (0.5 * _GROWTH_SCALE) ** 2 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
         return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
 

@@ -9,6 +9,7 @@ from buddyline.node.detect.detection import CLIPPED
 from buddyline.node.detect.proposals import CLEAR, Proposals
 from buddyline.node.detect.rings import (
     MEAN,
+    RAY_UV,
     Floats,
     elongation,
     find_shapes,
@@ -30,6 +31,8 @@ VEIL: Final = 40.0
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 _GUESS, _GUESS_MOST = 0.5, 0.4
 _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
+_AT_BORDER_PX: Final = 1.0
+"""An outline that ends this near to the border is cut by it."""
 
 
 class Lights(NamedTuple):
@@ -39,6 +42,8 @@ class Lights(NamedTuple):
     In that channel: centre_px and core_px, centre and radius of the rim; guess_px, a first guess of the source;
     ground, the grey level of the water around it; core_elongation, long over short axis near the top.
     unclipped: 0 (clipped) to 1. scattered: 0 to 1, see _scattered; for such a light centre_px is where its glow begins.
+    border_px: (N, 2), of the outline at half height that the picture's border cuts: how far its middle is inside of the
+    border, and how deep it reaches into the picture; 0, 0 where the border cuts nothing.
     In luminance: peak; height, the peak above the ground; edge_px (N, K), distances along the rays from edge_at_px to
     the outline at half height; area_px and elongation of that outline; open_share, share of rays without an edge;
     roundest, the least elongation of the outlines at 0.5, 0.7 and 0.9 of the height (lower down, the bar that a lamp
@@ -54,6 +59,7 @@ class Lights(NamedTuple):
     core_elongation: Floats
     unclipped: Floats
     scattered: Floats
+    border_px: Floats
     peak: Floats
     height: Floats
     edge_px: Floats
@@ -89,12 +95,12 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
     height = peak - ground
     shapes = find_shapes(level, rings, ground[:, None] + _LEVELS[:, None] * height[:, None])
     circle = own_circle = shapes.circle_px[0]
-    own_edge, own_ground, weakest = shapes.edge_px[0, _CORE], ground[0], np.zeros(len(radius), bool)
+    own_edge, own_ground, weakest = shapes.edge_px[0, _CORE : _HALF + 1], ground[0], np.zeros(len(radius), bool)
     if colour:
         # The weakest channel clips last. The luminance is sharper, because JPEG halves the resolution of colour.
         weakest = shapes.circle_px[1, 0, :, 2] + shapes.circle_px[1, 1, :, 2] >= 2.0 * _WEAKEST_FROM_PX
         own_circle = np.where(weakest[:, None], shapes.circle_px[1], circle)
-        own_edge = np.where(weakest[:, None], shapes.edge_px[1, _CORE], own_edge)
+        own_edge = np.where(weakest[:, None], shapes.edge_px[1, _CORE : _HALF + 1], own_edge)
         own_ground = np.where(weakest, ground[1], own_ground)
     rim_px, core_px = _rims(own_circle)
     unclipped = np.minimum(np.maximum((_UNCLIPPED - peak[0]) / _UNCLIPPED_OVER, 0.0), 1.0)
@@ -103,9 +109,10 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
         rim_px += scattered[:, None] * (_where_glow_begins(circle) - rim_px)
     step_px = _at_most(_GUESS * (own_circle[0, :, :2] - own_circle[_HALF, :, :2]), _GUESS_MOST * core_px)
     edge = shapes.edge_px[0, _HALF]
+    border_px = np.zeros((len(radius), 2)) if rings.inside is None else _at_border(centre, own_edge[1], image.shape)
     radius_px = circle[_HALF, :, 2]
     core_elongation, half_elongation, *higher = elongation(
-        np.concatenate([own_edge, edge, *shapes.edge_px[0, :_HALF]]),
+        np.concatenate([own_edge[0], edge, *shapes.edge_px[0, :_HALF]]),
         np.concatenate([own_circle[_CORE], circle[_HALF], *circle[:_HALF]]),
     ).reshape(2 + _HALF, -1)
     return Lights(
@@ -117,6 +124,7 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
         core_elongation,
         unclipped,
         scattered,
+        border_px,
         peak[0],
         height[0],
         edge,
@@ -187,6 +195,25 @@ def _where_glow_begins(circle_px: Floats) -> Floats:
     """
     top, low = circle_px[0, :, :2], circle_px[-1, :, :2]
     return top + _at_most(_GLOW_BACK * (top - low), _GLOW_BACK_MOST * circle_px[_HALF, :, 2])
+
+
+def _at_border(centre_px: Floats, edge_px: Floats, shape: tuple[int, ...]) -> Floats:
+    """Return where the border cuts outlines, (N, 2), as in Lights. centre_px: (N, 2); edge_px: (N, K); shape: (H, W).
+
+    The border cuts a chord of half length h out of a circle that reaches D deep into the picture. So the circle's
+    middle is (D^2 - h^2) / (2 D) inside of the border. For a light outside of the picture this is small or negative.
+    """
+    at_px = centre_px[:, None] + edge_px[:, :, None] * RAY_UV
+    far_px = np.array(shape[1::-1]) - 0.5
+    inside_px = np.concatenate([at_px + 0.5, far_px - at_px], axis=2)  # of the left, upper, right and lower border
+    lights = np.arange(len(at_px))
+    border = inside_px.min(axis=1).argmin(axis=1)
+    inside_px, along_px = inside_px[lights, :, border], at_px[lights, :, 1 - border % 2]
+    cut = inside_px < _AT_BORDER_PX
+    chord_px = np.where(cut, along_px, -np.inf).max(axis=1) - np.where(cut, along_px, np.inf).min(axis=1)
+    depth_px = np.maximum(inside_px.max(axis=1), 0.5)
+    found = np.stack([(depth_px * depth_px - 0.25 * chord_px * chord_px) / (2.0 * depth_px), depth_px], axis=1)
+    return np.where(cut.any(axis=1, keepdims=True), found, 0.0)
 
 
 def _at_most(step_px: Floats, length_px: Floats) -> Floats:

@@ -161,3 +161,12 @@ def test_real_leds_are_found_and_real_caustics_are_unlikely():
         sum(d.blob.score > 0.5 for d in make_detector().detect(cv2.resize(tile, None, fx=3, fy=3))) for tile in tiles
     ]
     assert float(np.mean(false)) <= 0.5
+
+
+@pytest.mark.parametrize("at", [(-4.0, 150.0), (413.0, 150.0), (200.0, -4.0), (200.0, 311.0)])
+def test_the_glow_of_a_lamp_outside_of_the_picture_says_so_in_its_sigma(at):
+    image = lamp_picture([at], core=3000.0, core_px=3.0, glow=3000.0)
+    blob = nearest(make_detector().detect(image), *at)
+    assert np.hypot(blob.u_px - at[0], blob.v_px - at[1]) < 2.5 * blob.sigma_px
+    inside = lamp_picture([(20.0, 150.0)], core=3000.0, core_px=3.0, glow=3000.0)
+    assert nearest(make_detector().detect(inside), 20.0, 150.0).sigma_px < 0.2 * blob.sigma_px

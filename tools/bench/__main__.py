@@ -18,6 +18,7 @@ BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
     "accuracy": "the solver: errors over the Cramer-Rao bound, and the right lights among false ones",
     "detect": "the detector: time per picture beside other finders, memory",
+    "lights": "the detector: lights found in rendered pictures, and the truth of sigma and score",
     "monitor": "the monitor: processor and memory with viewers, latency beside it, weight of the page",
     "node": "a whole node: capture to candidates published, processor, memory",
 }

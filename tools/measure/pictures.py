@@ -29,7 +29,7 @@ def stored_pictures(path: Path | str) -> Iterator[NDArray[np.uint8]]:
                 yield decode_picture(envelope.message.data, f"{path}: picture at {envelope.message.stamp_ns}")
 
 
-def simulated_world(environment: str, seed: int, width_px: int = 0, height_px: int = 0) -> World:
+def simulated_world(environment: str, seed: int, width_px: int = 0, height_px: int = 0, other_lamps: int = 1) -> World:
     """Return a simulated world (size 0: the simulator's own); raise BuddylineError for an unknown environment."""
     from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
     from buddyline.node.sim.world import World
@@ -37,7 +37,7 @@ def simulated_world(environment: str, seed: int, width_px: int = 0, height_px: i
     if environment not in ENVIRONMENTS:
         raise BuddylineError(f"{environment}: is neither a dive (.mcap) nor one of {', '.join(ENVIRONMENTS)}")
     size = {"width_px": width_px, "height_px": height_px} if width_px else {}
-    return World(Scenario(environment=environment, seed=seed, **size))  # type: ignore[arg-type]
+    return World(Scenario(environment=environment, seed=seed, other_lamps=other_lamps, **size))  # type: ignore[arg-type]
 
 
 def views(world: World, count: int, step_s: float) -> Iterator[tuple[str, int]]:
