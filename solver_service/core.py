@@ -12,10 +12,21 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS, trigger_index
-from buddyline.protocol.messages import Attitude, Candidates, Depth, Imu, Message, NodeInfo, RelativePose, SolverStatus
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    Imu,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+    SolverStatus,
+)
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
+from buddyline.solver_service.networking import NetTracker
 from buddyline.solver_service.pair_core import PairCore, PairId
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
@@ -37,9 +48,9 @@ class SolverCore:
 
     chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
-    estimate the clock offset of each pair. track: the tracks to make; None for no track. unused: number of messages of
-    each node that is in no pair. Work on several pairs, such as a network of all nodes, belongs here, after the pairs
-    have settled.
+    estimate the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of
+    the network beside those of the chosen pairs. network: follows all nodes in one frame; None for no track. unused:
+    number of messages of each node that is not used.
     """
 
     def __init__(
@@ -50,6 +61,7 @@ class SolverCore:
         *,
         align: bool = False,
         track: TrackSettings | None = None,
+        lone: Iterable[str] = (),
     ) -> None:
         self.settings = settings
         self.streams: dict[str, NodeStream] = {}
@@ -61,8 +73,12 @@ class SolverCore:
         self._align = align
         self._track = track
         self._pairs_of: dict[str, list[PairCore]] = {}
+        self._single: set[str] = set()
         self._now_ns = 0
         self._set_back_ns = 0
+        self.network = NetTracker(self.streams, track) if track is not None else None
+        for node in lone:
+            self.streams.setdefault(node, NodeStream(node))
         for pair in chosen or ():
             if pair[0] == pair[1]:
                 raise ValueError(f"the two nodes have the same id, {pair[0]!r}")
@@ -92,7 +108,7 @@ class SolverCore:
 
         receive_ns: receive time; None when read from a log.
         """
-        return _settled(self._take(message, self._steady(receive_ns), receive_ns))
+        return self._settled(self._take(message, self._steady(receive_ns), receive_ns))
 
     def handle_many(self, messages: Iterable[Message], receive_ns: int | None = None) -> list[Message]:
         """Take several messages, as if one by one; their matched triggers are solved together."""
@@ -101,14 +117,14 @@ class SolverCore:
         for message in messages:
             for pair in self._take(message, now_ns, receive_ns):
                 touched[pair.nodes] = pair
-        return _settled(touched.values())
+        return self._settled(touched.values())
 
     def advance(self, receive_ns: int) -> list[Message]:
         """Advance the receive time; return the outcomes whose waiting time is over."""
         now_ns = self._steady(receive_ns)
         for pair in self.pairs.values():
             pair.resolve(now_ns)
-        return _settled(self.pairs.values())
+        return self._settled(self.pairs.values())
 
     def flush(self) -> list[Message]:
         """Resolve all pending triggers with the data at hand, at the end of the dive."""
@@ -116,17 +132,30 @@ class SolverCore:
 
     def finish(self) -> Iterator[Message]:
         """Yield what `flush` returns, as it is made: a whole dive's track takes much memory."""
+        last: list[Message] = []
         for pair in self.pairs.values():
-            yield from pair.finish()
+            for message in pair.finish():
+                if isinstance(message, RelativePose | Rejected):
+                    last.append(message)
+                yield message
+        if self.network is not None:
+            yield from self.network.take(last)
+            yield from self.network.finish()
 
     def report(self, stamp_ns: int, receive_ns: int, bad_messages: int, problems: list[str]) -> list[SolverStatus]:
         """Return each pair's status. bad_messages: number of refused messages. problems: added to each pair's own."""
         now_ns = self._steady(receive_ns) or 0
+        problems = problems + (self.network.problems if self.network is not None else [])
         unused = sorted(self.unused)
         return [
             pair.report(stamp_ns, now_ns, self.health.problems(pair.nodes, now_ns) + problems, bad_messages, unused)
             for pair in self.pairs.values()
         ]
+
+    @property
+    def net_poses(self) -> list[tuple[str, str]]:
+        """The net and the node of each NodePose that may come."""
+        return [(self.network.net, node) for node in self.network.nodes] if self.network is not None else []
 
     def pairs_of(self, node: str) -> list[PairId]:
         """Return the pairs that a node is in."""
@@ -137,6 +166,10 @@ class SolverCore:
         for message in messages:
             if isinstance(message, RelativePose) and 0 <= now_ns - message.stamp_ns < LIVE_WITHIN_NS:
                 self.pairs[message.node_a, message.node_b].latencies_s.append((now_ns - message.stamp_ns) / S_NS)
+
+    def _settled(self, pairs: Iterable[PairCore]) -> list[Message]:
+        messages = [message for pair in pairs for message in pair.settle()]
+        return messages + (self.network.take(messages) if self.network is not None else [])
 
     def _steady(self, receive_ns: int | None) -> int | None:
         """Return the receive time on a clock that never goes back, so that a clock set back prolongs no waiting."""
@@ -155,7 +188,11 @@ class SolverCore:
         stream = self._stream(message.node)
         if stream is None:
             return ()
-        if isinstance(message, NodeInfo | Candidates) and stream.node not in self._pairs_of:
+        if isinstance(message, NodeInfo) and not (message.has_camera and message.has_lights):
+            # Two nodes form a pair that see each other.
+            self._single.add(stream.node)
+        formed = self._chosen is not None or stream.node in self._pairs_of or stream.node in self._single
+        if isinstance(message, NodeInfo | Candidates) and not formed:
             self._form_pairs(stream, now_ns)
         message = self._on_common_clock(message, stream)
         if isinstance(message, NodeInfo):
@@ -165,9 +202,11 @@ class SolverCore:
             live = receive_ns is not None and abs(receive_ns - message.stamp_ns) < LIVE_WITHIN_NS
             others_ns = [s.newest_ns for s in self.streams.values() if s is not stream and s.newest_ns is not None]
             arrival = stream.add_frame(message, others_ns, now_ns)
+            if arrival is Arrival.CLOCK_SET and self.network is not None:
+                self.network.forget()
             if now_ns is not None:
                 self.health.saw_frame(stream.node, message.stamp_ns, now_ns)
-            for pair in self._pairs_of[stream.node]:
+            for pair in self._pairs_of.get(stream.node, ()):
                 pair.take(message, arrival, now_ns, live=live)
         else:
             stream.add_sample(message)
@@ -217,7 +256,3 @@ class SolverCore:
         calibration = stream.calibration(stamp_ns)
         trigger = trigger_index(stamp_ns, calibration[0].trigger_period_ns) if calibration else message.trigger
         return replace(message, stamp_ns=stamp_ns, trigger=trigger)
-
-
-def _settled(pairs: Iterable[PairCore]) -> list[Message]:
-    return [message for pair in pairs for message in pair.settle()]

@@ -14,7 +14,7 @@ from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, POSE, REJECTED, Topic, key_of
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, NET_POSE, POSE, REJECTED, Topic, key_of
 from buddyline.solver_service.answered import Answered, Outcome
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
@@ -90,7 +90,9 @@ class SolverService(Service):
     def tick(self, status_due: bool) -> None:
         """Resolve triggers whose time has come; report where a status is due, or a node has started or ended."""
         with self._lock:
-            self._publish(self.core.advance(self.clock.now_ns()))
+            results = self.core.advance(self.clock.now_ns())
+            self._declare()
+            self._publish(results)
         if self._news or status_due:
             self.report()
 
@@ -161,6 +163,9 @@ class SolverService(Service):
         """Declare the publishers of new pairs, so that subscribers find them before the first message."""
         if self._bus is None:
             return
+        for of_net in self.core.net_poses:
+            if NET_POSE.key(*of_net) not in self._publishers:
+                self._publishers[NET_POSE.key(*of_net)] = self._bus.publisher(NET_POSE, *of_net)
         for pair in self.core.pairs.keys() - self._declared:
             log.info("solver: pair %s, %s", *pair)
             self._declared.add(pair)

@@ -145,19 +145,19 @@ class PairTracker:
             return []
         infos = known[0][0], known[1][0]
         messages: list[Message] = []
-        if self._infos is not None and not all(map(_same_rig, infos, self._infos)):
+        if self._infos is not None and not all(map(same_rig, infos, self._infos)):
             # The track of the old rigs ends here.
             messages = list(self._end(self._settled_ns))
             self.forget()
         if self._infos is None:
-            self._infos, self._nodes = infos, (_node_of(*known[0]), _node_of(*known[1]))
+            self._infos, self._nodes = infos, (track_node_of(*known[0]), track_node_of(*known[1]))
             self._make_filter(self._nodes)
         if self._first_ns is None:
             # However many outcomes come at once, the track begins with the first of them.
             self._first_ns = self._told_ns = min(stamps_ns)
             self._taken_ns = self._first_ns - S_NS
         self._settled_ns = max(self._settled_ns, *stamps_ns)
-        fixes = [_fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
+        fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if self._filter is not None:
             for fix in fixes:
                 self._filter.add_fix(fix)
@@ -266,7 +266,7 @@ class PairTracker:
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
         return NodeRecord(
             node=self._nodes[node],
-            frames=[_frame_of(frame) for frame in map(view_of, stream.frames.between(start_ns, end_ns))],
+            frames=[frame_of(frame) for frame in map(view_of, stream.frames.between(start_ns, end_ns))],
             imu_stamps_ns=stamps_ns,
             accel_mps2=values[:, :3],
             gyro_radps=values[:, 3:],
@@ -330,7 +330,8 @@ def _expected_light(seen: ForeseenLight) -> ExpectedLight:
     )
 
 
-def _node_of(info: NodeInfo, rig: Rig) -> TrackNode:
+def track_node_of(info: NodeInfo, rig: Rig) -> TrackNode:
+    """Return a node's constants as the track and the network take them."""
     return TrackNode(
         name=info.node,
         rig=rig,
@@ -339,17 +340,19 @@ def _node_of(info: NodeInfo, rig: Rig) -> TrackNode:
     )
 
 
-def _same_rig(info: NodeInfo, other: NodeInfo) -> bool:
+def same_rig(info: NodeInfo, other: NodeInfo) -> bool:
     """Whether two calibrations are one, whenever each was stated."""
     return info is other or info == replace(other, stamp_ns=info.stamp_ns)
 
 
-def _frame_of(view: View) -> FrameSeen:
+def frame_of(view: View) -> FrameSeen:
+    """Return a frame as the track and the network take it."""
     dt_ns = np.rint(view.dt_s * S_NS).astype(np.int64)
     return FrameSeen(view.stamp_ns, view.pixels, view.sigma_px, dt_ns, view.elsewhere)
 
 
-def _fix_of(pose: RelativePose) -> FixSeen:
+def fix_of(pose: RelativePose) -> FixSeen:
+    """Return a pose as the track and the network take it."""
     return FixSeen(
         stamp_ns=pose.stamp_ns,
         t_a_b_m=np.array(pose.t_a_b_m),

@@ -18,11 +18,11 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, Track
+from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, NodePose, Track
 from buddyline.protocol.topics import TRACK, check_node_id
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.pair_core import PairCore, PairId
+from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
@@ -48,11 +48,12 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
         core = SolverCore(
             settings,
-            list(combinations(nodes, 2)),
+            [pair for pair in combinations(nodes, 2) if all(_is_full(infos[node]) for node in pair)],
             chosen_curves(dive, nodes, args.clock_offset, args.clocks),
             track=track_settings(args.track, args.track_hz),
+            lone=[] if args.nodes else [node for node, info in infos.items() if not info.has_camera],
         )
-        began_s, tracks = time.monotonic(), defaultdict[PairId, Tracked](Tracked)
+        began_s, tracks = time.monotonic(), defaultdict[tuple[str, ...], Tracked](Tracked)
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
@@ -72,6 +73,10 @@ def run(args: argparse.Namespace) -> int:
     elif not core.matched:
         log.error("nodes %s have no trigger in common: are the logs of the same dive?", " and ".join(nodes))
     return 0 if core.matched else 1
+
+
+def _is_full(info: NodeInfo) -> bool:
+    return info.has_camera and info.has_lights
 
 
 def _is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:
@@ -162,7 +167,7 @@ class Tracked:
     last_ns: int = 0
     longest_gap_s: float = 0.0
 
-    def take(self, track: Track) -> None:
+    def take(self, track: Track | NodePose) -> None:
         """Count a row."""
         self.first_ns = self.first_ns if self.rows else track.stamp_ns
         self.last_ns = max(self.last_ns, track.stamp_ns)
@@ -175,18 +180,26 @@ class Tracked:
         return (self.last_ns - self.first_ns) / S_NS
 
 
-def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[PairId, Tracked]) -> None:
-    """Write outcomes and track; a track of any mode goes to the topic `track`."""
+def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[tuple[str, ...], Tracked]) -> None:
+    """Write outcomes, track and network; a track of any mode goes to the topic `track`.
+
+    tracks: by pair; by "net", the net and the node of what the network tells.
+    """
     for result in results:
         if isinstance(result, Track):
             tracks[result.node_a, result.node_b].take(result)
+        elif isinstance(result, NodePose):
+            tracks["net", result.net, result.node].take(result)
         key = TRACK.key(result.node_a, result.node_b) if isinstance(result, Track) else None
         writer.write_message(result, key=key)
 
 
 def _summarize(
-    args: argparse.Namespace, core: SolverCore, tracks: Mapping[PairId, Tracked], bad: int, took_s: float
+    args: argparse.Namespace, core: SolverCore, tracks: Mapping[tuple[str, ...], Tracked], bad: int, took_s: float
 ) -> None:
+    for problem in core.network.problems if core.network is not None else ():
+        log.warning("network: %s", problem)
+    told = {ids[1:]: of for ids, of in sorted(tracks.items()) if len(ids) == 3}
     for pair in core.pairs.values():
         for problem in pair.tracker.problems if pair.tracker is not None else ():
             log.warning("track of %s and %s: %s", *pair.nodes, problem)
@@ -204,7 +217,17 @@ def _summarize(
             for pair in core.pairs.values()
         ]
         totals = pairs[0] if len(pairs) == 1 else _totals(core)
-        run = {"pairs": pairs, "bad_messages": bad, "seconds": took_s, "output": str(Path(args.output))}
+        nodes = [
+            {"net": net, "node": node, "rows": of.rows, "span_s": of.span_s, "longest_gap_s": of.longest_gap_s}
+            for (net, node), of in told.items()
+        ]
+        run = {
+            "pairs": pairs,
+            "network": nodes,
+            "bad_messages": bad,
+            "seconds": took_s,
+            "output": str(Path(args.output)),
+        }
         print(json.dumps(totals | run))
         return
     for pair in core.pairs.values():
@@ -214,6 +237,8 @@ def _summarize(
             print(f"  {count:6d} {reason}")
         if pair.tracker is not None:
             print(_track_text(args.track, pair, tracks))
+    for (net, node), of in told.items():
+        print(f"  node {node} in the net {net}: {of.rows} rows, longest time without a light {of.longest_gap_s:.1f} s")
     if bad:
         print(f"  {bad:6d} messages that could not be used")
     print(f"  {took_s:.1f} s, {core.counts.total() / max(took_s, 1e-9):.0f} triggers/s")
@@ -233,7 +258,7 @@ def _rejected(counts: Counter[str]) -> dict[str, int]:
     return {reason: count for reason, count in sorted(counts.items()) if reason != "solved"}
 
 
-def _track_figures(pair: PairCore, tracks: Mapping[PairId, Tracked]) -> dict[str, object] | None:
+def _track_figures(pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) -> dict[str, object] | None:
     """Return the track's figures, None where none was asked for."""
     if pair.tracker is None:
         return None
@@ -248,7 +273,7 @@ def _track_figures(pair: PairCore, tracks: Mapping[PairId, Tracked]) -> dict[str
     }
 
 
-def _track_text(mode: str, pair: PairCore, tracks: Mapping[PairId, Tracked]) -> str:
+def _track_text(mode: str, pair: PairCore, tracks: Mapping[tuple[str, ...], Tracked]) -> str:
     told = tracks.get(pair.nodes, Tracked())
     if pair.tracker is None or not told.rows:
         return f"  no track ({mode}): it starts from a pose, or from lights and both attitudes"

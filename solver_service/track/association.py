@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
@@ -21,6 +21,9 @@ MAX_OPTIONS: Final = 10
 # The residual of a light behind the camera.
 NOWHERE_PX: Final = 1e8
 _LOG_SHARES: Final = np.log((1.0 - GROSS_SHARE, GROSS_SHARE))
+
+Case: TypeAlias = tuple[tuple[int, int] | None, tuple[int, int] | None]
+"""For both lights the candidate and whether it is off by a gross error, None where the light is missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,33 +43,10 @@ class Association:
 def associate(
     y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
 ) -> Association:
-    """Weigh every assignment of candidates (K) to two lights, each of which may be missing.
-
-    y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
-    detection (2,): how likely each light is to be among the candidates.
-    """
-    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]] = ([], [])
-    if len(y):
-        y = np.where(np.isfinite(y), y, NOWHERE_PX)
-        _weigh_single(options, y, H, P, sigma_px, detection, math.log(clutter_per_px2))
-    misses = [math.log(max(1.0 - detection[light], 1e-6)) for light in range(2)]
-
-    # Each case: for both lights the candidate and whether it is off by a gross error, None where the light is missing.
-    cases: list[tuple[tuple[int, int] | None, tuple[int, int] | None]] = [(None, None)]
-    logs = [misses[0] + misses[1]]
-    for log_l, k, mode in options[0]:
-        cases.append(((k, mode), None))
-        logs.append(log_l + misses[1])
-    for log_l, k, mode in options[1]:
-        cases.append((None, (k, mode)))
-        logs.append(log_l + misses[0])
-    pairs = [(one[1:], two[1:]) for one in options[0] for two in options[1] if one[1] != two[1]]
-    if pairs:
-        cases += pairs
-        logs += _weigh_pairs(np.array(pairs), y, H, P, sigma_px, detection, math.log(clutter_per_px2))
-    logs_array = np.array(logs)
-    top = float(logs_array.max())
-    weights = np.exp(logs_array - top)
+    """Weigh every assignment of candidates (K) to two lights, each of which may be missing; arguments as of `weigh`."""
+    cases, logs = weigh(y, H, P, sigma_px, detection, clutter_per_px2)
+    top = float(logs.max())
+    weights = np.exp(logs - top)
     total = float(weights.sum())
     weights /= total
     marginal: dict[tuple[int, int], list[float]] = {}
@@ -79,10 +59,44 @@ def associate(
     chosen: list[tuple[int, int, float]] = []
     for (k, light), (common, gross) in sorted(marginal.items()):
         if common + gross > SURE:
-            doubt = gross / (common + gross)
-            added_px2 = doubt * GROSS_PX**2 if doubt > 1.0 - SURE else 0.0
-            chosen.append((k, light, float(sigma_px[k]) ** 2 + added_px2))
+            chosen.append((k, light, variance_of(float(sigma_px[k]), common, gross)))
     return Association(tuple(chosen), seen, top + math.log(total))
+
+
+def variance_of(sigma_px: float, common: float, gross: float) -> float:
+    """Give a light's variance, px^2: the mixture's where a gross error cannot be told from a common one."""
+    doubt = gross / (common + gross)
+    added_px2 = doubt * GROSS_PX**2 if doubt > 1.0 - SURE else 0.0
+    return sigma_px**2 + added_px2
+
+
+def weigh(
+    y: Floats, H: Floats, P: Floats, sigma_px: Floats, detection: Floats, clutter_per_px2: float
+) -> tuple[list[Case], Floats]:
+    """Give every assignment of candidates (K) to two lights, each of which may be missing, and the logs of their odds.
+
+    y (K, 2, 2), H (K, 2, 2, C): residuals and Jacobians, by candidate and light; P (C, C): covariance of the errors.
+    detection (2,): how likely each light is to be among the candidates. The odds are against clutter alone.
+    """
+    options: tuple[list[tuple[float, int, int]], list[tuple[float, int, int]]] = ([], [])
+    if len(y):
+        y = np.where(np.isfinite(y), y, NOWHERE_PX)
+        _weigh_single(options, y, H, P, sigma_px, detection, math.log(clutter_per_px2))
+    misses = [math.log(max(1.0 - detection[light], 1e-6)) for light in range(2)]
+
+    cases: list[Case] = [(None, None)]
+    logs = [misses[0] + misses[1]]
+    for log_l, k, mode in options[0]:
+        cases.append(((k, mode), None))
+        logs.append(log_l + misses[1])
+    for log_l, k, mode in options[1]:
+        cases.append((None, (k, mode)))
+        logs.append(log_l + misses[0])
+    pairs = [(one[1:], two[1:]) for one in options[0] for two in options[1] if one[1] != two[1]]
+    if pairs:
+        cases += pairs
+        logs += _weigh_pairs(np.array(pairs), y, H, P, sigma_px, detection, math.log(clutter_per_px2))
+    return cases, np.array(logs)
 
 
 def _weigh_single(

@@ -183,7 +183,7 @@ class TrackFilter(TrackPool):
         return float(gap @ np.linalg.solve(S, gap)) < CONTRADICTS
 
     def _start(self, t_s: float, fix: FixSeen) -> Estimate | None:
-        attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes]
+        attitudes = [newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes]
         force = self.samples[0].between(t_s - 0.5, t_s, t_s)[1][:, :3].mean(0) if len(self.samples[0]) else None
         made = state_from_fix(self.nodes, fix, attitudes[0][1] if attitudes[0] else None, force, self.clock_sigma_s)
         if made is None:

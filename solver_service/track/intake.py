@@ -1,9 +1,10 @@
-"""What comes into a track: samples, sensors, pictures and fixes, each at its time."""
+"""What comes into a track, or a network: samples, sensors, pictures and fixes, each at its time."""
 
 from __future__ import annotations
 
 import bisect
 import heapq
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, TypeVar
 
@@ -27,22 +28,26 @@ Seen = TypeVar("Seen", AttitudeSeen, DepthSeen)
 
 
 class TrackIntake:
-    """All that two nodes, a (0) and b (1), have told, in order of time. `problems` says what is wrong with it."""
+    """All that nodes have told, in order of time. `problems` says what is wrong with it.
 
-    def __init__(self, nodes: tuple[TrackNode, TrackNode]) -> None:
+    Of a pair, node a is 0 and node b is 1; clock_ns is then b's clock minus a's, as first believed.
+    """
+
+    nodes: Sequence[TrackNode]
+
+    def __init__(self, nodes: Sequence[TrackNode]) -> None:
         self.nodes = nodes
         self._problems = Problems()
         self.epoch_ns: int | None = None
         self.clock_ns = 0
-        self.samples = (Samples(), Samples())
-        self._attitudes: tuple[list[tuple[float, AttitudeSeen]], list[tuple[float, AttitudeSeen]]] = ([], [])
-        self._depths: tuple[list[tuple[float, DepthSeen]], list[tuple[float, DepthSeen]]] = ([], [])
+        self.samples = [Samples() for _ in nodes]
+        self.attitudes: list[list[tuple[float, AttitudeSeen]]] = [[] for _ in nodes]
+        self.depths: list[list[tuple[float, DepthSeen]]] = [[] for _ in nodes]
         self._events: list[tuple[float, int, int, Sight | FixSeen | int]] = []
-        self._turning = (Turning(), Turning())
-        self._ports = np.stack([node.rig.depth_port_m for node in self.nodes])
+        self.turning = [Turning() for _ in nodes]
         self._count = 0
         self._checked_s = -np.inf
-        self._rejected = [0, 0]
+        self._rejected = [0 for _ in nodes]
 
     def seconds(self, node: int, stamp_ns: int) -> float:
         """Give a stamp of a node as s since the epoch, on A's clock as first believed."""
@@ -78,12 +83,12 @@ class TrackIntake:
             said = f"node {self.nodes[node].name}: attitude sigmas of zero are taken as unknown"
             self._problems.report(said, self.seconds(node, seen.stamp_ns))
         t_s = self.seconds(node, seen.stamp_ns)
-        bisect.insort(self._attitudes[node], (t_s, seen), key=_time_of)
-        self._turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
+        bisect.insort(self.attitudes[node], (t_s, seen), key=_time_of)
+        self.turning[node].add(t_s, self.level_camera(node, seen), seen.sigma_rad)
 
     def add_depth(self, node: int, seen: DepthSeen) -> None:
         """Take a depth message."""
-        bisect.insort(self._depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
+        bisect.insort(self.depths[node], (self.seconds(node, seen.stamp_ns), seen), key=_time_of)
 
     def add_frame(self, node: int, frame: FrameSeen) -> None:
         """Take a picture's candidates."""
@@ -123,7 +128,7 @@ class TrackIntake:
         if min(len(samples.last(t_s, CHECK_EVERY_S)) for samples in self.samples) > 100:
             self._checked_s = t_s
         for node, samples in enumerate(self.samples):
-            seen = newest_before(self._attitudes[node], t_s)
+            seen = newest_before(self.attitudes[node], t_s)
             down = None
             if seen is not None and t_s - seen[0] < 0.5:
                 down = self.level_camera(node, seen[1])[2]
@@ -139,8 +144,8 @@ class TrackIntake:
 
     @property
     def both(self) -> str:
-        """The two nodes, in words."""
-        return f"nodes {self.nodes[0].name} and {self.nodes[1].name}"
+        """The nodes, in words."""
+        return f"nodes {' and '.join(node.name for node in self.nodes)}"
 
     @property
     def problems(self) -> list[str]:
@@ -149,10 +154,10 @@ class TrackIntake:
 
     def _forget_before(self, t_s: float) -> None:
         """Drop what no step will look at again."""
-        for node in (0, 1):
+        for node in range(len(self.nodes)):
             self.samples[node].forget_before(t_s)
-            self._turning[node].forget_before(t_s)
-            for items in (self._attitudes[node], self._depths[node]):
+            self.turning[node].forget_before(t_s)
+            for items in (self.attitudes[node], self.depths[node]):
                 while len(items) > 1 and items[0][0] < t_s:
                     items.pop(0)
 

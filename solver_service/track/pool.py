@@ -129,7 +129,7 @@ class TrackPool(TrackSteps):
             self._fix_s = t_s - SEARCH_AFTER_S + 0.5
         if t_s - self._fix_s < SEARCH_AFTER_S:
             return
-        of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self._attitudes)
+        of_a, of_b = (newest_before(of_node, t_s + HOLD_S) for of_node in self.attitudes)
         if of_a is None or of_b is None or max(t_s - of_a[0], t_s - of_b[0]) > 0.2:
             return
         self._searched_s = t_s

@@ -68,11 +68,14 @@ class TrackSteps(TrackIntake):
     guides: by node and stamp of a picture.
     """
 
+    nodes: tuple[TrackNode, TrackNode]
+
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float) -> None:
         super().__init__(nodes)
         self.unrest = 1.0
         self.guides: dict[tuple[int, int], PassGuide] = {}
         self._keep_s = keep_s
+        self._ports = np.stack([node.rig.depth_port_m for node in nodes])
 
     def increments(self, estimate: Estimate, t_s: float) -> tuple[Increment, Increment]:
         """Integrate both nodes from the estimate's time to t_s."""
@@ -98,7 +101,7 @@ class TrackSteps(TrackIntake):
 
     def _noise(self, node: int, t_s: float) -> Noise:
         noise = self.samples[node].noise(t_s).scaled(self.unrest)
-        stated = self._turning[node].stated(t_s)
+        stated = self.turning[node].stated(t_s)
         if stated is None:
             return noise
         tilt, heading = (WANDER_PER_ROOT_S * sigma for sigma in stated)
@@ -129,7 +132,7 @@ class TrackSteps(TrackIntake):
 
         A diver who looks away turns within tenths of a second as he has not for minutes: attitude messages say so.
         """
-        near = self._turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] else None
+        near = self.turning[node].at(to_s, to_s + HOLD_S) if estimate.without[node] else None
         if near is None:
             return noise
         R_level_camera, variances = near
@@ -300,7 +303,7 @@ class TrackSteps(TrackIntake):
         return chi2
 
     def _take_depth(self, estimate: Estimate, t_s: float) -> None:
-        of_a, of_b = (newest_before(of_node, t_s) for of_node in self._depths)
+        of_a, of_b = (newest_before(of_node, t_s) for of_node in self.depths)
         if of_a is None or of_b is None:
             return
         (time_a, a), (time_b, b) = of_a, of_b
@@ -317,7 +320,7 @@ class TrackSteps(TrackIntake):
 
     def _take_attitude(self, estimate: Estimate, t_s: float) -> None:
         for node in (0, 1):
-            found = newest_before(self._attitudes[node], t_s)
+            found = newest_before(self.attitudes[node], t_s)
             since = t_s - estimate.attitude_s[node]
             if found is None or since < ATTITUDE_EVERY_S or t_s - found[0] > 0.1:
                 continue
@@ -338,7 +341,7 @@ class TrackSteps(TrackIntake):
     def _take_turning(self, estimate: Estimate, t_s: float) -> None:
         """Update a node without an inertial unit by its attitude as it is at t_s, which may be off by a slow error."""
         for node in (0, 1):
-            near = self._turning[node].at(t_s, t_s + HOLD_S) if estimate.without[node] else None
+            near = self.turning[node].at(t_s, t_s + HOLD_S) if estimate.without[node] else None
             if near is None:
                 continue
             R_level_camera, variances = near

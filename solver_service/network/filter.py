@@ -1,0 +1,210 @@
+"""The causal filter of a network: messages in the order of time, who joins, which estimate is followed, rows.
+
+A fixed node is a member from the start; any other joins when a few poses in a row place it beside a member. Poses on
+end that contradict the network open challengers, in which the node in question stands where these poses say: the one
+that explains the pictures best is followed. Without fixed nodes the frame moves with the first member.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import rotation_log, skew
+from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix, Place
+from buddyline.solver_service.track.inputs import FixSeen, TrackNode
+from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.lights import Sight
+from buddyline.solver_service.track.samples import Samples
+from buddyline.solver_service.track.stepping import HOLD_S, TOGETHER_S
+from buddyline.solver_service.track.turning import Turning
+
+# So many poses of one pair in a row, no further apart in time than this, and each in reach of the one before, place a
+# node: a single one may be wrong.
+FIXES_TO_JOIN: Final = 3
+JOIN_WITHIN_S: Final = 1.5
+REACH_MPS: Final = 1.5
+REACH_RADPS: Final = 1.5
+# A challenger replaces the estimate once it explains the pictures since its start better by this, after TRIED_S at
+# least; it is dropped after CHALLENGE_S, or when it is worse by REFUTED. No more are followed at a time.
+REPLACED: Final = 20.0
+TRIED_S: Final = 0.5
+CHALLENGE_S: Final = 3.0
+REFUTED: Final = 40.0
+MOST_CHALLENGERS: Final = 3
+# A pair opens a challenger no more often than this.
+AGAIN_S: Final = 1.0
+# Fixed nodes that contradict each other so often on end are said to.
+CONTRADICTIONS: Final = 10
+MEMORY_S: Final = 30.0
+# Rows come after all else of their time.
+ROW: Final = 1 << 20
+
+
+class NetFilter(TrackIntake):
+    """The network of nodes. Samples and events may be added in any order before `advance` passes them."""
+
+    nodes: list[TrackNode]
+
+    def __init__(self) -> None:
+        super().__init__([])
+        self.main = NetEstimate(self)
+        self.challengers: list[NetEstimate] = []
+        self._fixes: dict[tuple[int, int], list[tuple[float, PairFix]]] = {}
+        self._challenged_s: dict[tuple[int, int], float] = {}
+        self._contradicted: dict[tuple[int, int], int] = {}
+
+    def add_node(self, node: TrackNode, place: Place | None = None, *, shines: bool = True) -> int:
+        """Take a node into the network, and return its index. place: of a fixed node. shines: whether it has lamps."""
+        self.nodes.append(node)
+        self.samples.append(Samples())
+        self.turning.append(Turning())
+        self.attitudes.append([])
+        self.depths.append([])
+        self._rejected.append(0)
+        index = len(self.nodes) - 1
+        if place is not None:
+            self.main.places[index] = place
+            if self.main.state is not None:
+                self.main.settle(index, self.main.t_s)
+                self.challengers = []
+        if not shines:
+            self.main.dark.add(index)
+        return index
+
+    def advance(self, to_ns: int, outputs_ns: Sequence[int] = ()) -> list[NetRow]:
+        """Go on to to_ns, up to which all has been added; return the network at the asked stamps in between.
+
+        Events within HOLD_S of to_ns wait for the next call, so that the result does not depend on how often it is
+        called.
+        """
+        end_s = self.seconds(0, to_ns) - HOLD_S
+        rows: list[NetRow] = []
+        for stamp_ns in outputs_ns:
+            self._push(self.seconds(0, stamp_ns), ROW, stamp_ns)
+        while self._events and self._events[0][0] <= end_s:
+            t_s, _, _, what = heapq.heappop(self._events)
+            if isinstance(what, int):
+                rows += self.main.rows(t_s, what)
+            elif isinstance(what, PairFix):
+                self._take_fix(t_s, what)
+            elif isinstance(what, Sight):
+                self._take_sight(t_s, what)
+        self._forget_before(end_s - MEMORY_S)
+        return rows
+
+    def add_pair_fix(self, node: int, other: int, fix: FixSeen) -> None:
+        """Take a pose that one trigger's lights gave by themselves: of the node `other` from the node `node`."""
+        self.add_fix(PairFix(fix.stamp_ns, fix.t_a_b_m, fix.R_a_b, fix.covariance, node, other))
+
+    def _take_sight(self, t_s: float, sight: Sight) -> None:
+        self._check_units(t_s)
+        if self.main.state is None and self.main.places:
+            self.main.begin(t_s)
+        for estimate in [self.main, *self.challengers]:
+            estimate.take_sight(t_s, sight)
+        self._judge(t_s)
+
+    def _judge(self, t_s: float) -> None:
+        """Follow the estimate that explains the pictures best."""
+        kept = []
+        for challenger in self.challengers:
+            # Both began with the same evidence.
+            lead = challenger.evidence - self.main.evidence
+            if lead > REPLACED and t_s - challenger.start_s > TRIED_S:
+                self.main, self.challengers = challenger, []
+                return
+            if t_s - challenger.start_s < CHALLENGE_S and lead > -REFUTED:
+                kept.append(challenger)
+        self.challengers = kept
+
+    def _take_fix(self, t_s: float, fix: PairFix) -> None:
+        main = self.main
+        if main.state is None and main.places:
+            main.begin(t_s)
+        if t_s < main.t_s - TOGETHER_S:
+            return
+        recent = self._fixes.setdefault((fix.node, fix.other), [])
+        if recent and not _in_reach(recent[-1], (t_s, fix)):
+            recent.clear()
+        recent.append((t_s, fix))
+        del recent[:-FIXES_TO_JOIN]
+        settled = len(recent) == FIXES_TO_JOIN
+        one, two = main.member_of(fix.node), main.member_of(fix.other)
+        if one is not None and two is not None:
+            self._compare(t_s, fix, one, two, settled=settled)
+        elif settled:
+            _enter(main, t_s, fix)
+            for challenger in self.challengers:
+                _enter(challenger, t_s, fix)
+
+    def _compare(self, t_s: float, fix: PairFix, one: int, two: int, *, settled: bool) -> None:
+        """Open challengers where poses on end contradict the estimate: either node may be the one that is off."""
+        gap, chi2 = self.main.gap(t_s, fix, one, two)
+        pair = fix.node, fix.other
+        if chi2 < CONTRADICTS:
+            self._contradicted[pair] = 0
+            return
+        self._contradicted[pair] = self._contradicted.get(pair, 0) + 1
+        free = [node for node in pair if node not in self.main.places]
+        if not free:
+            self._say_contradiction(t_s, pair, math.dist(gap[:3], (0, 0, 0)), math.dist(gap[3:], (0, 0, 0)))
+        if not settled or t_s - self._challenged_s.get(pair, -np.inf) < AGAIN_S:
+            return
+        self._challenged_s[pair] = t_s
+        for node in free:
+            challenger = self.main.copied()
+            index = challenger.member_of(node)
+            if index is None or len(self.challengers) >= MOST_CHALLENGERS:
+                continue
+            challenger.start_s = t_s
+            challenger.remove(index)
+            _enter(challenger, t_s, fix)
+            if challenger.member_of(node) is not None:
+                self.challengers.append(challenger)
+
+    def _say_contradiction(self, t_s: float, pair: tuple[int, int], off_m: float, off_rad: float) -> None:
+        if self._contradicted[pair] < CONTRADICTIONS:
+            return
+        names = " and ".join(self.nodes[node].name for node in pair)
+        said = f"fixed nodes {names}: what they see of each other contradicts their places"
+        self._problems.report(f"{said}, by {off_m:.1f} m and {math.degrees(off_rad):.0f} deg", t_s)
+
+
+def _enter(estimate: NetEstimate, t_s: float, fix: PairFix) -> None:
+    """Make the one of a pose's two nodes a member that is none; both, where there are no members yet."""
+    one, two = estimate.member_of(fix.node), estimate.member_of(fix.other)
+    if one is None and two is None:
+        if estimate.state is not None or not estimate.open(t_s, fix):
+            return
+        one = 0
+    if one is not None and two is None:
+        estimate.join(t_s, fix, one, fix.other)
+    elif one is None and two is not None:
+        estimate.join(t_s, inverted(fix), two, fix.node)
+
+
+def _in_reach(before: tuple[float, PairFix], now: tuple[float, PairFix]) -> bool:
+    """Whether a node can have moved from one pose to the next, seen from a node that turns as well."""
+    (before_s, one), (now_s, two) = before, now
+    span_s = now_s - before_s
+    if span_s > JOIN_WITHIN_S:
+        return False
+    sigma_m = math.sqrt(float(np.trace(one.covariance[:3, :3] + two.covariance[:3, :3])))
+    range_m = float(np.linalg.norm(two.t_a_b_m))
+    reach_m = (REACH_MPS + REACH_RADPS * range_m) * span_s + 4.0 * sigma_m
+    sigma_rad = math.sqrt(float(np.trace(one.covariance[3:, 3:] + two.covariance[3:, 3:])))
+    turned = float(np.linalg.norm(rotation_log(two.R_a_b @ one.R_a_b.T)))
+    moved_m = float(np.linalg.norm(two.t_a_b_m - one.t_a_b_m))
+    return moved_m < reach_m and turned < 2.0 * REACH_RADPS * span_s + 4.0 * sigma_rad
+
+
+def inverted(fix: PairFix) -> PairFix:
+    """Give T_b_a of a pose T_a_b: t' = -R^T t, e_t' = -R^T (e_t + [t]x e_w), e_w' = -R^T e_w."""
+    back = fix.R_a_b.T
+    J = np.zeros((6, 6))
+    J[:3, :3], J[:3, 3:], J[3:, 3:] = -back, -back @ skew(fix.t_a_b_m), -back
+    return PairFix(fix.stamp_ns, -back @ fix.t_a_b_m, back, J @ fix.covariance @ J.T, fix.other, fix.node)

@@ -1,0 +1,108 @@
+"""How much each member's inertial unit is shaken in its mount, learned from the lights' residuals.
+
+As the track learns it (track/shaking.py), for any number of nodes: two variances of each, of its angle and of the
+velocity that shaking adds. What each variance contributes to the covariance is followed in its node's own block alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.network.state import MOVING, P_, PHI, SHAKE, SHOVE, V_
+from buddyline.solver_service.track.shaking import (
+    FIRST,
+    LEAST,
+    LONGEST_STEP,
+    MOST,
+    MOST_CHI2,
+    SHAKE_RAD,
+    SHAKEN_S,
+    SHOVE_MPS,
+)
+
+# A picture's weight is halved after so many more of each member.
+HALVED: Final = 100.0
+_BOUNDS: Final = np.array((LEAST[0], LEAST[2])), np.array((MOST[0], MOST[2]))
+_I: Final = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class NetShaking:
+    """Logs of the variances (n, 2), their information (2 n, 2 n), and parts (n, 2, MOVING, MOVING): what of each
+    member's covariance comes from each."""
+
+    logs: Floats
+    information: Floats
+    parts: Floats
+
+    @classmethod
+    def of_none(cls) -> NetShaking:
+        """Return that of no members."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 0)), np.zeros((0, 2, MOVING, MOVING)))
+
+    @property
+    def variances(self) -> Floats:
+        """Of each member's angle and velocity (n, 2)."""
+        return np.asarray(np.exp(self.logs))
+
+    def joined(self) -> NetShaking:
+        """Return it with one more member, of which nothing is known."""
+        n = len(self.logs)
+        information = np.zeros((2 * n + 2, 2 * n + 2))
+        information[: 2 * n, : 2 * n] = self.information
+        information[2 * n :, 2 * n :] = 0.5 * FIRST * np.eye(2)
+        first = 2.0 * np.log(np.array(((SHAKE_RAD, SHOVE_MPS),)))
+        more = np.zeros((1, 2, MOVING, MOVING))
+        return NetShaking(np.concatenate((self.logs, first)), information, np.concatenate((self.parts, more)))
+
+    def chosen(self, members: list[int]) -> NetShaking:
+        """Return it for some members."""
+        which = [2 * member + k for member in members for k in (0, 1)]
+        return NetShaking(self.logs[members], self.information[np.ix_(which, which)], self.parts[members])
+
+    def moved(self, F: Floats, drawn: Floats) -> NetShaking:
+        """Go on by a step of the members: F (n, MOVING, MOVING), and what it adds, (n, 2, MOVING, MOVING)."""
+        onward = F[:, None]
+        return NetShaking(self.logs, self.information, onward @ self.parts @ np.swapaxes(onward, -1, -2) + drawn)
+
+    def taught(self, y: Floats, S_inverse: Floats, H: Floats, P: Floats) -> NetShaking:
+        """Go on by one picture's residuals y (m,), H (m, N), P (N, N), by Fisher's scoring (Shaking.taught)."""
+        n, m = len(self.logs), len(y)
+        H_own = np.swapaxes(H[:, 1:].reshape(m, n, -1), 0, 1)[:, :, :MOVING]
+        D = (H_own[:, None] @ self.parts @ np.swapaxes(H_own, 1, 2)[:, None]).reshape(2 * n, m, m)
+        z = S_inverse @ y
+        z = z * math.sqrt(min(1.0, MOST_CHI2 * m / max(float(y @ z), 1e-9)))
+        W = S_inverse @ D
+        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2))
+        fisher = 0.5 * (W.reshape(2 * n, -1) @ np.swapaxes(W, 1, 2).reshape(2 * n, -1).T)
+        kept = 0.5 ** (1.0 / (HALVED * n))
+        information = kept * self.information + fisher + (1.0 - kept) * 0.5 * FIRST * np.eye(2 * n)
+        step = np.clip(np.linalg.solve(information, slope), -LONGEST_STEP, LONGEST_STEP).reshape(n, 2)
+        gain = (P @ H.T @ S_inverse)[1:].reshape(n, -1, m)[:, :MOVING]
+        rest = (np.eye(MOVING) - gain @ H_own)[:, None]
+        parts = rest @ self.parts @ np.swapaxes(rest, -1, -2)
+        return NetShaking(np.clip(self.logs + step, *_BOUNDS), information, parts)
+
+
+def shaking_parts(R: Floats, span_s: float) -> Floats:
+    """Give what shaking of unit variances adds in a step to a node's plain errors, (2, MOVING, MOVING).
+
+    R (3, 3): its attitude at the end. As track/shaking.shaking_noise, for one node.
+    """
+    a, t = math.exp(-span_s / SHAKEN_S), SHAKEN_S
+    fresh, both = 1.0 - a * a, t * (1.0 - a) ** 2
+    out = np.zeros((2, MOVING, MOVING))
+    angle, velocity = out
+    angle[PHI, PHI] = angle[SHAKE, SHAKE] = fresh * _I
+    angle[PHI, SHAKE] = -fresh * R
+    angle[SHAKE, PHI] = -fresh * R.T
+    velocity[V_, V_] = velocity[SHOVE, SHOVE] = fresh * _I
+    velocity[V_, SHOVE] = velocity[SHOVE, V_] = -fresh * _I
+    velocity[P_, V_] = velocity[V_, P_] = both * _I
+    velocity[P_, SHOVE] = velocity[SHOVE, P_] = -both * _I
+    velocity[P_, P_] = t * t * max(2.0 * span_s / t - 3.0 + 4.0 * a - a * a, 0.0) * _I
+    return out

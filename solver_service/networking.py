@@ -1,0 +1,205 @@
+"""The network out of all nodes' streams: what its estimator is given, when, and the messages that it makes.
+
+The estimator is in `network/`. A network is made of three or more nodes, or where a node is fixed. Everything here is
+a function of the messages so far, as for a pair's track (tracking.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Attitude, Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
+from buddyline.solver_service.network.estimate import NetRow, Place
+from buddyline.solver_service.network.filter import NetFilter
+from buddyline.solver_service.results import view_of
+from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen
+from buddyline.solver_service.tracking import STOPPED_NS, TrackSettings, fix_of, frame_of, same_rig, track_node_of
+from msgspec import UNSET
+
+NET: Final = "main"
+# A network's rows are as many as the track's, but no more than this: each is of all nodes.
+MOST_HZ: Final = 20.0
+
+
+class NetTracker:
+    """Follows all nodes in one frame. streams: by node; those that come later are taken, too."""
+
+    def __init__(self, streams: Mapping[str, NodeStream], settings: TrackSettings) -> None:
+        self._streams = streams
+        self._period_ns = round(S_NS / min(settings.rate_hz, MOST_HZ))
+        self._past: list[str] = []
+        self._filter: NetFilter | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Start anew: a clock was set, or a rig was changed."""
+        if self._filter is not None:
+            self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
+        self._filter = None
+        self._infos: dict[str, NodeInfo] = {}
+        self._nodes: list[str] = []
+        self._settled_ns: dict[tuple[str, str], int] = {}
+        self._first_ns: int | None = None
+        self._taken_ns = self._told_ns = -1
+        self.net = NET
+        self._zero_m = np.zeros(3)
+
+    @property
+    def nodes(self) -> list[str]:
+        """The nodes that the network knows, members or not."""
+        return self._nodes
+
+    @property
+    def problems(self) -> list[str]:
+        """What is wrong, and what was (it says so)."""
+        found = self._filter.problems if self._filter is not None else []
+        return self._past + [problem for problem in found if problem not in self._past]
+
+    def take(self, outcomes: Iterable[Message]) -> list[Message]:
+        """Go on to where these outcomes allow; return the poses of all nodes up to there."""
+        fixes = []
+        for one in outcomes:
+            # A late frame's stamp is old, or far from the dive's time: it does not carry the network on.
+            if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late"):
+                pair = one.node_a, one.node_b
+                self._settled_ns[pair] = max(self._settled_ns.get(pair, 0), one.stamp_ns)
+                # However many outcomes come at once, the network begins with the first of them.
+                self._first_ns = one.stamp_ns if self._first_ns is None else min(self._first_ns, one.stamp_ns)
+            if isinstance(one, RelativePose):
+                fixes.append(one)
+        with np.errstate(all="ignore"):
+            try:
+                return self._take(fixes, self._frontier_ns())
+            except (ArithmeticError, ValueError) as error:
+                self._note([f"values were out of numeric range ({error}): the network started anew"])
+                self.forget()
+                return []
+
+    def finish(self) -> list[Message]:
+        """Take what is left, at the end of the dive."""
+        if self._filter is None:
+            return []
+        with np.errstate(all="ignore"):
+            try:
+                return self._take([], max(self._settled_ns.values(), default=0) + S_NS)
+            except (ArithmeticError, ValueError) as error:
+                self._note([f"values were out of numeric range ({error}): the network started anew"])
+                self.forget()
+                return []
+
+    def _frontier_ns(self) -> int:
+        """Return up to when everything has come: outcomes, and samples of the sensors that have not stopped.
+
+        A pair, or a sensor, that is a second behind the newest outcome has stopped.
+        """
+        newest = max(self._settled_ns.values(), default=0)
+        sensors = [
+            sensor for stream in self._streams.values() for sensor in (stream.imu, stream.attitude, stream.depth)
+        ]
+        known = [*self._settled_ns.values(), *(sensor.newest_ns for sensor in sensors)]
+        return min([newest, *(ns for ns in known if ns is not None and ns > newest - STOPPED_NS)])
+
+    def _take(self, fixes: Sequence[RelativePose], to_ns: int) -> list[Message]:
+        self._meet(to_ns)
+        if self._filter is None:
+            return []
+        track = self._filter
+        for fix in fixes:
+            if fix.node_a in self._nodes and fix.node_b in self._nodes:
+                track.add_pair_fix(self._nodes.index(fix.node_a), self._nodes.index(fix.node_b), fix_of(fix))
+        if to_ns <= self._taken_ns:
+            return []
+        for index, node in enumerate(self._nodes):
+            self._feed(track, index, self._streams[node], self._taken_ns + 1, to_ns)
+        told_ns = min(to_ns, max(self._settled_ns.values(), default=to_ns))
+        due = range(-(-(self._told_ns + 1) // self._period_ns), told_ns // self._period_ns + 1)
+        self._taken_ns, self._told_ns = to_ns, told_ns
+        rows = track.advance(to_ns, [k * self._period_ns for k in due])
+        return [self._message(row) for row in rows]
+
+    def _meet(self, to_ns: int) -> None:
+        """Take nodes into the network whose calibration has come; start anew where one has changed."""
+        known = {node: found for node, one in self._streams.items() if (found := one.calibration(to_ns)) is not None}
+        if any(node in self._infos and not same_rig(info, self._infos[node]) for node, (info, _) in known.items()):
+            self.forget()
+        fixed = [info for info, _ in known.values() if info.fixed is not UNSET]
+        if self._first_ns is None or (self._filter is None and len(known) < 3 and not fixed):
+            return
+        new = sorted(known.keys() - self._infos.keys())
+        if (
+            self._filter is not None
+            and not self._filter.main.places
+            and any(known[n][0].fixed is not UNSET for n in new)
+        ):
+            # From now on a fixed node holds the frame.
+            self.forget()
+            new = sorted(known)
+        for node in new:
+            info, rig = known[node]
+            if self._filter is None:
+                self._filter = NetFilter()
+                self._taken_ns = self._told_ns = self._first_ns - S_NS
+            self._infos[node] = info
+            self._nodes.append(node)
+            self._filter.add_node(track_node_of(info, rig), self._place(info), shines=info.has_lights)
+            # What it told before the network knew it.
+            self._feed(self._filter, len(self._nodes) - 1, self._streams[node], self._taken_ns - S_NS, self._taken_ns)
+
+    def _place(self, info: NodeInfo) -> Place | None:
+        if info.fixed is UNSET:
+            return None
+        named = {one.fixed.net for one in self._infos.values() if one.fixed is not UNSET}
+        if len(named) > 1:
+            self._note([f"fixed nodes name the nets {' and '.join(sorted(named))}: all are taken for one frame"])
+        self.net = min(named)
+        if not (self._filter is not None and self._filter.main.places):
+            # Coordinates may be of a whole country: the estimator counts from the first fixed node.
+            self._zero_m = np.array(info.fixed.p_m)
+        R = quat_to_matrix(np.array(info.fixed.q_xyzw))
+        return Place(np.array(info.fixed.p_m) - self._zero_m, R, info.fixed.sigma_m, info.fixed.sigma_rad)
+
+    def _feed(self, track: NetFilter, index: int, stream: NodeStream, start_ns: int, end_ns: int) -> None:
+        stamps_ns, values = stream.imu.between(start_ns, end_ns)
+        track.add_imu(index, stamps_ns, values[:, :3], values[:, 3:])
+        for attitude in stream.attitude.between(start_ns, end_ns):
+            track.add_attitude(index, self._attitude(attitude, index))
+        for depth in stream.depth.between(start_ns, end_ns):
+            track.add_depth(index, DepthSeen(depth.stamp_ns, depth.depth_m, depth.sigma_m))
+        for frame in stream.frames.between(start_ns, end_ns):
+            track.add_frame(index, frame_of(view_of(frame)))
+
+    def _attitude(self, message: Attitude, index: int) -> AttitudeSeen:
+        """Return an attitude from the north of the first node's attitudes, which another declination may have."""
+        R = quat_to_matrix(np.array(message.q_ned_body_xyzw))
+        first, own = (self._infos[self._nodes[i]].declination_rad for i in (0, index))
+        if first != own:
+            R = rotation_exp(np.array([0.0, 0.0, first - own])) @ R
+        return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
+
+    def _message(self, row: NetRow, mode: TrackMode = "filter") -> NodePose:
+        node = self._nodes[row.node]
+        px, py, pz = (self._zero_m + row.p_m).tolist()
+        vx, vy, vz = row.v_mps.tolist()
+        qx, qy, qz, qw = matrix_to_quat(row.R).tolist()
+        if not (np.isfinite(row.covariance).all() and np.isfinite(row.p_m).all()):
+            raise ArithmeticError("no finite covariance")
+        return NodePose(
+            net=self.net,
+            node=node,
+            stamp_ns=row.stamp_ns,
+            p_m=(px, py, pz),
+            q_xyzw=(qx, qy, qz, qw),
+            v_mps=(vx, vy, vz),
+            covariance=row.covariance.ravel().tolist(),
+            fixed=self._infos[node].fixed is not UNSET,
+            mode=mode,
+            age_s=row.age_s,
+        )
+
+    def _note(self, problems: Iterable[str]) -> None:
+        self._past += [problem for problem in problems if problem not in self._past]

@@ -1,0 +1,217 @@
+"""Every Jacobian of the network against differences of the function that it belongs to."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.camera import Camera
+from buddyline.solver_service.geometry.rig import Rig
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
+from buddyline.solver_service.network.estimate import Member, NetEstimate, PairFix
+from buddyline.solver_service.network.filter import inverted
+from buddyline.solver_service.network.motion import Move, as_first_of_pair, moved_member
+from buddyline.solver_service.network.sights import columns, light_positions
+from buddyline.solver_service.network.state import (
+    ACCEL_BIAS,
+    BLOCK,
+    CLOCK,
+    GYRO_BIAS,
+    LEVER,
+    MOUNT,
+    MOVING,
+    P_,
+    PHI,
+    SHAKE,
+    SHOVE,
+    V_,
+    NetState,
+    block,
+)
+from buddyline.solver_service.track.inputs import TrackNode
+from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.strapdown import Noise, integrate
+
+STEP = 1e-6
+LIGHTS_M = np.array(((-0.44, 0.01, 0.02), (0.44, -0.02, 0.01)))
+PINHOLE = Camera("pinhole", 820, 616, 900.0, 900.0, 409.5, 307.5, np.zeros(5))
+
+
+def a_state(seed: int, n: int = 3) -> NetState:
+    rng = np.random.default_rng(seed)
+    level = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    away = np.array(((0.0, 0.0, 3.0), (5.0, 0.4, 2.5), (4.5, -0.9, 3.3)))[:n]
+    turned = [rotation_exp(np.array((0.0, 0.0, np.pi * (i > 0)))) @ level for i in range(n)]
+    return NetState(
+        p_m=away,
+        v_mps=rng.normal(0.0, 0.5, (n, 3)),
+        R=np.array([rotation_exp(rng.normal(0.0, 0.1, 3)) @ R for R in turned]),
+        shake_rad=rng.normal(0.0, 1e-3, (n, 3)),
+        shove_mps=rng.normal(0.0, 0.05, (n, 3)),
+        gyro_bias_radps=rng.normal(0.0, 0.02, (n, 3)),
+        accel_bias_mps2=rng.normal(0.0, 0.2, (n, 3)),
+        mount_rad=rng.normal(0.0, 0.05, (n, 3)),
+        lever_m=rng.normal(0.0, 0.1, (n, 3)),
+        delay_s=rng.normal(0.0, 0.003, n),
+        clock_s=rng.normal(0.0, 0.003, n),
+        gauge_m=rng.normal(0.0, 0.1, n),
+        datum_m=2.0,
+    )
+
+
+def differences(function: Callable[[Floats], Floats], size: int) -> Floats:
+    """Differentiate function(error (size,)) at zero by all errors."""
+    out = []
+    for column in range(size):
+        error = np.zeros(size)
+        error[column] = STEP
+        out.append((function(error) - function(-error)) / (2.0 * STEP))
+    return np.stack(out, axis=-1)
+
+
+def test_plus_and_minus_are_inverse() -> None:
+    state, rng = a_state(1), np.random.default_rng(2)
+    error = rng.normal(0.0, 0.1, 1 + 3 * BLOCK)
+    assert state.plus(error).minus(state) == pytest.approx(error, abs=1e-9)
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (2, 0)])
+def test_lights(pair: tuple[int, int]) -> None:
+    observer, other = pair
+    state, rates = a_state(3), np.random.default_rng(4).normal(0.0, 0.3, (3, 3))
+    dt_s = np.array((-0.004, 0.006))
+    _, D = light_positions(state, observer, other, LIGHTS_M, rates, dt_s)
+    whole = np.zeros((*D.shape[:3], 1 + 3 * BLOCK))
+    whole[..., columns(observer, other)] = D
+
+    def seen(error: Floats) -> Floats:
+        return light_positions(state.plus(error), observer, other, LIGHTS_M, rates, dt_s)[0]
+
+    assert whole == pytest.approx(differences(seen, 1 + 3 * BLOCK), abs=1e-6)
+
+
+def samples(state: NetState, member: int, at_s: float) -> tuple[Floats, Floats, Floats]:
+    """Give a grid of 0.1 s, what a unit with the member's delay says there, and its turn rates at both ends."""
+    grid = np.linspace(0.0, 0.1, 11)
+    t = (grid + at_s)[:, None]
+    force = np.hstack((0.3 * np.sin(3 * t), 0.2 * np.cos(2 * t) - 9.8, 0.5 * np.sin(t + 1)))
+    rate = np.hstack((0.2 * np.cos(2 * t), 0.3 * np.sin(3 * t), 0.1 * np.cos(t)))
+    return grid, np.hstack((force, rate)), rate[[0, -1]]
+
+
+def test_a_step() -> None:
+    """The transition of one member; the delay's column is of slow rates, and is tested with the track's integration."""
+    state, member, span_s = a_state(5), 1, 0.1
+
+    def after(error: Floats) -> NetState:
+        whole = np.zeros(1 + 3 * BLOCK)
+        whole[block(member)] = error
+        moved = state.plus(whole)
+        grid, values, slow = samples(moved, member, 0.0)
+        told = np.ones(len(grid) - 1, dtype=bool)
+        part = integrate(as_first_of_pair(moved, member), 0, grid, values[:, :3], values[:, 3:], told, slow)
+        noise = Noise(1e-3, 1e-2)
+        fields, found["F"], _, _ = moved_member(moved, member, part, noise, np.full(2, 1e-6), span_s)
+        every = {name: getattr(moved, name).copy() for name in fields}
+        for name, value in fields.items():
+            every[name][member] = value
+        return replace(moved, **every)
+
+    found: dict[str, Floats] = {}
+    still = after(np.zeros(BLOCK))
+    F = found["F"]
+    numeric = differences(lambda error: after(error).minus(still)[block(member)], BLOCK)
+    off = np.abs(F - numeric).max(axis=0)
+    assert off[np.r_[P_, V_, PHI, SHOVE, ACCEL_BIAS, LEVER, CLOCK:BLOCK]].max() < 1e-6
+    # The integration takes the mount and the bias of the gyroscope out of the lever arm's part (track/strapdown.py).
+    assert off[SHAKE].max() < 2e-2
+    assert off[np.r_[GYRO_BIAS, MOUNT]].max() < 0.1
+    assert np.abs(F[:MOVING]).max() > 1.0
+
+
+def test_a_frame_that_moves_with_a_node() -> None:
+    state = a_state(6)
+
+    def anchored(one: NetState) -> NetState:
+        return replace(one, p_m=one.p_m - one.p_m[1], v_mps=one.v_mps - one.v_mps[1])
+
+    still = np.broadcast_to(np.eye(BLOCK), (3, BLOCK, BLOCK))
+    move = Move(still, np.zeros((3, BLOCK, BLOCK)), 1, state.p_m[1], state.v_mps[1])
+    N = 1 + 3 * BLOCK
+    numeric = differences(lambda error: anchored(state.plus(error)).minus(anchored(state)), N)
+    assert move.onward(np.eye(N)) == pytest.approx(numeric, abs=1e-6)
+
+
+def an_estimate(state: NetState) -> NetEstimate:
+    intake = TrackIntake([TrackNode(name, Rig(PINHOLE, LIGHTS_M)) for name in "abc"])
+    estimate = NetEstimate(intake)
+    estimate.members = [Member(i, 0.0, confirmed=True, light_s=0.0) for i in range(3)]
+    estimate.state, estimate.t_s = state, 0.0
+    estimate.covariance = np.eye(1 + 3 * BLOCK)
+    estimate.rates_radps = np.zeros((3, 3))
+    return estimate
+
+
+def relative(state: NetState) -> tuple[Floats, Floats]:
+    """Where member 2 is from member 1."""
+    return state.R[1].T @ (state.p_m[2] - state.p_m[1]), state.R[1].T @ state.R[2]
+
+
+def test_the_gap_of_a_pose_counts_both_nodes_errors() -> None:
+    state = a_state(7)
+    t, R = relative(state)
+    estimate = an_estimate(state)
+    gap, chi2 = estimate.gap(0.0, PairFix(0, t + np.array((0.1, 0.0, 0.0)), R, 1e-6 * np.eye(6), 1, 2), 1, 2)
+    assert gap == pytest.approx([0.1, 0, 0, 0, 0, 0], abs=1e-12)
+
+    def seen(error: Floats) -> Floats:
+        t_now, R_now = relative(state.plus(error))
+        return np.concatenate((t_now - t, rotation_log(R_now @ R.T)))
+
+    H = differences(seen, 1 + 3 * BLOCK)
+    S = H @ H.T + 1e-6 * np.eye(6) + np.diag([1e-4] * 3 + [1e-5] * 3)
+    assert chi2 == pytest.approx(gap @ np.linalg.solve(S, gap), rel=1e-6)
+
+
+def test_a_pose_the_other_way_round_has_the_same_covariance() -> None:
+    rng = np.random.default_rng(8)
+    root = rng.normal(0.0, 1e-3, (6, 6))
+    fix = PairFix(0, np.array((0.3, -0.2, 4.0)), rotation_exp(np.array((0.1, 3.0, 0.2))), root @ root.T, 1, 2)
+    back = inverted(fix)
+
+    def turned(error: Floats) -> Floats:
+        R, t = rotation_exp(error[3:]) @ fix.R_a_b, fix.t_a_b_m + error[:3]
+        return np.concatenate((-R.T @ t - back.t_a_b_m, rotation_log(R.T @ back.R_a_b.T)))
+
+    J = differences(turned, 6)
+    assert (back.node, back.other) == (2, 1)
+    assert back.covariance == pytest.approx(J @ fix.covariance @ J.T, rel=1e-6, abs=1e-12)
+
+
+def test_a_node_that_joins_has_the_errors_of_who_sees_it() -> None:
+    state = a_state(9)
+    estimate = an_estimate(state)
+    root = np.random.default_rng(10).normal(0.0, 0.3, (1 + 3 * BLOCK, 1 + 3 * BLOCK))
+    estimate.covariance = P = 1e-4 * root @ root.T
+    t, R = relative(state)
+    estimate.intake.nodes = [*estimate.intake.nodes, TrackNode("d", Rig(PINHOLE, LIGHTS_M))]
+    estimate.intake.attitudes.append([])
+    fix = PairFix(0, t, R, 1e-8 * np.eye(6), 1, 3)
+    estimate.join(0.0, fix, 1, 3)
+    assert estimate.state is not None
+    assert estimate.state.p_m[3] == pytest.approx(state.p_m[2])
+
+    def place(error: Floats) -> Floats:
+        now = state.plus(error)
+        p, R_now = now.p_m[1] + now.R[1] @ t, now.R[1] @ R
+        phi = rotation_log(R_now @ estimate.state.R[3].T)
+        return np.concatenate((p - rotation_exp(phi) @ estimate.state.p_m[3], phi))
+
+    J = differences(place, len(P))
+    own = estimate.covariance[block(3), block(3)]
+    which = np.r_[0:3, 6:9]
+    cross = skew(estimate.state.p_m[3])
+    small = np.zeros((6, 6))
+    small[:3, :3] = (1e-4 + 1e-8) * np.eye(3) + (1e-5 + 1e-8) * cross @ cross.T
+    assert own[np.ix_(which, which)][:3, :3] == pytest.approx((J @ P @ J.T)[:3, :3] + small[:3, :3], abs=1e-7)
+    assert estimate.covariance[: len(P), block(3)][:, which] == pytest.approx(P @ J.T, abs=1e-7)

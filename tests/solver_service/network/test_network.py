@@ -1,0 +1,162 @@
+"""The network on simulated dives of four nodes: what it says of each node, and how true that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.messages import Candidates, LightTruth, Message, NodeInfo, NodePose, Truth
+from buddyline.solver_service.config import SolveConfig, track_settings
+from buddyline.solver_service.core import SolverCore
+from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
+from msgspec.structs import replace
+
+START_NS = 1_764_000_000_000_000_000
+HZ = 10.0
+
+
+def dive(seed: int, seconds: float, *, imu: bool = True, **scenario: Any) -> tuple[World, list[Message]]:
+    scenario = {"more_nodes": ("c", "d"), "fixed_nodes": ("a",)} | scenario
+    world = World(Scenario(seed=seed, start_ns=START_NS, **scenario))
+    told = [message for _, _, message in simulation.messages(world, DivePlan(seconds=seconds, imu=imu))]
+    return world, [message for message in told if not isinstance(message, Truth | LightTruth | NodePose)]
+
+
+def solved(messages: list[Message], together: int = 2000) -> tuple[list[NodePose], SolverCore]:
+    """Solve as a stored dive, so many messages at a time."""
+    core = SolverCore(SolveConfig().settings("test"), None, track=track_settings("filter", HZ))
+    found = []
+    for start in range(0, len(messages), together):
+        found += core.handle_many(messages[start : start + together])
+    found += core.flush()
+    return [one for one in found if isinstance(one, NodePose)], core
+
+
+def errors(world: World, poses: list[NodePose], origin: str | None = None) -> dict[str, Floats]:
+    """By node: errors of place (m), turn (rad), and their squares by the covariance over 6, (N, 3)."""
+    out: dict[str, list[tuple[float, float, float]]] = {}
+    for pose in poses:
+        true = world.node_truth(pose.node, pose.stamp_ns, "main")
+        zero = np.zeros(3) if origin is None else np.array(world.node_truth(origin, pose.stamp_ns, "main").p_m)
+        turn = quat_to_matrix(np.array(true.q_xyzw)) @ quat_to_matrix(np.array(pose.q_xyzw)).T
+        e = np.concatenate((np.array(true.p_m) - zero - pose.p_m, rotation_log(turn)))
+        P = np.array(pose.covariance).reshape(6, 6) + 1e-12 * np.eye(6)
+        squared = float(e @ np.linalg.solve(P, e)) / 6.0
+        out.setdefault(pose.node, []).append((float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:])), squared))
+    return {node: np.array(rows) for node, rows in out.items()}
+
+
+@pytest.fixture(scope="module")
+def four() -> tuple[World, list[Message], list[NodePose]]:
+    world, messages = dive(3, 6.0)
+    poses, _ = solved(messages)
+    return world, messages, poses
+
+
+def test_all_nodes_are_in_the_fixed_nodes_frame(four: tuple[World, list[Message], list[NodePose]]) -> None:
+    world, _, poses = four
+    found = errors(world, poses)
+    assert sorted(found) == ["a", "b", "c", "d"]
+    assert {pose.fixed for pose in poses if pose.node == "a"} == {True}
+    for node in "bcd":
+        assert len(found[node]) > 45
+        assert np.median(found[node][:, 0]) < 0.03
+        assert found[node][:, 0].max() < 0.15
+        assert 0.3 < found[node][:, 2].mean() < 1.6
+
+
+def test_the_network_does_not_depend_on_how_much_comes_at_once(
+    four: tuple[World, list[Message], list[NodePose]],
+) -> None:
+    _, messages, poses = four
+    by_turns, _ = solved(first_seconds(messages, 2.0), together=90)
+    keyed = {(one.node, one.stamp_ns): one for one in by_turns if one.stamp_ns < START_NS + 1_500_000_000}
+    once = [one for one in poses if one.stamp_ns < START_NS + 1_500_000_000]
+    assert len(keyed) == len(once) > 20
+    for one in once:
+        assert keyed[one.node, one.stamp_ns].p_m == pytest.approx(one.p_m, abs=1e-6)
+
+
+def test_without_a_fixed_node_the_frame_moves_with_one() -> None:
+    world, messages = dive(4, 3.0, fixed_nodes=())
+    poses, _ = solved(messages)
+    at_zero = {pose.node for pose in poses if pose.p_m == (0.0, 0.0, 0.0)}
+    assert len(at_zero) == 1
+    found = errors(world, poses, at_zero.pop())
+    assert sorted(found) == ["a", "b", "c", "d"]
+    # Only the compasses say where north is.
+    assert all(rows[:, 0].max() < 1.0 and rows[:, 2].mean() < 2.0 for rows in found.values())
+
+
+def test_two_nodes_make_no_network_unless_one_is_fixed() -> None:
+    _, messages = dive(5, 1.0, more_nodes=(), fixed_nodes=(), imu=False)
+    assert solved(messages)[0] == []
+    _, messages = dive(5, 2.5, more_nodes=(), fixed_nodes=("a",))
+    assert {pose.node for pose in solved(messages)[0]} == {"a", "b"}
+
+
+def first_seconds(messages: list[Message], seconds: float) -> list[Message]:
+    return [message for message in messages if getattr(message, "stamp_ns", 0) < START_NS + round(seconds * 1e9)]
+
+
+def changed(messages: list[Message], node: str, change: Callable[[NodeInfo], NodeInfo]) -> list[Message]:
+    return [
+        change(message) if isinstance(message, NodeInfo) and message.node == node else message for message in messages
+    ]
+
+
+def test_places_far_from_zero_cost_nothing(four: tuple[World, list[Message], list[NodePose]]) -> None:
+    """Coordinates of a country's grid: thousands of kilometres."""
+    _, messages, poses = four
+
+    def moved(info: NodeInfo) -> NodeInfo:
+        x, y, z = info.fixed.p_m
+        return replace(info, fixed=replace(info.fixed, p_m=(x + 6.5e6, y + 5e5, z)))
+
+    far, _ = solved(changed(first_seconds(messages, 2.0), "a", moved))
+    near = {(one.node, one.stamp_ns): one for one in poses}
+    assert len(far) > 40
+    for one in far:
+        if one.stamp_ns > START_NS + 1_500_000_000:
+            continue
+        x, y, z = near[one.node, one.stamp_ns].p_m
+        assert one.p_m == pytest.approx((x + 6.5e6, y + 5e5, z), abs=1e-3)
+
+
+def test_a_node_without_lamps_is_placed_and_in_no_pair(four: tuple[World, list[Message], list[NodePose]]) -> None:
+    _, messages, _ = four
+    messages = changed(first_seconds(messages, 1.0), "b", lambda info: replace(info, role="camera"))
+    _, core = solved(messages)
+    assert sorted(core.pairs) == [("a", "c"), ("a", "d"), ("c", "d")]
+
+
+def test_absurd_values_end_nothing() -> None:
+    world, messages = dive(6, 3.0)
+    spoilt: list[Message] = []
+    for message in messages:
+        if isinstance(message, Candidates) and message.node == "b" and message.blobs and message.seq % 10 == 5:
+            absurd = replace(message.blobs[0], sigma_px=1e300)
+            spoilt.append(replace(message, blobs=[absurd, *message.blobs[1:]]))
+        else:
+            spoilt.append(message)
+    poses, _ = solved(spoilt)
+    found = errors(world, poses)
+    assert all(np.median(found[node][:, 0]) < 0.1 for node in "bcd")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", ["good", "poor"])
+def test_networks_err_as_they_say(grade: str) -> None:
+    """Means over six dives of 20 s: wanted are NEES / 6 of 0.8 to 1.3, and next to none wrong."""
+    found = []
+    for seed in range(20, 26):
+        world, messages = dive(seed, 20.0, inertial=grade)
+        found.append(errors(world, solved(messages)[0]))
+    means = np.array([[one[node][:, 2].mean() for node in "bcd"] for one in found])
+    assert 0.65 < means.mean() < 1.3, means
+    assert all(one[node][:, 0].max() < 0.4 for one in found for node in "bcd")
