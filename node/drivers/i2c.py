@@ -43,6 +43,7 @@ class I2cBus:
         self._new_bus: Any = SMBus
         self._message: Any = i2c_msg
         self._bus: Any = None
+        self._messages: dict[tuple[int, int, int], tuple[Any, Any]] = {}
 
     def open(self) -> None:
         """Open the adapter if it is not open; raise DeviceError if it cannot be. The next call tries again."""
@@ -84,30 +85,39 @@ class I2cBus:
 
     def read(self, address: int, register: int, count: int) -> bytes:
         """Read count bytes from a register on, in one transfer."""
-        reply = self._message.read(address, count)
-        self._transfer(address, register, self._message.write(address, [register]), reply)
-        return bytes(reply)
+        with self._lock:
+            key = address, register, count
+            # Making them costs more than the transfer; the kernel fills the same reply again.
+            kept = self._messages.get(key)
+            if kept is None:
+                made = self._message.write(address, [register]), self._message.read(address, count)
+                kept = self._messages[key] = made
+            self._transfer(address, register, *kept)
+            return bytes(kept[1])
 
     def write(self, address: int, register: int, *values: int) -> None:
         """Write a register, byte by byte, in one transfer."""
-        self._transfer(address, register, self._message.write(address, [register, *values]))
+        with self._lock:
+            self._transfer(address, register, self._message.write(address, [register, *values]))
 
     def command(self, address: int, command: int) -> None:
         """Send a command byte without data."""
-        self._transfer(address, command, self._message.write(address, [command]))
+        with self._lock:
+            self._transfer(address, command, self._message.write(address, [command]))
 
     def _transfer(self, address: int, register: int, *messages: object) -> None:
-        self.open()
-        with self._lock:
-            for attempt in range(1, ATTEMPTS + 1):
-                try:
-                    self._bus.i2c_rdwr(*messages)
-                    return
-                except OSError as error:
-                    if error.errno in _PASSING and attempt < ATTEMPTS:
-                        self.retries += 1
-                        continue
-                    raise self.error(address, register, _explain(error)) from error
+        """Transfer messages, with the lock held."""
+        if self._bus is None:
+            self._bus = self._open()
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                self._bus.i2c_rdwr(*messages)
+                return
+            except OSError as error:
+                if error.errno in _PASSING and attempt < ATTEMPTS:
+                    self.retries += 1
+                    continue
+                raise self.error(address, register, _explain(error)) from error
 
     def error(self, address: int, register: int, what: str) -> DeviceError:
         """Return an error that names where it happened."""

@@ -18,6 +18,8 @@ def test_a_whole_node_is_measured(capsys, monkeypatch):
     assert figures["frames"] > 5
     assert 0 < figures["median_ms"] <= figures["p99_ms"] <= figures["most_ms"]
     assert figures["cpu"] > 0
+    assert {"detect", "camera", "imu", "others"} <= set(figures["cpu_by_thread"])
+    assert sum(figures["cpu_by_thread"].values()) == pytest.approx(figures["cpu"], rel=0.3, abs=0.05)
     assert figures["rss_mib"][-1][1] > 20
     assert {"candidates", "imu", "depth"} <= set(figures["rates_hz"])
     assert "p99" in node.table(figures)

@@ -39,11 +39,13 @@ from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, Message, NodeInfo
 from buddyline.tools.measure.children import Child, free_endpoint
-from buddyline.tools.measure.load import load_of
+from buddyline.tools.measure.load import load_of, thread_times_s
 from numpy.typing import NDArray
 
 PICTURES: Final = 24
 WARM_UP_S: Final = 5.0
+# A thread with less of a core is not named.
+SHOWN: Final = 2e-4
 CONNECT_S: Final = 20.0
 IMU_NOISE: Final = (0.01, 0.001, 3e-7)
 FORCE_MPS2: Final = np.array([0.0, 0.0, -9.81])
@@ -92,10 +94,13 @@ def table(figures: dict[str, Any]) -> str:
     """Return the figures for a person."""
     rss = ", ".join(f"{mib:.1f} MiB after {minutes:g} min" for minutes, mib in figures["rss_mib"])
     rates = ", ".join(f"{name} {rate:.1f}" for name, rate in sorted(figures["rates_hz"].items()))
+    threads = sorted(figures["cpu_by_thread"].items(), key=lambda one: -one[1])
+    shares = ", ".join(f"{name} {share:.2%}" for name, share in threads if share >= SHOWN)
     return (
         "{environment}, {width_px} px wide, {rate_hz:g} Hz, {images_hz:g} pictures a second recorded; {frames} frames\n"
         "capture to candidates published   median {median_ms:.1f} ms, p99 {p99_ms:.1f} ms, most {most_ms:.1f} ms\n"
         "processor, of one core            {cpu:.1%}\n"
+        f"of it by thread                   {shares}\n"
         f"memory (RSS)                      {rss}\n"
         "log without pictures              {log_kb_per_s:.1f} kB/s\n"
         f"rates, Hz                         {rates}\n"
@@ -201,14 +206,14 @@ def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
             raise BuddylineError("the node did not connect to its hub")
     service.stop.wait(WARM_UP_S)
     first, sent = len(service.times_s), service.outlet.sent.copy()
-    began_s, began = time.monotonic(), load_of()
+    began_s, began, threads = time.monotonic(), load_of(), thread_times_s()
     rss_mib: list[tuple[float, float]] = []
     while (passed_s := time.monotonic() - began_s) < seconds:
         if passed_s >= 60.0 and not rss_mib:
             rss_mib.append((1.0, load_of().rss_mib))
         if service.stop.wait(min(1.0, seconds - passed_s)):
             raise BuddylineError("the node ended")
-    ended = load_of()
+    ended, spent = load_of(), thread_times_s()
     cpu = (ended.cpu_s - began.cpu_s) / passed_s
     rss_mib.append((round(passed_s / 60.0, 1), ended.rss_mib))
     times_ms = 1e3 * np.array(service.times_s[first:])
@@ -220,6 +225,7 @@ def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
         "p99_ms": float(np.percentile(times_ms, 99)),
         "most_ms": float(times_ms.max()),
         "cpu": cpu,
+        "cpu_by_thread": {name: (spent_s - threads.get(name, 0.0)) / passed_s for name, spent_s in spent.items()},
         "rss_mib": rss_mib,
         "rates_hz": {name: (count - sent[name]) / passed_s for name, count in service.outlet.sent.copy().items()},
         "dropped": service.drops["frame"] + service.recorder.dropped,
