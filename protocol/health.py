@@ -11,6 +11,9 @@ from buddyline.protocol.topics import NODE_STATUS, Topic
 STALE_PERIODS: Final = 3
 # A node sends at least its status. After this time without any message, the node or the link is down.
 SILENT_S: Final = 1.5 / NODE_STATUS.rate_hz
+# All is said to be well only if each node and the solver have said something within this time. A page then shows a cut
+# within two seconds.
+WELL_S: Final = 1.6
 # When healthy nodes give no pose for NO_POSE_S, the reasons of the last REASONS_S are shown.
 NO_POSE_S: Final = 2.0
 REASONS_S: Final = 10.0

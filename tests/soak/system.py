@@ -76,7 +76,7 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
         system.start("hub")
         viewer = Viewer(system.endpoint)
         stack.callback(viewer.bus.close)
-        system.start("recorder", *(["monitor"] if find_spec("viser") else []), "solver", "a", "b")
+        system.start("recorder", *(["monitor"] if find_spec("websockets") else []), "solver", "a", "b")
         processes = dict(system.processes)
         pace = stack.enter_context(Process(module="buddyline.tools.measure.pace"))
         _measure(result, processes, viewer, pace, seconds, every_s, show)

@@ -77,7 +77,7 @@ NOT_ENOUGH = (
     "calibrate clock",
     "calibrate camera",
 )
-NEEDS = {"view": "viser", "export foxglove": "foxglove", "artag": "pupil_apriltags"}
+NEEDS = {"view": "websockets", "export foxglove": "foxglove", "artag": "pupil_apriltags"}
 
 
 @pytest.fixture
@@ -107,7 +107,6 @@ def run(dives, tmp_path, capsys, monkeypatch):
     return call
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # viser's
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_damage_is_named_and_what_is_left_is_used(run, name, damage, tmp_path):
@@ -126,7 +125,6 @@ def test_damage_is_named_and_what_is_left_is_used(run, name, damage, tmp_path):
         assert any("lost" in line for line in lines)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # viser's
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in NOT_ENOUGH])
 def test_undamaged_dives_report_no_losses(run, name):
     status, err, _ = run(name, None)

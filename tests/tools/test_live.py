@@ -30,7 +30,7 @@ from tests.processes import PATIENCE_S, Process, buddyline
     ids=lambda words: words[0],
 )
 def test_a_command_without_a_hub_ends_when_its_time_is_over(tmp_path, words):
-    for module in {"ros2": ["rosbags"], "monitor": ["viser"]}.get(words[0], []):
+    for module in {"ros2": ["rosbags"], "monitor": ["websockets"]}.get(words[0], []):
         pytest.importorskip(module)
     endpoint = free_endpoint()
     done = buddyline(*words, "--connect", endpoint, "--seconds", "0.5", cwd=tmp_path)

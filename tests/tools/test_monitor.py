@@ -6,8 +6,6 @@ import base64
 import math
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,20 +13,20 @@ import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import Message
+from buddyline.protocol.messages import Message, RelativePose, SolverStatus
 from buddyline.protocol.topics import ATTITUDE, INFO, POSE, TRACK
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.coverage import Coverage, clock_words
 from buddyline.tools.monitor.live import subscribe
-from buddyline.tools.monitor.page import MISSES, TimePlots
+from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, columns
-from buddyline.tools.monitor.scene import R_LEVEL, Floats, age_colours, ellipsoid, fit, frame_of, holds
+from buddyline.tools.monitor.scene import R_LEVEL, ellipsoid, frame_of
 from msgspec.structs import replace
 
 from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection, track
-from tests.tools.watched import at, attitude, feed, image, solver_status, status, take, watched
+from tests.tools.watched import at, attitude, feed, image, solver_status, status, take, tick, watched
 
 HALF = math.sqrt(0.5)
 
@@ -118,6 +116,35 @@ class TestHealth:
         assert not picture.is_stale(at(0) + 38 * S_NS // 10)
         assert picture.is_stale(at(0) + 12 * S_NS)
 
+    @pytest.mark.parametrize("silent", ["a", "solver", "poses"])
+    def test_green_needs_facts_younger_than_two_seconds_from_everyone(self, silent: str) -> None:
+        """One falls silent; whatever else is said of it, nobody says that all is well two seconds later."""
+        picture = watched()
+        for k in range(30, 48):
+            for message in tick(k):
+                is_solver = isinstance(message, RelativePose | SolverStatus)
+                left_out = {
+                    "solver": is_solver,
+                    "poses": isinstance(message, RelativePose),
+                    "a": getattr(message, "node", "") == "a",
+                }
+                if not left_out[silent]:
+                    take(picture, message, at(k))
+        assert "All is well" in words(picture, at(30))
+        for k in (48, 49):
+            assert "All is well" not in words(picture, at(k))
+
+    def test_that_nothing_is_wrong_does_not_make_it_well(self) -> None:
+        picture = watched(50)
+        picture.solver_heard_ns = at(30)
+        (said,) = findings(picture, at(49))
+        assert (said.level, said.text) == ("warning", "Not known to be well: nothing new from the solver.")
+
+    def test_clocks_that_are_apart_are_not_well(self) -> None:
+        picture = watched()
+        take(picture, replace(solver_status(at(29)), clock_skew_s=0.02), at(29))
+        assert "clocks are 20 ms apart" in words(picture, at(29))
+
     def test_without_messages_the_advice_is_to_start_everything(self) -> None:
         assert "start hub, nodes and solver" in words(PairPicture(), 5)
 
@@ -189,7 +216,7 @@ class TestTrack:
         shown = picture.shown(at(31))
         assert shown is not None
         assert (shown.estimate.range_m, shown.stale, shown.note) == (3.5, False, "no light for 1.2 s")
-        drawn = panel.headline(picture, at(31))
+        drawn = panel.figures(picture, at(31))
         assert "3.50 m" in drawn
         assert "No light for 1.2 s." in drawn
 
@@ -226,7 +253,7 @@ class TestTrack:
         picture = watched()
         angles = {"azimuth_rad": 1.0, "sigma_azimuth_rad": 0.05, "inclination_rad": 0.1, "sigma_inclination_rad": 0.01}
         take(picture, track(29, t_ned_m=(1.5, 2.5, 0.3), sigma_ned_m=(0.11, 0.08, 0.02), **angles), at(29))
-        drawn = panel.headline(picture, at(29))
+        drawn = panel.figures(picture, at(29))
         for text in ("± 5.8 mm", "57.3°", "± 2.9°", "± 0.6°", "north +1.50 ± 0.11 m, east +2.50 ± 0.08 m, down +0.30"):
             assert text in drawn
 
@@ -245,23 +272,13 @@ class TestTrack:
             take(picture, solver_status(at(k)), at(k))
         (said,) = [finding for finding in findings(picture, at(59)) if finding.name == "pair"]
         assert (said.level, said.text.endswith("The track goes on without.")) == ("warning", True)
-        assert panel.headline(picture, at(59)).count("3.00 m") == 1
+        assert panel.figures(picture, at(59)).count("3.00 m") == 1
 
     @pytest.mark.parametrize("live", [True, False])
     def test_the_solvers_problem_is_shown(self, live: bool) -> None:
         picture = watched()
         take(picture, solver_status(at(29), "the inertial unit of a is mounted otherwise"), at(29))
         assert "The solver reports: the inertial unit of a" in words(picture, at(29), live=live)
-
-    def test_poses_and_track_are_columns_of_one_plot(self) -> None:
-        picture, gui = watched(), PlotFolder()
-        for k in range(30):
-            take(picture, track(k, (0.0, 0.0, 3.5)), at(k))
-        TimePlots(gui).draw(picture, at(30))  # type: ignore[arg-type]
-        _, poses_m, track_m = gui.plots["Range, m"].data
-        assert np.nanmax(poses_m) == np.nanmin(poses_m) == 3.0
-        assert np.nanmax(track_m) == np.nanmin(track_m) == 3.5
-        assert np.isfinite(track_m).sum() == 15
 
 
 def _unsolved() -> PairPicture:
@@ -275,10 +292,10 @@ def _unsolved() -> PairPicture:
 class TestLive:
     def test_messages_update_the_picture_and_bad_ones_change_nothing(self) -> None:
         network = LocalNetwork(ManualClock(at(30)))
-        picture, refusals = PairPicture(), Refusals("t")
+        overview, refusals = Overview(), Refusals("t")
         with network.connect() as nodes, network.connect() as topside:
             nodes.publisher(INFO, "a").put(INFOS["a"])
-            subscribe(topside, refusals, picture, threading.Lock())
+            subscribe(topside, refusals, overview, threading.Lock())
             poses = nodes.publisher(POSE, "a", "b")
             poses.put(pose(0))
             poses.put_bytes(b'{"range_m": "far"}')
@@ -287,6 +304,7 @@ class TestLive:
             nodes.publisher(ATTITUDE, "a").put(attitude("a", at(1)))
             # All subscriptions have handed on what they hold when they are closed.
             topside.close()
+        picture = overview.picture()
         assert (picture.pose, picture.solved) == (pose(1), 2)
         assert picture.track == track(1)
         assert picture.nodes["a"].info == INFOS["a"]
@@ -294,19 +312,19 @@ class TestLive:
         assert refusals.count == 1
 
     def test_a_process_that_leaves_the_bus_is_noticed(self) -> None:
-        network, picture = LocalNetwork(ManualClock(at(30))), watched()
+        network, overview = LocalNetwork(ManualClock(at(30))), Overview()
         with network.connect() as topside:
             with network.connect() as node:
                 node.declare_alive("node/b")
-                subscribe(topside, Refusals("t"), picture, threading.Lock())
+                subscribe(topside, Refusals("t"), overview, threading.Lock())
             topside.close()
-        assert picture.nodes["b"].left_ns == at(30)
+        assert overview.nodes["b"].left_ns == at(30)
 
 
 class TestPanel:
     def test_stale_figures_are_struck_through_and_said_to_be_old(self) -> None:
         picture = watched()
-        fresh, old = panel.headline(picture, at(29)), panel.headline(picture, at(29) + S_NS)
+        fresh, old = panel.figures(picture, at(29)), panel.figures(picture, at(29) + S_NS)
         assert "STALE" not in fresh
         assert 'class="grid old"' in old
         assert "STALE: 1.0 s old" in old
@@ -315,7 +333,7 @@ class TestPanel:
         picture = watched()
         take(picture, status("a", at(30), "<script>alert(1)</script>"), at(30))
         take(picture, replace_detail("<img src=x>"), at(30))
-        for drawn in (panel.headline, panel.health):
+        for drawn in (panel.figures, panel.health):
             assert "<script>alert" not in drawn(picture, at(31))
         assert "<img" not in panel.camera(picture, picture.nodes["a"], at(30))
 
@@ -355,59 +373,14 @@ class TestPanel:
             "Gap between both nodes' ranges",
         }
 
-    @pytest.mark.parametrize("draw", [panel.headline, panel.health])
+    @pytest.mark.parametrize("draw", [panel.figures, panel.health])
     def test_every_state_can_be_drawn(self, draw: Callable[[PairPicture, int], str]) -> None:
         for picture in (PairPicture(), watched(1), watched(30), _unsolved()):
-            assert draw(picture, at(30)).startswith("<style>")
+            assert draw(picture, at(30)).startswith("<div")
 
 
 def replace_detail(detail: str) -> Message:
     return replace(rejection(29), detail=detail)
-
-
-class PlotFolder:
-    """Stands for viser's panel: keeps the plots that are added."""
-
-    def __init__(self) -> None:
-        self.plots: dict[str, SimpleNamespace] = {}
-
-    def add_folder(self, _: str) -> AbstractContextManager[None]:
-        return nullcontext()
-
-    def add_uplot(
-        self, data: tuple[Floats, ...], _: object, *, title: str, scales: object, **how: object
-    ) -> SimpleNamespace:
-        self.plots[title] = SimpleNamespace(data=data, scales=scales, visible=True)
-        return self.plots[title]
-
-
-class TestTimePlots:
-    def test_plots_get_finite_values_in_order_of_time(self) -> None:
-        picture, gui = watched(), PlotFolder()
-        for k in (30, 31, 32, 45):
-            take(picture, rejection(k), at(k))
-        take(picture, pose(40, azimuth_rad=1.0, inclination_rad=0.1), at(40))
-        TimePlots(gui).draw(picture, at(50))  # type: ignore[arg-type]
-        assert {title.split(",")[0] for title in gui.plots} >= {"Range", "Azimuth", "Triggers without a pose"}
-        for plot in gui.plots.values():
-            assert np.isfinite(plot.data[0]).all()
-            # Each instant has one value: the pose's or the track's.
-            assert (np.isfinite(plot.data[1:]).sum(axis=0) == 1).all()
-            low, high = plot.scales["y"]["range"]
-            assert low <= np.nanmin(plot.data[1:]) <= np.nanmax(plot.data[1:]) <= high
-            assert low < high
-            assert (np.diff(plot.data[0]) > 0).all()
-            assert len(plot.data[0]) == len(plot.data[1])
-        # The azimuth was known once.
-        assert next(len(plot.data[1]) for title, plot in gui.plots.items() if title.startswith("Azimuth")) == 1
-        assert gui.plots[MISSES].data[1][-3:].tolist() == [0.0, 3.0, 1.0]
-
-    def test_a_plot_without_values_is_hidden_until_there_are_some(self) -> None:
-        picture, gui = watched(), PlotFolder()
-        plots = TimePlots(gui)  # type: ignore[arg-type]
-        for now_ns, visible in ((at(29), True), (at(29) + 200 * S_NS, False), (at(29), True)):
-            plots.draw(picture, now_ns)
-            assert {plot.visible for plot in gui.plots.values()} == {visible}
 
 
 class TestScene:
@@ -417,27 +390,6 @@ class TestScene:
         assert half_m[longest] == pytest.approx(2.795 * 0.02)
         np.testing.assert_allclose(np.abs(R_s_axes[:, longest]), (1.0, 0.0, 0.0), atol=1e-9)
         assert np.linalg.det(R_s_axes) == pytest.approx(1.0)
-
-    @pytest.mark.parametrize("aspect", [0.46, 1.6])
-    def test_the_view_has_both_nodes_before_the_eye(self, aspect: float) -> None:
-        t_m = np.array([0.0, -8.0, 1.0])
-        eye, target = fit(t_m, aspect)
-        ahead = (target - eye) / np.linalg.norm(target - eye)
-        for point_m in (np.zeros(3), t_m):
-            seen = point_m - eye
-            assert seen @ ahead / np.linalg.norm(seen) > math.cos(math.radians(40))
-        assert eye[2] < target[2]
-
-    def test_a_node_outside_the_view_is_noticed(self) -> None:
-        eye, target = fit(np.array([3.0, 0.0, 0.0]), 1.6)
-        fov_rad = math.radians(75)
-        assert holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
-        assert not holds(eye, target, fov_rad, np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]]))
-        assert not holds(eye, target, fov_rad, np.array([eye + 0.1 * (eye - target)]))
-
-    def test_the_trails_colour_shows_its_age(self) -> None:
-        colours = age_colours(np.array([0.0, 60.0, 500.0]), 120.0).astype(int)
-        assert np.all(np.diff(colours[:, 0]) < 0)
 
 
 class TestCoverage:

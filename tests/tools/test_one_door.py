@@ -21,7 +21,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.live import follow
 from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.live import subscribe
-from buddyline.tools.monitor.picture import PairPicture
+from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.playback import Playback, cover
 from buddyline.tools.monitor.summary import summarize
 from buddyline.tools.survey.live import LiveAlarms, Watch
@@ -49,9 +49,9 @@ def test_only_the_envelope_decodes_payloads():
 
 
 def monitor_of(bus, took):
-    picture = PairPicture()
-    subscribe(bus, Refusals("t"), picture, threading.Lock())
-    return lambda: {name: node.depth.depth_m for name, node in picture.nodes.items() if node.depth}
+    overview = Overview()
+    subscribe(bus, Refusals("t"), overview, threading.Lock())
+    return lambda: {name: node.depth.depth_m for name, node in overview.nodes.items() if node.depth}
 
 
 def follower_of(bus, took):

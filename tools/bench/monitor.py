@@ -33,6 +33,7 @@ from buddyline.tools.client import ClientConfig
 from buddyline.tools.live import follow, open_bus_within
 from buddyline.tools.measure.children import Child, free_endpoint, free_port
 from buddyline.tools.measure.tables import cells_of, text_table
+from buddyline.tools.monitor.server import FILES
 
 RATE_HZ: Final = 30
 DIVE_S: Final = 120
@@ -44,7 +45,7 @@ READY_S: Final = 60.0
 SETTLE_S: Final = 5.0
 # The page draws its first picture in software, which may take this long.
 BROWSER_MS: Final = 120_000
-SOLVED: Final = "the solver finds the pose"
+SOLVED: Final = "± is 1 sd"
 CHROMIUM_FLAGS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
@@ -181,26 +182,16 @@ def monitor(endpoint: str) -> Iterator[tuple[Child, str]]:
 def viewer(address: str) -> Iterator[list[int]]:
     """Connect to a page as its client does, and receive everything; yield a list with the number of bytes so far."""
     try:
-        import msgspec
-        import viser
         from websockets.sync.client import connect
-        from websockets.typing import Subprotocol
     except ImportError as error:
         raise BuddylineError(f"{error.name} is not installed: make install EXTRAS=monitor") from error
-    eye: dict[str, Any] = {
-        **{"type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (3.0, 3.0, 3.0), "fov": 1.0},
-        **{"near": 0.1, "far": 100.0, "image_height": 800, "image_width": 1280},
-        **{"look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, -1.0)},
-    }
     taken = [0]
 
     def take(connection: Any) -> None:
         for data in connection:
             taken[0] += len(data)
 
-    spoken = [Subprotocol(f"viser-v{viser.__version__}")]
-    with connect(f"ws://{address}", subprotocols=spoken, max_size=None, compression=None) as connection:
-        connection.send(msgspec.msgpack.encode(eye))
+    with connect(f"ws://{address}/ws", max_size=None) as connection:
         taker = threading.Thread(target=take, args=(connection,))
         taker.start()
         try:
@@ -243,9 +234,12 @@ def measure_servers(endpoint: str, viewers: list[int], minutes: float) -> list[d
 def measure_page(endpoint: str) -> dict[str, float]:
     """Return the page's size as served and, with a browser, the seconds until it shows the scene."""
     with monitor(endpoint) as (_, address):
-        request = urllib.request.Request(f"http://{address}", headers={"Accept-Encoding": "gzip"})
-        with urllib.request.urlopen(request, timeout=30) as page:
-            figures = {"page_kbyte": len(page.read()) / 1e3}
+        size = 0
+        for path in FILES:
+            request = urllib.request.Request(f"http://{address}{path}", headers={"Accept-Encoding": "gzip"})
+            with urllib.request.urlopen(request, timeout=30) as file:
+                size += len(file.read())
+        figures = {"page_kbyte": size / 1e3}
         with viewer(address) as taken:
             time.sleep(2.0)
             figures["first_two_seconds_kbyte"] = taken[0] / 1e3

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import (
     CLOCK_OFF_S,
+    CLOCKS_APART_S,
     HOT_DEGC,
     NO_POSE_S,
     REASONS_S,
     SILENT_S,
     TRACK_SIGMA_SHARE,
+    WELL_S,
     stale_after_s,
 )
 from buddyline.protocol.messages import NodeStatus
@@ -46,8 +48,31 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
     said += _track(picture, now_ns)
     said += _pair(picture, now_ns, live)
     if not said:
-        said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose."))
+        missing = _unproven(picture, now_ns, live)
+        if missing:
+            text = f"Not known to be well: {', '.join(missing)}."
+            said.append(
+                Finding("pair", "warning", text, "wait a moment; if it stays, see the figures of nodes and solver")
+            )
+        else:
+            said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose."))
     return worst_first(said)
+
+
+def _unproven(picture: PairPicture, now_ns: int, live: bool) -> list[str]:
+    """Return the facts that are missing for all to be well, in words. That nothing is wrong is no such fact."""
+    missing = []
+    for end, node in zip(picture.ends(), picture.end_nodes(), strict=True):
+        if node is None or now_ns - node.alive_ns() > WELL_S * S_NS:
+            missing.append(f"nothing new from node {end or 'a or b'}")
+    if live and (picture.solver_heard_ns is None or now_ns - picture.solver_heard_ns > WELL_S * S_NS):
+        missing.append("nothing new from the solver")
+    if picture.is_stale(now_ns):
+        missing.append("no fresh track or pose")
+    skew_s = UNSET if picture.solver is None else picture.solver.clock_skew_s
+    if skew_s is not UNSET and abs(skew_s) > CLOCKS_APART_S:
+        missing.append(f"the nodes' clocks are {abs(skew_s) * 1e3:.0f} ms apart")
+    return missing
 
 
 def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:

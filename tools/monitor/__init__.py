@@ -1,1 +1,1 @@
-"""Watch a pair live, look at a dive again, and report on it."""
+"""Overview a pair live, look at a dive again, and report on it."""

@@ -31,9 +31,11 @@ class Coverage:
         self.rejected = np.zeros(bins, int)
         self.complete = False
         self._reasons: Counter[tuple[int, str]] = Counter()
+        self._times_ns: list[int] = []
 
     def add(self, at_ns: int, reason: str | None) -> None:
         """Count one trigger; reason: None for a pose."""
+        self._times_ns.append(at_ns)
         bins = len(self.solved)
         index = min(max((at_ns - self.begin_ns) * bins // (self.end_ns - self.begin_ns), 0), bins - 1)
         if reason is None:
@@ -41,6 +43,14 @@ class Coverage:
         else:
             self.rejected[index] += 1
             self._reasons[index, reason] += 1
+
+    def sort(self) -> None:
+        """Bring the times of all outcomes into order."""
+        self._times_ns.sort()
+
+    def times(self) -> list[int]:
+        """Return the times of all outcomes, in order; empty until the whole dive has been read."""
+        return self._times_ns if self.complete else []
 
     def without(self) -> list[tuple[int, int, Counter[str]]]:
         """Return the stretches (from, to in ns, reasons) in which most triggers ended without a pose."""

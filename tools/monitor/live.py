@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import logging
+import secrets
+import socket
 import threading
 import webbrowser
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol import topics
 from buddyline.tools.client import add_client_arguments, client_config
@@ -15,16 +18,19 @@ from buddyline.tools.pairs import add_pair_argument
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
+    from buddyline.protocol.clock import Clock
     from buddyline.protocol.envelope import Envelope, Refusals
-    from buddyline.tools.monitor.page import Page
-    from buddyline.tools.monitor.picture import PairPicture
+    from buddyline.tools.monitor.overview import Overview
+    from buddyline.tools.monitor.server import PageServer, Session
 
 log = logging.getLogger(__name__)
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
 STATES: Final = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
-STREAMS: Final = (topics.POSE, topics.TRACK, topics.REJECTED, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH)
+STREAMS: Final = (
+    *(topics.POSE, topics.TRACK, topics.REJECTED, topics.NET_POSE, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH),
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,48 +46,83 @@ def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--host",
         default=DEFAULT_HOST,
-        help=f"default: {DEFAULT_HOST}, this machine alone; 0.0.0.0: everyone on the network, without a password",
+        help=f"default: {DEFAULT_HOST}, this machine alone; 0.0.0.0: everyone on the network who has the printed link",
     )
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help=f"default: {DEFAULT_PORT}")
     parser.add_argument("--open", action="store_true", help="open the page in this machine's browser")
 
 
-def open_page(args: argparse.Namespace, title: str, *, live: bool) -> Page:
-    """Serve the page, and print its address."""
-    from buddyline.tools.monitor.page import Page, open_server
+def open_page(args: argparse.Namespace, title: str, open_session: Callable[[], Session], *, live: bool) -> PageServer:
+    """Listen for viewers, and print the page's link."""
+    from buddyline.tools.monitor.server import PageServer, is_local, open_listener
 
-    server = open_server(args.host, args.port, title)
-    address = f"http://{'127.0.0.1' if args.host == '0.0.0.0' else args.host}:{server.get_port()}"
-    if args.host not in ("127.0.0.1", "localhost", "::1"):
-        log.warning("the page is open to everyone who reaches this machine on port %d", server.get_port())
-    log.info("%s: look at %s; Ctrl-C ends", title, address)
+    listener = open_listener(args.host, args.port)
+    token = "" if is_local(args.host) else secrets.token_urlsafe(16)
+    page = PageServer(listener, title, token, open_session, live)
+    host = this_machine() if args.host in ("0.0.0.0", "::") else args.host
+    link = f"http://{f'[{host}]' if ':' in host else host}:{page.port}/{f'#{token}' if token else ''}"
+    if token:
+        log.warning("everyone who has this link can look; it goes over the network in the clear")
+    log.info("%s: look at %s ; Ctrl-C ends", title, link)
     if args.open:
-        webbrowser.open(address)
-    return Page(server, live=live)
+        webbrowser.open(link)
+    return page
+
+
+def this_machine() -> str:
+    """Return this machine's address as others see it, or its name."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Nothing is sent: the kernel only chooses the way.
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return socket.gethostname()
+        return str(probe.getsockname()[0])
+
+
+class LiveSession:
+    """What all viewers of running nodes share."""
+
+    def __init__(self, overview: Overview, clock: Clock) -> None:
+        self.lock = threading.Lock()
+        self._overview = overview
+        self._clock = clock
+
+    def step(self, commands: list[dict[str, Any]]) -> tuple[Overview, int, bool]:
+        """Return what is watched, now."""
+        return self._overview, self._clock.now_ns(), False
+
+    def playback(self) -> None:
+        """Return None: nothing is played."""
+        return
+
+    def close(self) -> None:
+        """Do nothing: the other viewers look on."""
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until stopped."""
     from buddyline.protocol.clock import SystemClock
-    from buddyline.tools.monitor.picture import PairPicture
+    from buddyline.tools.monitor.overview import Overview
 
     client = LiveClient("monitor", client_config(args), args.seconds)
-    page = open_page(args, "Buddyline", live=True)
-    clock, picture, lock = SystemClock(), PairPicture(args.pair), threading.Lock()
+    overview = Overview(args.pair)
+    session = LiveSession(overview, SystemClock())
+    page = open_page(args, "Buddyline", lambda: session, live=True)
 
     def work(bus: Bus) -> None:
-        subscribe(bus, client.refusals, picture, lock)
+        subscribe(bus, client.refusals, overview, session.lock)
         client.wait()
 
-    client.spawn("page", lambda: page.draw_until(client.stop, lambda _: (picture, clock.now_ns(), False), lock))
+    client.spawn("page", lambda: page.run(client.stop))
     try:
         return client.run(work)
     finally:
         page.close()
 
 
-def subscribe(bus: Bus, refusals: Refusals, picture: PairPicture, lock: threading.Lock) -> None:
-    """Subscribe to everything that is shown; messages go into the picture, under the lock.
+def subscribe(bus: Bus, refusals: Refusals, overview: Overview, lock: threading.Lock) -> None:
+    """Subscribe to everything that is shown; messages go into overview, under the lock.
 
     Only the last message of each latest-only topic is fetched: a history of the rest would load the link that the
     solver needs. Each subscription's queue drops its oldest message, so a slow page does not slow the publishers.
@@ -89,11 +130,11 @@ def subscribe(bus: Bus, refusals: Refusals, picture: PairPicture, lock: threadin
 
     def take(envelope: Envelope) -> None:
         with lock:
-            picture.take(envelope)
+            overview.take(envelope)
 
     def alive(name: str, is_alive: bool) -> None:
         with lock:
-            picture.alive(name, is_alive, bus.clock.now_ns())
+            overview.alive(name, is_alive, bus.clock.now_ns())
 
     for followed, capacity, history in ((STATES, 64, True), (STREAMS, 1024, False), ((topics.IMAGE,), 4, False)):
         follow(bus, tuple(topic.key_any() for topic in followed), refusals, take, capacity=capacity, history=history)

@@ -22,45 +22,17 @@ TRACK_WORDS: Final[dict[TrackMode, str]] = {
     "lag": "from what came up to a second later",
     "smooth": "from the whole dive",
 }
-CSS: Final = (
-    "<style>"
-    ".bl{font:13px/1.4 system-ui,sans-serif;padding:2px 12px;container-type:inline-size}"
-    ".bl .banner{border-radius:6px;padding:6px 10px;margin:2px 0 6px;font-weight:600;color:#fff}"
-    ".bl .ok{background:#2b7a43}.bl .warning{background:#8a6410}.bl .problem{background:#a32f2a}"
-    ".bl .big{font-size:clamp(17px,6.4cqw,25px);font-weight:650;font-variant-numeric:tabular-nums;"
-    "letter-spacing:-.5px;white-space:nowrap}"
-    ".bl .old,.bl .old *{color:#8b8f96!important;text-decoration:line-through}"
-    ".bl .grid{display:grid;grid-template-columns:repeat(3,1fr);gap:2px 8px}"
-    ".bl .dim{opacity:.65;font-size:11px}"
-    ".bl table{width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums}"
-    ".bl td{padding:1px 4px 1px 0;vertical-align:top}.bl td.n{text-align:right;white-space:nowrap}"
-    ".bl .find{border-left:4px solid;padding:1px 8px;margin:4px 0;background:rgba(128,128,128,.1)}"
-    ".bl .find.problem{border-color:#e0574f;background:rgba(224,87,79,.14)}.bl .find.warning{border-color:#e0a93b;"
-    "background:rgba(224,169,59,.12)}.bl .find.ok{border-color:#4caf6a;background:rgba(76,175,106,.12)}"
-    ".bl .cam{position:relative;margin:4px 0}.bl .cam svg{width:100%;height:auto;display:block;background:#05080c;"
-    "border-radius:4px}.bl .cam.stale svg{filter:grayscale(1) brightness(.55)}</style>"
-)
 
 
-def block(*parts: str) -> str:
-    """Wrap parts of HTML as one block of the panel, with its style."""
-    return f'{CSS}<div class="bl">{"".join(parts)}</div>'
-
-
-def headline(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
-    """Return the worst finding, and B's place in large figures, which are struck through if they are stale."""
-    worst = findings(picture, now_ns, live=live)[0]
-    banner = f'<div class="banner {worst.level}">{escape(sentence(worst, now_ns))}</div>'
-    return block(banner, _figures(picture, now_ns))
-
-
-def _figures(picture: PairPicture, now_ns: int) -> str:
+def figures(picture: PairPicture, now_ns: int) -> str:
+    """Return B's place in large figures, which are struck through if they are stale."""
     shown = picture.shown(now_ns)
     if shown is None:
         return '<div class="dim">No pose yet.</div>'
     estimate = shown.estimate
     cells = "".join(
-        f'<div><div class="dim">{name}</div><div class="big">{value}</div><div class="dim">{sigma}</div></div>'
+        f'<div class="figure"><div class="dim">{name}</div><div class="big">{value}</div>'
+        f'<div class="dim">{sigma}</div></div>'
         for name, value, sigma in (
             ("range", f"{estimate.range_m:.2f} m", f"± {length_words(range_sigma_m(estimate))}"),
             ("azimuth", *_angle(estimate, "azimuth_rad", ".1f")),
@@ -72,7 +44,8 @@ def _figures(picture: PairPicture, now_ns: int) -> str:
     facts += "".join(
         f" {node.node} is {node.depth.depth_m:.2f} m deep." for node in picture.end_nodes() if node and node.depth
     )
-    return f'<div class="grid{" old" if shown.stale else ""}">{cells}</div><div class="dim">{note}{escape(facts)}</div>'
+    old = " old" if shown.stale else ""
+    return f'<div class="grid{old}">{cells}</div><div class="dim facts">{note}{escape(facts)}</div>'
 
 
 def _angle(estimate: Estimate, field: str, digits: str) -> tuple[str, str]:
@@ -119,7 +92,7 @@ def health(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
         f'<tr><td><b>{escape(who).replace(" ", "&nbsp;")}</b></td><td class="dim">{escape(", ".join(facts))}</td></tr>'
         for who, facts in rows
     )
-    return block(said, f"<table>{table}</table>", _rejections(picture))
+    return f"{said}<table>{table}</table>{_rejections(picture)}"
 
 
 def _finding(finding: Finding, now_ns: int) -> str:
@@ -166,7 +139,7 @@ def _rejections(picture: PairPicture) -> str:
         f'<td class="n">{count}</td><td class="n">{count / total:.0%}</td></tr>'
         for words, reason, count in counts
     )
-    return f'<div class="dim" style="margin-top:6px">Triggers seen here</div><table>{rows}</table>'
+    return f'<div class="dim">Triggers seen here</div><table>{rows}</table>'
 
 
 def camera(picture: PairPicture, node: NodePicture, now_ns: int) -> str:
@@ -175,15 +148,15 @@ def camera(picture: PairPicture, node: NodePicture, now_ns: int) -> str:
     topic = CANDIDATES if image is None else IMAGE
     age_ns, old = node.age_ns(topic.name, now_ns), node.is_stale(topic, now_ns)
     if age_ns is None:
-        return block(f'<div class="dim">Node {escape(node.node)}: no picture yet.</div>')
+        return f'<div class="dim">Node {escape(node.node)}: no picture yet.</div>'
     facts = ["picture" if image is not None else "no preview, candidates only"]
     facts += [f"STALE: {duration_words(age_ns / S_NS)} old"] if old else []
     if frame is not None:
         facts.append(f"{len(frame.blobs)} candidates" + (f" and {frame.truncated} more" if frame.truncated else ""))
     drawing, words = judged_picture(picture, node)
-    return block(
-        f'<div class="cam{" stale" if old else ""}"><b>Node {escape(node.node)}</b> '
-        f'<span class="dim">{", ".join(facts)}</span>{drawing}<div class="dim">{escape(words)}</div></div>'
+    return (
+        f'<div class="cam{" stale" if old else ""}">{drawing}<div><b>Node {escape(node.node)}</b> '
+        f'<span class="dim">{", ".join(facts)}. {escape(words)}</span></div></div>'
     )
 
 

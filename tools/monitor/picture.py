@@ -198,10 +198,11 @@ class PairPicture:
     """The state of one pair, and of all nodes.
 
     pair: the one to follow; None: the first that a solver reports, and until then the first two nodes by name.
+    nodes: shared with other pairs' pictures; None: its own.
     """
 
-    def __init__(self, pair: Pair | None = None) -> None:
-        self.nodes: dict[str, NodePicture] = {}
+    def __init__(self, pair: Pair | None = None, nodes: dict[str, NodePicture] | None = None) -> None:
+        self.nodes: dict[str, NodePicture] = {} if nodes is None else nodes
         self.pair = pair
         self.pose: RelativePose | None = None
         self.pose_ns: int | None = None
@@ -215,6 +216,7 @@ class PairPicture:
         self.results: dict[int, RelativePose | Rejected] = {}
         self.solver: SolverStatus | None = None
         self.solver_ns: int | None = None
+        self.solver_heard_ns: int | None = None
         self.solver_problem_since_ns = 0
         self.solver_left_ns: int | None = None
         self.first_ns: int | None = None
@@ -224,8 +226,7 @@ class PairPicture:
     def take(self, envelope: Envelope) -> None:
         """Take one message, received at its time_ns."""
         message, at_ns = envelope.message, envelope.time_ns
-        self.first_ns = at_ns if self.first_ns is None else self.first_ns
-        self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
+        self.heard(at_ns)
         if len(envelope.ids) == 1:
             self.nodes.setdefault(envelope.node, NodePicture(envelope.node)).take(envelope)
             return
@@ -233,7 +234,9 @@ class PairPicture:
         self.pair = self.pair or pair
         if pair != self.pair:
             self.other_pairs.add(pair)
-        elif isinstance(message, SolverStatus):
+            return
+        self.solver_heard_ns = at_ns
+        if isinstance(message, SolverStatus):
             if _is_new_problem(self.solver, message):
                 self.solver_problem_since_ns = at_ns
             self.solver, self.solver_ns = message, at_ns
@@ -242,6 +245,11 @@ class PairPicture:
             self._keep(message, at_ns)
         elif isinstance(message, RelativePose | Rejected):
             self._take_result(message, at_ns)
+
+    def heard(self, at_ns: int) -> None:
+        """Note that something has come at this time, of this pair or of another."""
+        self.first_ns = at_ns if self.first_ns is None else self.first_ns
+        self.last_ns = at_ns if self.last_ns is None else max(self.last_ns, at_ns)
 
     def alive(self, name: str, alive: bool, at_ns: int) -> None:
         """Take a change of the names that are alive: `node/<id>` or `solver/...`."""

@@ -11,12 +11,13 @@ from buddyline.protocol.messages import Rejected
 from buddyline.protocol.topics import INFO
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
+from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.picture import PairPicture
 from buddyline.tools.pairs import Pair
 
 SHOWN: Final = (
     *("info", "candidates", "attitude", "depth", "image", "node_status"),
-    *("pose", "track", "rejected", "solver_status"),
+    *("pose", "track", "rejected", "net_pose", "solver_status"),
 )
 # After a jump, this much of the dive before the new instant is read for trail and plots.
 LEAD_NS: Final = 30 * S_NS
@@ -33,13 +34,18 @@ class Playback:
         self.start_ns, self.end_ns = dive.start_ns, dive.end_ns
         self.seek(self.start_ns)
 
+    @property
+    def picture(self) -> PairPicture:
+        """The pair that is shown first."""
+        return self.overview.picture()
+
     def seek(self, to_ns: int) -> None:
         """Go to an instant of log time, forward or back."""
         to_ns = min(max(to_ns, self.start_ns), self.end_ns)
-        self.picture = PairPicture(self._pair)
+        self.overview = Overview(self._pair)
         # The first calibrations, which a jump may pass over.
         for node, info in self._dive.infos().items():
-            self.picture.take(Envelope(INFO.key(node), INFO, (node,), info, b"", self.start_ns))
+            self.overview.take(Envelope(INFO.key(node), INFO, (node,), info, b"", self.start_ns))
         self._messages = self._dive.messages(*SHOWN, since_ns=to_ns - LEAD_NS)
         self._next = next(self._messages, None)
         self.position_ns = to_ns
@@ -50,9 +56,13 @@ class Playback:
         self.position_ns = min(max(to_ns, self.position_ns), self.end_ns)
         self._feed()
 
+    def close(self) -> None:
+        """Close the logs."""
+        self._dive.close()
+
     def _feed(self) -> None:
         while self._next is not None and self._next.time_ns <= self.position_ns:
-            self.picture.take(self._next)
+            self.overview.take(self._next)
             self._next = next(self._messages, None)
 
 
@@ -68,4 +78,5 @@ def cover(coverage: Coverage, paths: list[str], pair: Pair | None, stop: threadi
                 coverage.add(envelope.time_ns, outcome.reason if isinstance(outcome, Rejected) else None)
             if count % PACE == PACE - 1 and stop.wait(0.001):
                 return
+    coverage.sort()
     coverage.complete = True

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.monitor.frames import rig_outline
 from buddyline.tools.monitor.picture import PairPicture, Point
-from buddyline.tools.monitor.scene import fields_of_view
 
 
 class Keyframe(msgspec.Struct, frozen=True, array_like=True):
@@ -36,18 +35,6 @@ def keyframes(points: Sequence[Point], begin_ns: int, joined_ns: int) -> list[Ke
         found.append(Keyframe(round((point.at_ns - begin_ns) / S_NS, 3), t, a, b, joined))
         before_ns = point.at_ns
     return found
-
-
-def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
-    """Return a node's outline for the replay: both lights and the corners of its view, in its camera frame (m)."""
-    if info is None:
-        return {"lights": [[-0.5, 0, 0], [0.5, 0, 0]], "corners": [0.25, 0.2, 0.35]}
-    fov_rad, aspect = fields_of_view(info)
-    half_m = 0.35 * min(max(fov_rad / 2, 0.1), 1.2)
-    return {
-        "lights": [list(info.light_left_m), list(info.light_right_m)],
-        "corners": [round(half_m * aspect, 4), round(half_m, 4), 0.35],
-    }
 
 
 def replay_html(frames: Sequence[Keyframe], picture: PairPicture, *, levelled: bool, what: str, stale_s: float) -> str:

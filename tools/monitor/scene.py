@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from buddyline.protocol.messages import Attitude, NodeInfo
-from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.estimate import Estimate
 from msgspec import UNSET
 from numpy.typing import NDArray
@@ -24,8 +24,6 @@ ELLIPSOID_SD: Final = 2.795
 # A smaller ellipsoid looks like a point, and its axes are rounding errors.
 MIN_HALF_AXIS_M: Final = 1e-4
 MAX_HALF_AXIS_M: Final = 50.0
-# Share of a view's height, from its middle, that is well inside it; the panel covers one side.
-INSIDE: Final = 0.4
 
 
 @dataclass(frozen=True)
@@ -71,47 +69,7 @@ def ellipsoid(estimate: Estimate, frame: SceneFrame) -> tuple[Floats, Floats]:
     return np.clip(half_m, MIN_HALF_AXIS_M, MAX_HALF_AXIS_M), frame.R_s_a @ axes
 
 
-def wxyz(R: Floats) -> tuple[float, float, float, float]:
-    """Return a rotation as a quaternion with its real part first."""
-    x, y, z, w = matrix_to_quat(R).tolist()
-    return w, x, y, z
-
-
 def fields_of_view(info: NodeInfo) -> tuple[float, float]:
     """Return the camera's vertical field of view (rad) and aspect, as a pinhole would have them."""
     camera = info.camera
     return float(2.0 * np.arctan2(0.5 * info.height_px, camera.fy_px)), info.width_px / info.height_px
-
-
-def fit(t_m: Floats, aspect: float) -> tuple[Floats, Floats]:
-    """Return eye and target (3,) of a view from above with A, at the origin, and B, at t_m, side by side.
-
-    aspect: width by height of the view.
-    """
-    target: Floats = 0.5 * t_m
-    across_m = float(np.hypot(t_m[0], t_m[1]))
-    forward = np.array([t_m[0], t_m[1], 0.0]) / across_m if across_m > 1e-3 else np.array([1.0, 0.0, 0.0])
-    aside = np.array([-forward[1], forward[0], 0.0])
-    distance_m = float(np.linalg.norm(t_m)) + 1.5
-    up = np.array([0.0, 0.0, -1.0])
-    if aspect < 1.0:
-        # A phone held upright: one behind the other, in the upper half; the panel covers the lower.
-        return target + distance_m * (0.45 * aside - forward + 0.75 * up), target - 0.6 * distance_m * up
-    return target + distance_m * (0.8 * aside - 0.35 * forward + 0.5 * up), target
-
-
-def holds(eye: Floats, target: Floats, fov_rad: float, points: Floats) -> bool:
-    """Return whether an eye that looks at target has all points (n, 3) well inside a view of this height."""
-    towards, ahead = points - eye, target - eye
-    cosine = (towards @ ahead) / (np.linalg.norm(towards, axis=1) * np.linalg.norm(ahead) + 1e-9)
-    return bool((cosine > np.cos(INSIDE * fov_rad)).all())
-
-
-def age_colours(ages_s: Floats, whole_s: float) -> NDArray[np.uint8]:
-    """Return a colour (n, 3) for each age: bright amber at 0, fading into blue at whole_s.
-
-    Linear values, not sRGB: viser takes the colours of single points so.
-    """
-    share = np.clip(ages_s / whole_s, 0.0, 1.0)[:, None]
-    fresh, old = np.array([1.0, 0.45, 0.04]), np.array([0.03, 0.09, 0.26])
-    return np.asarray(np.round(255.0 * (fresh + (old - fresh) * np.sqrt(share))), np.uint8)

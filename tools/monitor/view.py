@@ -1,11 +1,11 @@
-"""`buddyline view`: a stored dive on the monitor's page, with play, pause, speed and a scrubber."""
+"""`buddyline view`: a stored dive on the monitor's page; each viewer plays, steps and scrubs for himself."""
 
 from __future__ import annotations
 
 import argparse
+import bisect
 import logging
 import threading
-from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol.clock import S_NS
@@ -13,13 +13,14 @@ from buddyline.tools.monitor.live import add_page_arguments, open_page
 from buddyline.tools.pairs import add_pair_argument, solved_pair
 
 if TYPE_CHECKING:
+    from buddyline.protocol.clock import Clock
     from buddyline.tools.monitor.coverage import Coverage
-    from buddyline.tools.monitor.page import Page
-    from buddyline.tools.monitor.picture import PairPicture
+    from buddyline.tools.monitor.overview import Overview
+    from buddyline.tools.monitor.playback import Playback
 
 log = logging.getLogger(__name__)
 
-SPEEDS: Final = ("0.25", "1", "4", "16", "64")
+MIN_SPEED, MAX_SPEED = 0.05, 64.0
 # A slow machine plays a dive more slowly, instead of in jumps longer than this.
 MAX_STEP_NS: Final = 3 * S_NS // 10
 
@@ -33,69 +34,90 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_page_arguments(parser)
 
 
-class Controls:
-    """The page's controls and the playback's position; the playing thread reads their state."""
+class DiveSession:
+    """One viewer's playback. Commands: play, loop, speed, seek (s), step and gap (1: to the next one, -1: back)."""
 
-    def __init__(self, page: Page, duration_s: float, playing: bool) -> None:
-        gui = page.server.gui
-        self.playing = playing
-        self.speed = 1.0
-        self._page = page
-        self._lock = threading.Lock()
-        self._wanted_s: float | None = None
-        with gui.add_folder("Playback", order=-1):
-            self._button = gui.add_button(self._button_text())
-            speeds = gui.add_button_group("Speed", SPEEDS)
-            # viser's types wrongly say that the value cannot be set.
-            self._slider: Any = gui.add_slider("Seconds", 0.0, max(round(duration_s, 1), 0.1), 0.1, 0.0)
-            self._strip = gui.add_html("")
-        self._button.on_click(self._toggle)
-        speeds.on_click(self._choose)
-        self._slider.on_update(self._scrub)
+    def __init__(self, playback: Playback, coverage: Coverage, clock: Clock, *, playing: bool) -> None:
+        self.lock = threading.Lock()
+        self._playback = playback
+        self._coverage = coverage
+        self._clock = clock
+        self._playing = playing
+        self._loop = False
+        self._speed = 1.0
+        self._before_ns = clock.now_ns()
+        self._told_strip = False
 
-    def _button_text(self) -> str:
-        return "Pause" if self.playing else "Play"
+    def step(self, commands: list[dict[str, Any]]) -> tuple[Overview, int, bool]:
+        """Obey, and play on by the time that has passed."""
+        playback = self._playback
+        now_ns = self._clock.now_ns()
+        passed_ns, self._before_ns = max(now_ns - self._before_ns, 0), now_ns
+        to_ns: int | None = None
+        for command in commands:
+            to_ns = self._obey(command, to_ns)
+        if to_ns is not None:
+            playback.seek(to_ns)
+            return playback.overview, playback.position_ns, True
+        if self._playing:
+            playback.advance(playback.position_ns + round(min(passed_ns, MAX_STEP_NS) * self._speed))
+            if playback.position_ns >= playback.end_ns:
+                if self._loop:
+                    playback.seek(playback.start_ns)
+                    return playback.overview, playback.position_ns, True
+                self._playing = False
+        return playback.overview, playback.position_ns, False
 
-    def _toggle(self, _: Any) -> None:
-        self.playing = not self.playing
-        self._button.label = self._button_text()
+    def _obey(self, command: dict[str, Any], to_ns: int | None) -> int | None:
+        """Take one command; return where the playback goes, None if it goes nowhere."""
+        at_ns = self._playback.position_ns if to_ns is None else to_ns
+        for name, value in command.items():
+            if isinstance(value, bool):
+                if name == "play":
+                    self._playing = value
+                    if value and at_ns >= self._playback.end_ns:
+                        to_ns = self._playback.start_ns
+                elif name == "loop":
+                    self._loop = value
+            elif isinstance(value, int | float):
+                if name == "speed":
+                    self._speed = min(max(float(value), MIN_SPEED), MAX_SPEED)
+                elif name == "seek":
+                    to_ns = self._playback.start_ns + round(min(max(value, 0.0), 1e9) * S_NS)
+                elif name == "step":
+                    self._playing = False
+                    to_ns = _next(self._coverage.times(), at_ns, value > 0)
+                elif name == "gap":
+                    begins = [begin_ns for begin_ns, _, _ in self._coverage.without()]
+                    to_ns = _next(begins, at_ns, value > 0)
+        return to_ns
 
-    def _choose(self, event: Any) -> None:
-        self.speed = float(event.target.value)
+    def close(self) -> None:
+        """Close the logs."""
+        self._playback.close()
 
-    def _scrub(self, event: Any) -> None:
-        # The playback moves the slider too: such an event names no client.
-        if event.client_id is not None:
-            with self._lock:
-                self._wanted_s = float(event.target.value)
+    def playback(self) -> dict[str, Any]:
+        """Return position and length (s), whether it plays, its speed, and once the strip of the whole dive."""
+        coverage, playback = self._coverage, self._playback
+        said: dict[str, Any] = {
+            "at": (playback.position_ns - playback.start_ns) / S_NS,
+            "length": (playback.end_ns - playback.start_ns) / S_NS,
+            "playing": self._playing,
+            "speed": self._speed,
+            "loop": self._loop,
+        }
+        if coverage.complete and not self._told_strip:
+            from buddyline.tools.monitor.coverage import LEGEND
 
-    def wanted_s(self) -> float | None:
-        """Return where a viewer has moved the slider since the last call, s from the start; None: nowhere."""
-        with self._lock:
-            wanted_s, self._wanted_s = self._wanted_s, None
-            return wanted_s
+            self._told_strip = True
+            said |= {"strip": coverage.strip(), "legend": LEGEND}
+        return said
 
-    def pause(self) -> None:
-        """Pause the playback, at the dive's end."""
-        if self.playing:
-            self._toggle(None)
 
-    def show(self, coverage: Coverage, position_ns: int) -> None:
-        """Show the playback's position in slider and strip."""
-        from buddyline.tools.monitor import panel
-        from buddyline.tools.monitor.coverage import CSS, LEGEND, clock_words
-
-        at_s = (position_ns - coverage.begin_ns) / S_NS
-        whole_s = (coverage.end_ns - coverage.begin_ns) / S_NS
-        if self._wanted_s is None and self._slider.value != round(at_s, 1):
-            self._slider.value = round(at_s, 1)
-        text = panel.block(
-            f"<style>{CSS}</style><b>{clock_words(at_s)}</b> of {clock_words(whole_s)}, speed {self.speed:g}"
-            f"{'' if self.playing else ', paused'}",
-            coverage.strip(position_ns),
-            f'<div class="dim">{LEGEND if coverage.complete else "reading the whole dive ..."}</div>',
-        )
-        self._page.set_html(self._strip, text)
+def _next(times_ns: list[int], at_ns: int, forward: bool) -> int | None:
+    """Return the next, or the last, of ordered times; None if there is none."""
+    index = bisect.bisect_right(times_ns, at_ns) if forward else bisect.bisect_left(times_ns, at_ns) - 1
+    return times_ns[index] if 0 <= index < len(times_ns) else None
 
 
 def run(args: argparse.Namespace) -> int:
@@ -108,34 +130,20 @@ def run(args: argparse.Namespace) -> int:
 
     service = Service("view")
     service.handle_signals()
-    clock = SystemClock()
     with Dive(args.dives, one_rig=False) as dive:
         pair = solved_pair(dive, args.pair)
-        playback = Playback(dive, pair)
-        page = open_page(args, "Buddyline dive", live=False)
-        coverage = Coverage(playback.start_ns, playback.end_ns)
-        controls = Controls(page, dive.seconds, not args.paused)
-        if args.start:
-            playback.seek(playback.start_ns + round(args.start * S_NS))
-        before_ns = clock.now_ns()
+        start_ns = dive.start_ns + round(args.start * S_NS)
+        coverage = Coverage(dive.start_ns, dive.end_ns)
 
-        def step(watched: bool) -> tuple[PairPicture, int, bool]:
-            nonlocal before_ns
-            now_ns = clock.now_ns()
-            passed_ns, before_ns = max(now_ns - before_ns, 0), now_ns
-            wanted_s = controls.wanted_s()
-            if wanted_s is not None:
-                playback.seek(playback.start_ns + round(wanted_s * S_NS))
-            elif controls.playing and watched:
-                # Without viewers the playback waits.
-                playback.advance(playback.position_ns + round(min(passed_ns, MAX_STEP_NS) * controls.speed))
-                if playback.position_ns >= playback.end_ns:
-                    controls.pause()
-            controls.show(coverage, playback.position_ns)
-            return playback.picture, playback.position_ns, wanted_s is not None
+        def open_session() -> DiveSession:
+            # What is damaged has been said of the first reader.
+            playback = Playback(Dive(args.dives, one_rig=False), pair)
+            playback.seek(start_ns)
+            return DiveSession(playback, coverage, SystemClock(), playing=not args.paused)
 
+        page = open_page(args, "Buddyline dive", open_session, live=False)
         service.spawn("coverage", lambda: cover(coverage, args.dives, pair, service.stop))
-        service.spawn("page", lambda: page.draw_until(service.stop, step, nullcontext()))
+        service.spawn("page", lambda: page.run(service.stop))
         service.wait(args.seconds)
         status = service.join()
         page.close()

@@ -1,0 +1,240 @@
+"""What a viewer's page is told at an instant, as JSON: only what has changed since it was last told.
+
+A frame has the page's time (`now`, ms) and, as far as they are new: `scene`, `points` and `misses` (for trail and
+plots), `banner`, `figures`, `health`, `cameras` (HTML whose text is escaped), `rigs`, `pairs`, `probe`, `playback`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.messages import NodeInfo, RelativePose
+from buddyline.solver_service.geometry.rotation import quat_to_matrix
+from buddyline.tools.estimate import Estimate, known, sigma_m
+from buddyline.tools.health.pair import findings
+from buddyline.tools.health.words import sentence
+from buddyline.tools.monitor import panel
+from buddyline.tools.monitor.overview import Overview
+from buddyline.tools.monitor.picture import NodePicture, PairPicture, Point
+from buddyline.tools.monitor.scene import SceneFrame, ellipsoid, fields_of_view
+from buddyline.tools.pairs import Pair
+
+# Texts are made anew in every so many frames, so that they can be read.
+TEXTS_EVERY: Final = 6
+# Fields of messages that can be plotted are numbers, and lists of at most this many of them.
+MAX_ELEMENTS: Final = 4
+MAX_FIELDS: Final = 2000
+FRUSTUM_M: Final = 0.35
+
+# The columns of a point after its time and whether it is the track's; the page names and plots them.
+Row = list[float | int | None]
+
+
+class Viewer:
+    """What one viewer has been told, and what he has chosen: a pair, and a field to plot."""
+
+    def __init__(self, *, live: bool) -> None:
+        self.pair: Pair | None = None
+        self.field: tuple[str, str] | None = None
+        self._live = live
+        self._tick = 0
+        self._told: dict[str, Any] = {}
+        self._point_ns = self._miss_ns = self._probe_ns = -1
+        self._reset = True
+
+    def restart(self) -> None:
+        """Tell everything again: another pair, or another instant of a dive."""
+        self._told.clear()
+        self._point_ns = self._miss_ns = self._probe_ns = -1
+        self._tick = 0
+        self._reset = True
+
+    def choose_field(self, text: str) -> None:
+        """Choose the field to plot, `key field`; "": none."""
+        key, _, path = text.partition(" ")
+        self.field = (key, path) if path else None
+        self._probe_ns = -1
+
+    def frame(self, overview: Overview, now_ns: int) -> dict[str, Any]:
+        """Return what is new for this viewer."""
+        picture = overview.picture(self.pair)
+        said: dict[str, Any] = {"now": now_ns / MS_NS, "scene": scene(overview, picture, now_ns)}
+        if self._reset:
+            said["reset"] = True
+            self._reset = False
+        said |= self._new_points(picture)
+        found = findings(picture, now_ns, live=self._live)
+        self._tell(said, "banner", {"level": found[0].level, "text": sentence(found[0], now_ns)})
+        if self._tick % TEXTS_EVERY == 0:
+            self._tell(said, "figures", panel.figures(picture, now_ns))
+            self._tell(said, "health", panel.health(picture, now_ns, live=self._live))
+            ends = picture.end_nodes()
+            self._tell(said, "cameras", [panel.camera(picture, node, now_ns) if node else "" for node in ends])
+            self._tell(said, "rigs", {name: rig_outline(node.info) for name, node in picture.nodes.items()})
+            shown = [name or "" for name in picture.ends()]
+            self._tell(said, "pairs", {"all": ["/".join(pair) for pair in overview.pairs()], "shown": shown})
+        if self.field is not None:
+            said |= self._probe(overview)
+        self._tick += 1
+        return said
+
+    def _tell(self, said: dict[str, Any], name: str, content: Any) -> None:
+        if self._told.get(name) != content:
+            self._told[name] = said[name] = content
+
+    def _new_points(self, picture: PairPicture) -> dict[str, Any]:
+        points: list[Row] = []
+        for point in reversed(picture.points):
+            if point.at_ns <= self._point_ns:
+                break
+            points.append(row(point))
+        misses = []
+        for miss in reversed(picture.misses):
+            if miss.at_ns <= self._miss_ns:
+                break
+            misses.append(miss.at_ns / MS_NS)
+        if picture.points:
+            self._point_ns = max(self._point_ns, picture.points[-1].at_ns)
+        if picture.misses:
+            self._miss_ns = max(self._miss_ns, picture.misses[-1].at_ns)
+        said = {"points": points[::-1], "misses": misses[::-1]}
+        return {name: new for name, new in said.items() if new}
+
+    def _probe(self, overview: Overview) -> dict[str, Any]:
+        """Return the chosen field's newest value, if it is new."""
+        assert self.field is not None
+        envelope = overview.last.get(self.field[0])
+        if envelope is None or envelope.time_ns <= self._probe_ns:
+            return {}
+        value = numbers(msgspec.to_builtins(envelope.message)).get(self.field[1])
+        self._probe_ns = envelope.time_ns
+        return {} if value is None else {"probe": [envelope.time_ns / MS_NS, value]}
+
+
+def fields(overview: Overview) -> list[str]:
+    """Return all fields that can be plotted, as `key field`."""
+    found = []
+    for key, envelope in sorted(overview.last.items()):
+        found += [f"{key} {path}" for path in numbers(msgspec.to_builtins(envelope.message, builtin_types=(bytes,)))]
+    return found[:MAX_FIELDS]
+
+
+def numbers(value: Any, path: str = "") -> dict[str, float]:
+    """Return the numbers within a message by their path: `depth_m`, `t_a_b_m[2]`, `rates_hz.imu`."""
+    if isinstance(value, bool):
+        return {path: float(value)}
+    if isinstance(value, int | float):
+        return {path: float(value)}
+    if isinstance(value, dict):
+        parts = [(f"{path}.{name}" if path else str(name), part) for name, part in value.items()]
+    elif isinstance(value, list | tuple) and len(value) <= MAX_ELEMENTS:
+        parts = [(f"{path}[{index}]", part) for index, part in enumerate(value)]
+    else:
+        return {}
+    return {name: number for each, part in parts for name, number in numbers(part, each).items()}
+
+
+def row(point: Point) -> Row:
+    """Return a point of trail and plots: time (ms), 1 for the track, north, east, down, then the plotted quantities.
+
+    They are range (m), azimuth and inclination (deg), the position's sigma and the gap of the two ranges (mm), latency
+    (ms); None where a quantity is not known.
+    """
+    estimate = point.estimate
+    quantities = (
+        estimate.range_m,
+        _degrees(known(estimate, "azimuth_rad")),
+        _degrees(known(estimate, "inclination_rad")),
+        1e3 * sigma_m(estimate),
+        1e3 * estimate.range_gap_m if isinstance(estimate, RelativePose) else None,
+        None if math.isnan(point.latency_s) else 1e3 * point.latency_s,
+    )
+    rounded = [None if value is None else round(value, 4) for value in (*point.t_m, *quantities)]
+    return [point.at_ns / MS_NS, int(point.tracked), *rounded]
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def scene(overview: Overview, picture: PairPicture, now_ns: int) -> dict[str, Any]:
+    """Return all nodes in north-east-down from A's camera, A first, then B, then those of A's other pairs and net.
+
+    A node: id, label, t (m), R (camera to scene, row by row), stale; half and axes of its 95 % ellipsoid if it has one.
+    """
+    frame = picture.frame()
+    (name_a, name_b), (node_a, _) = picture.ends(), picture.end_nodes()
+    nodes: list[dict[str, Any]] = []
+    if name_a is not None:
+        silent = node_a is None or now_ns - node_a.alive_ns() > S_NS
+        label = f"{name_a}{_depth_words(node_a)}{'' if frame.levelled else ', attitude unknown: drawn level'}"
+        nodes.append({"id": name_a, "label": label, "t": [0.0, 0.0, 0.0], "R": _flat(frame.R_s_a), "stale": silent})
+    for pair in (picture.pair, *(pair for pair in overview.pairs() if pair != picture.pair)):
+        if pair is not None and pair[0] == name_a:
+            other = overview.picture(pair)
+            node = _placed(other, frame, overview.nodes.get(pair[1]), now_ns)
+            if node is not None:
+                nodes.append(node)
+    nodes += _of_net(overview, name_a, {node["id"] for node in nodes}, now_ns)
+    depth_m = node_a.depth.depth_m if node_a is not None and node_a.depth is not None else None
+    seen: list[int] = [0, 0, 0, 0]
+    if picture.pose is not None and picture.pose_ns is not None and now_ns - picture.pose_ns < S_NS:
+        seen = [int(index >= 0) for index in (*picture.pose.blobs_a, *picture.pose.blobs_b)]
+    return {"nodes": nodes, "levelled": frame.levelled, "depth": depth_m, "pair": [name_a, name_b], "seen": seen}
+
+
+def _placed(picture: PairPicture, frame: SceneFrame, node: NodePicture | None, now_ns: int) -> dict[str, Any] | None:
+    shown = picture.shown(now_ns)
+    if shown is None or picture.pair is None:
+        return None
+    estimate: Estimate = shown.estimate
+    half_m, R_s_axes = ellipsoid(estimate, frame)
+    return {
+        "id": picture.pair[1],
+        "label": f"{picture.pair[1]}{_depth_words(node)}{f', {shown.note}' if shown.note else ''}",
+        "t": [round(x, 4) for x in frame.place(estimate)],
+        "R": _flat(frame.turn_b(estimate)),
+        "stale": shown.stale,
+        "half": [round(x, 5) for x in half_m.tolist()],
+        "axes": _flat(R_s_axes),
+    }
+
+
+def _of_net(overview: Overview, name_a: str | None, placed: set[str], now_ns: int) -> list[dict[str, Any]]:
+    """Return the net's nodes that no pair of A places, from A's own place in the net."""
+    base = overview.net.get(name_a or "")
+    if base is None:
+        return []
+    found = []
+    for name, (pose, at_ns) in sorted(overview.net.items()):
+        if name not in placed and pose.net == base[0].net:
+            t_m = np.subtract(pose.p_m, base[0].p_m)
+            R = quat_to_matrix(np.array(pose.q_xyzw))
+            stale = now_ns - at_ns > S_NS
+            label = f"{name} (net {pose.net})"
+            found.append({"id": name, "label": label, "t": t_m.tolist(), "R": _flat(R), "stale": stale})
+    return found
+
+
+def _flat(R: Any) -> list[float]:
+    return [round(x, 5) for x in R.ravel().tolist()]
+
+
+def _depth_words(node: NodePicture | None) -> str:
+    return "" if node is None or node.depth is None else f", {node.depth.depth_m:.1f} m deep"
+
+
+def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
+    """Return a node's outline: both lights and the corners of its view, in its camera frame (m)."""
+    if info is None:
+        return {"lights": [[-0.5, 0, 0], [0.5, 0, 0]], "corners": [0.25, 0.2, FRUSTUM_M]}
+    fov_rad, aspect = fields_of_view(info)
+    half_m = FRUSTUM_M * min(max(fov_rad / 2, 0.1), 1.2)
+    return {
+        "lights": [list(info.light_left_m), list(info.light_right_m)],
+        "corners": [round(half_m * aspect, 4), round(half_m, 4), FRUSTUM_M],
+    }

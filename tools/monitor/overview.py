@@ -1,0 +1,63 @@
+"""Everything that is watched: all nodes, and a picture of each pair of them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from buddyline.protocol.envelope import Envelope
+from buddyline.protocol.messages import NodePose
+from buddyline.tools.monitor.picture import NodePicture, PairPicture
+from buddyline.tools.pairs import Pair
+
+# A client that invents pairs must not fill the memory.
+MAX_PAIRS: Final = 128
+MAX_KEYS: Final = 1024
+
+
+class Overview:
+    """Sorts messages to nodes, pairs and nets. pair: the one that is shown first; None: the first that comes.
+
+    last: the newest message of each key. net: the newest pose of each node in a common frame.
+    """
+
+    def __init__(self, pair: Pair | None = None) -> None:
+        self.nodes: dict[str, NodePicture] = {}
+        self.last: dict[str, Envelope] = {}
+        self.net: dict[str, tuple[NodePose, int]] = {}
+        self._first = PairPicture(pair, self.nodes)
+        self._others: dict[Pair, PairPicture] = {}
+
+    def take(self, envelope: Envelope) -> None:
+        """Take one message, received at its time_ns."""
+        if envelope.key in self.last or len(self.last) < MAX_KEYS:
+            self.last[envelope.key] = envelope
+        message, at_ns = envelope.message, envelope.time_ns
+        if isinstance(message, NodePose):
+            if message.mode != "truth" and (message.node in self.net or len(self.net) < MAX_KEYS):
+                self.net[message.node] = message, at_ns
+        elif len(envelope.ids) == 1:
+            self.nodes.setdefault(envelope.node, NodePicture(envelope.node)).take(envelope)
+        else:
+            pair = envelope.node, envelope.ids[1]
+            picture = self._first if self._first.pair in (None, pair) else self._others.get(pair)
+            if picture is None and len(self._others) < MAX_PAIRS:
+                picture = self._others[pair] = PairPicture(pair, self.nodes)
+                picture.heard(self._first.first_ns or at_ns)
+            if picture is not None:
+                picture.take(envelope)
+        for picture in (self._first, *self._others.values()):
+            picture.heard(at_ns)
+
+    def alive(self, name: str, alive: bool, at_ns: int) -> None:
+        """Take a change of the names that are alive."""
+        for picture in (self._first, *self._others.values()):
+            picture.alive(name, alive, at_ns)
+
+    def pairs(self) -> list[Pair]:
+        """Return all pairs that have been heard of, the one that is shown first at the head."""
+        first = [self._first.pair] if self._first.pair is not None else []
+        return [*first, *sorted(self._others)]
+
+    def picture(self, pair: Pair | None = None) -> PairPicture:
+        """Return a pair's picture; None, or a pair that is not known: the first one's."""
+        return self._first if pair is None else self._others.get(pair, self._first)
