@@ -19,7 +19,7 @@ import numpy as np
 from buddyline.tools.survey import survex
 from buddyline.tools.survey.averages import wrap
 from buddyline.tools.survey.derive import Derived
-from buddyline.tools.survey.lines import bearing_of, line_of
+from buddyline.tools.survey.lines import bearing_of, line_of, measures_of
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.readings import of_messages
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
@@ -82,7 +82,7 @@ def _legs(legs, at, figures):
     project = world.project_of(legs)
     for leg in legs:
         way = at[leg.to] - at[leg.from_]
-        line = line_of(leg, project, 0.0, {}, alone=True)
+        line = line_of(leg, measures_of(leg, project, 0.0, {}, alone=True), 0.0)
         figures["distance / sigma"].append((leg.distance_m - np.linalg.norm(way)) / leg.distance_sigma_m)
         azimuth = math.atan2(line.vector_m[0], line.vector_m[1]) - math.atan2(way[0], way[1])
         figures["azimuth / sigma"].append(wrap(azimuth) / bearing_of(leg, project).sigma)

@@ -221,7 +221,8 @@ def as_json(adjusted: Adjusted) -> dict[str, object]:
         },
         "loops": [asdict(loop) for loop in adjusted.loops],
         "residuals": [{"leg": one.leg.name, "moved_m": one.moved_m, "chi2": one.chi2} for one in adjusted.residuals],
-        "blunders": [{"legs": one.legs, "chi2": one.chi2} for one in adjusted.blunders],
+        "blunders": [asdict(one) | {"text": one.text} for one in adjusted.blunders],
+        "fit": asdict(adjusted.fit) | {"variance_factor": adjusted.fit.factor},
         "proposals": [asdict(one) for one in adjusted.proposals],
         "left_out": [{"leg": leg.name, "why": why} for leg, why in adjusted.left_out],
     }

@@ -15,8 +15,11 @@ from msgspec import UNSET, UnsetType
 WORTH_BOTH: Final = math.sqrt(3)
 # If two sights differ by more than this many sigmas, their sigmas are too small.
 CONTRADICT: Final = 2.5
+# Sights further apart than this are no error of reading: one of them is wrong, and the network tells which.
+TURNED_RAD: Final = math.radians(90.0)
 # On steeper legs the clinometers give the horizontal distance better than the depths do.
 STEEP_RAD: Final = math.radians(55.0)
+SLOPE_STEPS: Final = 3
 # Held depths are nearly exact in a leg, so that a horizontal misclosure moves no depth.
 ABSOLUTE_DEPTH_SIGMA_M: Final = 0.002
 
@@ -91,30 +94,47 @@ def _weighed(
         else:
             # If the two contradict each other, the truth may be as far from their mean as they are.
             chi = abs(gap) / math.hypot(fore_sigma, back_sigma)
-            grown = chi if chi > CONTRADICT else 1.0
+            grown = chi if chi > CONTRADICT and abs(gap) < TURNED_RAD else 1.0
             fore_sigma, back_sigma = grown * fore_sigma, grown * back_sigma
     return SightPair(fore, back, fore_sigma, back_sigma, gap)
 
 
+def is_steep(leg: Leg) -> bool:
+    """Tell whether the clinometers are used: where depths are missing, or give the horizontal distance badly."""
+    from_m, to_m = leg.depth_from_m, leg.depth_to_m
+    return from_m is UNSET or to_m is UNSET or abs(from_m - to_m) > leg.distance_m * math.sin(STEEP_RAD)
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What goes into a leg's vector, with 1 sd each: metres and radians.
+
+    azimuth: from the grid's north. rise: up, and None without depths. slopes: inclinations in use, up positive.
+    """
+
+    distance: tuple[float, float]
+    azimuth: tuple[float, float]
+    rise: tuple[float, float] | None
+    slopes: tuple[tuple[float, float], ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A leg to adjust. vector_m: east, north, up of the grid; covariance (3, 3), m^2. turn_m: (3,), per rad of azimuth.
+    """A leg as a vector: east, north, up of the grid; covariance (3, 3), m^2. turn_rad: grid azimuth minus magnetic.
 
-    rise_m: up, and its sigma; by_clino: it is the clinometers'. distance_sigma_m: as weighed. turn_rad: grid
-    azimuth minus magnetic. read_rise_m, read_rise_sigma_m: of the leg's own two depths, where others are held.
+    rise_m: up. rise_sigma_m, run_sigma_m: of the slope's two parts. by_clino: clinometers took part in it.
+    measures: what it is made of.
     """
 
     leg: Leg
+    measures: Measures
     vector_m: Floats
     covariance: Floats
-    turn_m: Floats
     rise_m: float
     rise_sigma_m: float
-    distance_sigma_m: float
+    run_sigma_m: float
     by_clino: bool
     turn_rad: float
-    read_rise_m: float
-    read_rise_sigma_m: float
 
     @property
     def length_m(self) -> float:
@@ -122,22 +142,13 @@ class Line:
         return float(np.linalg.norm(self.vector_m))
 
 
-def line_of(
-    leg: Leg,
-    project: Project,
-    turn_rad: float,
-    depths_m: dict[str, float],
-    *,
-    alone: bool = False,
-    read_m: tuple[float, float] | None = None,
-) -> Line | None:
-    """Return a leg as a vector; None if its bearing or its rise is unknown.
+def measures_of(
+    leg: Leg, project: Project, turn_rad: float, depths_m: dict[str, float], *, alone: bool = False
+) -> Measures | None:
+    """Return what a leg's readings say by themselves; None if its bearing or its rise is unknown.
 
-    turn_rad: grid azimuth minus magnetic. depths_m: stations held at these depths; others by their readings.
-    alone: no other legs share the gauges' slow errors, so the rise has all of them. read_m: its
-    own two depths, with zeros and levels taken off; by default as read.
-    Distance, bearing and rise are independent; the run along follows from distance and rise, except for steep
-    legs, where the clinometers give both.
+    depths_m: stations held at these depths; others by their readings. alone: no other legs share the gauges' slow
+    errors, so the rise has all of them.
     """
     bearing = bearing_of(leg, project)
     if bearing is None:
@@ -146,61 +157,89 @@ def line_of(
     if fore is None:
         return None
     azimuth = turn_rad + (fore if bearing.fore is None else fore + 0.5 * wrap(bearing.fore - fore))
-    distance_m, distance_sigma_m = leg.distance_m, leg.distance_sigma_m
+    distance_sigma_m = leg.distance_sigma_m
     held = leg.from_ in depths_m and leg.to in depths_m
     own = leg.depth_from_m, leg.depth_to_m
     from_m, to_m = (depths_m[leg.from_], depths_m[leg.to]) if held else own
-    clino = clino_of(leg)
-    steep = from_m is UNSET or to_m is UNSET or abs(from_m - to_m) > distance_m * math.sin(STEEP_RAD)
-    if steep and clino is not None:
-        known = [a for a in (clino.fore, None if clino.back is None else -clino.back) if a is not None]
-        slope = sum(known) / len(known)
-        run_m, rise_m = distance_m * math.cos(slope), distance_m * math.sin(slope)
-        by_distance, by_other = (math.cos(slope), math.sin(slope)), (-rise_m, run_m)
-        other_sigma, rise_sigma_m = clino.sigma, distance_m * clino.sigma
-    elif from_m is not UNSET and to_m is not UNSET and abs(from_m - to_m) < distance_m:
-        rise_m = from_m - to_m
+    rise = None
+    if from_m is not UNSET and to_m is not UNSET:
         gauges_m = _hypot(leg.depth_from_sigma_m, leg.depth_to_sigma_m)
-        noises = leg.depth_from_noise_m, leg.depth_to_noise_m
         if held:
-            rise_sigma_m = math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
+            rise = from_m - to_m, math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
             # Held depths have errors as well; their effect on the horizontal distance is added to the distance's sigma.
-            distance_sigma_m = math.hypot(distance_sigma_m, rise_m / distance_m * gauges_m)
+            distance_sigma_m = math.hypot(distance_sigma_m, rise[0] / leg.distance_m * gauges_m)
         else:
+            noises = leg.depth_from_noise_m, leg.depth_to_noise_m
             # A node keeps its gauge, and mostly its station, from leg to leg, so slow errors cancel along the line.
-            rise_sigma_m = gauges_m if alone or UNSET in noises else _hypot(*noises)
-        run_m = math.sqrt(distance_m**2 - rise_m**2)
-        by_distance, by_other = (distance_m / run_m, 0.0), (-rise_m / run_m, 1.0)
-        other_sigma = rise_sigma_m
+            rise = from_m - to_m, gauges_m if alone or UNSET in noises else _hypot(*noises)
+    return Measures((leg.distance_m, distance_sigma_m), (azimuth, bearing.sigma), rise, slopes_of(leg))
+
+
+def slopes_of(leg: Leg) -> tuple[tuple[float, float], ...]:
+    """Return the inclinations that are used, up positive, and their sigmas; none where depths do better."""
+    clino = clino_of(leg) if is_steep(leg) else None
+    if clino is None:
+        return ()
+    sights = (clino.fore, clino.fore_sigma), (None if clino.back is None else -clino.back, clino.back_sigma)
+    return tuple((angle, sigma) for angle, sigma in sights if angle is not None)
+
+
+def line_of(leg: Leg, measures: Measures | None, turn_rad: float) -> Line | None:
+    """Return a leg's vector; None if its rise is not known, or longer than its distance.
+
+    Distance, bearing, rise and inclinations are independent; the run along follows from distance and rise, or by
+    least squares from all of them.
+    """
+    if measures is None:
+        return None
+    (distance_m, distance_sigma_m), (azimuth, azimuth_sigma) = measures.distance, measures.azimuth
+    slopes, rise = measures.slopes, measures.rise
+    if slopes:
+        (run_m, up_m), covariance = _sloped(measures)
+    elif rise is not None and abs(rise[0]) < distance_m:
+        up_m, rise_var = rise[0], rise[1] ** 2
+        run_m = math.sqrt(distance_m**2 - up_m**2)
+        tilt = up_m / run_m
+        run_var = (distance_m / run_m * distance_sigma_m) ** 2 + tilt**2 * rise_var
+        covariance = np.array([[run_var, -tilt * rise_var], [-tilt * rise_var, rise_var]])
     else:
         return None
-    read_rise_m, read_sigma_m = rise_m, rise_sigma_m
-    if read_m is not None and not steep:
-        read_rise_m = read_m[0] - read_m[1]
-        noises = leg.depth_from_noise_m, leg.depth_to_noise_m
-        read_sigma_m = _hypot(*((leg.depth_from_sigma_m, leg.depth_to_sigma_m) if UNSET in noises else noises))
     east, north = math.sin(azimuth), math.cos(azimuth)
-    # Columns: by distance, by azimuth, by rise or slope.
-    jacobian = np.array(
-        [
-            [by_distance[0] * east, run_m * north, by_other[0] * east],
-            [by_distance[0] * north, -run_m * east, by_other[0] * north],
-            [by_distance[1], 0.0, by_other[1]],
-        ]
-    )
+    # Columns: by run, by rise, by azimuth.
+    jacobian = np.array([[east, 0.0, run_m * north], [north, 0.0, -run_m * east], [0.0, 1.0, 0.0]])
+    parts = np.zeros((3, 3))
+    parts[:2, :2], parts[2, 2] = covariance, azimuth_sigma**2
     return Line(
         leg=leg,
-        vector_m=np.array([run_m * east, run_m * north, rise_m]),
-        covariance=jacobian @ np.diag(np.array([distance_sigma_m, bearing.sigma, other_sigma]) ** 2) @ jacobian.T,
-        turn_m=jacobian[:, 1],
-        rise_m=rise_m,
-        rise_sigma_m=rise_sigma_m,
-        distance_sigma_m=distance_sigma_m,
-        by_clino=steep,
+        measures=measures,
+        vector_m=np.array([run_m * east, run_m * north, up_m]),
+        covariance=jacobian @ parts @ jacobian.T,
+        rise_m=up_m,
+        rise_sigma_m=math.sqrt(covariance[1, 1]),
+        run_sigma_m=math.sqrt(covariance[0, 0]),
+        by_clino=bool(slopes),
         turn_rad=turn_rad,
-        read_rise_m=read_rise_m,
-        read_rise_sigma_m=read_sigma_m,
     )
+
+
+def _sloped(measures: Measures) -> tuple[tuple[float, float], Floats]:
+    """Return run and rise by least squares of distance, inclinations and rise, and their covariance (2, 2)."""
+    distance_m, distance_sigma_m = measures.distance
+    slope = sum(angle for angle, _ in measures.slopes) / len(measures.slopes)
+    sloped = np.array([distance_m * math.cos(slope), distance_m * math.sin(slope)])
+    for _ in range(SLOPE_STEPS):
+        run_m, up_m = sloped.tolist()
+        far_m, angle = math.hypot(run_m, up_m), math.atan2(up_m, run_m)
+        rows = [(run_m / far_m, up_m / far_m, distance_m - far_m, distance_sigma_m)]
+        if measures.rise is not None:
+            rows.append((0.0, 1.0, measures.rise[0] - up_m, measures.rise[1]))
+        rows += [(-up_m / far_m**2, run_m / far_m**2, one - angle, sigma) for one, sigma in measures.slopes]
+        table = np.array(rows)
+        A = table[:, :2] / table[:, 3:]
+        covariance = np.linalg.inv(A.T @ A)
+        sloped = sloped + covariance @ (A.T @ (table[:, 2] / table[:, 3]))
+    run_m, up_m = sloped.tolist()
+    return (run_m, up_m), covariance
 
 
 def _hypot(*sigmas: float | UnsetType) -> float:

@@ -128,9 +128,44 @@ class Equate(Config, frozen=True, kw_only=True):
 
 
 class AdjustSettings(Config, frozen=True, kw_only=True):
-    """[adjust]. depth: absolute holds each station at its gauges' mean; readings lets each leg keep its own two."""
+    """[adjust]. depth: absolute takes each reading as its station's depth; readings lets each leg keep its own two.
+
+    compass: ignore takes directions from gyroscopes and known azimuths or fixed points alone. datum: where nothing is
+    fixed, ellipses are relative to the first station (start), or to all stations' mean (free: inner constraints).
+    """
 
     depth: Literal["absolute", "readings"] = "absolute"
+    compass: Literal["use", "ignore"] = "use"
+    datum: Literal["start", "free"] = "start"
+
+
+class Known(Config, frozen=True, kw_only=True):
+    """[[known]]: a line between two stations that is known from elsewhere: a tape, a baseline, a theodolite.
+
+    azimuth_deg: from the grid's north. sigma_m, azimuth_sigma_deg: 1 sd; 0 for exact.
+    """
+
+    from_: str = field(name="from")
+    to: str
+    distance_m: Positive | UnsetType = UNSET
+    sigma_m: NonNegative = 0.0
+    azimuth_deg: float | UnsetType = UNSET
+    azimuth_sigma_deg: NonNegative = 0.0
+    note: str = ""
+
+
+class Turn(Config, frozen=True, kw_only=True):
+    """[[turn]]: how much a node's sight turned between two legs of a dive, clockwise, by its gyroscope; sigma: 1 sd.
+
+    from_ns, to_ns: the legs' start_ns. A sight is the direction in which the node sees the other one.
+    """
+
+    node: str
+    dive: int = 1
+    from_ns: int
+    to_ns: int
+    angle_deg: float
+    sigma_deg: Positive
 
 
 class Leg(Config, frozen=True, kw_only=True):
@@ -216,9 +251,11 @@ class Project(Config, frozen=True, kw_only=True):
     equate: list[Equate] = field(default_factory=list)
     settings: SurveySettings = field(default_factory=SurveySettings)
     alarms: AlarmSettings = field(default_factory=AlarmSettings)
+    known: list[Known] = field(default_factory=list)
     adjust: AdjustSettings = field(default_factory=AdjustSettings)
     leg: list[Leg] = field(default_factory=list)
     point: list[Leg] = field(default_factory=list)
+    turn: list[Turn] = field(default_factory=list)
     station: list[Station] = field(default_factory=list)
     problem: list[Problem] = field(default_factory=list)
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.tools.survey.averages import Bools, Floats, Ints
+from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.observations import Solution
 
-# Stations fewer legs apart than this are neighbours, which may be close to each other.
-LEAST_LEGS_APART: Final = 3
 # Chi^2 of two degrees of freedom that three sd of each allow; and of one.
 NEAR_CHI2: Final = 11.83
 NEAR_SIGMAS: Final = 3.0
+# So many pairs, the nearest first, are looked at.
+MOST_PAIRS: Final = 30
 # 1 sd between two nodes that two divers hold at the same tie-off on two days.
 HELD_M: Final = 0.05
 # Two different stations are seldom closer to each other than this share of the legs around them.
@@ -39,46 +41,57 @@ class Proposal:
         )
 
 
-def proposals(
-    names: list[str],
-    position_m: Floats,
-    covariance: Floats,
-    up_sigma_m: Floats,
-    ends: tuple[Ints, Ints],
-    length_m: Floats,
-) -> list[Proposal]:
-    """Return pairs of stations that may be one place, the likeliest first.
-
-    position_m: (n, 3), east, north, up. covariance: (n, n, 3, 3), of each with each. up_sigma_m: (n,), what gauges add
-    to it. ends: of each leg, (m,) numbers of stations; length_m: (m,).
-    """
-    count = len(names)
-    apart = ~_near(count, ends)
-    shortest_m = np.full(count, np.inf)
-    for side in ends:
+def proposals(solution: Solution, lines: Sequence[tuple[str, str]]) -> list[Proposal]:
+    """Return pairs of stations that may be one place, the likeliest first. lines: ends of the legs between stations."""
+    at = solution.observations.at
+    names = sorted({name for ends in lines for name in ends}, key=lambda name: at[name])
+    number = np.array([at[name] for name in names], dtype=np.int64)
+    P, covariances = solution.position_m[number], solution.station_covariances[number]
+    place = {name: i for i, name in enumerate(names)}
+    ends = np.array([(place[start], place[end]) for start, end in lines], dtype=np.int64).reshape(-1, 2)
+    shortest_m = np.full(len(names), np.inf)
+    length_m = np.linalg.norm(P[ends[:, 1]] - P[ends[:, 0]], axis=1)
+    for side in ends.T:
         np.minimum.at(shortest_m, side, length_m)
+    beside: list[set[int]] = [{i} for i in range(len(names))]
+    for start, end in ends.tolist():
+        beside[start].add(end)
+        beside[end].add(start)
+    up_sd = np.sqrt(covariances[:, 2, 2] + HELD_M**2)
     found = []
-    for i in range(1, count):
-        d = position_m[i] - position_m[:i]
-        C = covariance[i, i] + covariance[np.arange(i), np.arange(i)] - covariance[i, :i] - covariance[:i, i]
-        flat = C[:, :2, :2] + 2 * HELD_M**2 * np.eye(2)
-        chi2 = np.einsum("ni,nij,nj->n", d[:, :2], np.linalg.inv(flat), d[:, :2])
-        up_sd = np.sqrt(np.maximum(C[:, 2, 2], 0.0) + up_sigma_m[i] ** 2 + up_sigma_m[:i] ** 2 + 2 * HELD_M**2)
-        across_m = np.hypot(d[:, 0], d[:, 1])
-        near = apart[i, :i] & (chi2 < NEAR_CHI2) & (np.abs(d[:, 2]) < NEAR_SIGMAS * up_sd)
-        near &= across_m < LEG_SHARE * np.minimum(shortest_m[i], shortest_m[:i])
-        for j in np.flatnonzero(near).tolist():
-            ratio = float(across_m[j] / math.sqrt(float(np.trace(flat[j]))))
-            away_m = float(np.linalg.norm(d[j]))
-            found.append(Proposal(names[i], names[j], away_m, math.sqrt(float(chi2[j])), ratio))
+    # Their common error is not taken off here, so this is a wide gate for the heights.
+    pairs = [
+        (math.dist(P[i], P[j]), i, j)
+        for i, j in _near(P, LEG_SHARE * shortest_m)
+        if abs(float(P[i, 2] - P[j, 2])) < NEAR_SIGMAS * math.hypot(up_sd[i], up_sd[j])
+        and not any(beside[one] & beside[j] for one in beside[i])
+    ]
+    pairs = sorted(pairs)[:MOST_PAIRS]
+    # Of the difference of two places: so many right sides are solved at once.
+    apart = np.zeros((len(solution.x), 3 * len(pairs)))
+    for k, (_, i, j) in enumerate(pairs):
+        for axis in range(3):
+            apart[3 * number[i] + axis, 3 * k + axis], apart[3 * number[j] + axis, 3 * k + axis] = 1.0, -1.0
+    solved = solution.normal.solve(apart) if pairs else apart
+    for k, (_, i, j) in enumerate(pairs):
+        part = slice(3 * k, 3 * k + 3)
+        C = solved[3 * number[i] : 3 * number[i] + 3, part] - solved[3 * number[j] : 3 * number[j] + 3, part]
+        d = P[i] - P[j]
+        flat = C[:2, :2] + 2 * HELD_M**2 * np.eye(2)
+        chi2 = float(d[:2] @ np.linalg.solve(flat, d[:2]))
+        if chi2 < NEAR_CHI2 and abs(float(d[2])) < NEAR_SIGMAS * math.sqrt(float(C[2, 2]) + 2 * HELD_M**2):
+            ratio = float(np.hypot(d[0], d[1])) / math.sqrt(float(np.trace(flat)))
+            found.append(Proposal(names[i], names[j], float(np.linalg.norm(d)), math.sqrt(chi2), ratio))
     return sorted(found, key=lambda one: one.sigmas)
 
 
-def _near(count: int, ends: tuple[Ints, Ints]) -> Bools:
-    """Return which stations (n, n) are fewer than LEAST_LEGS_APART legs apart."""
-    beside = np.eye(count, dtype=bool)
-    beside[ends] = beside[ends[::-1]] = True
-    reached = beside
-    for _ in range(LEAST_LEGS_APART - 2):
-        reached = reached @ beside
-    return reached
+def _near(P: Floats, reach_m: Floats) -> Iterator[tuple[int, int]]:
+    """Yield pairs i > j of places that are nearer to each other on the map than the lesser of their reaches."""
+    cell_m = max(float(reach_m.max()), 1e-3) if len(reach_m) else 1.0
+    cells: dict[tuple[int, int], list[int]] = {}
+    for i, (x, y) in enumerate(np.floor(P[:, :2] / cell_m).astype(int).tolist()):
+        for other in ((x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)):
+            for j in cells.get(other, ()):
+                if math.dist(P[i, :2], P[j, :2]) < min(reach_m[i], reach_m[j]):
+                    yield i, j
+        cells.setdefault((x, y), []).append(i)

@@ -11,10 +11,13 @@ from buddyline.tools.draw import page as html
 from buddyline.tools.draw.figures import inline_svg
 from buddyline.tools.draw.survey import plan, profile
 from buddyline.tools.survey.lines import SightPair, bearing_of
+from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Sheet
 from msgspec import UNSET
 
+# An instrument's error is said from this many sd on.
+SHOWN_SIGMAS: Final = 3.0
 # Numbers are aligned to the right, words to the left.
 CSS: Final = (
     "td,th{text-align:right;white-space:nowrap}td:last-child{text-align:left;white-space:normal;min-width:16em}"
@@ -35,11 +38,8 @@ def summary(sheet: Sheet) -> list[str]:
             f"loop {'-'.join(loop.stations)}: {loop.length_m:.1f} m, misclosure {loop.error_m:.2f} m ({share:.2%}), "
             f"H {loop.horizontal_ratio:.2f} V {loop.vertical_ratio:.2f}"
         )
-    for blunder in adjusted.blunders:
-        off = "" if math.isnan(blunder.off_m) else f" by {blunder.off_m:.2f} m"
-        first, *others = blunder.legs
-        also = f" (or {', '.join(others)})" if others else ""
-        lines.append(f"BLUNDER: leg {first}{also} is off{off}, chi2 {blunder.chi2:.0f}")
+    lines += tests_of(adjusted)
+    lines += [f"BLUNDER: {blunder.text}" for blunder in adjusted.blunders]
     lines += [f"QUESTION: {one.text}" for one in adjusted.proposals]
     lines += [f"left out: leg {leg.name}, {why}" for leg, why in adjusted.left_out]
     lines += [f"ALARM: leg {leg.name}: {alarm}" for leg in project.leg + project.point for alarm in leg.alarms]
@@ -51,6 +51,16 @@ def summary(sheet: Sheet) -> list[str]:
             f"least certain station: {far.name}, {major_m:.2f} x {minor_m:.2f} m (1 sd) towards "
             f"{math.degrees(azimuth):.0f} deg, {far.sigmas_m[2]:.2f} m up"
         )
+    return lines
+
+
+def tests_of(adjusted: Adjusted) -> list[str]:
+    """Return the global test, and what the instruments are found to be off, where the survey shows it."""
+    fit = adjusted.fit
+    lines = [f"adjustment: chi2 {fit.chi2:.0f} of {fit.freedom} observations too many, {fit.verdict}"]
+    for name, (value, sigma, unit) in fit.instruments.items():
+        if abs(value) > SHOWN_SIGMAS * sigma:
+            lines.append(f"{name}: {value:+.2f} {unit}, sd {sigma:.2f}; taken off")
     return lines
 
 

@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from buddyline.tools.survey.assembly import Fixed
 from buddyline.tools.survey.geodesy import leg_date, survey_date
 from buddyline.tools.survey.lines import Line, bearing_of
-from buddyline.tools.survey.network import Adjusted, Fixed, fixed_points, held_depths
+from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET
 
@@ -17,6 +19,7 @@ from msgspec import UNSET
 class Reading:
     """One leg as surveyors write it: degrees, metres, depths positive down; None: not read. Sigmas: 1 sd.
 
+    off_deg: what compass and backcompass read too much, by the adjustment. scale: what distances are multiplied by.
     by_clino: the rise is the clinometers'; then there are no depths. held: its stations are held at their depths.
     looped: the leg is part of a loop. compass_sigma_deg: of each sight, the same for both, for their plain mean.
     turn_deg: grid azimuth minus magnetic. declination_deg: true azimuth minus magnetic, there and then.
@@ -36,6 +39,8 @@ class Reading:
     declination_deg: float
     distance_m: float
     remark: str
+    off_deg: tuple[float, float] = (0.0, 0.0)
+    scale: float = 1.0
 
     @property
     def leg(self) -> Leg:
@@ -110,8 +115,16 @@ class Sheet:
 
     @property
     def fixed(self) -> Fixed:
-        """Fixed stations: positions and sigmas."""
-        return fixed_points(self.project, self.adjusted.grid)
+        """Fixed stations: positions and sigmas; an altitude by depths is the adjusted one."""
+        fixed: Fixed = {}
+        for name, (position_m, sigmas_m) in self.adjusted.survey.fixed.items():
+            altitude_m = self.adjusted.positions[name].position_m[2] if name in self.adjusted.positions else 0.0
+            by_depth = math.isnan(position_m[2])
+            fixed[name] = (
+                np.array([*position_m[:2], altitude_m if by_depth else position_m[2]]),
+                np.array([*sigmas_m[:2], 0.0 if by_depth else sigmas_m[2]]),
+            )
+        return fixed
 
     @property
     def entrances(self) -> list[str]:
@@ -121,35 +134,56 @@ class Sheet:
     @cached_property
     def readings(self) -> list[Reading]:
         """Every leg that took part, as it was weighed."""
-        depths = held_depths(self.project)
-        looped = {id(one.leg) for one in self.adjusted.residuals if one.chi2 is not None}
-        return [self._reading(line, depths, id(line.leg) in looped) for line in self.adjusted.lines]
+        looped = {number for loop in self.adjusted.loops for number in loop.legs}
+        numbers = {id(leg): number for number, leg in enumerate(self.adjusted.survey.legs)}
+        return [
+            self._reading(line, numbers[id(line.leg)], numbers[id(line.leg)] in looped) for line in self.adjusted.lines
+        ]
 
-    def _reading(self, line: Line, depths: dict[str, float], looped: bool) -> Reading:
-        leg = line.leg
+    def _reading(self, line: Line, number: int, looped: bool) -> Reading:
+        leg, survey = line.leg, self.adjusted.survey
         bearing = bearing_of(leg, self.project)
         if bearing is None:
             raise ValueError(f"leg {leg.name} has no bearing")
-        held = leg.from_ in depths and leg.to in depths
-        own = (depths[leg.from_], depths[leg.to]) if held else (leg.depth_from_m, leg.depth_to_m)
-        from_m, to_m = (None if line.by_clino or depth_m is UNSET else depth_m for depth_m in own)
+        start, end = (self.adjusted.positions[name].position_m for name in (leg.from_, leg.to))
+        held = self.project.adjust.depth == "absolute" and not line.by_clino
+        level_m = survey.level_m
+        depths: tuple[float | None, float | None] = (None, None)
+        if not line.by_clino and leg.depth_from_m is not UNSET and leg.depth_to_m is not UNSET:
+            own = leg.depth_from_m, leg.depth_from_m - line.rise_m
+            depths = (level_m - float(start[2]), level_m - float(end[2])) if held else own
         both = bearing.fore is not None and bearing.back is not None
+        azimuth_deg = math.degrees(line.measures.azimuth[0] - line.turn_rad)
         fore_deg, back_deg = (None if rad is None else math.degrees(rad) % 360 for rad in (bearing.fore, bearing.back))
+        off_deg = tuple(
+            0.0 if read is None else math.remainder(read - azimuth_deg - turn_deg, 360)
+            for read, turn_deg in ((fore_deg, 0.0), (back_deg, 180.0))
+        )
+        if both and number not in survey.carried:
+            # Their mean is corrected; what the sights differ by stays to be seen.
+            off_deg = (0.5 * (off_deg[0] + off_deg[1]),) * 2
+        distance_m, remark, scale = leg.distance_m, remark_on(leg), line.measures.distance[0] / leg.distance_m
+        if line.by_clino:
+            # Distance, inclinations and depths together make one vector.
+            distance_m, scale = line.length_m, 1.0
+            remark = f"by clino, read {leg.distance_m:.3f} m; {remark}"
         return Reading(
             line=line,
             compass_deg=fore_deg,
             back_deg=back_deg,
-            clino_deg=math.degrees(math.asin(max(-1.0, min(1.0, line.rise_m / leg.distance_m)))),
-            depth_from_m=from_m,
-            depth_to_m=to_m,
-            compass_sigma_deg=math.degrees(bearing.sigma) * (math.sqrt(2) if both else 1.0),
+            clino_deg=math.degrees(math.asin(max(-1.0, min(1.0, line.rise_m / (distance_m * scale))))),
+            depth_from_m=depths[0],
+            depth_to_m=depths[1],
+            compass_sigma_deg=math.degrees(line.measures.azimuth[1]) * (math.sqrt(2) if both else 1.0),
             by_clino=line.by_clino,
-            held=held and not line.by_clino,
+            held=held,
             looped=looped,
-            distance_m=leg.distance_m,
-            remark=remark_on(leg),
+            distance_m=distance_m,
+            remark=remark,
             turn_deg=math.degrees(line.turn_rad),
             declination_deg=math.degrees(self._declination_rad(leg)),
+            off_deg=(off_deg[0], off_deg[1]),
+            scale=scale,
         )
 
     def _declination_rad(self, leg: Leg) -> float:

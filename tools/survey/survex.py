@@ -21,6 +21,8 @@ class Language:
     gap: str
     ending: str = ""
     back_sd: bool = False
+    # Whether the program itself can correct readings; if not, they are written corrected.
+    corrects: bool = True
     # Whether the program itself turns from true north to the north of a coordinate system.
     turns: bool = False
 
@@ -37,12 +39,19 @@ class Language:
     def data(self, sheet: Sheet, readings: Iterable[Reading], by_clino: Callable[[Reading], bool]) -> Iterator[str]:
         """Yield every leg's row, after the standard deviations and column names if they have changed."""
         state: dict[str, str] = {}
-        for reading in readings:
+        for as_read in readings:
+            reading = as_read if self.corrects else corrected(as_read)
             clino = by_clino(reading)
             now = {f"{self.command}sd {name}": value for name, value in self._sds(reading, clino).items()}
             if sheet.north_known:
                 north_deg = reading.declination_deg if self.turns else reading.turn_deg
                 now[f"{self.command}declination"] = f"{north_deg + 0.0:.3f} degrees"
+            off_deg, back_deg = reading.off_deg
+            for name, read_too_much in (("compass", off_deg), ("backcompass", back_deg)):
+                if round(read_too_much, 3) or f"{self.command}calibrate {name}" in state:
+                    now[f"{self.command}calibrate {name}"] = f"{read_too_much + 0.0:.3f}"
+            if abs(reading.scale - 1) > 1e-6 or f"{self.command}calibrate {self.tape}" in state:
+                now[f"{self.command}calibrate {self.tape}"] = f"0 {reading.scale:.6f}"
             now[self.normal if clino else self.diving] = ""
             for name, value in now.items():
                 if state.get(name) != value:
@@ -65,7 +74,7 @@ class Language:
 
     def _sds(self, reading: Reading, clino: bool) -> dict[str, str]:
         line, distance_m = reading.line, reading.distance_m
-        tape_m, level = line.distance_sigma_m, math.cos(math.radians(reading.clino_deg))
+        tape_m, level = line.measures.distance[1], math.cos(math.radians(reading.clino_deg))
         if not clino:
             rise = {"depth": f"{line.rise_sigma_m / math.sqrt(2):.4f} metres"}
         else:
@@ -73,7 +82,7 @@ class Language:
             if reading.held:
                 # The rise is exact, so an error of the tape is one of the run, and none of the height. Equal sds
                 # along the leg and across its slope say that: then no misclosure on the map moves a height.
-                tape_m /= level
+                tape_m = line.run_sigma_m
                 clino_rad = tape_m / distance_m
             rise = {"clino": f"{max(math.degrees(clino_rad), 0.001):.3f} degrees"}
         compass = f"{reading.compass_sigma_deg:.3f} degrees"
@@ -86,7 +95,8 @@ class Language:
 
 
 SURVEX: Final = Language("*", ";", "tape", "\t", " ignoreall", back_sd=True)
-THERION: Final = Language("", "#", "length", " ", turns=True)
+# Therion's `calibrate` knows no backcompass.
+THERION: Final = Language("", "#", "length", " ", corrects=False, turns=True)
 THERION_INSTRUMENTS: Final = ("tape", "length", "compass", "backcompass", "clino", "depth")
 
 
@@ -107,6 +117,27 @@ def therion_person(name: str) -> str:
     return quoted(" ".join(words) if len(words) < 3 else f"{' '.join(words[:-1])}/{words[-1]}")
 
 
+def corrected(reading: Reading) -> Reading:
+    """Return a reading with what the instruments are found to be off taken off, and what was read in its remark."""
+    if not any(round(off, 3) for off in reading.off_deg) and abs(reading.scale - 1) <= 1e-6:
+        return reading
+    fore, back = (
+        None if read is None else read - off
+        for read, off in zip((reading.compass_deg, reading.back_deg), reading.off_deg, strict=True)
+    )
+    read = [f"{reading.leg.distance_m:.3f} m"]
+    read += [f"{angle:.2f}" for angle in (reading.compass_deg, reading.back_deg) if angle is not None]
+    return replace(
+        reading,
+        compass_deg=fore,
+        back_deg=back,
+        distance_m=reading.distance_m * reading.scale,
+        off_deg=(0.0, 0.0),
+        scale=1.0,
+        remark=f"corrected, read {' '.join(read)}; {reading.remark}",
+    )
+
+
 def _adjusted(sheet: Sheet, reading: Reading) -> Reading:
     """Return a leg's reading as it would be between the adjusted stations."""
     leg = reading.leg
@@ -122,6 +153,8 @@ def _adjusted(sheet: Sheet, reading: Reading) -> Reading:
         compass_deg=fore_deg if reading.compass_deg is not None else None,
         back_deg=fore_deg + 180 if reading.back_deg is not None else None,
         clino_deg=math.degrees(math.asin(up_m / distance_m)),
+        off_deg=(0.0, 0.0),
+        scale=1.0,
         remark=f"adjusted, read {' '.join(read)}; {reading.remark}",
     )
 

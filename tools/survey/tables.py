@@ -11,10 +11,11 @@ from datetime import date
 from typing import Any, Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.survey.connected import station_depths
 from buddyline.tools.survey.geodesy import leg_date
-from buddyline.tools.survey.network import station_depths
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
+from buddyline.tools.survey.survex import corrected
 from msgspec import to_builtins
 
 # A station's columns and their digits after the point; empty if a value is not known.
@@ -138,14 +139,15 @@ def _compass_section(sheet: Sheet, when: date, turn_deg: str, readings: list[Rea
         "FROM TO LENGTH BEARING INC LEFT UP DOWN RIGHT AZM2 INC2 FLAGS COMMENTS",
         "",
     ]
-    for reading in readings:
+    # The format has no corrections of a single leg.
+    for reading in map(corrected, readings):
         leg, fore_deg, back_deg, remark = reading.leg, reading.compass_deg, reading.back_deg, reading.remark
         if fore_deg is None and back_deg is not None:
             # The format has no leg without a bearing.
             fore_deg, remark = (back_deg + 180) % 360, f"bearing by backsight; {remark}"
         fore, back = (MISSING if angle is None else f"{angle:.2f}" for angle in (fore_deg, back_deg))
         rows.append(
-            f"{leg.from_:>12} {leg.to:>12} {leg.distance_m / FOOT_M:.3f} {fore} {reading.clino_deg:.3f} "
+            f"{leg.from_:>12} {leg.to:>12} {reading.distance_m / FOOT_M:.3f} {fore} {reading.clino_deg:.3f} "
             f"-9.90 -9.90 -9.90 -9.90 {back} {MISSING} {remark}"
         )
     return "\r\n".join(rows) + "\r\n\f\r\n"

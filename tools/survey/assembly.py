@@ -1,0 +1,338 @@
+"""A project's observations: legs, points, turns, known lines and fixed points, with their instruments' unknowns."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Final, TypeAlias
+
+from buddyline.protocol.clock import S_NS
+from buddyline.tools.survey.averages import Floats, wrap
+from buddyline.tools.survey.lines import SightPair, bearing_of, slopes_of
+from buddyline.tools.survey.observations import Observations
+from buddyline.tools.survey.project import Known, Leg, Project, Turn
+from msgspec import UNSET
+
+EXACT_M: Final = 1e-4
+LEAST_NOISE_M: Final = 0.002
+# A leg's stated sd of distance holds the scale's: at least this share of it is the leg's own.
+OWN_SHARE: Final = 0.25
+# 1 sd of a scale that the survey itself determines better than its calibration.
+SCALE_FREE: Final = 0.02
+# Shares of a compass's stated variance: constant, and each of cosine and sine of the heading (what calibration leaves
+# of hard iron). The rest is new in each leg.
+ZERO_SHARE: Final = 0.1
+IRON_SHARE: Final = 0.4
+# Time in which a gauge's zero may change by its slow error (MS5837-30BA data sheet: long-term stability; measured
+# zeros of a rig that warms up change within the first hour).
+DRIFT_S: Final = 3600.0
+# The water level of another dive, 1 sd: tide, flood, or the air pressure at which the zero was taken.
+LEVEL_M: Final = 0.5
+# 1 sd of a tide's rate.
+TIDE_M_PER_S: Final = 0.5 / 3600.0
+# The surface's altitude, where fixed points' altitudes alone tell it.
+WATER_M: Final = 1e4
+NORTH: Final = "north"
+WATER: Final = "water level"
+
+# Position (3,) and its standard deviations (3,): east, north, up, m.
+Fixed: TypeAlias = dict[str, tuple[Floats, Floats]]
+
+
+def scale_name(leg: Leg) -> str:
+    """Return the name of the unknown scale of a leg's two nodes."""
+    return "scale of {} and {}".format(*sorted((leg.from_node, leg.to_node)))
+
+
+def compass_name(dive: int, node: str) -> str:
+    """Return the name of a compass of a dive."""
+    return f"compass of {node} in dive {dive}"
+
+
+def gauge_name(dive: int, node: str) -> str:
+    """Return the name of a gauge of a dive."""
+    return f"gauge of {node} in dive {dive}"
+
+
+@dataclass
+class Assembly:
+    """Legs and their observations. ends: each leg's stations. turns_rad: by leg, grid azimuth minus magnetic.
+
+    bearings: by leg, as they are weighed.
+    """
+
+    observations: Observations
+    legs: Sequence[Leg]
+    ends: list[tuple[str, str]]
+    turns_rad: Sequence[float]
+    bearings: dict[int, SightPair | None] = field(default_factory=dict)
+
+
+class _Gauges:
+    """Terms of depth readings."""
+
+    def __init__(self, of: Observations, legs: Sequence[Leg], tides: Sequence[int]) -> None:
+        self._of, self._tides = of, tides
+        self._start_s: dict[int, float] = {}
+        slow: dict[tuple[int, str], list[float]] = defaultdict(list)
+        for leg in legs:
+            start_s = (leg.start_ns + leg.end_ns) / 2 / S_NS
+            self._start_s[leg.dive] = min(self._start_s.get(leg.dive, math.inf), start_s)
+            for node, depth in ((leg.from_node, from_depth(leg)), (leg.to_node, to_depth(leg))):
+                if depth is not None:
+                    slow[leg.dive, node].append(depth[2])
+        self._slow_m = {key: max(median(values), LEAST_NOISE_M) for key, values in slow.items()}
+        self._first = min((dive for dive, _ in slow), default=1)
+
+    def terms(self, leg: Leg, node: str, sign: float) -> list[tuple[int, float]]:
+        """Return zero, drift, level and tide of one reading."""
+        of, dive, name, slow_m = self._of, leg.dive, gauge_name(leg.dive, node), self._slow_m[leg.dive, node]
+        time_s = (leg.start_ns + leg.end_ns) / 2 / S_NS - self._start_s[dive]
+        terms = [
+            (of.unknown(f"{name}: zero", slow_m), sign),
+            (of.unknown(f"{name}: drift", slow_m), sign * time_s / DRIFT_S),
+        ]
+        if dive != self._first:
+            terms.append((of.unknown(f"water level in dive {dive}", LEVEL_M), sign))
+        if dive in self._tides:
+            terms.append((of.unknown(f"tide in dive {dive}", TIDE_M_PER_S), sign * time_s))
+        return terms
+
+
+def from_depth(leg: Leg) -> tuple[float, float, float] | None:
+    """Return the depth read at the leg's start, its noise and its slow error (1 sd), m; None if not read."""
+    return _depth(leg.depth_from_m, leg.depth_from_sigma_m, leg.depth_from_noise_m)
+
+
+def to_depth(leg: Leg) -> tuple[float, float, float] | None:
+    """Return the depth read at the leg's end."""
+    return _depth(leg.depth_to_m, leg.depth_to_sigma_m, leg.depth_to_noise_m)
+
+
+def _depth(depth_m: object, sigma_m: object, noise_m: object) -> tuple[float, float, float] | None:
+    if not isinstance(depth_m, float | int) or not isinstance(sigma_m, float | int):
+        return None
+    noise = max(min(noise_m, sigma_m) if isinstance(noise_m, float | int) else sigma_m, LEAST_NOISE_M)
+    return float(depth_m), float(noise), math.sqrt(max(sigma_m**2 - noise**2, 0.0))
+
+
+def depths_alone(legs: Sequence[Leg], tides: Sequence[int]) -> Assembly:
+    """Return the observations of all gauges alone: stations' depths as `up` (negative)."""
+    names = dict.fromkeys(
+        name
+        for leg in legs
+        for name, depth in ((leg.from_, from_depth(leg)), (leg.to, to_depth(leg)))
+        if depth is not None
+    )
+    of = Observations(list(names))
+    found = Assembly(of, legs, [(leg.from_, leg.to) for leg in legs], [0.0] * len(legs))
+    _add_depths(found, tides, 0.0)
+    for number in range(len(names)):
+        # Depths alone say nothing of the map.
+        of.add("east", number, -1, 0.0, 1.0, what="map")
+        of.add("north", number, -1, 0.0, 1.0, what="map")
+    return found
+
+
+def _add_depths(to: Assembly, tides: Sequence[int], level_m: float, *, free_level: bool = False) -> None:
+    of, gauges = to.observations, _Gauges(to.observations, to.legs, tides)
+    for number, (leg, (start, end)) in enumerate(zip(to.legs, to.ends, strict=True)):
+        for what, name, node, depth in (
+            ("depth_from", start, leg.from_node, from_depth(leg)),
+            ("depth_to", end, leg.to_node, to_depth(leg)),
+        ):
+            if depth is None:
+                continue
+            terms = gauges.terms(leg, node, -1.0)
+            if free_level:
+                terms.append((of.unknown(WATER, WATER_M), -1.0))
+            to.observations.rows[number, what] = of.add(
+                "up", of.at[name], -1, level_m - depth[0], depth[1], terms, leg=number, what=f"gauge of {node}"
+            )
+
+
+def assemble(
+    project: Project,
+    legs: Sequence[Leg],
+    ends: list[tuple[str, str]],
+    stations: list[str],
+    fixed: Fixed,
+    turns_rad: Sequence[float],
+    tides: Sequence[int],
+    level_m: float,
+    origin_m: Floats,
+    north_along: tuple[str, str] | None = None,
+) -> Observations:
+    """Return all observations of these legs. fixed: with the altitudes that count, NaN elsewhere. origin_m: (3,), of
+    which coordinates are relative.
+
+    north_along: stations whose
+    line is the north of a survey without any direction.
+    """
+    of = Observations(stations)
+    to = Assembly(of, legs, ends, turns_rad)
+    sighted = _Compasses(project, of, legs)
+    turned = {(one.dive, ns) for one in project.turn for ns in (one.from_ns, one.to_ns)}
+    for number, (leg, names) in enumerate(zip(legs, ends, strict=True)):
+        start, end = of.at[names[0]], of.at[names[1]]
+        share = project.settings.range_share if leg.from_node else 0.0
+        sigma_m = math.sqrt(
+            max(leg.distance_sigma_m**2 - (share * leg.distance_m) ** 2, (OWN_SHARE * leg.distance_sigma_m) ** 2)
+        )
+        terms = []
+        if share:
+            name = scale_name(leg)
+            if of.has(name) is None:
+                # Known lines or fixed points may tell the scale better than the calibration does.
+                of.loosen[len(of.value)] = of.unknown(name, share), SCALE_FREE
+            terms = [(of.unknown(name), 1.0)]
+        to.observations.rows[number, "distance"] = of.add(
+            "distance", start, end, leg.distance_m, sigma_m, terms, leg=number, what="distance"
+        )
+        if project.adjust.compass == "use":
+            sighted.add(to, number, start, end, turned=(leg.dive, leg.start_ns) in turned)
+        elif (leg.dive, leg.start_ns) in turned:
+            sighted.carry(to, number, start, end)
+        for slope, sigma in slopes_of(leg):
+            of.add("inclination", start, end, slope, sigma, leg=number, what="clinometers")
+    free_level = any(not math.isnan(position[2]) for position, _ in fixed.values())
+    if project.adjust.depth == "absolute":
+        _add_depths(to, tides, level_m - origin_m[2], free_level=free_level)
+    else:
+        _add_rises(to, tides)
+    _add_turns(to, project.turn, sighted)
+    _add_known(to, project.known)
+    if north_along is not None:
+        of.add("azimuth", of.at[north_along[0]], of.at[north_along[1]], 0.0, 1e-6, what="arbitrary north")
+    for name, (position_m, sigmas_m) in fixed.items():
+        if name not in of.at:
+            continue
+        away_m = position_m - origin_m
+        for kind, value_m, known_m in zip(("east", "north", "up"), away_m.tolist(), sigmas_m.tolist(), strict=True):
+            # Depths give the other altitudes, where there is any depth.
+            if not math.isnan(value_m) or not legs:
+                at_m = 0.0 if math.isnan(value_m) else value_m
+                of.add(kind, of.at[name], -1, at_m, max(known_m, EXACT_M), what=f"fixed point {name}")  # type: ignore[arg-type]
+    return of
+
+
+def _add_rises(to: Assembly, tides: Sequence[int]) -> None:
+    """Let each leg keep the difference of its own two readings."""
+    of, gauges = to.observations, _Gauges(to.observations, to.legs, tides)
+    for number, (leg, names) in enumerate(zip(to.legs, to.ends, strict=True)):
+        depths = from_depth(leg), to_depth(leg)
+        if depths[0] is None or depths[1] is None:
+            continue
+        terms = gauges.terms(leg, leg.from_node, 1.0) + gauges.terms(leg, leg.to_node, -1.0)
+        to.observations.rows[number, "rise"] = of.add(
+            "rise",
+            of.at[names[0]],
+            of.at[names[1]],
+            depths[0][0] - depths[1][0],
+            math.hypot(depths[0][1], depths[1][1]),
+            terms,
+            leg=number,
+            what="gauges",
+        )
+
+
+class _Compasses:
+    """Azimuths of legs, by compasses, and the unknown azimuths of sights that gyroscopes carry from leg to leg."""
+
+    def __init__(self, project: Project, of: Observations, legs: Sequence[Leg]) -> None:
+        self._project, self._of = project, of
+        self.sights: dict[tuple[int, int], tuple[int, Leg]] = {}
+        sigmas: dict[tuple[int, str], list[float]] = defaultdict(list)
+        for leg in legs:
+            for node, sigma_deg in (
+                (leg.from_node, leg.azimuth_sigma_deg),
+                (leg.to_node, leg.back_azimuth_sigma_deg),
+            ):
+                if sigma_deg is not UNSET:
+                    sigmas[leg.dive, node].append(math.radians(sigma_deg))
+        self._sigma = {key: median(values) for key, values in sigmas.items()}
+
+    def _terms(self, leg: Leg, node: str, heading: float) -> list[tuple[int, float]]:
+        name, sigma = compass_name(leg.dive, node), self._sigma[leg.dive, node]
+        of, iron = self._of, math.sqrt(IRON_SHARE) * sigma
+        common = math.radians(self._project.settings.compass_common_deg)
+        north = [(of.unknown(NORTH, common), 1.0)] if common else []
+        return [
+            *north,
+            (of.unknown(f"{name}: zero", math.sqrt(ZERO_SHARE) * sigma), 1.0),
+            (of.unknown(f"{name}: iron ahead", iron), math.cos(heading)),
+            (of.unknown(f"{name}: iron abeam", iron), math.sin(heading)),
+        ]
+
+    def carry(self, to: Assembly, number: int, start: int, end: int) -> int:
+        """Add the unknown azimuth of a leg's line from camera to camera; return its column."""
+        leg = to.legs[number]
+        guess = _guess(leg, to.turns_rad[number])
+        column = self._of.unknown(f"sight {number}", None, guess, early=True)
+        run_m = max(leg.distance_m, 0.3)
+        held = math.sqrt(2) * max(self._project.settings.centering_m, 1e-3) / run_m
+        self._of.add("azimuth", start, end, 0.0, held, [(column, -1.0)], leg=number, what="centering")
+        self.sights[leg.dive, leg.start_ns] = column, leg
+        return column
+
+    def add(self, to: Assembly, number: int, start: int, end: int, *, turned: bool) -> None:
+        """Add a leg's azimuths. turned: others hang on this one by gyroscopes, so that a disturbed compass shows."""
+        leg, of, turn_rad = to.legs[number], self._of, to.turns_rad[number]
+        to.bearings[number] = bearing = bearing_of(leg, self._project)
+        if bearing is None:
+            return
+        column = self.carry(to, number, start, end) if turned else None
+        own = math.sqrt(1 - ZERO_SHARE - IRON_SHARE)
+        both = bearing.fore is not None and bearing.back is not None
+        # Equal weights for both, as all cave programs have it: then their plain mean is the leg's.
+        sigma = own * bearing.sigma * (math.sqrt(2) if both else 1.0)
+        for what, node, angle, against in (
+            ("fore", leg.from_node, bearing.fore, 0.0),
+            ("back", leg.to_node, bearing.back, math.pi),
+        ):
+            if angle is None:
+                continue
+            terms = self._terms(leg, node, angle)
+            value, words = wrap(angle - against + turn_rad), f"compass of {node}"
+            if column is None:
+                row = of.add("azimuth", start, end, value, sigma, terms, leg=number, what=words)
+            else:
+                terms.append((column, 1.0))
+                row = of.add("angle", -1, -1, value, sigma, terms, leg=number, what=words, robust=True)
+            to.observations.rows[number, what] = row
+
+
+def _guess(leg: Leg, turn_rad: float) -> float:
+    if leg.azimuth_deg is not UNSET:
+        return wrap(math.radians(leg.azimuth_deg) + turn_rad)
+    return 0.0 if leg.back_azimuth_deg is UNSET else wrap(math.radians(leg.back_azimuth_deg) + math.pi + turn_rad)
+
+
+def _add_turns(to: Assembly, turns: Sequence[Turn], sighted: _Compasses) -> None:
+    of = to.observations
+    for one in turns:
+        ends = [sighted.sights.get((one.dive, ns)) for ns in (one.from_ns, one.to_ns)]
+        if ends[0] is None or ends[1] is None:
+            continue
+        # A leg's azimuth is its start's sight; a node at its end looks the other way.
+        facing = [math.pi * (one.node != leg.from_node) for _, leg in (ends[0], ends[1])]
+        value = wrap(math.radians(one.angle_deg) - facing[1] + facing[0])
+        terms = [(ends[1][0], 1.0), (ends[0][0], -1.0)]
+        of.add("angle", -1, -1, value, math.radians(one.sigma_deg), terms, what=f"gyroscope of {one.node}")
+
+
+def _add_known(to: Assembly, known: Sequence[Known]) -> None:
+    of = to.observations
+    for one in known:
+        start, end = of.at.get(one.from_), of.at.get(one.to)
+        if start is None or end is None:
+            continue
+        name = f"known line {one.from_}-{one.to}"
+        if one.distance_m is not UNSET:
+            of.add("distance", start, end, one.distance_m, max(one.sigma_m, EXACT_M), what=name)
+        if one.azimuth_deg is not UNSET:
+            angle, sigma = math.radians(one.azimuth_deg), math.radians(one.azimuth_sigma_deg)
+            of.add("azimuth", start, end, wrap(angle), max(sigma, 1e-5), what=name)
