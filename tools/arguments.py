@@ -189,7 +189,8 @@ def evaluate(parser: argparse.ArgumentParser) -> None:
         "logs", nargs="+", metavar="OUT.mcap", help="the solved log; further logs where it lacks candidates or truth"
     )
     parser.add_argument("--truth", action="append", default=[], metavar="T.mcap", help="the log with the truth")
-    add_pair_argument(parser, "the only one")
+    add_pair_argument(parser, "the only one; of several pairs, all nodes of their net")
+    parser.add_argument("--net", action="store_true", help="all nodes in one frame, also of a single pair")
     _json(parser, "print one JSON object: metres, radians, seconds")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write plots (PNG); needs the extra `plots`")
 
@@ -260,16 +261,18 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", metavar="OUT.mcap", help="the solved log, or one with truth")
     parser.add_argument(
         "--format",
-        choices=("tum", "csv", "foxglove"),
+        choices=("tum", "csv", "trc", "foxglove"),
         required=True,
-        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row for each sample, units in the header; foxglove: "
+        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row for each sample, units in the header; trc: all "
+        "nodes and their lamps as markers, for motion capture programs; foxglove: "
         "a log with pictures, marks, transforms and the track's path for Foxglove, Lichtblick and rerun",
     )
     parser.add_argument(
         "--what",
-        choices=("poses", "track"),
-        help="default: the track if the log has one (the best of its modes), else the poses",
+        choices=("poses", "track", "net"),
+        help="default: the track if the log has one (the best of its modes), else the poses; net: all nodes",
     )
+    parser.add_argument("--node", metavar="ID", help="of --what net: this node; tum needs it")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     parser.add_argument("--truth", action="store_true", help="the true poses instead of the solved ones (tum)")
     parser.add_argument(

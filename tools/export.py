@@ -55,6 +55,10 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
+    if args.format == "trc" or args.what == "net":
+        return _export_network(args)
+    if args.node is not None:
+        raise BuddylineError("--node: only with --what net")
     if args.format == "foxglove":
         return _export_foxglove(args)
     if args.output is not None:
@@ -88,6 +92,22 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
         raise BuddylineError(f"{name}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     lines = tum_lines(poses) if args.format == "tum" else csv_lines(poses, rejected, reasons=args.rejected)
     return f"the poses, {len(poses)} rows", lines
+
+
+def _export_network(args: argparse.Namespace) -> int:
+    from buddyline.tools.export_network import network_lines
+
+    if args.what not in (None, "net") or args.format == "foxglove" or args.truth or args.rejected or args.pair:
+        raise BuddylineError(f"--format {args.format} --what {args.what}: all nodes go as tum, csv or trc, alone")
+    if args.output is not None:
+        check_new(args.output)
+    what, lines = network_lines(args.logs, args.format, args.node, str(args.output or "buddyline.trc"))
+    if args.output is None:
+        sys.stdout.writelines(lines)
+    else:
+        write_new(args.output, "".join(lines))
+    print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
+    return 0
 
 
 def _export_foxglove(args: argparse.Namespace) -> int:

@@ -1,0 +1,172 @@
+"""Compare the poses of all nodes in one frame with truth: errors, whether the covariances are true, coverage."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodePose
+from buddyline.protocol.topics import NET_POSE, NET_TRUTH, POSE, REJECTED
+from buddyline.tools.dives import open_each
+from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
+from buddyline.tools.evaluation.statistics import Stats
+from buddyline.tools.evaluation.truth import PoseHistory
+from buddyline.tools.measure.tables import number, text_table
+
+# A node's pose is wrong where it is off by more than this, and by more than WRONG_SIGMAS.
+WRONG_M: Final = 0.3
+WRONG_SIGMAS: Final = 3.0
+
+
+@dataclass(frozen=True)
+class NodeFigures:
+    """The figures of one node. samples: number with truth. sigma_m: RMS of the stated sigma of the place, all axes.
+
+    covered: share of the net's samples at which the node was told. nees6: mean 6 if the covariance is true. wrong: see
+    WRONG_M.
+    """
+
+    net: str
+    node: str
+    fixed: bool
+    samples: int
+    covered: float
+    position_m: Stats
+    worst_m: float
+    sigma_m: float
+    rotation_rad: Stats
+    nees6: Stats
+    wrong: int
+
+
+def network_figures(poses: Sequence[NodePose], truths: Sequence[NodePose]) -> list[NodeFigures]:
+    """Return the figures of each net's nodes that have truth, by net and node.
+
+    Where one node is the origin, which moves with it, places count from its true place.
+    """
+    of_truth: dict[tuple[str, str], list[NodePose]] = defaultdict(list)
+    for truth in truths:
+        of_truth[truth.net, truth.node].append(truth)
+    # The truth of a simulated dive has one net; the estimate may have another name.
+    by_node = {node: _history(found) for (_, node), found in of_truth.items()}
+    own: dict[tuple[str, str], list[NodePose]] = defaultdict(list)
+    stamps: dict[str, set[int]] = defaultdict(set)
+    origins: dict[tuple[str, int], str] = {}
+    for pose in poses:
+        own[pose.net, pose.node].append(pose)
+        stamps[pose.net].add(pose.stamp_ns)
+        if not any(pose.covariance[i] for i in (0, 7, 14)) and not pose.fixed:
+            origins[pose.net, pose.stamp_ns] = pose.node
+    return [
+        _figures(net, node, found, by_node, len(stamps[net]), origins)
+        for (net, node), found in sorted(own.items())
+        if node in by_node
+    ]
+
+
+def _history(found: Sequence[NodePose]) -> PoseHistory:
+    return PoseHistory(
+        [one.stamp_ns for one in found], np.array([one.p_m for one in found]), np.array([one.q_xyzw for one in found])
+    )
+
+
+def _figures(
+    net: str,
+    node: str,
+    poses: Sequence[NodePose],
+    truth: dict[str, PoseHistory],
+    count: int,
+    origins: dict[tuple[str, int], str],
+) -> NodeFigures:
+    rows = []
+    for pose in poses:
+        true = truth[node].at(pose.stamp_ns)
+        origin = origins.get((net, pose.stamp_ns))
+        zero = truth[origin].at(pose.stamp_ns) if origin in truth and origin is not None else None
+        if true is None:
+            continue
+        off_m = true[0] - (zero[0] if zero is not None else 0.0) - pose.p_m
+        q = multiply(true[1], conjugate(normalized(np.array(pose.q_xyzw))))
+        off = np.concatenate((off_m, rotation_vector(q)))
+        P = np.array(pose.covariance).reshape(6, 6)
+        # What truth is rounded by, and the origin's place, which is known exactly.
+        nees = off @ np.linalg.solve(P + 1e-10 * np.eye(6), off)
+        rows.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), nees, np.sqrt(max(np.trace(P[:3, :3]), 0.0))))
+    e = np.array(rows).reshape(-1, 4)
+    wrong = (e[:, 0] > WRONG_M) & (e[:, 0] > WRONG_SIGMAS * e[:, 3])
+    return NodeFigures(
+        net=net,
+        node=node,
+        fixed=poses[0].fixed,
+        samples=len(e),
+        covered=len(poses) / count,
+        position_m=Stats.of(e[:, 0]),
+        worst_m=float(e[:, 0].max(initial=0.0)),
+        sigma_m=float(np.sqrt(np.mean(e[:, 3] ** 2))) if len(e) else 0.0,
+        rotation_rad=Stats.of(e[:, 1]),
+        nees6=Stats.of(e[:, 2]),
+        wrong=int(wrong.sum()),
+    )
+
+
+def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list[NodePose], list[NodePose]]:
+    """Read the poses of all nodes, of the first log that has any, and their truth; raise BuddylineError for none."""
+    with ExitStack() as stack:
+        logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
+        named = ", ".join([*paths, *truth_paths])
+        telling = next((log for log in logs if log.ids(NET_POSE.name)), None)
+        if telling is None:
+            raise BuddylineError(
+                f"{', '.join(paths)}: no poses of a net in it; solve it with three nodes or a fixed one"
+            )
+        poses = [one.message for one in telling.messages(NET_POSE.name) if isinstance(one.message, NodePose)]
+        truths = [
+            one.message
+            for log in [*truth_logs, *logs]
+            for one in log.messages(NET_TRUTH.name)
+            if isinstance(one.message, NodePose)
+        ]
+    if not truths:
+        raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")
+    return poses, truths
+
+
+def shows_network(paths: Sequence[str]) -> bool:
+    """Return whether logs have poses of a net, and results of more than one pair."""
+    with ExitStack() as stack:
+        logs = open_each(paths, stack)
+        pairs = {ids for log in logs for ids in log.ids(POSE.name, REJECTED.name)}
+        return len(pairs) > 1 and any(log.ids(NET_POSE.name) for log in logs)
+
+
+def network_text(figures: Sequence[NodeFigures]) -> str:
+    """Return a table of all nodes."""
+    head = ("node", "rows", "told", "place, mm: median", "RMS", "worst", "stated", "turn, mrad", "NEES / 6", "wrong")
+    body = [
+        (
+            f"{one.node} (fixed)" if one.fixed else one.node,
+            str(one.samples),
+            f"{one.covered:.0%}",
+            _scaled(one.position_m.median, 1e3),
+            _scaled(one.position_m.rmse, 1e3),
+            _scaled(one.worst_m, 1e3),
+            _scaled(one.sigma_m, 1e3),
+            _scaled(one.rotation_rad.median, 1e3),
+            "-" if one.fixed or one.nees6.mean is None else number(one.nees6.mean / 6.0, 2),
+            str(one.wrong),
+        )
+        for one in figures
+    ]
+    nets = ", ".join(dict.fromkeys(one.net for one in figures))
+    return f"all nodes in the frame of the net {nets}; --pair A/B evaluates a pair's poses\n" + text_table(
+        [head, *body]
+    )
+
+
+def _scaled(value: float | None, factor: float) -> str:
+    return "-" if value is None else number(value * factor, 1)

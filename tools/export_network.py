@@ -1,0 +1,119 @@
+"""Export all nodes of a net: TUM a node, one CSV, or TRC for motion capture programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.messages import NodeInfo, NodePose
+from buddyline.protocol.topics import NET_POSE
+from buddyline.tools.columns import in_order
+from buddyline.tools.dives import open_each
+from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
+
+_CSV: Final = (
+    *("stamp_ns", "net", "node", "fixed", "mode", "north_m", "east_m", "down_m", "q_x", "q_y", "q_z", "q_w"),
+    *("v_north_mps", "v_east_mps", "v_down_mps", "sd_north_m", "sd_east_m", "sd_down_m"),
+    *("sd_w_north_rad", "sd_w_east_rad", "sd_w_down_rad", "age_s"),
+)
+# TRC programs take y for up: x north, y up, z east.
+_NORTH_UP_EAST: Final = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+
+
+def network_lines(logs: Sequence[str], form: str, node: str | None, name: str) -> tuple[str, Iterator[str]]:
+    """Return what is exported, in words, and its lines. form: "tum", "csv" or "trc"; name: of the file."""
+    poses, infos = _load(logs)
+    known = sorted({pose.node for pose in poses})
+    if node is not None:
+        poses = [pose for pose in poses if pose.node == node]
+    if not poses:
+        raise BuddylineError(f"{', '.join(logs)}: nothing of node {node}; nodes: {', '.join(known)}")
+    said = f"{'node ' + node if node else 'nodes ' + ', '.join(known)} in the net's frame, {len(poses)} rows"
+    if form == "trc":
+        return said, _trc_lines(poses, infos, name)
+    if form == "csv":
+        return said, _csv_lines(poses)
+    if node is None:
+        raise BuddylineError(f"--format tum --what net: one node a file; choose with --node: {', '.join(known)}")
+    return said, _tum_lines(poses)
+
+
+def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
+    """Read the poses of the first log that has any, by time, and all nodes' calibrations."""
+    with ExitStack() as stack:
+        logs = open_each(paths, stack)
+        telling = next((log for log in logs if log.ids(NET_POSE.name)), None)
+        if telling is None:
+            raise BuddylineError(
+                f"{', '.join(paths)}: no poses of a net in it; solve it with three nodes or a fixed one"
+            )
+        of_node: dict[str, list[NodePose]] = {}
+        for envelope in telling.messages(NET_POSE.name):
+            if isinstance(envelope.message, NodePose):
+                of_node.setdefault(envelope.message.node, []).append(envelope.message)
+        infos: dict[str, NodeInfo] = {}
+        for log in logs:
+            infos = log.infos() | infos
+    poses = [pose for node in sorted(of_node) for pose in in_order(of_node[node])]
+    return sorted(poses, key=lambda pose: pose.stamp_ns), infos
+
+
+def _tum_lines(poses: Sequence[NodePose]) -> Iterator[str]:
+    for pose in poses:
+        seconds, rest_ns = divmod(pose.stamp_ns, S_NS)
+        yield f"{seconds}.{rest_ns:09d} {' '.join(map(repr, (*pose.p_m, *pose.q_xyzw)))}\n"
+
+
+def _csv_lines(poses: Sequence[NodePose]) -> Iterator[str]:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_CSV)
+    for pose in poses:
+        sigmas = [math.sqrt(max(variance, 0.0)) for variance in pose.covariance[::7]]
+        head = (pose.stamp_ns, pose.net, pose.node, int(pose.fixed), pose.mode)
+        writer.writerow((*head, *pose.p_m, *pose.q_xyzw, *pose.v_mps, *sigmas, pose.age_s))
+        yield text.getvalue()
+        text.seek(0)
+        text.truncate()
+
+
+def _trc_lines(poses: Sequence[NodePose], infos: dict[str, NodeInfo], name: str) -> Iterator[str]:
+    """Yield a TRC file: of each node its camera's centre and its lamps, in mm; a marker that is not known is empty."""
+    nodes = sorted({pose.node for pose in poses})
+    marked = {node: _markers(node, infos.get(node)) for node in nodes}
+    names = [marker for node in nodes for marker, _ in marked[node]]
+    stamps_ns = sorted({pose.stamp_ns for pose in poses})
+    found = {(pose.stamp_ns, pose.node): pose for pose in poses}
+    rate_hz = S_NS / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
+    yield f"PathFileType\t4\t(X/Y/Z)\t{name}\n"
+    yield "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
+    count = len(stamps_ns)
+    yield f"{rate_hz:g}\t{rate_hz:g}\t{count}\t{len(names)}\tmm\t{rate_hz:g}\t1\t{count}\n"
+    yield "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t\n"
+    yield "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, len(names) + 1)) + "\n\n"
+    for frame, stamp_ns in enumerate(stamps_ns, start=1):
+        cells = [str(frame), f"{(stamp_ns - stamps_ns[0]) / S_NS:.6f}"]
+        for node in nodes:
+            pose = found.get((stamp_ns, node))
+            for _, place_m in marked[node]:
+                if pose is None:
+                    cells += ["", "", ""]
+                    continue
+                ned_m = np.array(pose.p_m) + rotate(normalized(np.array(pose.q_xyzw)), place_m)
+                cells += [f"{1e3 * value:.3f}" for value in _NORTH_UP_EAST @ ned_m]
+        yield "\t".join(cells) + "\n"
+
+
+def _markers(node: str, info: NodeInfo | None) -> list[tuple[str, Floats]]:
+    """Return a node's markers and their places in its camera frame."""
+    markers = [(node, np.zeros(3))]
+    if info is not None and info.has_lights:
+        markers += [(f"{node}_left", np.array(info.light_left_m)), (f"{node}_right", np.array(info.light_right_m))]
+    return markers
