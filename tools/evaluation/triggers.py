@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from buddyline.protocol.messages import Candidates, Rejected, RelativePose
 from buddyline.tools.evaluation.statistics import share
+from buddyline.tools.evaluation.stretches import Outcome, stretches
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,7 @@ class Triggers:
     """The outcomes of the triggers. Each trigger should have exactly one pose or one rejection.
 
     unanswered: number with Candidates and without an outcome; None if the logs have no Candidates. doubled: number of
-    second outcomes, which do not count. gap_s: the longest time between two poses.
+    second outcomes, which do not count. gap_s: the longest stretch without a pose (stretches.py); None without a pose.
     """
 
     total: int
@@ -51,7 +52,11 @@ def trigger_figures(
     results = {pose.trigger for pose in poses} | {rejection.trigger for rejection in rejected}
     asked = {frame.trigger for frame in frames}
     span_s = (max(stamps_ns.values()) - min(stamps_ns.values())) / 1e9 if stamps_ns else 0.0
+    outcomes = [Outcome(pose.stamp_ns, pose.stamp_ns, None) for pose in poses]
+    outcomes += [Outcome(rejection.stamp_ns, rejection.stamp_ns, rejection.reason) for rejection in rejected]
     solved = sorted(pose.stamp_ns for pose in poses)
+    # Without a stretch, the longest time is that from one pose to the next.
+    gaps_s = [(end - start) / 1e9 for start, end in pairwise(solved)] + [each.seconds for each in stretches(outcomes)]
     return Triggers(
         total=len(asked | results),
         unanswered=len(asked - results) if frames else None,
@@ -60,7 +65,7 @@ def trigger_figures(
         span_s=span_s,
         triggers_hz=share(len(stamps_ns) - 1, span_s),
         poses_hz=share(len(poses), span_s),
-        gap_s=max(((end - start) / 1e9 for start, end in pairwise(solved)), default=None),
+        gap_s=max(gaps_s, default=None) if poses else None,
     )
 
 

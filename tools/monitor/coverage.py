@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import base64
-from collections import Counter
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
+from buddyline.tools.evaluation.stretches import Outcome, Stretch, stretches
 from buddyline.tools.health.words import duration_words, reason_words
 
 BINS: Final = 600
@@ -30,40 +30,25 @@ class Coverage:
         self.solved = np.zeros(bins, int)
         self.rejected = np.zeros(bins, int)
         self.complete = False
-        self._reasons: Counter[tuple[int, str]] = Counter()
-        self._times_ns: list[int] = []
+        self._outcomes: list[Outcome] = []
 
-    def add(self, at_ns: int, reason: str | None) -> None:
-        """Count one trigger; reason: None for a pose."""
-        self._times_ns.append(at_ns)
+    def add(self, at_ns: int, reason: str | None, stamp_ns: int | None = None) -> None:
+        """Count one trigger; reason: None for a pose; stamp_ns: the trigger's own time, if it is not the log's."""
+        self._outcomes.append(Outcome(at_ns if stamp_ns is None else stamp_ns, at_ns, reason))
         bins = len(self.solved)
         index = min(max((at_ns - self.begin_ns) * bins // (self.end_ns - self.begin_ns), 0), bins - 1)
         if reason is None:
             self.solved[index] += 1
         else:
             self.rejected[index] += 1
-            self._reasons[index, reason] += 1
-
-    def sort(self) -> None:
-        """Bring the times of all outcomes into order."""
-        self._times_ns.sort()
 
     def times(self) -> list[int]:
-        """Return the times of all outcomes, in order; empty until the whole dive has been read."""
-        return self._times_ns if self.complete else []
+        """Return the times of all outcomes in the log, in order; empty until the whole dive has been read."""
+        return sorted(outcome.at_ns for outcome in self._outcomes) if self.complete else []
 
-    def without(self) -> list[tuple[int, int, Counter[str]]]:
-        """Return the stretches (from, to in ns, reasons) in which most triggers ended without a pose."""
-        bins, span_ns = len(self.solved), self.end_ns - self.begin_ns
-        edges = np.flatnonzero(np.diff(self.rejected > self.solved, prepend=False, append=False)).tolist()
-        found = []
-        for begin, end in zip(edges[0::2], edges[1::2], strict=True):
-            reasons: Counter[str] = Counter()
-            for (index, reason), count in self._reasons.items():
-                if begin <= index < end:
-                    reasons[reason] += count
-            found.append((self.begin_ns + span_ns * begin // bins, self.begin_ns + span_ns * end // bins, reasons))
-        return found
+    def without(self) -> list[Stretch]:
+        """Return the stretches without a pose; empty until the whole dive has been read."""
+        return stretches(self._outcomes) if self.complete else []
 
     def strip(self, cursor_ns: int | None = None) -> str:
         """Return the dive as a strip of colours, as HTML, which CSS stretches; cursor_ns: marked in it."""
@@ -80,11 +65,11 @@ class Coverage:
         image = f'<img alt="where the dive has poses" src="data:image/png;base64,{data}">'
         return f'<div class="strip">{image}{cursor}</div>'
 
-    def words(self, begin_ns: int, end_ns: int, reasons: Counter[str]) -> str:
-        """Return begin, length and reasons of a stretch without poses, in words."""
-        why = ", ".join(f"{reason_words(reason)} ({count})" for reason, count in reasons.most_common(3))
-        at_s = (begin_ns - self.begin_ns) / S_NS
-        return f"from {clock_words(at_s)} for {duration_words((end_ns - begin_ns) / S_NS)}: {why}"
+    def words(self, stretch: Stretch) -> str:
+        """Return begin, length and reasons of a stretch without a pose, in words."""
+        why = ", ".join(f"{reason_words(reason)} ({count})" for reason, count in stretch.reasons.most_common(3))
+        at_s = (stretch.begin_at_ns - self.begin_ns) / S_NS
+        return f"from {clock_words(at_s)} for {duration_words(stretch.seconds)}: {why or 'no pictures'}"
 
 
 def clock_words(seconds: float) -> str:

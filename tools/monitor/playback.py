@@ -7,7 +7,7 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope
-from buddyline.protocol.messages import Rejected
+from buddyline.protocol.messages import Rejected, RelativePose
 from buddyline.protocol.topics import INFO
 from buddyline.tools.dives import Dive
 from buddyline.tools.monitor.coverage import Coverage
@@ -74,9 +74,9 @@ def cover(coverage: Coverage, paths: list[str], pair: Pair | None, stop: threadi
     with Dive(paths, one_rig=False) as dive:
         for count, envelope in enumerate(dive.messages("pose", "rejected")):
             outcome = envelope.message
-            if pair is None or envelope.ids == pair:
-                coverage.add(envelope.time_ns, outcome.reason if isinstance(outcome, Rejected) else None)
+            if isinstance(outcome, RelativePose | Rejected) and (pair is None or envelope.ids == pair):
+                reason = outcome.reason if isinstance(outcome, Rejected) else None
+                coverage.add(envelope.time_ns, reason, outcome.stamp_ns)
             if count % PACE == PACE - 1 and stop.wait(0.001):
                 return
-    coverage.sort()
     coverage.complete = True

@@ -35,7 +35,7 @@ from msgspec import UNSET
 
 log = logging.getLogger(__name__)
 
-MIN_STRETCH_NS: Final = S_NS
+MIN_STRETCH_S: Final = 1.0
 MAX_STRETCHES: Final = 40
 # Poses further apart than this are not joined.
 JOINED_NS: Final = 3 * S_NS // 2
@@ -97,7 +97,7 @@ def _figures(summary: Summary) -> str:
         rows.append((f"covered by the track (1 sd below {TRACK_SIGMA_SHARE:.0%} of the range)", f"{covered:.0%}"))
         rows.append(("longest time without a light", duration_words(summary.dark_s)))
     if triggers.gap_s is not None:
-        rows.append(("longest time between two poses", duration_words(triggers.gap_s)))
+        rows.append(("longest time without a pose", duration_words(triggers.gap_s)))
     if summary.poses:
         ranges_m = [pose.range_m for pose in summary.poses]
         rows.append(("range", f"{min(ranges_m):.2f} to {max(ranges_m):.2f} m"))
@@ -161,7 +161,9 @@ def _maps(summary: Summary) -> str:
 def _over_time(summary: Summary) -> str:
     coverage = summary.coverage
     span_ns = coverage.begin_ns, coverage.end_ns
-    without_ns = [(begin_ns, end_ns) for begin_ns, end_ns, _ in coverage.without()]
+    without_ns = [
+        (stretch.begin_at_ns, stretch.end_at_ns) for stretch in coverage.without() if stretch.seconds >= MIN_STRETCH_S
+    ]
     return inline_svg(
         dive_figures.over_time([*summary.points, *summary.tracks], summary.depths, span_ns, without_ns), "over time"
     )
@@ -171,9 +173,9 @@ def _coverage(summary: Summary) -> str:
     coverage, rejected = summary.coverage, Counter(rejection.reason for rejection in summary.rejected)
     total = len(summary.poses) + len(summary.rejected)
     rows = [(reason_words(why), why, f"{count}", f"{count / total:.1%}") for why, count in rejected.most_common()]
-    gaps = [gap for gap in coverage.without() if gap[1] - gap[0] >= MIN_STRETCH_NS]
-    longest = sorted(sorted(gaps, key=lambda gap: gap[0] - gap[1])[:MAX_STRETCHES], key=lambda gap: gap[0])
-    listed = "".join(f"<li>{escape(coverage.words(*gap))}</li>" for gap in longest)
+    gaps = [stretch for stretch in coverage.without() if stretch.seconds >= MIN_STRETCH_S]
+    longest = sorted(sorted(gaps, key=lambda gap: -gap.seconds)[:MAX_STRETCHES], key=lambda gap: gap.begin_ns)
+    listed = "".join(f"<li>{escape(coverage.words(gap))}</li>" for gap in longest)
     more = f"<p class='dim'>The {MAX_STRETCHES} longest of {len(gaps)}.</p>" if len(gaps) > MAX_STRETCHES else ""
     track = summary.track_coverage
     return (

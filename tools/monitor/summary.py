@@ -101,7 +101,7 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
                 _take_outcome(summary, message, at_ns)
         elif isinstance(message, Track):
             if envelope.ids == pair:
-                lit_ns = at_ns - round(message.age_s * S_NS)
+                lit_ns = message.stamp_ns - round(message.age_s * S_NS)
                 summary.dark_s = max(summary.dark_s, message.age_s, (lit_ns - (lit_before_ns or lit_ns)) / S_NS)
                 lit_before_ns = lit_ns
                 if summary.track_coverage is None:
@@ -118,17 +118,19 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
             known = summary.infos.setdefault(message.node, [])
             if not known or known[-1].camera != message.camera or known[-1].light_left_m != message.light_left_m:
                 known.append(message)
-    summary.coverage.complete = True
+    for coverage in (summary.coverage, summary.track_coverage):
+        if coverage is not None:
+            coverage.complete = True
     summary.shots = _shots(dive, pair)
     return summary
 
 
 def _take_outcome(summary: Summary, outcome: RelativePose | Rejected, at_ns: int) -> None:
     if isinstance(outcome, Rejected):
-        summary.coverage.add(at_ns, outcome.reason)
+        summary.coverage.add(at_ns, outcome.reason, outcome.stamp_ns)
         summary.rejected.append(outcome)
         return
-    summary.coverage.add(at_ns, None)
+    summary.coverage.add(at_ns, None, outcome.stamp_ns)
     summary.poses.append(outcome)
     _keep(summary, summary.points, outcome, at_ns)
 

@@ -88,7 +88,7 @@ class DiveSession:
                     self._playing = False
                     to_ns = _next(self._coverage.times(), at_ns, value > 0)
                 elif name == "gap":
-                    begins = [begin_ns for begin_ns, _, _ in self._coverage.without()]
+                    begins = sorted(stretch.begin_at_ns for stretch in self._coverage.without())
                     to_ns = _next(begins, at_ns, value > 0)
         return to_ns
 
