@@ -204,6 +204,21 @@ class VqfAttitude:
         self._last_ns = sample.stamp_ns
         return self._advance(sample, dt_s)
 
+    def turn_back(self, ends_ns: int) -> None:
+        """Go on backward in time: with samples whose rate is the opposite, stamped ends_ns minus their stamp.
+
+        Attitude, field and what is known of them stay; rates and biases are the opposite from now on.
+        """
+        if self._vqf is None:
+            return
+        state = self._vqf.state
+        for name in ("bias", "motionBiasEstBiasLpState", "restLastGyrLp", "restGyrLpState"):
+            state[name] = -np.asarray(state[name])
+        self._vqf.state = state
+        self._bias_radps = -self._bias_radps
+        self._last_ns = ends_ns - self._last_ns
+        self._heading.turn_back()
+
     def _begin(self, sample: ImuSample, bias_radps: Vector, bias_sigma_dps: float) -> None:
         self._bias_radps = bias_radps
         self._vqf = self._new_filter(

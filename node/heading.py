@@ -147,6 +147,12 @@ class HeadingFilter:
         doubtful = self._started and self.problem and not self._confirmed
         self._doubt_rad = abs(wrap(delta_rad - self.delta_rad)) if doubtful else 0.0
 
+    def turn_back(self) -> None:
+        """Go on backward in time: the drift is the opposite."""
+        p00, p01, p11 = self._p
+        self._p = (p00, -p01, p11)
+        self._drift_radps = -self._drift_radps
+
     def widen(self, turned_rad: float) -> None:
         """Add an unobserved rotation with this standard deviation."""
         p00, p01, p11 = self._p

@@ -162,6 +162,13 @@ def solve(parser: argparse.ArgumentParser) -> None:
     )
     clocks.add_argument("--clocks", metavar="FILE.json", help="offset and drift, from `buddyline align --json`")
     parser.add_argument(
+        "--attitude-again",
+        nargs="*",
+        metavar="NODE=FILE.toml",
+        help="attitudes anew from the inertial samples, in both directions of time; with the log's calibration of the "
+        "magnetometer, or a later one in these files",
+    )
+    parser.add_argument(
         "--track",
         choices=TRACKS,
         default=TRACKS[0],

@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
             track=track_settings(args.track, args.track_hz),
             lone=[] if args.nodes else [node for node, info in infos.items() if not info.has_camera],
         )
+        attitudes = _attitudes(dive, args, nodes)
         began_s, tracks = time.monotonic(), defaultdict[tuple[str, ...], Tracked](Tracked)
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
         with new_dive_log(args.output, metadata) as writer:
@@ -60,6 +61,10 @@ def run(args: argparse.Namespace) -> int:
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
             envelopes = messages_of(dive, args, infos, *nodes, doing="solve")
+            if attitudes:
+                from buddyline.tools.attitudes import in_place_of
+
+                envelopes = in_place_of(envelopes, attitudes)
             while together := list(islice(envelopes, TOGETHER)):
                 sound = [envelope for envelope in together if not _is_replaced(envelope.message, replaced)]
                 for envelope in sound:
@@ -77,6 +82,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _is_full(info: NodeInfo) -> bool:
     return info.has_camera and info.has_lights
+
+
+def _attitudes(dive: Dive, args: argparse.Namespace, nodes: list[str]) -> list[Envelope]:
+    """Return the attitudes that were asked for anew."""
+    if args.attitude_again is None:
+        return []
+    from buddyline.tools.attitudes import again
+
+    return again(dive, args.attitude_again, nodes)
 
 
 def _is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from buddyline.node.attitude import AttitudeEstimator, VqfAttitude, quaternion_to_matrix
+from buddyline.node.attitude import AttitudeEstimator, quaternion_to_matrix
+from buddyline.node.attitude_again import attitude_estimator
 from buddyline.node.config import NodeConfig
 from buddyline.node.drivers.depth import SurfaceZero, depth_m, load_zero, save_zero
 from buddyline.node.drivers.health import DeviceHealth
@@ -223,17 +224,13 @@ def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSour
     """
     sensors = config.sensors
     check_names(sensors.imu, sensors.depth)
-    calibration = sensors.magnetometer_calibration
     x, y, z, w = sensors.mount_xyzw
     R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]))
     sources: list[ImuSource | DepthSource] = []
     bus = I2cBus(sensors.i2c_bus)
     try:
         if sensors.imu != NONE:
-            now_ns = clock.now_ns()
-            # What an uncalibrated magnetometer reads would never be the field of the place.
-            here = None if calibration.is_none else config.earth_field(now_ns)
-            attitude = VqfAttitude(calibration, here, config.declination_rad(now_ns))
+            attitude = attitude_estimator(config, clock.now_ns())
             sources.append(
                 ImuSource(config.node, bus, lambda: open_imu(bus, sensors.imu, R_body_chip, clock), attitude, clock)
             )
