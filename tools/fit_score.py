@@ -38,7 +38,7 @@ FAR: Final = (0.6, 1.4)
 """Greatest range of a scene, as a share of the water's own: lamps that only just show count as well."""
 DARK_SHARE: Final = 0.2
 """Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
-STOPS: Final = (0.0, 0.0, 0.0, -1.0, -2.0, -3.0, -5.0, 1.0)
+STOPS: Final = (0.0, 0.0, -1.0, -2.0, -3.0, -5.0, -7.0, 1.0)
 SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
 GREY_SHARE: Final = 0.15
 DECOYS: Final = (
@@ -87,7 +87,13 @@ def fit(samples: Sequence[Sample]) -> Floats:
     return weights
 
 
-def calibration_error(likely: Floats, lamp: NDArray[np.bool_]) -> float:
+def calibration_error(samples: Sequence[Sample], weights: Floats) -> float:
+    """Return how far the scores are from the share of lamps, see score_error."""
+    likely = np.concatenate([probability(sample.found, weights) for sample in samples]).astype(float)
+    return score_error(likely, np.concatenate([sample.lamp for sample in samples]))
+
+
+def score_error(likely: Floats, lamp: NDArray[np.bool_]) -> float:
     """Return the mean distance between score and share of lamps over bins of the score, weighted by their numbers.
 
     likely: (N,), scores of candidates. lamp: (N,), whether each is a lamp.
@@ -95,11 +101,6 @@ def calibration_error(likely: Floats, lamp: NDArray[np.bool_]) -> float:
     which = np.digitize(likely, BINS[1:-1])
     apart = [abs(float((likely[which == k] - lamp[which == k]).sum())) for k in range(len(BINS) - 1)]
     return sum(apart) / len(likely)
-
-
-def _calibration_error(samples: Sequence[Sample], weights: Floats) -> float:
-    likely = np.concatenate([probability(sample.found, weights) for sample in samples]).astype(float)
-    return calibration_error(likely, np.concatenate([sample.lamp for sample in samples]))
 
 
 def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[Sample]:
@@ -218,7 +219,7 @@ def described(
         f"# Mean distance of score and share of lamps, on pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}.",
         "[calibration_error]",
         *(
-            f"{name} = {_calibration_error([one for one in held_out if one.source == name], weights):.3f}"
+            f"{name} = {calibration_error([one for one in held_out if one.source == name], weights):.3f}"
             for name in sorted({one.source for one in held_out})
         ),
         "",

@@ -31,6 +31,8 @@ VEIL: Final = 40.0
 _GLOW_BACK, _GLOW_BACK_MOST = 2.0, 0.7
 _GUESS, _GUESS_MOST = 0.5, 0.4
 _SHARES: Final = np.linspace(0.0, 1.0, 16, dtype=np.float32)
+_DARK: Final = 0.51
+"""Where the first ring is below a level on every ray, the outline has half its radius (rings.find_shapes)."""
 _AT_BORDER_PX: Final = 1.0
 """An outline that ends this near to the border is cut by it."""
 
@@ -77,7 +79,10 @@ class Lights(NamedTuple):
 
 
 def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float) -> Lights:
-    """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture. water: its water_level."""
+    """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture. water: its water_level.
+
+    A place beside a light is left out: it is darker than half the light's height, and so has no outline.
+    """
     kept = distinct(proposals.centre_px, proposals.radius_px, _MAX_MEASURED)
     kept = kept[: max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.outstanding[kept] >= CLEAR)))]
     centre, radius_px, outstanding = proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept]
@@ -111,11 +116,12 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
     edge = shapes.edge_px[0, _HALF]
     border_px = np.zeros((len(radius), 2)) if rings.inside is None else _at_border(centre, own_edge[1], image.shape)
     radius_px = circle[_HALF, :, 2]
+    bright = np.flatnonzero(radius_px > _DARK * radius[:, 0])
     core_elongation, half_elongation, *higher = elongation(
         np.concatenate([own_edge[0], edge, *shapes.edge_px[0, :_HALF]]),
         np.concatenate([own_circle[_CORE], circle[_HALF], *circle[:_HALF]]),
     ).reshape(2 + _HALF, -1)
-    return Lights(
+    lights = Lights(
         centre + rim_px,
         core_px,
         centre + (rim_px + step_px),
@@ -136,6 +142,7 @@ def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float)
         shapes.is_open[0, _HALF] @ MEAN,
         outstanding,
     )
+    return lights if len(bright) == len(radius_px) else lights.at(bright)
 
 
 def distinct(centre_px: Floats, radius_px: Floats, at_most: int) -> list[int]:

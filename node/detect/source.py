@@ -110,6 +110,8 @@ class SourceDetector:
         if len(proposals.radius_px) == 0:
             return None
         lights = measure_lights(image, proposals, self._water)
+        if len(lights.peak) == 0:
+            return None
         return Examined(lights, features(lights, self._focal_of(image), self._texture))
 
     def _chosen(

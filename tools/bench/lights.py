@@ -30,7 +30,7 @@ from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob
-from buddyline.tools.fit_score import calibration_error
+from buddyline.tools.fit_score import score_error
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
 from numpy.typing import NDArray
@@ -218,7 +218,7 @@ def _of_water(water: str, seen: Seen) -> dict[str, Any]:
         "both_first": seen.pairs_first / max(seen.pairs, 1),
         "median_px": _median([light.away_px for light in lights if light.near]),
         "false": seen.false / max(seen.pictures, 1),
-        "calibration": calibration_error(np.array(seen.scores), np.array(seen.lamp, bool)) if seen.scores else 0.0,
+        "calibration": score_error(np.array(seen.scores), np.array(seen.lamp, bool)) if seen.scores else 0.0,
         **_truth_of_sigma(lights),
     }
 
