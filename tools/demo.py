@@ -1,4 +1,4 @@
-"""`buddyline demo`: hub, two simulated nodes and the solver as processes of this machine, and their poses live."""
+"""`buddyline demo`: hub, simulated nodes and the solver as processes of this machine, and their poses live."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from buddyline.node.sim.scenario import ENVIRONMENTS
+from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario, more_nodes
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.service import Service
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from buddyline.protocol.messages import Message
     from buddyline.tools.dashboard import Dashboard
     from buddyline.tools.measure.children import Child
+    from buddyline.tools.team_dashboard import TeamDashboard
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="triggers a second; default: 10")
+    parser.add_argument(
+        "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...; each renders its pictures; default: 2"
+    )
+    parser.add_argument(
+        "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
+    )
     parser.add_argument(
         "--record",
         metavar="DIR",
@@ -60,6 +67,8 @@ directory = {directory}
 environment = "{environment}"
 seed = {seed}
 start_ns = {start_ns}
+more_nodes = {more_nodes}
+fixed_nodes = {fixed_nodes}
 """
 
 
@@ -69,24 +78,37 @@ def run(args: argparse.Namespace) -> int:
     from buddyline.tools.dashboard import Dashboard, summary_text
     from buddyline.tools.live import open_bus
     from buddyline.tools.measure.children import end_all, free_endpoint
+    from buddyline.tools.team_dashboard import TeamDashboard, team_summary_text
 
+    start_ns = time.time_ns()
+    scenario = Scenario(
+        environment=args.environment,
+        seed=args.seed,
+        start_ns=start_ns,
+        more_nodes=more_nodes(args.nodes),
+        fixed_nodes=tuple(args.fixed),
+    )
     service = Service("demo")
     service.handle_signals()
     work = Path(tempfile.mkdtemp(prefix="buddyline-demo-"))
     records = Path(args.record).resolve() if args.record else work
     before = set(records.glob("*.mcap"))
-    endpoint, start_ns = free_endpoint(), time.time_ns()
+    endpoint = free_endpoint()
     children: list[Child] = []
     over = False
     try:
-        _start(children, args, work, records, endpoint, start_ns)
+        _start(children, args, work, records, endpoint, scenario)
         service.spawn("processes", lambda: _watch(service, children))
         bus = open_bus(ClientConfig(connect=endpoint), service.stop, lambda _: None)
         if bus is None:
             return service.join()
         with bus:
             bus.on_failure(lambda error: service.fail("bus", error))
-            dashboard = Dashboard(args.environment, args.seed, start_ns, args.rate)
+            dashboard: Dashboard | TeamDashboard = (
+                TeamDashboard(scenario, args.rate)
+                if scenario.is_team
+                else Dashboard(args.environment, args.seed, start_ns, args.rate)
+            )
             dashboard.subscribe(bus)
             over = _show(service, dashboard, args.seconds)
         summary = dashboard.summary(_cpu_seconds(children))
@@ -95,7 +117,8 @@ def run(args: argparse.Namespace) -> int:
         for name in end_all(children):
             log.warning("demo: %s did not end when asked; killed", name)
         shutil.rmtree(work, ignore_errors=True)
-    print(json.dumps(summary) if args.json else summary_text(summary), flush=True)
+    text = team_summary_text if scenario.is_team else summary_text
+    print(json.dumps(summary) if args.json else text(summary), flush=True)
     status = service.join()
     if args.record:
         _keep(sorted(set(records.glob("*.mcap")) - before), dashboard.truth(time.time_ns()))
@@ -103,14 +126,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _start(
-    children: list[Child], args: argparse.Namespace, work: Path, records: Path, endpoint: str, start_ns: int
+    children: list[Child], args: argparse.Namespace, work: Path, records: Path, endpoint: str, scenario: Scenario
 ) -> None:
     """Start hub, nodes, solver and, where it is wanted, the monitor; nodes and solver end before the hub."""
     from buddyline.tools.measure.children import Child, free_port
 
     hub = Child("hub", "--listen", endpoint)
     try:
-        for node in ("a", "b"):
+        for node in scenario.nodes:
             config = work / f"{node}.toml"
             config.write_text(
                 NODE_TOML.format(
@@ -120,7 +143,9 @@ def _start(
                     directory=json.dumps(str(records)),
                     environment=args.environment,
                     seed=args.seed,
-                    start_ns=start_ns,
+                    start_ns=scenario.start_ns,
+                    more_nodes=json.dumps(scenario.more_nodes),
+                    fixed_nodes=json.dumps(scenario.fixed_nodes),
                 )
             )
             children.append(Child("node", "--config", str(config), name=f"node {node}"))
@@ -180,7 +205,7 @@ def _cpu_seconds(children: list[Child]) -> dict[str, float]:
     return used
 
 
-def _show(service: Service, dashboard: Dashboard, seconds: float | None) -> bool:
+def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float | None) -> bool:
     """Show the state until the end; return True if the time was over, False if the demo was stopped."""
     ends_s = None if seconds is None else time.monotonic() + seconds
     interactive = sys.stderr.isatty()

@@ -6,7 +6,6 @@ import argparse
 import math
 import sys
 from dataclasses import asdict, fields
-from string import ascii_lowercase
 
 from buddyline.node.sim.scenario import (
     DECOYS,
@@ -16,9 +15,9 @@ from buddyline.node.sim.scenario import (
     TRAJECTORIES,
     DivePlan,
     Scenario,
+    more_nodes,
 )
 from buddyline.protocol.clock import MS_NS, S_NS
-from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.progress import Progress
 
 START_NS = 1_764_000_000 * S_NS
@@ -143,13 +142,6 @@ def run(args: argparse.Namespace) -> int:
         count = writer.count
     print(f"{args.output}: {plan.seconds:g} s of {scenario.environment}, {count} messages", file=sys.stderr)
     return 0
-
-
-def more_nodes(count: int) -> tuple[str, ...]:
-    """Return the names of the nodes beside a and b: c, d, ...; raise BuddylineError for a count out of range."""
-    if not 2 <= count <= len(ascii_lowercase):
-        raise BuddylineError(f"--nodes {count}: give 2 to {len(ascii_lowercase)}")
-    return tuple(ascii_lowercase[2:count])
 
 
 def _differing(scenario: Scenario) -> dict[str, object]:

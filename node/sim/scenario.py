@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Final, Literal, TypeAlias, get_args
 
 from buddyline.protocol.clock import MS_NS, S_NS
@@ -205,6 +206,13 @@ class Scenario:
     def baseline_m(self, index: int) -> float:
         """Return the baseline of a node, metres; further nodes have A's and B's by turns."""
         return (self.baseline_a_m, self.baseline_b_m)[index % 2]
+
+
+def more_nodes(count: int) -> tuple[str, ...]:
+    """Return the names of the nodes beside a and b: c, d, ...; raise BuddylineError for a count out of range."""
+    if not 2 <= count <= len(ascii_lowercase):
+        raise BuddylineError(f"--nodes {count}: give 2 to {len(ascii_lowercase)}")
+    return tuple(ascii_lowercase[2:count])
 
 
 _LOWEST: Final = {

@@ -1,0 +1,104 @@
+"""The demo's text about more than two nodes."""
+
+from dataclasses import asdict
+from itertools import pairwise
+
+import pytest
+from buddyline.node.sim.scenario import Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.codec import encode
+from buddyline.protocol.envelope import open_envelope
+from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.topics import key_of
+from buddyline.tools.cli import main
+from buddyline.tools.team_dashboard import TeamDashboard, team_summary_text
+from msgspec.structs import replace
+
+from tests.tools.evaluated import pose, rejection
+from tests.tools.watched import START_NS, at
+
+SCENARIO = Scenario(environment="cavern", seed=1, start_ns=START_NS, more_nodes=("c",), fixed_nodes=("a",))
+WORLD = World(SCENARIO)
+COVARIANCE = [1e-4 if i % 7 == 0 else 0.0 for i in range(36)]
+
+
+class Watch:
+    """A dashboard of three nodes, and a clock that stands still."""
+
+    def __init__(self, scenario=SCENARIO):
+        self.now_s = 0.0
+        self.world = World(scenario)
+        self.dashboard = TeamDashboard(scenario, 10.0, lambda: self.now_s)
+
+    def take(self, message):
+        self.dashboard.take(open_envelope(key_of(message), encode(message), at(0)))
+
+    def tell(self, node, k, east_m=0.0, origin=None):
+        true = self.world.node_truth(node, at(k), "main")
+        zero = self.world.node_truth(origin, at(k), "main").p_m if origin else (0.0, 0.0, 0.0)
+        x, y, z = (a - b for a, b in zip(true.p_m, zero, strict=True))
+        covariance = [0.0] * 36 if node == origin else COVARIANCE
+        self.take(replace(true, p_m=(x, y + east_m, z), covariance=covariance, mode="filter"))
+
+
+def test_the_line_shows_each_node_and_how_far_it_is_off():
+    watch = Watch()
+    watch.tell("a", 0)
+    watch.tell("b", 0, east_m=0.02)
+    line = watch.dashboard.line()
+    assert "off 20 mm" in line
+    assert "c not known" in line
+    watch.now_s = 3.0
+    assert "b lost" in watch.dashboard.line()
+
+
+def test_the_screen_fits_the_terminal_and_counts_pairs():
+    watch = Watch()
+    watch.tell("b", 0)
+    for k in range(4):
+        watch.take(pose(k) if k else rejection(k))
+    screen = watch.dashboard.screen(40, 12)
+    assert len(screen.splitlines()) <= 12
+    assert max(map(len, screen.removeprefix("\x1b[H\x1b[2J").splitlines())) <= 40
+    assert "a/b" in screen
+
+
+def test_the_summary_has_each_nodes_errors():
+    watch = Watch()
+    for k in range(0, 20, 2):
+        watch.tell("a", k)
+        watch.tell("b", k, east_m=0.01)
+        watch.tell("c", k, east_m=0.5 if k == 8 else 0.0)
+    watch.take(pose(3))
+    watch.now_s = 2.0
+    summary = watch.dashboard.summary({"solver": 1.0})
+    assert {node: one["fixed"] for node, one in summary["network"].items()} == {"a": True, "b": False, "c": False}
+    assert summary["network"]["b"]["position_error_m"] == pytest.approx(0.01)
+    assert summary["network"]["c"]["wrong"] == 1
+    assert (summary["pairs"], summary["cpu_share"]) == ({"a/b": {"poses": 1, "triggers": 1}}, {"solver": 0.5})
+    text = team_summary_text(summary)
+    assert "a (fixed)" in text
+    assert "solver 50%" in text
+
+
+def test_without_a_fixed_node_places_count_from_the_origin():
+    watch = Watch(Scenario(**(asdict(SCENARIO) | {"fixed_nodes": ()})))
+    watch.tell("a", 0, origin="a")
+    watch.tell("b", 0, origin="a")
+    assert watch.dashboard.line().count("off 0 mm") == 2
+
+
+def test_the_truth_is_of_all_pairs_and_nodes():
+    stamped = list(Watch().dashboard.truth(at(3)))
+    assert {key for _, key, _ in stamped} == {
+        *(f"buddyline/pair/{pair}/truth" for pair in ("a/b", "a/c", "b/c")),
+        *(f"buddyline/net/main/truth/{node}" for node in "abc"),
+    }
+    assert all(one[0] <= other[0] for one, other in pairwise(stamped))
+
+
+def test_a_demo_that_cannot_be_is_refused(capsys):
+    assert main(["demo", "--nodes", "1"]) == 2
+    assert "--nodes 1" in capsys.readouterr().err
+    with pytest.raises(BuddylineError, match="fixed_nodes: 'z'"):
+        Scenario(fixed_nodes=("z",))
