@@ -13,6 +13,8 @@ _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "
 # key behind a namespace, so they match none of them.
 _ROS_KEYS: Final = [
     *("*/buddyline/*/attitude/*/*", "*/buddyline/*/depth/*/*", "*/buddyline/*/*/pose/*/*", "*/tf/*/*"),
+    *("*/buddyline/*/*/track/*/*", "*/buddyline/*/*/track_lag/*/*", "*/buddyline/*/*/range/*/*"),
+    *("*/buddyline/*/camera/image/compressed/*/*", "*/buddyline/*/camera/camera_info/*/*", "*/diagnostics/*/*"),
     "@ros2_lv/**",
 ]
 # What nodes publish: all topics of a node but those that the solver computes for it.

@@ -14,6 +14,7 @@ from buddyline.node.choices import DETECTORS, PRESETS
 from buddyline.protocol.security import PLAYER, ROS
 from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
+from buddyline.tools.export_formats import FORMATS
 from buddyline.tools.pairs import add_pair_argument
 
 DIVE: Final = "one dive: its log, or each node's own"
@@ -268,11 +269,9 @@ def export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", nargs="+", metavar="OUT.mcap", help="the solved log, or one with truth")
     parser.add_argument(
         "--format",
-        choices=("tum", "csv", "trc", "foxglove"),
+        choices=tuple(each.name for each in FORMATS),
         required=True,
-        help="tum: t x y z qx qy qz qw, for evo and others; csv: a row for each sample, units in the header; trc: all "
-        "nodes and their lamps as markers, for motion capture programs; foxglove: "
-        "a log with pictures, marks, transforms and the track's path for Foxglove, Lichtblick and rerun",
+        help="; ".join(f"{each.name}: {each.says}" for each in FORMATS),
     )
     parser.add_argument(
         "--what",

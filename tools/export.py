@@ -8,6 +8,7 @@ import io
 import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
@@ -16,6 +17,7 @@ from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
 from buddyline.tools.columns import in_order, of_mode
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.recorded import Recorded
+from buddyline.tools.export_formats import ExportFormat, format_of
 from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
 
@@ -34,7 +36,10 @@ _CSV_FIELDS: Final = (
     *("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "checks", "skew_ns"),
     *_NED_SD_FIELDS,
     "heading_gap_rad",
+    # The row-major upper triangle, in m and rad.
+    *(f"cov_{_AXES[row]}_{_AXES[column]}" for row, column in _UPPER),
 )
+NO_POSES: Final = "no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap"
 _REASON_FIELDS: Final = ("reason", "detail")
 _TRACK_FIELDS: Final = (
     *("stamp_ns", "node_a", "node_b", "mode"),
@@ -49,6 +54,7 @@ _TRACK_FIELDS: Final = (
 
 def run(args: argparse.Namespace) -> int:
     """Write the track or the poses; return 0."""
+    form = format_of(args.format)
     if args.truth and args.format != "tum":
         raise BuddylineError("--truth: only with --format tum")
     if args.rejected and args.format != "csv":
@@ -59,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
         return _export_network(args)
     if args.node is not None:
         raise BuddylineError("--node: only with --what net")
-    if args.format == "foxglove":
-        return _export_foxglove(args)
+    if form.module:
+        return _export_file(args, form)
     if args.output is not None:
         check_new(args.output)
     recorded = load(args.logs, pair=args.pair)
@@ -80,24 +86,45 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
         if not recorded.truths:
             raise BuddylineError(f"{name}: no truth in it")
         return f"the truth, {len(recorded.truths)} rows", tum_lines(recorded.truths)
-    track = [] if args.what == "poses" or args.rejected else in_order(of_mode(recorded.tracks))
-    if args.what == "track" and not track:
+    if args.rejected:
+        if not recorded.poses and not recorded.rejected:
+            raise BuddylineError(f"{name}: {NO_POSES}")
+        rows = csv_lines(recorded.poses, recorded.rejected, reasons=True)
+        return f"the poses, {len(recorded.poses)} rows", rows
+    said, estimates = chosen(recorded, args.what, name)
+    if args.format == "tum":
+        return said, tum_lines(estimates)
+    tracks = [one for one in estimates if isinstance(one, Track)]
+    poses = [one for one in estimates if isinstance(one, RelativePose)]
+    return said, track_csv_lines(tracks) if tracks else csv_lines(poses, [], reasons=False)
+
+
+def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[RelativePose] | list[Track]]:
+    """Return the best track, or the poses, in words and in order; what: "track", "poses", or None for the better."""
+    track = [] if what == "poses" else in_order(of_mode(recorded.tracks))
+    if what == "track" and not track:
         raise BuddylineError(f"{name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
     if track:
-        other = "; --what poses gives the poses" if args.what is None and recorded.poses else ""
-        said = f"the track ({track[0].mode}), {len(track)} rows{other}"
-        return said, tum_lines(track) if args.format == "tum" else track_csv_lines(track)
-    poses, rejected = recorded.poses, recorded.rejected if args.rejected else []
-    if not poses and not rejected:
-        raise BuddylineError(f"{name}: no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
-    lines = tum_lines(poses) if args.format == "tum" else csv_lines(poses, rejected, reasons=args.rejected)
-    return f"the poses, {len(poses)} rows", lines
+        other = "; --what poses gives the poses" if what is None and recorded.poses else ""
+        return f"the track ({track[0].mode}), {len(track)} rows{other}", track
+    if not recorded.poses:
+        raise BuddylineError(f"{name}: {NO_POSES}")
+    return f"the poses, {len(recorded.poses)} rows", recorded.poses
+
+
+def rows_of(recorded: Recorded, what: str | None, name: str) -> tuple[str, tuple[str, ...], list[dict[str, object]]]:
+    """Return what is exported, in words, its columns, and its rows; an unknown value is absent or ""."""
+    said, estimates = chosen(recorded, what, name)
+    if isinstance(estimates[0], Track):
+        return said, _TRACK_FIELDS, [_track_csv_row(one) for one in estimates if isinstance(one, Track)]
+    poses = sorted((one for one in estimates if isinstance(one, RelativePose)), key=lambda pose: pose.stamp_ns)
+    return said, _CSV_FIELDS, [_csv_row(pose) for pose in poses]
 
 
 def _export_network(args: argparse.Namespace) -> int:
     from buddyline.tools.export_network import network_lines
 
-    if args.what not in (None, "net") or args.format == "foxglove" or args.truth or args.rejected or args.pair:
+    if args.what not in (None, "net") or format_of(args.format).module or args.truth or args.rejected or args.pair:
         raise BuddylineError(f"--format {args.format} --what {args.what}: all nodes go as tum, csv or trc, alone")
     if args.output is not None:
         check_new(args.output)
@@ -110,15 +137,15 @@ def _export_network(args: argparse.Namespace) -> int:
     return 0
 
 
-def _export_foxglove(args: argparse.Namespace) -> int:
+def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
     from buddyline.tools.dives import Dive
-    from buddyline.tools.export_foxglove import export_foxglove
 
     if args.output is None:
-        raise BuddylineError("--format foxglove: give -o FILE.mcap")
+        raise BuddylineError(f"--format {form.name}: give -o FILE")
+    module = import_module(f"buddyline.tools.{form.module}")
     with Dive(args.logs) as dive:
-        count = export_foxglove(dive, args.output, args.what)
-    print(f"{args.output}: {count} messages", file=sys.stderr)
+        count = module.export(dive, args.output, args.what)
+    print(f"{args.output}: {count} {'rows' if form.name == 'parquet' else 'messages'}", file=sys.stderr)
     return 0
 
 
@@ -163,7 +190,7 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
     }
     row["heading_gap_rad"] = "" if result.heading_gap_rad is UNSET else result.heading_gap_rad
     row["checks"] = " ".join(result.checks)
-    return row
+    return row | {f"cov_{_AXES[i]}_{_AXES[k]}": result.covariance[6 * i + k] for i, k in _UPPER}
 
 
 def track_csv_lines(track: Iterable[Track]) -> Iterator[str]:

@@ -226,7 +226,7 @@ class FoxgloveTranslation:
         return self._fox.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def export_foxglove(dive: Dive, output: Path, what: str | None = None) -> int:
+def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write a dive as Foxglove messages into output, which must not exist; return how many there are.
 
     what: "poses" leaves the track out, "track" asks for one; None: with the track if there is one.

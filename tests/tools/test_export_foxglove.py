@@ -102,13 +102,13 @@ def test_chosen_lights_are_named_and_a_missing_one_is_left_out(exported: dict[st
 
 def test_an_output_is_named_and_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from buddyline.tools.dives import Dive
-    from buddyline.tools.export_foxglove import export_foxglove
+    from buddyline.tools.export_foxglove import export
 
     dive = write_log(tmp_path / "dive.mcap", *INFOS.values(), pose(0))
     assert main(["export", dive, "--format", "foxglove"]) == 2
     assert "give -o" in capsys.readouterr().err
     with Dive([dive]) as opened, pytest.raises(BuddylineError, match="exists"):
-        export_foxglove(opened, Path(dive))
+        export(opened, Path(dive))
 
 
 def test_a_track_moves_b_and_draws_its_path(tmp_path: Path) -> None:

@@ -1,0 +1,41 @@
+"""The formats of `export`: a line of this table, and a module that writes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True)
+class ExportFormat:
+    """A format. module: below buddyline.tools, with export(dive, output, what) -> number of messages or rows.
+
+    "": text, which tools/export.py writes to a file or to standard output.
+    """
+
+    name: str
+    says: str
+    module: str = ""
+
+
+FORMATS: Final = (
+    ExportFormat("tum", "t x y z qx qy qz qw, for evo and others"),
+    ExportFormat("csv", "a row for each sample, units in the header"),
+    ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
+    ExportFormat("parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet"),
+    ExportFormat(
+        "foxglove",
+        "a log with pictures, marks, transforms and the track's path for Foxglove, Lichtblick and rerun",
+        "export_foxglove",
+    ),
+    ExportFormat(
+        "mcap-ros2",
+        "a log for `ros2 bag play` and other programs: tf, odometry, poses, pictures, diagnostics (extra `ros2`)",
+        "export_ros2",
+    ),
+)
+
+
+def format_of(name: str) -> ExportFormat:
+    """Return the format of this name."""
+    return next(each for each in FORMATS if each.name == name)
