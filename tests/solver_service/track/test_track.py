@@ -227,9 +227,13 @@ def test_a_dead_lamp_and_no_fix_at_all() -> None:
 
 def test_nodes_that_do_not_face_each_other_get_no_track(dive: Dive) -> None:
     """Both look at a third's bar: the lights fit, the headings do not."""
-    about = np.diag((-1.0, 1.0, -1.0))
-    facing = [FixSeen(fix.stamp_ns, fix.t_a_b_m, fix.R_a_b @ about, fix.covariance) for fix in dive.fixes]
-    assert not filter_of(dive.records, facing[:3]).advance(facing[3].stamp_ns + 1_000_000_000, dive.stamps_ns)
+    a, b = dive.records
+    about_down = np.diag((-1.0, -1.0, 1.0))
+    turned = [replace(seen, R_ned_body=about_down @ seen.R_ned_body) for seen in b.attitudes]
+    track = filter_of((a, replace(b, attitudes=turned)), dive.fixes)
+    assert not track.advance(last_ns(dive.records), dive.stamps_ns)
+    assert any("attitudes and fixes contradict each other" in problem for problem in track.problems)
+    assert filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns)
 
 
 def test_clock_and_depth_offset_nobody_told_of() -> None:
