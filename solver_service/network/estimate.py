@@ -237,7 +237,7 @@ class NetEstimate:
         samples = self.intake.samples[self.members[index].node]
         shift = min(max(float(state.delay_s[index]), -MAX_DELAY_S), MAX_DELAY_S)
         known_s = to_s + HOLD_S
-        grid, values, told = samples.between(from_s + shift, to_s + shift, known_s)
+        grid, values, told, _ = samples.between(from_s + shift, to_s + shift, known_s)
         without = not told.any() and not samples.near(to_s + shift, known_s)
         if without:
             values = np.zeros_like(values)

@@ -6,6 +6,7 @@ import bisect
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from itertools import chain, combinations
 from typing import Final, TypeAlias, TypeVar
 
@@ -22,6 +23,7 @@ from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV
 from buddyline.solver_service.track.stepping import PassGuide
 from buddyline.solver_service.track.trail import Trail
+from buddyline.solver_service.track.vibration import Shares, fast_part
 
 # The clocks' offset in the last pass, 1 sd: what the first pass has left beside its own sigma; and where a node has no
 # inertial unit, so that no pass estimates it.
@@ -55,7 +57,10 @@ Records: TypeAlias = tuple["NodeRecord", "NodeRecord"]
 
 @dataclass(frozen=True, eq=False)
 class NodeRecord:
-    """What one node recorded, in order of stamps. Inertial columns: stamps (N,), accel and gyro (N, 3), body frame."""
+    """What one node recorded, in order of stamps.
+
+    Inertial columns: stamps (N,), accel and gyro (N, 3), body frame; fast (N, 6): the fast part of both, where known.
+    """
 
     node: TrackNode
     frames: Sequence[FrameSeen]
@@ -64,6 +69,7 @@ class NodeRecord:
     gyro_radps: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     attitudes: Sequence[AttitudeSeen] = ()
     depths: Sequence[DepthSeen] = ()
+    fast: Floats | None = None
 
     def between(self, start_ns: int, end_ns: int) -> NodeRecord:
         """Give what was recorded from start_ns on and before end_ns."""
@@ -76,6 +82,7 @@ class NodeRecord:
             gyro_radps=self.gyro_radps[first:last],
             attitudes=_between(self.attitudes, start_ns, end_ns),
             depths=_between(self.depths, start_ns, end_ns),
+            fast=None if self.fast is None else self.fast[first:last],
         )
 
 
@@ -118,7 +125,7 @@ def joined(pieces: Sequence[NodeRecord]) -> NodeRecord:
 
 def feed(track: TrackFilter, node: int, record: NodeRecord) -> None:
     """Give a filter what a node recorded."""
-    track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps)
+    track.add_imu(node, record.imu_stamps_ns, record.accel_mps2, record.gyro_radps, record.fast)
     for attitude in record.attitudes:
         track.add_attitude(node, attitude)
     for depth in record.depths:
@@ -149,7 +156,7 @@ def pass_over(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) ->
 
 def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    records, fixes = (in_order(records[0]), in_order(records[1])), sorted(fixes, key=_stamp_of)
+    records, fixes = (_parted(in_order(records[0])), _parted(in_order(records[1]))), sorted(fixes, key=_stamp_of)
     told_ns = clock_ns
     if fixes and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS:
         # The dive's beginning gives the clocks' offset, so that the whole dive needs no other round.
@@ -178,6 +185,8 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
     second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
     second.restarts = False
+    shares = reduce(Shares.plus, [part.shares for part in parts]).best()
+    second.take_off(shares)
     told = sum(part.told for part in parts)
     if told > 100:
         second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
@@ -185,13 +194,14 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     for part in parts:
         path = smoothed(part.steps)
         guide_by(second, path)
-        earlier = _path_before(records, clock_ns, path, since_s)
+        earlier = _path_before(records, clock_ns, path, since_s, shares)
         if earlier is not None:
             guide_by(second, earlier)
             path = earlier
         state = replace(path.state(0), clock_s=0.0)
-        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest, part.shaking)
-        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, part.shaking)
+        shaking = part.shaking.less(shares)
+        begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest, shaking)
+        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, shaking)
         since_s = part.end_s
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
     del first, parts, part, learned, path, earlier
@@ -199,10 +209,11 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     return _smoothed(second, parts_of(second), outputs_ns)
 
 
-def _path_before(records: Records, clock_ns: int, path: Path, since_s: float) -> Path | None:
+def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, shares: Floats) -> Path | None:
     """Give the path before another's start, from since_s or the dive's first picture on; None where there is none."""
     track = EarlierFilter(records[0].node, records[1].node, keep_s=math.inf, clock_sigma_s=CLOCK_S)
     track.clock_ns = clock_ns
+    track.take_off(shares)
     first_ns = min(frame.stamp_ns for record in records for frame in record.frames[:1])
     track.seconds(0, first_ns)
     start_s = float(path.t_s[0])
@@ -273,6 +284,12 @@ def in_order(record: NodeRecord) -> NodeRecord:
         attitudes=sorted(record.attitudes, key=_stamp_of),
         depths=sorted(record.depths, key=_stamp_of),
     )
+
+
+def _parted(record: NodeRecord) -> NodeRecord:
+    """Give a record with the fast part of its inertial samples."""
+    values = np.hstack((record.accel_mps2, record.gyro_radps))
+    return replace(record, fast=fast_part(record.imu_stamps_ns, values))
 
 
 def last_ns(records: Records) -> int:

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 from buddyline.solver_service.track.shaking import Shaking
-from buddyline.solver_service.track.state import MOVING, State
+from buddyline.solver_service.track.state import MOVING, SIZE, State
 from buddyline.solver_service.track.trail import Chosen, Trail
+from buddyline.solver_service.track.vibration import SHARES, Shares
 
 # A challenger that has not replaced the track after so long is dropped.
 CHALLENGE_S: Final = 4.0
@@ -22,7 +23,10 @@ class Estimate:
 
     The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
     learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
-    without: which nodes have no inertial unit now. attitude_s, depth_s: when attitudes and depths were last used.
+    without: which nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what its attitudes
+    are off their prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1 of the
+    samples' fast parts; shares: what the lights tell of them (vibration.py). attitude_s, depth_s: when attitudes and
+    depths were last used.
 
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
@@ -69,6 +73,9 @@ class Estimate:
     told_by: list[int] = field(default_factory=lambda: [0, 0])
     missed: list[int] = field(default_factory=lambda: [0, 0])
     without: list[bool] = field(default_factory=lambda: [False, False])
+    by_shares: Floats = field(default_factory=lambda: np.zeros((SIZE, SHARES)))
+    shares: Shares = field(default_factory=Shares)
+    turning_off: list[Floats] = field(default_factory=lambda: [np.zeros(3), np.zeros(3)])
     agreed_s: float = np.inf
     agreed: int = 0
     used: dict[tuple[int, int], Chosen] = field(default_factory=dict)
@@ -78,7 +85,7 @@ class Estimate:
 
     def copied(self, **changes: object) -> Estimate:
         """Give an estimate that goes its own way from here."""
-        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "course")
+        lists = ("evidence_by", "trigger", "attitude_s", "told_by", "missed", "without", "turning_off", "course")
         own: dict[str, object] = {name: list(getattr(self, name)) for name in lists}
         own |= {"detection": self.detection.copy(), "steps": self.steps.copy(), "used": dict(self.used)}
         return replace(self, **(own | changes))  # type: ignore[arg-type]

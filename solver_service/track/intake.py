@@ -63,8 +63,10 @@ class TrackIntake:
         """Give a stamp between both clocks, as those of fixes and rows are, as `seconds` does."""
         return self.seconds(0, stamp_ns - self.clock_ns // 2)
 
-    def add_imu(self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats) -> None:
-        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame."""
+    def add_imu(
+        self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats, fast: Floats | None = None
+    ) -> None:
+        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame; fast (N, 6): the fast part of both."""
         if not len(stamps_ns):
             return
         self.seconds(node, int(stamps_ns[0]))
@@ -74,7 +76,14 @@ class TrackIntake:
         with np.errstate(invalid="ignore", over="ignore"):
             values = np.hstack((accel_mps2 @ R_body_camera, gyro_radps @ R_body_camera))
             values[clipped(gyro_radps), 3:] = np.nan
-        self.samples[node].add(times_s, values)
+        if fast is not None:
+            fast = np.hstack((fast[:, :3] @ R_body_camera, fast[:, 3:] @ R_body_camera))
+        self.samples[node].add(times_s, values, fast)
+
+    def take_off(self, shares: Floats) -> None:
+        """Use the samples without these shares (2 nodes, 2: force, rate) of their fast parts."""
+        for samples, of_node in zip(self.samples, shares, strict=True):
+            samples.shares = of_node
 
     def add_attitude(self, node: int, seen: AttitudeSeen) -> None:
         """Take an attitude message; sigmas that no attitude filter reaches are taken for unknown."""

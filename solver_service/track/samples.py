@@ -21,12 +21,16 @@ ACCEL_FLOOR: Final = 1e-3
 class Samples:
     """Inertial samples in camera axes, by stamp in s since an epoch.
 
-    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used.
+    `rejected` counts samples that were not finite, or came twice. `trusted`: whether they are to be used. `shares`
+    (2,): how much of the fast part of force and rate is the unit's alone, and is taken off (vibration.py).
     """
 
     def __init__(self) -> None:
         self._t = np.empty(1024)
-        self._values = np.empty((1024, 6))
+        # Force, rate, and the fast part of both.
+        self._values = np.zeros((1024, 12))
+        self._parted = False
+        self.shares = np.zeros(2)
         self._count = 0
         self._noise_s = -np.inf
         self._noise = Noise(GYRO_FLOOR, ACCEL_FLOOR)
@@ -44,12 +48,17 @@ class Samples:
     @property
     def values(self) -> Floats:
         """Force and rate (N, 6)."""
-        return self._values[: self._count]
+        return self._values[: self._count, :6]
 
-    def add(self, times_s: Floats, values: Floats) -> None:
-        """Take samples (N,), (N, 6), in any order; a stamp that is there already is refused."""
+    def add(self, times_s: Floats, values: Floats, fast: Floats | None = None) -> None:
+        """Take samples (N,), (N, 6), in any order; a stamp that is there already is refused.
+
+        fast (N, 6): their fast part, where it is known.
+        """
         sound = np.isfinite(times_s) & np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1)
         self.rejected += int(len(sound) - sound.sum())
+        self._parted |= fast is not None
+        values = np.hstack((values, np.zeros_like(values) if fast is None else fast))
         times_s, values = times_s[sound], values[sound]
         if not len(times_s):
             return
@@ -58,13 +67,13 @@ class Samples:
             merged = np.concatenate((self.times_s, times_s))
             every, first = np.unique(merged, return_index=True)
             self.rejected += len(merged) - len(every)
-            values = np.concatenate((self.values, values))[first]
+            values = np.concatenate((self._values[: self._count], values))[first]
             times_s, self._count = every, 0
         need = self._count + len(times_s)
         if need > len(self._t):
             room = max(2 * len(self._t), need)
             self._t = np.concatenate((self.times_s, np.empty(room - self._count)))
-            self._values = np.concatenate((self.values, np.empty((room - self._count, 6))))
+            self._values = np.concatenate((self._values[: self._count], np.empty((room - self._count, 12))))
         self._t[self._count : need] = times_s
         self._values[self._count : need] = values
         self._count = need
@@ -77,9 +86,10 @@ class Samples:
             self._t[:kept], self._values[:kept] = self._t[first : self._count], self._values[first : self._count]
             self._count = kept
 
-    def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools]:
+    def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools, Floats | None]:
         """Give the grid (M,) from start_s to end_s, the values (M, 6) there, and which intervals are told (M - 1,).
 
+        The values are without `shares` of their fast part, which comes last (M, 6), None where it is not known.
         known_s: nothing later than this is looked at, so that more samples do not change the answer.
         """
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
@@ -87,7 +97,7 @@ class Samples:
         first, stop = int(np.searchsorted(t, start_s, side="right")), int(np.searchsorted(t, end_s, side="left"))
         ends = np.array((start_s, end_s))
         if last == 0 or not self.trusted:
-            return ends, np.zeros((2, 6)), np.zeros(1, dtype=bool)
+            return ends, np.zeros((2, 6)), np.zeros(1, dtype=bool), None
         grid = np.concatenate(((start_s,), t[first:stop], (end_s,)))
         right = np.clip(np.searchsorted(t, ends), 1, max(last - 1, 1))
         if last == 1:
@@ -102,7 +112,10 @@ class Samples:
         after = t[np.minimum(np.arange(first, stop + 1), last - 1)]
         late = np.maximum(grid[1:] - t[last - 1], 0.0) + np.maximum(t[0] - grid[:-1], 0.0)
         told = (after - before < GAP_S) & (late < 0.5 * GAP_S)
-        return grid, at, told
+        if not self._parted:
+            return grid, at[:, :6], told, None
+        fast = at[:, 6:]
+        return grid, at[:, :6] - np.repeat(self.shares, 3) * fast, told, fast
 
     def slow_rate(self, time_s: float, known_s: float) -> Floats | None:
         """Give the mean turn rate (3,) of SLOW_S until known_s or shortly after time_s, None where there is none.
@@ -112,7 +125,7 @@ class Samples:
         first, stop = np.searchsorted(self.times_s, (time_s - SLOW_S, min(time_s + 0.1 * SLOW_S, known_s)))
         if stop <= first:
             return None
-        return np.asarray(np.add.reduce(self._values[first:stop, 3:]) / (stop - first))
+        return np.asarray(np.add.reduce(self._values[first:stop, 3:6]) / (stop - first))
 
     def near(self, time_s: float, known_s: float) -> bool:
         """Whether there is a sample within a second before time_s, nothing later than known_s looked at."""
@@ -122,7 +135,7 @@ class Samples:
     def last(self, time_s: float, span_s: float) -> Floats:
         """Give the values (N, 6) of the last span_s up to time_s."""
         first, stop = np.searchsorted(self.times_s, (time_s - span_s, time_s))
-        return self._values[first:stop]
+        return self._values[first:stop, :6]
 
     def noise(self, time_s: float) -> Noise:
         """Give the samples' noise as densities, from their third differences over the last seconds.
@@ -134,7 +147,7 @@ class Samples:
             first = int(np.searchsorted(self.times_s, time_s - _NOISE_SPAN_S))
             if last - first > 20:
                 self._noise_s = time_s
-                t, values = self._t[first:last], self._values[first:last]
+                t, values = self._t[first:last], self._values[first:last, :6]
                 step_s = float(np.median(np.diff(t)))
                 # The median of squares, not the mean: a jolt is no noise.
                 white = np.median(np.abs(np.diff(values, 3, axis=0)), axis=0) / (0.6745 * np.sqrt(20.0))

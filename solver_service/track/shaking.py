@@ -30,6 +30,8 @@ KEPT: Final = 0.5 ** (1.0 / 200.0)
 LONGEST_STEP: Final = 0.5
 # One residual's chi^2 counts at most so much: gross errors are no shaking.
 MOST_CHI2: Final = 9.0
+# So much of the shaking is taken to be left at least where a share of the samples' fast part is taken off.
+LEAST_LEFT: Final = 0.2
 _IDENTITY: Final = np.eye(3)
 
 
@@ -44,6 +46,11 @@ class Shaking:
     def variances(self) -> Floats:
         """Of A's angle, B's angle, and the velocity."""
         return np.asarray(np.exp(self.logs))
+
+    def less(self, shares: Floats) -> Shaking:
+        """Give what to start with where shares (2 nodes, 2: force, rate) of the samples' fast parts are taken off."""
+        left = 1.0 - np.array((shares[0, 1], shares[1, 1], shares[:, 0].min()))
+        return Shaking(np.maximum(self.logs + 2.0 * np.log(np.maximum(left, LEAST_LEFT)), LEAST))
 
     def taught(self, y: Floats, S_inverse: Floats, H: Floats, shaken: Floats) -> Shaking:
         """Go on by one picture's residuals y (m,), H (m, NAV) and shaken (3, NAV, NAV), by Fisher's scoring.

@@ -24,7 +24,15 @@ from buddyline.solver_service.track.lights import (
 )
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, PHI, SIZE, State
-from buddyline.solver_service.track.strapdown import Increment, Noise, integrate, predicted, process_noise, propagate
+from buddyline.solver_service.track.strapdown import (
+    Increment,
+    Noise,
+    integrate,
+    moved_by_shares,
+    predicted,
+    process_noise,
+    propagate,
+)
 from buddyline.solver_service.track.trail import Look, Step
 
 # How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
@@ -43,6 +51,10 @@ WITHOUT_RAD: Final = 0.03
 # Beyond this chi^2 (3 degrees of freedom, a chance of 0.01) a node without a unit is taken to have begun to turn, by
 # at most so much: a head turned by 45 degrees in a second speeds up by 4 rad/s^2.
 STARTLED: Final = 11.3
+# A turn shows as residuals of one sign before any single one is that large: they are summed, each older one by LASTING
+# less. The sum's variance is SUMMED times one residual's.
+LASTING: Final = 0.6
+SUMMED: Final = 1.0 / (1.0 - LASTING**2)
 MOST_GAP_RATE: Final = 4.0
 # How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
 # 0.7 of its sigma in half a second.
@@ -83,7 +95,7 @@ class TrackSteps(TrackIntake):
         parts = []
         for node in (0, 1):
             shift = min(max(float(state.delay_s[node]), -MAX_DELAY_S), MAX_DELAY_S)
-            grid, values, told = self.samples[node].between(estimate.t_s + shift, t_s + shift, t_s + HOLD_S)
+            grid, values, told, fast = self.samples[node].between(estimate.t_s + shift, t_s + shift, t_s + HOLD_S)
             without = not told.any() and not self.samples[node].near(t_s + shift, t_s + HOLD_S)
             if without:
                 values = np.zeros_like(values)
@@ -91,7 +103,7 @@ class TrackSteps(TrackIntake):
                 self.samples[node].slow_rate(each_s, t_s + HOLD_S) for each_s in (estimate.t_s + shift, t_s + shift)
             ]
             ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
-            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends))
+            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends), fast)
             parts.append(replace(part, without=True) if without else part)
         return parts[0], parts[1]
 
@@ -116,6 +128,10 @@ class TrackSteps(TrackIntake):
         Q, walk, shaken = process_noise(after, parts, noises, estimate.shaking.variances, span_s)
         onward = F[:, :MOVING]
         estimate.shaken = onward @ estimate.shaken @ onward.T + shaken
+        if parts[0].by_fast is not None or parts[1].by_fast is not None:
+            by_shares = estimate.by_shares.copy()
+            by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts)
+            estimate.by_shares = by_shares
         for node, part in enumerate(parts):
             if part.without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
@@ -143,8 +159,12 @@ class TrackSteps(TrackIntake):
         walks = (noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)
         S = H @ estimate.covariance @ H.T + np.diag(np.square(walks) * span_s)
         S += noise.gap_rate_radps**2 * span_s**3 / 3.0 * np.eye(3) + (R_level_camera * variances) @ R_level_camera.T
-        if float(y @ np.linalg.solve(S, y)) < STARTLED:
+        whitened = np.linalg.solve(np.linalg.cholesky(S), y)
+        lasting = whitened + LASTING * estimate.turning_off[node]
+        estimate.turning_off[node] = lasting
+        if max(float(whitened @ whitened), float(lasting @ lasting) / SUMMED) < STARTLED:
             return noise
+        estimate.turning_off[node] = np.zeros(3)
         rate = math.sqrt(float(y @ y) / max(span_s, TOGETHER_S) ** 3)
         return replace(noise, gap_rate_radps=max(noise.gap_rate_radps, min(rate, MOST_GAP_RATE)))
 
@@ -294,6 +314,11 @@ class TrackSteps(TrackIntake):
         before = estimate.covariance
         error, estimate.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
         estimate.state = estimate.state.plus(error)
+        if estimate.by_shares.any():
+            moved = H @ estimate.by_shares
+            if teaches:
+                estimate.shares = estimate.shares.taught(y, S_inverse, moved)
+            estimate.by_shares = estimate.by_shares - before @ H.T @ (S_inverse @ moved)
         # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:
             moving = H[:, :MOVING]

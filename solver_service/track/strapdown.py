@@ -76,7 +76,8 @@ class Increment:
     R: its attitude at the end. dv_mps, dp_m (3,): its velocity gained, and its way gained over moving on unaccelerated
     (gravity left in: it cancels between the nodes). jacobian (9, SIZE): of attitude (left), dv, dp by the node's own
     attitude at the start and constants. gap_s: how much of the time no sample covers. rate_radps (3,): the turn rate
-    at the end. without: whether there is no unit at all: the gyro's bias is then minus the turn rate.
+    at the end. without: whether there is no unit at all: the gyro's bias is then minus the turn rate. by_fast (9, 2):
+    what a share of the fast part of force and of rate does to the same as the jacobian's rows; None where not known.
     """
 
     R: Floats
@@ -86,16 +87,25 @@ class Increment:
     gap_s: float
     rate_radps: Floats
     without: bool = False
+    by_fast: Floats | None = None
 
 
 def integrate(
-    state: State, node: int, grid_s: Floats, force_mps2: Floats, rate_radps: Floats, told: Bools, slow_radps: Floats
+    state: State,
+    node: int,
+    grid_s: Floats,
+    force_mps2: Floats,
+    rate_radps: Floats,
+    told: Bools,
+    slow_radps: Floats,
+    fast: Floats | None = None,
 ) -> Increment:
     """Integrate one node's samples over a grid (M,) with values (M, 3) at its points, in camera axes, uncorrected.
 
     told (M - 1,): whether the accelerometer covers each interval; where not, the node moves on unaccelerated.
     slow_radps (2, 3): the turn rates at both ends without shaking, uncorrected. Delay and lever arm are told by them:
-    by rates that are themselves shaken both would be fitted to the shaking.
+    by rates that are themselves shaken both would be fitted to the shaking. fast (M, 6): the fast part of force and
+    rate.
     """
     R0 = state.R[node]
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
@@ -168,7 +178,20 @@ def integrate(
         J[3:6, LEVER[node]] = slow0 - slow1
         J[6:9, LEVER[node]] = R0 + slow0 * span - R
     gap = float(h @ ~told)
-    return Increment(R, dv, dp, J, gap, w[-1])
+    by_fast = None
+    if fast is not None and whole_told:
+        fast_mid = 0.5 * (fast[1:] + fast[:-1])
+        by_force, by_rate = (
+            -(turned[:, :, :3] @ part[:, :, None])[:, :, 0] for part in (fast_mid[:, :3], fast_mid[:, 3:])
+        )
+        turns = by_rate * h[:, None]
+        swung = np.add.accumulate(turns, axis=0)
+        tipped = np.cross(-u, swung - 0.5 * turns)
+        by_fast = np.zeros((9, 2))
+        by_fast[0:3, 1] = swung[-1]
+        by_fast[3:9, 0] = (weights @ by_force).ravel()
+        by_fast[3:9, 1] = (weights @ tipped).ravel()
+    return Increment(R, dv, dp, J, gap, w[-1], by_fast=by_fast)
 
 
 def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -> tuple[State, Floats]:
@@ -209,6 +232,19 @@ def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -
         F[SHAKE[node], SHAKE[node]] = kept * _IDENTITY
     F[:, :MOVING] = F[:, :MOVING] @ plain_of_invariant(state)
     return after, invariant_of_plain(after) @ F
+
+
+def moved_by_shares(after: State, parts: tuple[Increment, Increment]) -> Floats:
+    """Give how a step's end is moved by a share of 1 of each fast part (MOVING, 4), in the errors of `State.plus`."""
+    moved = np.zeros((MOVING, 4))
+    for node, part in enumerate(parts):
+        if part.by_fast is not None:
+            columns = slice(2 * node, 2 * node + 2)
+            sign = 1.0 if node else -1.0
+            moved[PHI[node], columns] = part.by_fast[0:3]
+            moved[V_, columns] = sign * part.by_fast[3:6]
+            moved[R_, columns] = sign * part.by_fast[6:9]
+    return invariant_of_plain(after) @ moved
 
 
 def process_noise(

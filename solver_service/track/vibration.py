@@ -1,0 +1,74 @@
+"""What in a node's inertial samples is faster than a diver moves, and how much of it is the unit's alone.
+
+Fins and housings shake a unit in its mount, faster than its camera moves. The fast part of its samples is known where
+later samples are: on a dive that is over. Which share of it the camera does not do is told by the lights. With shares s
+a sample is x - s x_fast, and every residual of a light that is not corrected so is y = H U s + noise, where U is how a
+share of 1 would have moved the state, carried along by the same transition and the same gains (Friedland 1969). Least
+squares over a pass give s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.inputs import Stamps
+
+# The fast part begins here, and is made by a window of so long on either side.
+FAST_HZ: Final = 1.5
+HALF_WINDOW_S: Final = 1.5
+# Samples further apart than this many periods are of two runs; a run of less than a window has no fast part.
+BROKEN: Final = 1.5
+# The shares of both units' forces and turn rates: A's force, A's rate, B's.
+SHARES: Final = 4
+
+
+def fast_part(stamps_ns: Stamps, values: Floats) -> Floats:
+    """Give what is faster than FAST_HZ in samples (N, C) in order of time; 0 where samples are too few to tell."""
+    fast = np.zeros_like(values)
+    if len(stamps_ns) < 3:
+        return fast
+    steps_s = np.diff(stamps_ns) * 1e-9
+    period_s = float(np.median(steps_s))
+    half = round(HALF_WINDOW_S / period_s) if period_s > 0.0 else 0
+    if half < 2:
+        return fast
+    t_s = np.arange(-half, half + 1) * period_s
+    window = np.sinc(2.0 * FAST_HZ * t_s) * np.hanning(2 * half + 3)[1:-1]
+    breaks = np.flatnonzero(np.abs(steps_s / period_s - 1.0) > BROKEN - 1.0) + 1
+    for first, stop in zip((0, *breaks.tolist()), (*breaks.tolist(), len(values)), strict=True):
+        run = values[first:stop]
+        if stop - first < 2 * half + 1 or not np.isfinite(run).all():
+            continue
+        # Near the ends of a run the window is cut.
+        weight = np.convolve(np.ones(stop - first), window, "same")
+        for column in range(values.shape[1]):
+            middle = run[:, column].mean()
+            slow = np.convolve(run[:, column] - middle, window, "same") / weight
+            fast[first:stop, column] = run[:, column] - middle - slow
+    return fast
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """What the lights tell of the shares, as normal equations: information (4, 4) and told (4,)."""
+
+    information: Floats = field(default_factory=lambda: np.zeros((SHARES, SHARES)))
+    told: Floats = field(default_factory=lambda: np.zeros(SHARES))
+
+    def taught(self, y: Floats, S_inverse: Floats, moved: Floats) -> Shares:
+        """Go on by one picture's residuals y (m,), of which moved (m, 4) is how much a share of 1 makes."""
+        weighed = moved.T @ S_inverse
+        return Shares(self.information + weighed @ moved, self.told + weighed @ y)
+
+    def plus(self, other: Shares) -> Shares:
+        """Join what two tracks tell."""
+        return Shares(self.information + other.information, self.told + other.told)
+
+    def best(self) -> Floats:
+        """Give the shares (2 nodes, 2: force, rate), each between 0, which is believed without light, and 1."""
+        found = np.linalg.solve(self.information + np.eye(SHARES), self.told)
+        shares: Floats = np.minimum(np.maximum(found, 0.0), 1.0).reshape(2, 2)
+        return shares

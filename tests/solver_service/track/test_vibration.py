@@ -1,0 +1,105 @@
+"""The fast part of inertial samples, and how much of it the lights say is the unit's alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.rotation import Floats
+from buddyline.solver_service.track.dive import in_order, pass_over, smooth
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.strapdown import integrate, moved_by_shares, propagate
+from buddyline.solver_service.track.vibration import Shares, fast_part
+
+from tests.solver_service.track.dives import Dive, Setting, make, score
+from tests.solver_service.track.test_track_jacobians import a_state, samples
+
+STAMPS_NS = np.arange(2000) * 10_000_000
+INNER = slice(200, -200)
+
+
+def wave(hz: float) -> Floats:
+    return np.sin(2.0 * np.pi * hz * STAMPS_NS * 1e-9)[:, None]
+
+
+def test_slow_motion_has_no_fast_part_and_shaking_is_all_fast() -> None:
+    assert np.abs(fast_part(STAMPS_NS, 5.0 + wave(0.5))[INNER]).max() < 0.01
+    assert np.abs(fast_part(STAMPS_NS, wave(4.0)) - wave(4.0))[INNER].max() < 0.01
+
+
+def test_runs_on_both_sides_of_a_gap_are_parted_by_themselves() -> None:
+    values = wave(0.4) + 0.1 * wave(5.0)
+    keep = np.ones(len(values), dtype=bool)
+    keep[900:960] = False
+    parted = fast_part(STAMPS_NS[keep], values[keep])
+    alone = fast_part(STAMPS_NS[:900], values[:900])
+    assert np.array_equal(parted[:900], alone)
+    assert not fast_part(STAMPS_NS[:200], values[:200]).any()
+    assert not fast_part(np.zeros(5, np.int64), np.ones((5, 6))).any()
+
+
+def test_shares_are_least_squares() -> None:
+    rng = np.random.default_rng(5)
+    truth = np.array((0.2, 0.9, 0.5, 0.7))
+    shares = Shares()
+    for _ in range(400):
+        moved = rng.normal(0.0, 2.0, (4, 4))
+        shares = shares.taught(moved @ truth + rng.normal(0.0, 0.7, 4), np.eye(4) / 0.49, moved)
+    assert shares.best().ravel() == pytest.approx(truth, abs=0.05)
+    assert not Shares().best().any()
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_what_a_share_moves(column: int) -> None:
+    state = a_state(3)
+    rng = np.random.default_rng(8)
+    fast = rng.normal(0.0, 0.1, (2, 41, 6))
+
+    def after(share: float) -> tuple[object, Floats]:
+        parts = []
+        for node in (0, 1):
+            t, force, turn = samples(node)
+            grid = np.linspace(0.0, 0.1, 41)
+            values = np.hstack(
+                [np.stack([np.interp(grid, t, of[:, axis]) for axis in range(3)], axis=1) for of in (force, turn)]
+            )
+            taken = np.zeros(6)
+            if column // 2 == node:
+                taken[3 * (column % 2) : 3 * (column % 2) + 3] = share
+            values = values - taken * fast[node]
+            ends = values[[0, -1], 3:]
+            told = np.ones(40, dtype=bool)
+            still = replace(state, lever_m=np.zeros((2, 3)))
+            parts.append(integrate(still, node, grid, values[:, :3], values[:, 3:], told, ends, fast[node]))
+        both = parts[0], parts[1]
+        moved, _ = propagate(still, both, 0.1)
+        return moved, moved_by_shares(moved, both)
+
+    (more, _), (less, _), (middle, moved) = after(1e-3), after(-1e-3), after(0.0)
+    numeric = (more.minus(middle) - less.minus(middle)) / 2e-3  # type: ignore[attr-defined]
+    assert moved[:, column] == pytest.approx(numeric[: len(moved)], abs=0.02 * np.abs(numeric).max())
+
+
+def shaken(dive: Dive, size_radps: float) -> Dive:
+    """The dive with B's unit turned to and fro in its mount, which its camera is not."""
+    b = dive.records[1]
+    t = (b.imu_stamps_ns - b.imu_stamps_ns[0]) * 1e-9
+    rates, phases = np.array((14.0, 19.0, 23.0)), np.array((0.3, 2.0, 4.0))
+    swing = size_radps * np.sin(t[:, None] * rates + phases)
+    return replace(dive, records=(dive.records[0], replace(b, gyro_radps=b.gyro_radps + swing)))
+
+
+def test_a_unit_that_shakes_alone_costs_little_once_the_lights_have_told_so() -> None:
+    still = make(21, Setting(seconds=12.0))
+    dive = shaken(still, 0.04)
+    good, bad = (score(each, smooth(each.records, each.fixes, each.stamps_ns).rows) for each in (still, dive))
+    assert np.median(bad.errors_m) < 1.35 * np.median(good.errors_m)
+    assert bad.nees < 1.6
+    a, b = map(in_order, dive.records)
+    columns = np.hstack((b.accel_mps2, b.gyro_radps))
+    records = a, replace(b, fast=fast_part(b.imu_stamps_ns, columns))
+    track = TrackFilter(a.node, b.node, keep_s=np.inf)
+    pass_over(track, records, dive.fixes)
+    assert track.main is not None
+    assert track.main.shares.best()[1, 1] > 0.8
