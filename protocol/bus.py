@@ -15,15 +15,20 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Protocol, Self, TypeAlias
 
-from buddyline.protocol.clock import Clock
+from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.delivery import FailureLatch, RateCap, ThreadDiedError
 from buddyline.protocol.envelope import Envelope, open_envelope
 from buddyline.protocol.messages import Message
+from buddyline.protocol.sequence import owner_of
 from buddyline.protocol.topics import Topic, parse_key
 
 CACHE_S: Final = 60.0
 MAX_TRIGGER_HZ: Final = 30.0
+# Stamps of a live dive are this near to now.
+LIVE_NS: Final = 60 * S_NS
+# Of larger messages, which are pictures, the stamp is not looked at.
+STAMPED_BYTES: Final = 65536
 
 KeyExprs: TypeAlias = str | tuple[str, ...]
 
@@ -218,6 +223,15 @@ def held_order(key: str, payload: bytes) -> tuple[bool, int]:
     """
     parsed = parse_key(key)
     return parsed is None or not parsed[0].latest_only, payload_stamp_ns(payload) or 0
+
+
+def queue_of(key: str, payload: bytes, now_ns: int) -> str:
+    """Return the name of the queue (`Delivery`) of a message: its owner's.
+
+    All messages of stored dives, whose stamps are not of now, share one: there the order of the nodes counts.
+    """
+    stamp_ns = payload_stamp_ns(payload) if len(payload) <= STAMPED_BYTES else None
+    return "stored" if stamp_ns is not None and abs(stamp_ns - now_ns) > LIVE_NS else owner_of(key)
 
 
 def check_alive_name(name: str) -> str:

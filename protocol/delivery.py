@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
 
@@ -53,11 +53,20 @@ class FailureLatch:
 T = TypeVar("T")
 
 
-class Delivery(Generic[T]):
-    """A bounded queue, and the thread that passes its items to one handler in order.
+class _Queue(Generic[T]):
+    """Items with their sizes in bytes."""
 
-    When the queue is full (`capacity` items, or MAX_QUEUED_BYTES together) the oldest item is dropped; `dropped`
-    counts them.
+    def __init__(self) -> None:
+        self.items: deque[tuple[T, int]] = deque()
+        self.bytes = 0
+
+
+class Delivery(Generic[T]):
+    """Bounded queues, and the thread that passes their items to one handler.
+
+    Queues take turns: a sender of more than can be handled delays and loses what is in its own queue. Items of a queue
+    come in order; the queue "" comes before all others. Of a queue that is full (`capacity` items) the oldest item is
+    dropped; of all together beyond MAX_QUEUED_BYTES, that of the largest. `dropped` counts them.
     """
 
     def __init__(self, name: str, handle: Callable[[T], None], capacity: int, failures: FailureLatch) -> None:
@@ -67,22 +76,32 @@ class Delivery(Generic[T]):
         self._handle = handle
         self._capacity = capacity
         self._failures = failures
-        self._items: deque[tuple[T, int]] = deque()
+        # By name; the one whose turn is next is first. None is empty.
+        self._queues: OrderedDict[str, _Queue[T]] = OrderedDict()
         self._bytes = 0
         self._closing = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def offer(self, item: T, size_bytes: int = 0) -> None:
+    def offer(self, item: T, size_bytes: int = 0, queue: str = "") -> None:
         """Queue an item; never waits."""
         with self._changed:
             if self._closing:
                 return
-            self._items.append((item, size_bytes))
+            into = self._queues.setdefault(queue, _Queue())
+            into.items.append((item, size_bytes))
+            into.bytes += size_bytes
             self._bytes += size_bytes
-            while len(self._items) > self._capacity or (self._bytes > MAX_QUEUED_BYTES and len(self._items) > 1):
-                self._bytes -= self._items.popleft()[1]
+            if len(into.items) > self._capacity:
+                self._take(queue)
+                self.dropped += 1
+            while self._bytes > MAX_QUEUED_BYTES:
+                largest = max(self._queues, key=lambda name: self._queues[name].bytes)
+                # A single item may exceed the bound, or it could never be delivered.
+                if len(self._queues[largest].items) == 1:
+                    break
+                self._take(largest)
                 self.dropped += 1
             self._changed.notify()
 
@@ -96,25 +115,42 @@ class Delivery(Generic[T]):
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             with self._changed:
-                self._items.clear()
+                self._queues.clear()
             log.warning("thread %r is still busy after %g s", self._thread.name, timeout_s)
 
     def _run(self) -> None:
         try:
             while True:
                 with self._changed:
-                    while not self._items and not self._closing:
+                    while not self._queues and not self._closing:
                         self._changed.wait()
-                    if not self._items:
+                    if not self._queues:
                         return
-                    item, size_bytes = self._items.popleft()
-                    self._bytes -= size_bytes
+                    item = self._next()
                 self._handle(item)
         except Exception as error:
             with self._changed:
                 self._closing = True
-                self._items.clear()
+                self._queues.clear()
             self._failures.report(self._thread.name, error)
+
+    def _next(self) -> T:
+        """Take an item of the queue whose turn it is."""
+        name = "" if "" in self._queues else next(iter(self._queues))
+        item = self._take(name)
+        if name in self._queues:
+            self._queues.move_to_end(name)
+        return item
+
+    def _take(self, name: str) -> T:
+        """Take the oldest item of a queue; a queue without items is forgotten."""
+        queue = self._queues[name]
+        item, size_bytes = queue.items.popleft()
+        queue.bytes -= size_bytes
+        self._bytes -= size_bytes
+        if not queue.items:
+            del self._queues[name]
+        return item
 
 
 class RateCap:

@@ -17,6 +17,7 @@ from buddyline.protocol.bus import (
     check_alive_name,
     each_of,
     held_order,
+    queue_of,
 )
 from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap
@@ -95,11 +96,12 @@ class LocalPublisher(Publisher):
 
 
 class LocalSubscription:
-    """A Subscription within one process, where no message is lost on the way."""
+    """A Subscription within one process, where no message is lost on the way. joined: what was held is queued."""
 
     missed = 0
 
     def __init__(self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received]) -> None:
+        self.joined = False
         self._key_exprs = key_exprs
         self._network = network
         self._delivery = delivery
@@ -115,8 +117,9 @@ class LocalSubscription:
 
     def offer(self, publisher: LocalPublisher, payload: bytes) -> None:
         """Queue a message of publisher."""
-        received = Received(publisher.key, payload, self._network.clock.now_ns(), publisher.topic.encoding)
-        self._delivery.offer(received, len(payload))
+        now_ns = self._network.clock.now_ns()
+        received = Received(publisher.key, payload, now_ns, publisher.topic.encoding)
+        self._delivery.offer(received, len(payload), queue_of(publisher.key, payload, now_ns) if self.joined else "")
 
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end its thread."""
@@ -179,6 +182,7 @@ class LocalBus(Bus):
                 held = [(publisher, payload) for publisher in publishers for payload in publisher.cache]
                 for publisher, payload in sorted(held, key=lambda item: held_order(item[0].key, item[1])):
                     subscription.offer(publisher, payload)
+            subscription.joined = True
             self._network.subscriptions.append(subscription)
             self._subscriptions.append(subscription)
         return subscription

@@ -21,6 +21,13 @@ OWNER_CHUNKS: Final = 3
 S = TypeVar("S")
 
 
+def owner_of(key: str) -> str:
+    """Return the first chunks of a key, such as "buddyline/node/a"; a namespace counts as one more."""
+    chunks = key.split("/")
+    start = chunks.index("buddyline") if "buddyline" in chunks else 0
+    return "/".join(chunks[: start + OWNER_CHUNKS])
+
+
 class PublisherId(NamedTuple):
     """One publisher: its key, and what it says of itself.
 
@@ -34,10 +41,8 @@ class PublisherId(NamedTuple):
 
     @property
     def owner(self) -> str:
-        """The first chunks of the key, such as "buddyline/node/a"; a namespace counts as one more."""
-        chunks = self.key.split("/")
-        start = chunks.index("buddyline") if "buddyline" in chunks else 0
-        return "/".join(chunks[: start + OWNER_CHUNKS])
+        """The owner of its key."""
+        return owner_of(self.key)
 
 
 @dataclass(frozen=True)

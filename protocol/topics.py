@@ -77,6 +77,9 @@ class Topic:
         return f"application/json;{self.schema_name}"
 
 
+# Of a sample: ten times what it takes.
+SAMPLE_BYTES: Final = 4096
+
 INFO: Final = Topic("info", "buddyline/node/{node}/info", messages.NodeInfo, 0.0, "data", latest_only=True)
 CANDIDATES: Final = Topic(
     "candidates",
@@ -100,7 +103,9 @@ EXPECT: Final = Topic(
     stale_s=0.5,
     solved=True,
 )
-IMU: Final = Topic("imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0, shed=2)
+IMU: Final = Topic(
+    "imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0, shed=2, max_bytes=SAMPLE_BYTES
+)
 ATTITUDE: Final = Topic(
     "attitude",
     "buddyline/node/{node}/attitude",
@@ -111,6 +116,7 @@ ATTITUDE: Final = Topic(
     stale_s=2.0,
     shed=3,
     keep_hz=5.0,
+    max_bytes=SAMPLE_BYTES,
 )
 DEPTH: Final = Topic(
     "depth",
@@ -122,6 +128,7 @@ DEPTH: Final = Topic(
     stale_s=2.0,
     shed=3,
     keep_hz=2.0,
+    max_bytes=SAMPLE_BYTES,
 )
 # A full picture of a stored dive, in base64; a live preview is a twentieth of it.
 IMAGE: Final = Topic(
@@ -146,7 +153,13 @@ NODE_STATUS: Final = Topic(
     keep_hz=0.5,
 )
 CLOCK: Final = Topic(
-    "clock", "buddyline/node/{node}/clock", messages.ClockBeacon, 4.0, "interactive_high", express=True
+    "clock",
+    "buddyline/node/{node}/clock",
+    messages.ClockBeacon,
+    4.0,
+    "interactive_high",
+    express=True,
+    max_bytes=SAMPLE_BYTES,
 )
 CLOCK_SET: Final = Topic("clock_set", "buddyline/node/{node}/clock_set", messages.ClockSet, 0.0, "data")
 LIGHT_TRUTH: Final = Topic("light_truth", "buddyline/node/{node}/light_truth", messages.LightTruth, 10.0, "data_low")

@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 import zenoh
 from buddyline.protocol.delivery import CLOSE_S, FailureLatch
 
-INTAKE: Final = 8192
+INTAKE: Final = 2048
 
 RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
 

@@ -47,6 +47,11 @@ class Link:
         self._thread = threading.Thread(target=self._run, name="bus link", daemon=True)
         self._thread.start()
 
+    @property
+    def is_slow(self) -> bool:
+        """Whether an answer may take long on it."""
+        return self.is_long or self._budget.bytes_per_s is not None
+
     def heard_within(self, seconds: float) -> bool:
         """Return whether Zenoh has read anything from the hub in this time."""
         return time.monotonic() - self._heard_s < seconds

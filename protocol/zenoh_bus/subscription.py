@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import zenoh
-from buddyline.protocol.bus import Received, held_order
+from buddyline.protocol.bus import Received, held_order, queue_of
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
 from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
@@ -47,6 +47,7 @@ class ZenohSubscription:
         self._clock = clock
         self._failures = failures
         self._lock = threading.Lock()
+        self._joined = False
         self._sequence = SampleSequence(self._deliver)
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
@@ -59,6 +60,8 @@ class ZenohSubscription:
                 self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
+        # What was held goes first, in its own order.
+        self._joined = True
         self._intakes = [Intake(key_expr, subscriber, accept, failures) for key_expr, accept, subscriber in subscribers]
 
     def _declare(self, key_expr: str) -> RingSubscriber:
@@ -178,7 +181,8 @@ class ZenohSubscription:
             receive_ns=self._clock.now_ns(),
             encoding=str(sample.encoding),
         )
-        self._delivery.offer(received, len(received.payload))
+        queue = queue_of(received.key, received.payload, received.receive_ns) if self._joined else ""
+        self._delivery.offer(received, len(received.payload), queue)
 
 
 def _source(sample: zenoh.Sample) -> PublisherId:

@@ -26,7 +26,8 @@ log = logging.getLogger(__name__)
 class Watchdog:
     """Cuts a connection over which the hub does not answer, so that Zenoh makes a new one.
 
-    Half a connection whose bytes nobody reads at this end is found by `Link`; this finds the others.
+    Half a connection whose bytes nobody reads at this end is found by `Link`. This finds the others: a new connection
+    may meet the old one's end in the hub (Zenoh 1.10), which then keeps it alive and passes nothing on.
     """
 
     def __init__(self, session: zenoh.Session, link: Link) -> None:
@@ -57,7 +58,7 @@ class Watchdog:
             now_s = time.monotonic()
             if not deaf:
                 answered_s = now_s
-            elif not self._link.heard_within(PROBE_S) or now_s - answered_s > SLOW_S:
+            elif not (self._link.is_slow and self._link.heard_within(PROBE_S)) or now_s - answered_s > SLOW_S:
                 self._cut(patience_s + PROBE_AGAIN_S)
                 answered_s = now_s
             just_cut = deaf and not just_cut

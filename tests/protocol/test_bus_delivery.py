@@ -35,6 +35,31 @@ def test_a_queue_is_bounded_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> Non
     assert handled == ["first", "huge"]
 
 
+def test_one_queue_delays_and_drops_only_its_own_items() -> None:
+    begun, go_on, handled = threading.Event(), threading.Event(), []
+
+    def handle(item: str) -> None:
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+        handled.append(item)
+
+    queue = Delivery("test", handle, capacity=100, failures=FailureLatch())
+    queue.offer("first", queue="flood")
+    assert begun.wait(PATIENCE_S)
+    for number in range(1000):
+        queue.offer(f"flood {number}", queue="flood")
+    for number in range(3):
+        queue.offer(f"a {number}", queue="a")
+    queue.offer("held before")
+    assert queue.dropped == 900
+    go_on.set()
+    queue.close(PATIENCE_S)
+    assert handled[:2] == ["first", "held before"]
+    assert [item for item in handled if item.startswith("a")] == ["a 0", "a 1", "a 2"]
+    assert max(handled.index(f"a {number}") for number in range(3)) < 10
+    assert [item for item in handled if item.startswith("flood")] == [f"flood {number}" for number in range(900, 1000)]
+
+
 def test_a_handler_that_never_ends_does_not_delay_closing(caplog: pytest.LogCaptureFixture) -> None:
     go_on, handled = threading.Event(), []
 

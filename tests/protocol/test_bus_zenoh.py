@@ -373,12 +373,13 @@ def test_the_hub_passes_on_no_payload_above_its_topics_limit(namespace: str | No
         inbox = Inbox()
         receiver.subscribe(topics.EVERYTHING, inbox)
         sender = zenoh.open(config_of(client_settings(endpoint, namespace)))
+        wait = zenoh.CongestionControl.BLOCK
         image, depth = topics.IMAGE.max_bytes, topics.DEPTH.max_bytes
         sizes = {"image": [image, image + 1, 1], "depth": [depth, depth + 1, 2]}
         for name, all_sizes in sizes.items():
             for size in all_sizes:
-                sender.put(f"buddyline/node/a/{name}", b"1" * size)
-                sender.put(f"buddyline/node/a/{name}/@adv/pub/1/1/_", b"1" * (size + 1))
+                for key, payload in (("", b"1" * size), ("/@adv/pub/1/1/_", b"1" * (size + 1))):
+                    sender.put(f"buddyline/node/a/{name}{key}", payload, congestion_control=wait)
         inbox.wait_for(4)
         assert sorted(len(received.payload) for received in inbox.received) == [1, 2, depth, image]
         sender.close()  # type: ignore[no-untyped-call]
