@@ -39,6 +39,8 @@ MAX_BIAS_DPS: Final = 5.0
 MAX_BIAS_SIGMA_DPS: Final = 0.5
 # Time in which the bias moves by 0.1 deg/s: 0.05 deg/s per K, 25 K from deck to water, time constant 120 s.
 BIAS_FORGETTING_S: Final = 10.0
+# Of a new temperature: a chip that counts whole degrees must not step the bias.
+WARMTH_SHARE: Final = 0.2
 GAP_S: Final = 0.2
 LONG_GAP_S: Final = 5.0
 GAP_TURN_RADPS: Final = math.radians(10.0)
@@ -115,7 +117,13 @@ def attitudes(samples: Iterable[Imu], estimator: AttitudeEstimator) -> Iterator[
     """
     for message in samples:
         mag_t = None if message.mag_t is UNSET else np.array(message.mag_t)
-        sample = ImuSample(message.stamp_ns, np.array(message.accel_mps2), np.array(message.gyro_radps), mag_t)
+        sample = ImuSample(
+            message.stamp_ns,
+            np.array(message.accel_mps2),
+            np.array(message.gyro_radps),
+            mag_t,
+            temperature_degc=None if message.temperature_degc is UNSET else message.temperature_degc,
+        )
         estimate = estimator.update(sample)
         if estimate is not None:
             yield estimate.message(message.node)
@@ -150,11 +158,36 @@ class _RestWatch:
         return (np.zeros(3), MOVING_BIAS_SIGMA_DPS) if waited_s > GIVE_UP_REST_S else None
 
 
+class _Warmth:
+    """The part of the gyroscope's bias that comes from its temperature since the first sample."""
+
+    def __init__(self, slope_radps_per_k: Vector) -> None:
+        self.bias_radps = np.zeros(3)
+        self._slope = slope_radps_per_k
+        self._first_degc: float | None = None
+        self._smooth_degc = 0.0
+
+    def update(self, sample: ImuSample) -> None:
+        """Take a sample; one a second has a temperature."""
+        degc = sample.temperature_degc
+        if degc is None:
+            return
+        if self._first_degc is None:
+            self._first_degc = self._smooth_degc = degc
+        self._smooth_degc += WARMTH_SHARE * (degc - self._smooth_degc)
+        self.bias_radps = self._slope * (self._smooth_degc - self._first_degc)
+
+    def turn_back(self) -> None:
+        """Go on backward in time: every bias is the opposite."""
+        self._slope, self.bias_radps = -self._slope, -self.bias_radps
+
+
 class VqfAttitude:
     """Estimates tilt and gyroscope bias with VQF, and heading with the gated compass.
 
     calibration: of the magnetometer. field: the Earth's field at the dive site, with its declination; None: the
-    field's strength and dip are learned. declination_rad: used without a field. A gap in the samples increases
+    field's strength and dip are learned. declination_rad: used without a field. gyro_bias_radps_per_k: (3,), how the
+    gyroscope's bias moves with its temperature; what is left of it is estimated. A gap in the samples increases
     sigma_rad; a gap longer than LONG_GAP_S restarts the tilt with the bias known so far.
     """
 
@@ -163,6 +196,7 @@ class VqfAttitude:
         calibration: MagnetometerCalibration,
         field: EarthField | None = None,
         declination_rad: float = 0.0,
+        gyro_bias_radps_per_k: Vector | None = None,
     ) -> None:
         try:
             from vqf import VQF
@@ -175,6 +209,7 @@ class VqfAttitude:
         self._rest: _RestWatch | None = _RestWatch()
         self._vqf: Any = None
         self._bias_radps = np.zeros(3)
+        self._warmth = _Warmth(np.zeros(3) if gyro_bias_radps_per_k is None else gyro_bias_radps_per_k)
         self._last_ns = 0
         self._tilt_tau_s = MOVING_TILT_TAU_S
         self._transient_rad = 0.0
@@ -182,6 +217,7 @@ class VqfAttitude:
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
         """Take a sample; return None during the start."""
+        self._warmth.update(sample)
         if self._rest is not None:
             found = self._rest.update(sample)
             if found is None:
@@ -216,6 +252,7 @@ class VqfAttitude:
             state[name] = -np.asarray(state[name])
         self._vqf.state = state
         self._bias_radps = -self._bias_radps
+        self._warmth.turn_back()
         self._last_ns = ends_ns - self._last_ns
         self._heading.turn_back()
 
@@ -246,7 +283,8 @@ class VqfAttitude:
     def _advance(self, sample: ImuSample, dt_s: float) -> AttitudeEstimate | None:
         vqf = self._vqf
         # VQF assumes a fixed sample time; scaling the rate keeps the rotation between two samples right.
-        vqf.update((sample.gyro_radps - self._bias_radps) * (dt_s / SAMPLE_S), np.asarray(sample.accel_mps2))
+        gyro_radps = sample.gyro_radps - self._bias_radps - self._warmth.bias_radps
+        vqf.update(gyro_radps * (dt_s / SAMPLE_S), np.asarray(sample.accel_mps2))
         q_level_body = vqf.getQuat6D()
         R_level_body = quaternion_to_matrix(q_level_body)
         _, bias_sigma_radps = vqf.getBiasEstimate()

@@ -28,7 +28,8 @@ def attitude_estimator(config: NodeConfig, at_ns: int) -> VqfAttitude:
     calibration = config.sensors.magnetometer_calibration
     # What an uncalibrated magnetometer reads would never be the field of the place.
     here = None if calibration.is_none else config.earth_field(at_ns)
-    return VqfAttitude(calibration, here, config.declination_rad(at_ns))
+    slope = np.array(config.sensors.gyro_bias_radps_per_k)
+    return VqfAttitude(calibration, here, config.declination_rad(at_ns), slope)
 
 
 def attitudes_again(samples: Sequence[Imu], estimator: VqfAttitude) -> list[Attitude]:

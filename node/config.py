@@ -91,7 +91,8 @@ class SensorsConfig(Config, frozen=True, kw_only=True):
 
     imu, depth: which chips, "auto" or "none". mount_xyzw: board to body. position_deg: latitude and longitude of
     the dive, for the declination of its day (in place of calibration.declination_rad) and the field's strength.
-    magnetometer: field = matrix (reading - offset), body frame.
+    magnetometer: field = matrix (reading - offset), body frame. gyro_bias_radps_per_k: how the gyroscope's bias moves
+    with its temperature, body frame.
     """
 
     name: str = "simulated"
@@ -101,6 +102,7 @@ class SensorsConfig(Config, frozen=True, kw_only=True):
     mount_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
     position_deg: tuple[float, float] | None = None
     water_density_kgpm3: Positive = 997.0
+    gyro_bias_radps_per_k: Vector3 = (0.0, 0.0, 0.0)
     magnetometer_offset_t: Vector3 = (0.0, 0.0, 0.0)
     magnetometer_matrix: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 

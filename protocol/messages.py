@@ -244,13 +244,17 @@ class Expect(Message, frozen=True, kw_only=True):
 
 
 class Imu(Message, frozen=True, kw_only=True):
-    """Raw inertial sample in the body frame; mag_t is absent without a magnetometer."""
+    """Raw inertial sample in the body frame; mag_t is absent without a magnetometer.
+
+    temperature_degc: of the gyroscope, once a second.
+    """
 
     node: NodeId
     stamp_ns: StampNs
     accel_mps2: Vector3
     gyro_radps: Vector3
     mag_t: Vector3 | UnsetType = UNSET
+    temperature_degc: float | UnsetType = UNSET
 
 
 class Attitude(Message, frozen=True, kw_only=True):

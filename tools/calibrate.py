@@ -1,4 +1,7 @@
-"""`buddyline calibrate`: camera, lights and magnetometer of a node, and two nodes' clocks. Poor data is refused."""
+"""`buddyline calibrate`: a node's camera, lights, magnetometer and gyroscope, and two nodes' clocks.
+
+Poor data is refused.
+"""
 
 from __future__ import annotations
 
@@ -93,6 +96,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     magnetometer.add_argument(
         "--position", nargs=2, type=float, metavar=("LAT", "LON"), help="where it was taken: sets the field's strength"
     )
+
+    gyroscope = add(
+        "find how the gyroscope's bias moves with its temperature, from a log of a node that lies still and warms up",
+        _gyroscope,
+        "gyroscope a.mcap",
+    )
+    gyroscope.add_argument("dives", nargs="+", metavar="DIVE.mcap", help="a log with the node's inertial samples")
+    gyroscope.add_argument("--node", help="whose samples, of a log of several nodes")
 
     clock = add("find offset and drift between the nodes' clocks, before and after a dive", _clock, "clock")
     clock.add_argument(
@@ -228,6 +239,26 @@ def _magnetometer(args: argparse.Namespace) -> None:
             "[sensors]",
             f"magnetometer_offset_t = {_numbers(found.offset_t, '.4e')}",
             f"magnetometer_matrix = [{', '.join(_numbers(row, '.6f') for row in found.matrix)}]",
+        ]
+    )
+
+
+def _gyroscope(args: argparse.Namespace) -> None:
+    import numpy as np
+    from buddyline.tools.calibration.gyroscope import fit
+    from buddyline.tools.calibration.inputs import inertial_samples
+
+    node, samples = inertial_samples(args.dives, args.node)
+    found = fit(samples)
+    log.info(
+        f"{found.rests} rests over {found.span_k:.1f} K; the line leaves {np.degrees(found.left_radps):.4f} deg/s rms; "
+        f"1 sd {_numbers(np.degrees(found.sigma_radps_per_k), '.5f')} deg/s per K"
+    )
+    _print(
+        [
+            f"# node {node}: {_numbers(np.degrees(found.slope_radps_per_k), '.4f')} deg/s per K",
+            "[sensors]",
+            f"gyro_bias_radps_per_k = {_numbers(found.slope_radps_per_k, '.3e')}",
         ]
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,7 @@ from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_
 from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import Depth, Imu, Message, Vector3
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ class ImuSource:
         self._turn = Metronome(IMU_PERIOD_NS, clock)
         self._health = DeviceHealth(self.name)
         self._compass = DeviceHealth("compass")
+        self._told_ns = 0
 
     @property
     def problem(self) -> str:
@@ -95,6 +97,9 @@ class ImuSource:
         return None
 
     def _messages(self, sample: ImuSample) -> list[Message]:
+        # The attitude is to be the same from the log, which has no more than this.
+        degc = self._temperature(sample)
+        sample = replace(sample, temperature_degc=None if degc is UNSET else degc)
         messages: list[Message] = [
             Imu(
                 node=self._node,
@@ -102,6 +107,7 @@ class ImuSource:
                 accel_mps2=_triple(sample.accel_mps2),
                 gyro_radps=_triple(sample.gyro_radps),
                 mag_t=UNSET if sample.mag_t is None else _triple(sample.mag_t),
+                temperature_degc=degc,
             )
         ]
         estimate = self._attitude.update(sample)
@@ -109,6 +115,13 @@ class ImuSource:
             self._compass.update(estimate.problem)
             messages.append(estimate.message(self._node))
         return messages
+
+    def _temperature(self, sample: ImuSample) -> float | UnsetType:
+        """Return the temperature once a second: it changes slowly."""
+        if sample.temperature_degc is None or 0 <= sample.stamp_ns - self._told_ns < S_NS:
+            return UNSET
+        self._told_ns = sample.stamp_ns
+        return round(sample.temperature_degc, 2)
 
     def close(self) -> None:
         """Free the bus, for all of its sources."""

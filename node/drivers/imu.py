@@ -34,6 +34,11 @@ class MotionSensor(Protocol):
     @property
     def watches(self) -> tuple[SensorWatch, SensorWatch]: ...  # noqa: D102
 
+    @property
+    def temperature_degc(self) -> float | None:
+        """Of the gyroscope, when it was read last; None before that."""
+        ...
+
     def start(self) -> None:
         """Check the identities and write the settings."""
         ...
@@ -66,6 +71,11 @@ class MotionChipPair:
             SensorWatch("LSM303D accelerometer", lsm303d, FULL_SCALE_COUNTS * ACCEL_MPS2_PER_COUNT),
             SensorWatch("L3GD20H gyroscope", l3gd20h, FULL_SCALE_COUNTS * GYRO_RADPS_PER_COUNT),
         )
+
+    @property
+    def temperature_degc(self) -> float | None:
+        """Of the gyroscope, when it was read last; None before that."""
+        return self._l3gd20h.temperature_degc
 
     def start(self) -> None:
         """Check the identities and write the settings."""
@@ -182,7 +192,12 @@ class ImuBoard:
         self._note_saturation(saturated, stamp_ns)
         R = self._R_body_chip
         return ImuSample(
-            stamp_ns, R @ accel_mps2, R @ gyro_radps, None if mag_t is None else R @ mag_t, bool(saturated)
+            stamp_ns,
+            R @ accel_mps2,
+            R @ gyro_radps,
+            None if mag_t is None else R @ mag_t,
+            bool(saturated),
+            self._motion.temperature_degc,
         )
 
     def _note_saturation(self, names: list[str], now_ns: int) -> None:

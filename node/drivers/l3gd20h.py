@@ -9,7 +9,7 @@ from buddyline.node.drivers.samples import Vector
 from buddyline.node.drivers.st_chip import StChip, decode_vector
 
 AUTO_INCREMENT: Final = 0x80
-OUT_GYRO: Final = 0x28
+OUT_TEMPERATURE: Final = 0x26  # the status, then the rates at 0x28, follow: one burst of eight bytes
 
 GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
 
@@ -17,6 +17,14 @@ GYRO_RADPS_PER_COUNT: Final = math.radians(17.50e-3)  # +-500 deg/s
 def decode_gyro(data: bytes) -> Vector:
     """Return the angular rate in rad/s, (3,) in the chip's frame, of six bytes at +-500 deg/s."""
     return decode_vector(data) * GYRO_RADPS_PER_COUNT
+
+
+def decode_temperature(data: bytes) -> float:
+    """Return the chip's temperature in degrees C, of its first byte: a degree a count, falling; its zero is not known.
+
+    Taken as 25 degrees: only differences count.
+    """
+    return 25.0 - int.from_bytes(data[:1], "little", signed=True)
 
 
 class L3gd20h(StChip):
@@ -31,6 +39,10 @@ class L3gd20h(StChip):
         (0x20, 0x6F),  # CTRL1: 200 Hz, all axes on
     )
 
+    temperature_degc: float | None = None
+
     def read_gyro(self) -> Vector:
         """Return the angular rate in rad/s, (3,)."""
-        return decode_gyro(self.bus.read(self.address, OUT_GYRO | AUTO_INCREMENT, 6))
+        data = self.bus.read(self.address, OUT_TEMPERATURE | AUTO_INCREMENT, 8)
+        self.temperature_degc = decode_temperature(data)
+        return decode_gyro(data[2:])

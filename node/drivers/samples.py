@@ -27,7 +27,8 @@ class ImuSample:
     """One reading in the body frame, (3,) each.
 
     accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None without a magnetometer.
-    saturated: acceleration or rate was at full scale, so that the true one may be larger.
+    saturated: acceleration or rate was at full scale, so that the true one may be larger. temperature_degc: of the
+    gyroscope; None where it is not known.
     """
 
     stamp_ns: int
@@ -35,6 +36,7 @@ class ImuSample:
     gyro_radps: Vector
     mag_t: Vector | None = None
     saturated: bool = False
+    temperature_degc: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -205,6 +205,24 @@ def test_a_gyroscope_that_cools_after_a_rested_start_is_followed(cooling_dps):
     assert not any(run.problems)
 
 
+@pytest.mark.parametrize("steps_k", [0.01, 1.0])
+def test_a_known_slope_over_the_temperature_keeps_the_heading_while_the_gyroscope_cools(steps_k):
+    """By 25 K in two minutes; a chip that counts whole degrees does almost as well."""
+    slope = np.radians(0.05) * np.array([1.0, -1.0, 1.0])
+    dive = swell.simulate(90.0, cooling_radps=-25.0 * slope)
+    cooled_k = -25.0 * (1 - np.exp(-np.clip(dive.times_s - 6.0, 0.0, None) / swell.COOLING_TAU_S))
+    told = np.round((30.0 + cooled_k) / steps_k) * steps_k
+    samples = [
+        replace(s, temperature_degc=float(told[i]) if i % 100 == 0 else None) for i, s in enumerate(dive.samples)
+    ]
+    unknown = estimate(dive, VqfAttitude(SOUND, HERE))
+    known = estimate(replace(dive, samples=samples), VqfAttitude(SOUND, HERE, gyro_bias_radps_per_k=slope))
+    late = known.times_s > 10
+    assert known.heading_rms_deg(late) < 0.35 * unknown.heading_rms_deg(late)
+    assert known.tilt_rms_deg() < unknown.tilt_rms_deg()
+    assert (np.abs(known.errors_rad) < 1.5 * known.sigmas_rad).all()
+
+
 def test_without_rest_the_filter_starts_late_with_a_large_sigma():
     run = estimate(swell.simulate(30.0, rest_s=0.0), VqfAttitude(SOUND, HERE))
     assert 20 < run.times_s[0] < 21

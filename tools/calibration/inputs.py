@@ -57,6 +57,18 @@ def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
     return wanted, np.array(mags), np.array(accels)
 
 
+def inertial_samples(paths: list[str], node: str | None) -> tuple[str, list[Imu]]:
+    """Return the node's id, and its inertial samples in order of time."""
+    with Dive(paths) as dive:
+        wanted = _one_node(dive, node, "imu")
+        found = [
+            envelope.message
+            for envelope in dive.messages("imu", doing="calibrate gyroscope")
+            if isinstance(envelope.message, Imu) and envelope.message.node == wanted
+        ]
+    return wanted, sorted(found, key=lambda one: one.stamp_ns)
+
+
 def _one_node(dive: Dive, node: str | None, topic: str) -> str:
     present = dive.nodes(topic)
     if node is None and len(present) == 1:

@@ -17,6 +17,7 @@ from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, CameraModel, Depth, Imu
+from msgspec import UNSET
 
 from tests.node.drivers import wire
 from tests.node.drivers.wire import Adapter, Sky
@@ -72,6 +73,20 @@ def collect(source, clock: ManualClock, seconds: float) -> list:
 
 
 pytest.importorskip("vqf", reason="vqf is not installed: make install EXTRAS=pi")
+
+
+@pytest.mark.parametrize(("identity", "counts_per_degc"), [(0x69, 16), (0x6C, 256)])
+def test_the_gyroscope_s_temperature_comes_once_a_second(config, clock, adapter, sky, identity, counts_per_degc):
+    chip = wire.lsm6ds(sky, identity)
+    adapter.chips.update({0x6B: chip, 0x1E: wire.lis3mdl(sky)})
+    imu, _depth = open_sensors(config, clock)
+    collect(imu, clock, 0.1)
+    chip.registers.update(enumerate((-12 * counts_per_degc).to_bytes(2, "little", signed=True), 0x20))
+    samples = [m for m in collect(imu, clock, 4.0) if isinstance(m, Imu)]
+    told = [m.temperature_degc for m in samples if m.temperature_degc is not UNSET]
+    imu.close()
+    assert len(told) == 4
+    assert set(told[1:]) == {13.0}
 
 
 def test_imu_and_attitude_at_100_hz(config, clock, board, gauge):
