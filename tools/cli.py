@@ -148,6 +148,14 @@ COMMANDS: Final = (
         ("evaluate poses.mcap --truth dive.truth.mcap",),
     ),
     Command(
+        "net",
+        "find where nodes on tripods stand, for their configurations",
+        (
+            "net init dive.mcap --still a --still c",
+            "net init a/*.mcap b/*.mcap c/*.mcap --still a --still c -o places/",
+        ),
+    ),
+    Command(
         "monitor",
         "watch running nodes in the browser: scene, cameras, plots, health",
         ("monitor", "monitor --connect tcp/192.168.2.1:7447 --open"),

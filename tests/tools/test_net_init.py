@@ -1,0 +1,60 @@
+"""`buddyline net init`: where nodes on tripods stand, out of a short dive."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from buddyline.node.config import load_node_config
+from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.messages import NodeInfo
+from buddyline.solver_service.geometry.rotation import quat_to_matrix, rotation_log
+from buddyline.tools.cli import main
+
+
+@pytest.fixture(scope="module")
+def dive(tmp_path_factory):
+    """A and c stand still and do not see each other; b moves, and sees both."""
+    path = tmp_path_factory.mktemp("init") / "dive.mcap"
+    words = ["--nodes", "3", "--fixed", "a", "--fixed", "c", "--seconds", "6", "--imu", "--seed", "8"]
+    assert main(["simulate", str(path), *words]) == 0
+    with DiveLogReader(path) as reader:
+        told = [record.open().message for record in reader.records(lambda key: key.endswith("/info"))]
+    return path, {one.node: one.fixed for one in told if isinstance(one, NodeInfo)}
+
+
+def relative(a, c):
+    R = quat_to_matrix(np.array(a["q_xyzw"]))
+    return R.T @ (np.array(c["p_m"]) - a["p_m"]), R.T @ quat_to_matrix(np.array(c["q_xyzw"]))
+
+
+def test_the_places_are_found_through_a_third_node(dive, tmp_path):
+    path, true = dive
+    assert main(["net", "init", str(path), "--still", "a", "--still", "c", "-o", str(tmp_path / "places")]) == 0
+    texts = {node: (tmp_path / "places" / f"{node}.toml").read_text() for node in "ac"}
+    found = {node: tomllib.loads(text)["fixed"] for node, text in texts.items()}
+    expected = {node: {"p_m": true[node].p_m, "q_xyzw": true[node].q_xyzw} for node in "ac"}
+    (t, R), (t_true, R_true) = relative(found["a"], found["c"]), relative(expected["a"], expected["c"])
+    assert np.linalg.norm(t - t_true) < max(4 * found["c"]["sigma_m"], 0.02)
+    assert np.linalg.norm(rotation_log(R @ R_true.T)) < 0.01
+    assert found["a"]["p_m"][:2] == [0.0, 0.0]
+    assert found["a"]["p_m"][2] == pytest.approx(true["a"].p_m[2], abs=0.02)
+    # The lines are a node's configuration.
+    config = tmp_path / "c.toml"
+    config.write_text('node = "c"\n' + texts["c"])
+    assert load_node_config(config).fixed.net == "main"
+
+
+def test_a_node_that_moves_is_no_fixed_node(dive, capsys):
+    assert main(["net", "init", str(dive[0]), "--still", "a", "--still", "b"]) == 2
+    assert "node b: does not stand still" in capsys.readouterr().err
+
+
+def test_a_node_that_is_not_in_the_dive_is_named(dive, capsys):
+    assert main(["net", "init", str(dive[0]), "--still", "z", "--json"]) == 2
+    assert "no NodeInfo of node z; nodes: a, b, c" in capsys.readouterr().err
+
+
+def test_one_node_alone_is_the_origin(dive, capsys):
+    assert main(["net", "init", str(dive[0]), "--still", "c", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["c"]["p_m"][:2] == [0.0, 0.0]
