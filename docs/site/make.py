@@ -23,7 +23,7 @@ PAGES: Final = {
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "protocol/README.md"],
     "Build and survey": ["docs/build/README.md", "node/README.md", "tools/survey/README.md"],
     "Reference": ["commands", "docs/glossary.md"],
-    "How it works": ["docs/track.md", "docs/network.md", "docs/decisions.md"],
+    "How it works": ["docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md"],
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
 }
 LINK: Final = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")

@@ -120,6 +120,11 @@ class _Node:
         self.gauge = rng.normal(0, flaws.depth_m * math.sqrt(0.1))
         self.drift = _Slow(rng, 120.0)
         self.disturbance = 0.0
+        # Of its own, so that the other errors stay the same without it: zero 0.1 deg/s that wanders, scale 0.3 %.
+        self.felt = np.random.default_rng(int(1e9 * abs(self.lights).sum()))
+        self.gyro_zero, self.gyro_scale = self.felt.normal(0, math.radians(0.1), 3), self.felt.normal(1, 0.003)
+        self.gyro_wander = [_Slow(self.felt, 300.0) for _ in range(3)]
+        self.turned = None
         calibrated = self.lights + rng.normal(0, flaws.calibration_m, (2, 3))
         self.info = NodeInfo(
             node=self.name,
@@ -160,14 +165,28 @@ class _Node:
         dip = DIP_RAD + math.radians(0.5 * self.disturbance + 0.5 * rng.normal())
         mag = strength * (R_ned_body.T @ [math.cos(dip), 0.0, math.sin(dip)])
         accel = R_ned_body.T @ [0.0, 0.0, -9.80665] + rng.normal(0, 0.05, 3)
+        rng.normal(size=3)  # So that the other errors stay those of earlier figures.
+        gyro = self.gyro(t_s, R_ned_body)
         imu = Imu(
             node=self.name,
             stamp_ns=stamp_ns,
             accel_mps2=tuple(accel.tolist()),
-            gyro_radps=tuple(rng.normal(0, 0.05, 3).tolist()),
+            gyro_radps=tuple(gyro.tolist()),
             mag_t=tuple(mag.tolist()),
         )
         return attitude, depth, imu
+
+    def gyro(self, t_s, R_ned_body):
+        """The mean rate since the last sample, with this gyroscope's errors."""
+        before_s, before = self.turned or (t_s - PERIOD_NS / 1e9, R_ned_body)
+        self.turned = t_s, R_ned_body
+        step_s = t_s - before_s
+        x, y, z, w = rotation.to_quaternion(before.T @ R_ned_body)
+        axis, angle = np.array([x, y, z]), 2 * math.atan2(math.hypot(x, y, z), w)
+        rate = axis / max(np.linalg.norm(axis), 1e-12) * angle / step_s
+        slow = math.radians(0.003) * np.array([one.at(t_s) for one in self.gyro_wander])
+        noise = math.radians(0.01) / math.sqrt(step_s) * self.felt.normal(size=3)
+        return self.gyro_scale * rate + self.gyro_zero + slow + noise
 
     def frame(self, stamp_ns, seq, place, R_ned_body, other, other_place, other_R):
         """What its camera sees of the other's lights, among other things."""
@@ -199,15 +218,17 @@ class _Node:
         )
 
 
-def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s=0.0):
+def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s=0.0, unchecked=()):
     """Return all messages of a leapfrog survey along a course, poses and rejections of the true solver included.
 
     disturb: of a node's index and a station's, to its compass's error there (degrees). After each rest the nodes
-    see nothing of each other for swim_s, and for pause_s more, of which there are no messages.
+    see nothing of each other for swim_s, and for pause_s more, of which there are no messages. unchecked: checks that
+    the solver leaves out.
     """
     flaws = flaws or Flaws()
     nodes = [_Node(rng, 0, flaws), _Node(rng, 1, flaws)]
-    core = SolverCore(SolveConfig().settings("test"), [("a", "b")])
+    checks = [check for check in SolveConfig().checks if check not in unchecked]
+    core = SolverCore(SolveConfig(checks=checks).settings("test"), [("a", "b")])
     out = []
 
     def take(*messages):

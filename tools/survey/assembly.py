@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import median
 from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.averages import Floats, wrap
-from buddyline.tools.survey.lines import SightPair, bearing_of, slopes_of
+from buddyline.tools.survey.lines import bearing_of, sights_apart, slopes_of
 from buddyline.tools.survey.observations import Observations
-from buddyline.tools.survey.project import Known, Leg, Project, Turn
+from buddyline.tools.survey.project import Known, Leg, Project
 from msgspec import UNSET
 
 EXACT_M: Final = 1e-4
@@ -59,16 +59,12 @@ def gauge_name(dive: int, node: str) -> str:
 
 @dataclass
 class Assembly:
-    """Legs and their observations. ends: each leg's stations. turns_rad: by leg, grid azimuth minus magnetic.
-
-    bearings: by leg, as they are weighed.
-    """
+    """Legs and their observations. ends: each leg's stations. turns_rad: by leg, grid azimuth minus magnetic."""
 
     observations: Observations
     legs: Sequence[Leg]
     ends: list[tuple[str, str]]
     turns_rad: Sequence[float]
-    bearings: dict[int, SightPair | None] = field(default_factory=dict)
 
 
 class _Gauges:
@@ -203,7 +199,7 @@ def assemble(
         _add_depths(to, tides, level_m - origin_m[2], free_level=free_level)
     else:
         _add_rises(to, tides)
-    _add_turns(to, project.turn, sighted)
+    _add_turns(to, project, sighted)
     _add_known(to, project.known)
     if north_along is not None:
         of.add("azimuth", of.at[north_along[0]], of.at[north_along[1]], 0.0, 1e-6, what="arbitrary north")
@@ -244,7 +240,8 @@ class _Compasses:
 
     def __init__(self, project: Project, of: Observations, legs: Sequence[Leg]) -> None:
         self._project, self._of = project, of
-        self.sights: dict[tuple[int, int], tuple[int, Leg]] = {}
+        # By dive, leg's start_ns and node: the unknown azimuth of the leg, and the node's sight from it.
+        self.sights: dict[tuple[int, int, str], tuple[int, float]] = {}
         sigmas: dict[tuple[int, str], list[float]] = defaultdict(list)
         for leg in legs:
             for node, sigma_deg in (
@@ -275,23 +272,27 @@ class _Compasses:
         run_m = max(leg.distance_m, 0.3)
         held = math.sqrt(2) * max(self._project.settings.centering_m, 1e-3) / run_m
         self._of.add("azimuth", start, end, 0.0, held, [(column, -1.0)], leg=number, what="centering")
-        self.sights[leg.dive, leg.start_ns] = column, leg
+        for node, facing in ((leg.from_node, 0.0), (leg.to_node, math.pi)):
+            self.sights[leg.dive, leg.start_ns, node] = column, facing
         return column
 
     def add(self, to: Assembly, number: int, start: int, end: int, *, turned: bool) -> None:
         """Add a leg's azimuths. turned: others hang on this one by gyroscopes, so that a disturbed compass shows."""
         leg, of, turn_rad = to.legs[number], self._of, to.turns_rad[number]
-        to.bearings[number] = bearing = bearing_of(leg, self._project)
+        own = math.sqrt(1 - ZERO_SHARE - IRON_SHARE)
+        column = self.carry(to, number, start, end) if turned else None
+        bearing = bearing_of(leg, self._project)
         if bearing is None:
             return
-        column = self.carry(to, number, start, end) if turned else None
-        own = math.sqrt(1 - ZERO_SHARE - IRON_SHARE)
         both = bearing.fore is not None and bearing.back is not None
         # Equal weights for both, as all cave programs have it: then their plain mean is the leg's.
-        sigma = own * bearing.sigma * (math.sqrt(2) if both else 1.0)
-        for what, node, angle, against in (
-            ("fore", leg.from_node, bearing.fore, 0.0),
-            ("back", leg.to_node, bearing.back, math.pi),
+        sigmas = [own * bearing.sigma * (math.sqrt(2) if both else 1.0)] * 2
+        angles = [bearing.fore, bearing.back]
+        if column is not None:
+            angles, sigmas = sights_apart(leg, self._project)
+        for what, node, angle, sigma, against in (
+            ("fore", leg.from_node, angles[0], sigmas[0], 0.0),
+            ("back", leg.to_node, angles[1], sigmas[1], math.pi),
         ):
             if angle is None:
                 continue
@@ -301,8 +302,8 @@ class _Compasses:
                 row = of.add("azimuth", start, end, value, sigma, terms, leg=number, what=words)
             else:
                 terms.append((column, 1.0))
-                row = of.add("angle", -1, -1, value, sigma, terms, leg=number, what=words, robust=True)
-            to.observations.rows[number, what] = row
+                row = of.add("angle", -1, -1, value, own * sigma, terms, leg=number, what=words, robust=True)
+            of.rows[number, what] = row
 
 
 def _guess(leg: Leg, turn_rad: float) -> float:
@@ -311,16 +312,21 @@ def _guess(leg: Leg, turn_rad: float) -> float:
     return 0.0 if leg.back_azimuth_deg is UNSET else wrap(math.radians(leg.back_azimuth_deg) + math.pi + turn_rad)
 
 
-def _add_turns(to: Assembly, turns: Sequence[Turn], sighted: _Compasses) -> None:
-    of = to.observations
-    for one in turns:
-        ends = [sighted.sights.get((one.dive, ns)) for ns in (one.from_ns, one.to_ns)]
+def _add_turns(to: Assembly, project: Project, sighted: _Compasses) -> None:
+    of, settings = to.observations, project.settings
+    for one in project.turn:
+        ends = [sighted.sights.get((one.dive, ns, one.node)) for ns in (one.from_ns, one.to_ns)]
         if ends[0] is None or ends[1] is None:
             continue
-        # A leg's azimuth is its start's sight; a node at its end looks the other way.
-        facing = [math.pi * (one.node != leg.from_node) for _, leg in (ends[0], ends[1])]
-        value = wrap(math.radians(one.angle_deg) - facing[1] + facing[0])
-        terms = [(ends[1][0], 1.0), (ends[0][0], -1.0)]
+        (column_0, facing_0), (column_1, facing_1) = ends[0], ends[1]
+        angle, name = math.radians(one.angle_deg), f"gyroscope of {one.node} in dive {one.dive}"
+        terms = [
+            (column_1, 1.0),
+            (column_0, -1.0),
+            (of.unknown(f"{name}: zero", math.radians(settings.gyro_zero_dps)), one.seconds),
+            (of.unknown(f"{name}: scale", settings.gyro_scale), angle),
+        ]
+        value = wrap(angle - facing_1 + facing_0)
         of.add("angle", -1, -1, value, math.radians(one.sigma_deg), terms, what=f"gyroscope of {one.node}")
 
 

@@ -126,7 +126,14 @@ def _legs(args: argparse.Namespace) -> int:
             f"water level in dive {dive}: {rate:+.2f} m an hour, by the gauges' own readings; taken off"
         )
     write_derived(
-        path, {"problem": derived.problems, "station": stations, "leg": derived.legs, "point": derived.points}
+        path,
+        {
+            "problem": derived.problems,
+            "station": stations,
+            "leg": derived.legs,
+            "turn": derived.turns,
+            "point": derived.points,
+        },
     )
     alarms = sum(len(leg.alarms) for leg in derived.legs + derived.points) + len(gauges.alarms)
     print(f"{path}: {len(derived.legs)} legs, {len(stations)} stations, {len(derived.points)} points, {alarms} alarms")

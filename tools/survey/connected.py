@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.assembly import Fixed, assemble, from_depth, to_depth
 from buddyline.tools.survey.averages import Floats, wrap
@@ -94,6 +95,9 @@ class Survey:
         for name in self.fixed:
             if name not in stations:
                 raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
+        azimuths = any(one.azimuth_deg is not UNSET for one in project.known)
+        if project.adjust.compass == "ignore" and len(self.fixed) < 2 and not azimuths:
+            raise ConfigError('adjust.compass = "ignore": north needs a [[known]] azimuth_deg or two fixed points')
         self.origin_m = np.nan_to_num(next(iter(self.fixed.values()))[0])
         self.level_m = water_level_m(project)
         self.tides = [dive for dive in adjust_gauges(project.leg).tides_m_per_h] if _may_have_tides(project) else []

@@ -18,12 +18,13 @@ from buddyline.tools.survey.averages import Mean
 from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.gauges import StationDepth
 from buddyline.tools.survey.magnetism import usual_field
-from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station
+from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station, Turn
 from buddyline.tools.survey.readings import PairReadings
 from buddyline.tools.survey.rests import rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
+from buddyline.tools.survey.turns import turns_of
 from msgspec.structs import replace
 
 # A mark belongs to the nearest rest, but not to one further away than this.
@@ -32,7 +33,7 @@ LEAST_POINT_FIXES: Final = 3
 
 
 class Derived:
-    """The result of all dives: legs, points, problems; notes on stations by name.
+    """The result of all dives: legs, points, turns, problems; notes on stations by name.
 
     numbered: stations that no mark has named, and the dive that numbered them. faults: number of unusable marks.
     """
@@ -40,6 +41,7 @@ class Derived:
     def __init__(self) -> None:
         self.legs: list[Leg] = []
         self.points: list[Leg] = []
+        self.turns: list[Turn] = []
         self.problems: list[Problem] = []
         self.notes: dict[str, list[str]] = defaultdict(list)
         self.numbered: dict[str, int] = {}
@@ -64,6 +66,7 @@ class Derived:
         for readings in pairs:
             chain = _Chain(self, readings, marks, corrected, settings, limits, dive)
             self.legs += chain.legs
+            self.turns += chain.turns
             chains.append(chain)
         nodes = {node for chain in chains for node in chain.readings.nodes}
         marked = {name for chain in chains for stations in chain.named for name in stations.values()}
@@ -183,6 +186,8 @@ class _Chain:
             if id(rest) in doubtful and len(stations) < 2:
                 said.append("a rest before this one makes no leg; mark both nodes' stations, or they may be wrong")
             legs.append(replace(leg, alarms=[*leg.alarms, *(f"stations: {text}" for text in said)]))
+        used = [np.isin(self.seen.triggers, shot.used) for shot in shots]
+        self.turns = turns_of(readings, used, dive, settings)
         self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
 
     def _named(self, out: Derived, corrected: set[int]) -> list[dict[str, str]]:

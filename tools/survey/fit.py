@@ -68,8 +68,10 @@ def fit_of(solution: Solution) -> Fit:
 
 
 def _unit(name: str) -> tuple[float, str]:
-    if name.startswith("scale"):
+    if name.startswith("scale") or name.endswith(": scale"):
         return 100.0, "%"
+    if name.startswith("gyroscope"):
+        return math.degrees(1), "deg/s"
     if name.startswith("tide"):
         return 3600.0, "m an hour"
     return (math.degrees(1), "deg") if name == "north" or name.startswith("compass") else (1.0, "m")

@@ -52,21 +52,30 @@ def bearing_of(leg: Leg, project: Project) -> SightPair | None:
 
     A disturbed compass is not used if the other one is undisturbed; a person's edit takes precedence.
     """
+    (fore, back), (fore_sigma, back_sigma) = sights_apart(leg, project)
+    both = leg.azimuth_deg is not UNSET and leg.back_azimuth_deg is not UNSET
+    gap = wrap(math.radians(leg.azimuth_deg - leg.back_azimuth_deg - 180)) if both else None  # type: ignore[operator]
+    bad_fore, bad_back = leg.from_node in leg.disturbed, leg.to_node in leg.disturbed
+    edit = project.edit_of(leg)
+    if (edit is None or edit.compass is UNSET) and fore is not None and back is not None and bad_fore != bad_back:
+        fore, back = (None, back) if bad_fore else (fore, None)
+    return _weighed(fore, back, fore_sigma, back_sigma, gap)
+
+
+def sights_apart(leg: Leg, project: Project) -> tuple[list[float | None], list[float]]:
+    """Return foresight and backsight as read, without what an edit takes out, and their own sigmas, radians."""
     fore, back, fore_sigma, back_sigma = map(
         _radians, (leg.azimuth_deg, leg.back_azimuth_deg, leg.azimuth_sigma_deg, leg.back_azimuth_sigma_deg)
     )
-    gap = None if fore is None or back is None else wrap(fore - back - math.pi)
-    bad_fore, bad_back = leg.from_node in leg.disturbed, leg.to_node in leg.disturbed
     disturbed = math.radians(project.settings.disturbed_deg)
-    fore_sigma = math.hypot(fore_sigma or 0.0, disturbed * bad_fore)
-    back_sigma = math.hypot(back_sigma or 0.0, disturbed * bad_back)
     edit = project.edit_of(leg)
     if edit is not None and edit.compass is not UNSET:
         fore = None if edit.compass == "back" else fore
         back = None if edit.compass == "fore" else back
-    elif fore is not None and back is not None and bad_fore != bad_back:
-        fore, back = (None, back) if bad_fore else (fore, None)
-    return _weighed(fore, back, fore_sigma, back_sigma, gap)
+    return [fore, back], [
+        math.hypot(fore_sigma or 0.0, disturbed * (leg.from_node in leg.disturbed)),
+        math.hypot(back_sigma or 0.0, disturbed * (leg.to_node in leg.disturbed)),
+    ]
 
 
 def clino_of(leg: Leg) -> SightPair | None:

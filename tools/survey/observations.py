@@ -36,9 +36,8 @@ MOST_HALVINGS: Final = 6
 KNOWN_SHARE: Final = 0.5
 # A step after which the observations fit worse than this is too long.
 WORSE: Final = 1.05
-# Student's t with this many degrees of freedom stands for compasses among which some are disturbed: what lies far off
-# counts little, however far it lies.
-ROBUST_FREEDOM: Final = 4.0
+# A compass this many sd off counts a quarter (Geman and McClure 1987): some are disturbed, by any angle.
+FAR_SIGMAS: Final = 2.5
 # An error is checked where at least this share of it shows.
 CHECKED: Final = 1e-3
 # A leg that ends this share of its length away from where it reads is taken as it reads.
@@ -145,7 +144,7 @@ class Observations:
         normal = None
         misfit, at, values = model.linear(x)
         for number in range(1 if linear else MOST_ITERATIONS):
-            weights = model.weights(misfit)
+            weights = model.weights(misfit) if number else model.sigma**-2
             normal = Normal(at, values, weights, model.blocks)
             step = normal.solve(np.bincount(at[1], values * (weights * misfit)[at[0]], len(x)).astype(float))
             chi2 = float(weights @ misfit**2)
@@ -261,9 +260,8 @@ class Model:
 
     def weights(self, misfit: Floats) -> Floats:
         """Return the weights: 1 / sigma^2, of robust ones less where they are far off."""
-        w = self.sigma**-2
-        far = (ROBUST_FREEDOM + 1) / (ROBUST_FREEDOM + (misfit / self.sigma) ** 2)
-        return np.asarray(np.where(self.robust, w * far, w))
+        near = 1 + (misfit / (FAR_SIGMAS * self.sigma)) ** 2
+        return np.asarray(np.where(self.robust, near**-2, 1.0) * self.sigma**-2)
 
 
 @dataclass(eq=False)

@@ -155,15 +155,17 @@ class Known(Config, frozen=True, kw_only=True):
 
 
 class Turn(Config, frozen=True, kw_only=True):
-    """[[turn]]: how much a node's sight turned between two legs of a dive, clockwise, by its gyroscope; sigma: 1 sd.
+    """[[turn]]: how far a node's sight turned between two legs of a dive, clockwise, by its gyroscope, in `seconds`.
 
-    from_ns, to_ns: the legs' start_ns. A sight is the direction in which the node sees the other one.
+    from_ns, to_ns: the legs' start_ns. A sight is the direction in which the node sees the other one. sigma_deg: 1 sd,
+    without what the gyroscope's zero and scale add.
     """
 
     node: str
     dive: int = 1
     from_ns: int
     to_ns: int
+    seconds: float
     angle_deg: float
     sigma_deg: Positive
 

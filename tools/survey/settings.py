@@ -20,6 +20,8 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging over a rest does not reduce.
     compass_common_deg: 1 sd, an error that all azimuths share (declination, mount): it turns the survey as a whole.
     disturbed_deg: 1 sd of a compass in a disturbed field, used where there is no other compass.
+    gyro_zero_dps, gyro_scale: 1 sd of a gyroscope's zero (deg/s) and of its scale, unknowns of each dive.
+    gyro_wander_dps: 1 sd, how much the zero differs from turn to turn. gyro_noise_dps_rthz: its noise density.
     reference_m: node id to its station's point ([x, y, z], camera frame), where that is not the camera's centre.
     """
 
@@ -37,6 +39,10 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     depth_floor_m: NonNegative = 0.005
     compass_common_deg: NonNegative = 0.5
     disturbed_deg: Positive = 10.0
+    gyro_zero_dps: Positive = 0.2
+    gyro_scale: Positive = 0.005
+    gyro_wander_dps: Positive = 0.003
+    gyro_noise_dps_rthz: Positive = 0.01
     point_s: Positive = 2.0
     reference_m: dict[str, Vector3] = field(default_factory=dict)
 

@@ -1,0 +1,139 @@
+"""How far a node's sight turns from one rest to the next, by its gyroscope: azimuths that need no compass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotate
+from buddyline.tools.survey.averages import Bools, Floats, Ints, effective_count, unwrapped
+from buddyline.tools.survey.project import Turn
+from buddyline.tools.survey.readings import NodeReadings, PairReadings
+from buddyline.tools.survey.settings import SurveySettings
+
+# A gap between samples this many times the usual one may hide a turn.
+GAP_SHARE: Final = 5.0
+LEAST_SIGHTS: Final = 3
+
+
+def turns_of(readings: PairReadings, chosen: Sequence[Bools], dive: int, settings: SurveySettings) -> list[Turn]:
+    """Return both nodes' turns between rests that follow each other; chosen: the fixes (n,) of each rest."""
+    references = [np.array(settings.reference_m.get(node, (0.0, 0.0, 0.0))) for node in readings.nodes]
+    between_m = readings.t_a_b_m + rotate(readings.q_a_b, references[1]) - references[0]
+    # Each node's line to the other one, in its own camera frame.
+    sights_m = between_m, -rotate(conjugate(readings.q_a_b), between_m)
+    found = []
+    for node, line_m in zip(readings.pair, sights_m, strict=True):
+        q_body_camera = normalized(np.array(node.info.q_body_camera_xyzw))
+        line_body_m = rotate(np.broadcast_to(q_body_camera, (len(line_m), 4)), line_m)
+        zero = _zero(node, readings.stamps_ns, chosen)
+        turns = []
+        for before, after in pairwise(chosen):
+            turn = _turn(node, zero, readings.stamps_ns, line_body_m, np.flatnonzero(before), np.flatnonzero(after))
+            if turn is not None:
+                turns.append((int(readings.stamps_ns[before][0]), int(readings.stamps_ns[after][0]), *turn))
+        # A gyroscope is at least as noisy as sights wander during rests, in its own frame.
+        walk = max(float(np.median([one[-1] for one in turns])), 0.0) if turns else 0.0
+        for from_ns, to_ns, angle, seconds, scatter, _ in turns:
+            drift = math.radians(settings.gyro_wander_dps) * seconds
+            noise = math.sqrt((math.radians(settings.gyro_noise_dps_rthz) ** 2 + walk) * seconds)
+            found.append(
+                Turn(
+                    node=node.info.node,
+                    dive=dive,
+                    from_ns=from_ns,
+                    to_ns=to_ns,
+                    seconds=round(seconds, 3),
+                    angle_deg=round(math.degrees(angle), 4),
+                    sigma_deg=round(math.degrees(math.hypot(drift, noise, scatter)), 4),
+                )
+            )
+    return found
+
+
+def _zero(node: NodeReadings, stamps_ns: Ints, chosen: Sequence[Bools]) -> Floats:
+    """Return what a gyroscope reads at rest, (3,), rad/s: the median over all rests of its mean."""
+    rates = []
+    for one in chosen:
+        part = node.imu.between(int(stamps_ns[one][0]), int(stamps_ns[one][-1]))
+        rates.append(np.nanmean(node.imu["gyro_radps"][part], axis=0) if part.stop > part.start else np.zeros(3))
+    return np.asarray(np.median(rates, axis=0)) if rates else np.zeros(3)
+
+
+def _turn(
+    node: NodeReadings, zero: Floats, stamps_ns: Ints, line_m: Floats, before: Ints, after: Ints
+) -> tuple[float, float, float, float] | None:
+    """Return the angle (rad, whole turns included), its time (s), and the 1 sd of both rests' sights (rad).
+
+    The last is the random walk, rad^2/s, that the sights show during the rests.
+    """
+    imu = node.imu
+    part = imu.between(int(stamps_ns[before[0]]), int(stamps_ns[after[-1]]))
+    at_ns, rate, accel = imu.stamps_ns[part], imu["gyro_radps"][part], imu["accel_mps2"][part]
+    steps_s = np.diff(at_ns) / S_NS
+    if len(at_ns) < LEAST_SIGHTS or np.isnan(rate).any() or steps_s.max() > GAP_SHARE * float(np.median(steps_s)):
+        return None
+    q = _carried((rate[1:] - zero) * steps_s[:, None])
+    azimuths, ahead = [], []
+    for sights in (before, after):
+        index = np.clip(np.searchsorted(at_ns, stamps_ns[sights]), 0, len(at_ns) - 1)
+        first, last = int(index[0]), int(index[-1]) + 1
+        # At rest the specific force points up: what the gyroscope has tilted since is taken off.
+        up = rotate(q[first:last], accel[first:last]).mean(axis=0)
+        level = _levelling(up)
+        seen_m = rotate(np.broadcast_to(level, (len(sights), 4)), rotate(q[index], line_m[sights]))
+        azimuths.append(unwrapped(np.arctan2(seen_m[:, 1], seen_m[:, 0])))
+        ahead.append(level)
+    turned = float(azimuths[1].mean() - azimuths[0].mean())
+    # The way round that the node has gone.
+    heading = rotate(multiply(np.broadcast_to(ahead[0], q.shape), q), np.array([1.0, 0.0, 0.0]))
+    swept = np.unwrap(np.arctan2(heading[:, 1], heading[:, 0]))
+    turned += 2 * math.pi * round((float(swept[-1] - swept[0]) - turned) / (2 * math.pi))
+    times_s = stamps_ns / S_NS
+    scatter = math.hypot(
+        *(
+            float(one.std(ddof=1)) / math.sqrt(effective_count(times_s[which], one)) if len(one) > 1 else math.pi
+            for one, which in zip(azimuths, (before, after), strict=True)
+        )
+    )
+    walks = [
+        _walk(times_s[which], one)
+        for one, which in zip(azimuths, (before, after), strict=True)
+        if len(one) > LEAST_SIGHTS
+    ]
+    return turned, float(times_s[after].mean() - times_s[before].mean()), scatter, float(np.mean(walks or [0.0]))
+
+
+def _walk(times_s: Floats, azimuths: Floats) -> float:
+    """Return the rate of a random walk, rad^2/s, beside white noise, by which neighbours differ.
+
+    About its trend, which the zero explains, a walk over T has a variance of its rate times T / 15.
+    """
+    away = azimuths - np.polyval(np.polyfit(times_s - times_s[0], azimuths, 1), times_s - times_s[0])
+    white = 0.5 * float((np.diff(away) ** 2).mean())
+    return 15 * (float(away @ away) / (len(away) - 2) - white) / float(np.ptp(times_s))
+
+
+def _levelling(up: Floats) -> Floats:
+    """Return the shortest rotation (4,) that takes `up` to up, which is -z."""
+    unit = up / np.linalg.norm(up)
+    q = np.array([*np.cross(unit, (0.0, 0.0, -1.0)), 1.0 - unit[2]])
+    return normalized(q) if np.linalg.norm(q) > 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _carried(turned_rad: Floats) -> Floats:
+    """Return orientations (n + 1, 4) relative to the first, that turn by turned_rad (n, 3) in the body frame."""
+    angle = np.linalg.norm(turned_rad, axis=1, keepdims=True)
+    share = np.where(angle > 1e-9, np.sin(angle / 2) / np.maximum(angle, 1e-9), 0.5)
+    start = np.array([[0.0, 0.0, 0.0, 1.0]])
+    q = np.concatenate([start, np.hstack([share * turned_rad, np.cos(angle / 2)])])
+    # Products of all before, in as many steps as the count has binary digits.
+    reach = 1
+    while reach < len(q):
+        q = np.concatenate([q[:reach], multiply(q[:-reach], q[reach:])])
+        reach *= 2
+    return normalized(q)
