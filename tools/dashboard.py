@@ -37,6 +37,7 @@ from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, track
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.health.words import REASONS
 from buddyline.tools.live import follow
+from buddyline.tools.terminal import overwritten
 from msgspec import UNSET
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ class Dashboard:
             troubled = coloured and shown is not None and self._age(shown)
         if troubled:
             lines[0] = f"{YELLOW}{lines[0]}{PLAIN}"
-        return "\x1b[H\x1b[2J" + "\n".join([self._title[: width - 1], *above, *lines])
+        return overwritten([self._title[: width - 1], *above, *lines])
 
     def _count_in_view(self, outcome: RelativePose | Rejected) -> bool:
         """Count a trigger's lights; return whether all four were in view, each by itself."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shutil
 import sys
 from collections import Counter
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import EVERYTHING
@@ -18,6 +20,15 @@ if TYPE_CHECKING:
     from buddyline.protocol.envelope import Envelope
 
 log = logging.getLogger(__name__)
+
+# How often what is recorded is said, on a terminal.
+LOOK_S: Final = 0.5
+
+
+def progress_words(total: int, new: int, output: Path) -> str:
+    """Return what has been recorded, how fast (new: since the last look), and what the disk still takes."""
+    free = shutil.disk_usage(output.absolute().parent).free
+    return f"{total} messages, {new / LOOK_S:.0f} a second, {free / 1e9:.1f} GB free"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,11 +46,15 @@ def run(args: argparse.Namespace) -> int:
             nonlocal dropped
             subscription = follow(bus, EVERYTHING, client.refusals, write, capacity=65536)
             log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
-            while not client.stop.wait(0.5):
+            before = 0
+            while not client.stop.wait(LOOK_S):
                 if recorder.error is not None:
                     client.fail("recorder", recorder.error)
                 if sys.stderr.isatty():
-                    print(f"\r{sum(counts.values())} messages", end="\x1b[K", file=sys.stderr, flush=True)
+                    total = counts.total()
+                    words = progress_words(total, total - before, Path(args.output))
+                    print(f"\r{words}", end="\x1b[K", file=sys.stderr, flush=True)
+                    before = total
             bus.close()
             dropped = subscription.dropped
 

@@ -20,6 +20,7 @@ from buddyline.tools.draw.above import ARROWS
 from buddyline.tools.evaluation.network import network_figures
 from buddyline.tools.live import follow
 from buddyline.tools.measure.tables import text_table
+from buddyline.tools.terminal import overwritten
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -110,7 +111,7 @@ class TeamDashboard:
                 "Ctrl-C ends.",
             ]
         lines = "\n".join(text).split("\n")
-        return "\x1b[H\x1b[2J" + "\n".join(line[:width] for line in lines[: max(height - 1, 1)])
+        return overwritten(line[:width] for line in lines[: max(height - 1, 1)])
 
     def _place(self, node: str) -> str:
         place, off = self._cells(node)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from buddyline.node.sim.scenario import Scenario
@@ -84,8 +86,11 @@ def test_a_track_without_poses_is_shown():
 def test_the_screen_fits_its_terminal(size):
     watch = running()
     text = watch.dashboard.screen(*size)
-    assert text.startswith("\x1b[H\x1b[2J")
-    lines = text.removeprefix("\x1b[H\x1b[2J").split("\n")
+    # Never cleared as a whole, which flickers; each line clears its own rest, and the end what is below.
+    assert "\x1b[2J" not in text
+    assert text.startswith("\x1b[H")
+    assert text.endswith("\x1b[K\x1b[J")
+    lines = text.removeprefix("\x1b[H").removesuffix("\x1b[K\x1b[J").split("\x1b[K\n")
     assert len(lines) <= size[1]
     assert all(len(line) < size[0] for line in lines)
     assert "from above; a row is" in text
@@ -97,7 +102,7 @@ def test_the_screen_fits_its_terminal(size):
 def test_colours_are_left_out_where_nobody_wants_them():
     watch = running()
     plain = watch.dashboard.screen(80, 24, arrows=ASCII_ARROWS)
-    assert plain.count("\x1b") == 2
+    assert not re.search(r"\x1b\[[0-9;]*m", plain)
     assert all(character.isascii() or character == "±" for character in plain)
     coloured = watch.dashboard.screen(80, 24, coloured=True)
     assert "\x1b[36mA" in coloured

@@ -21,6 +21,7 @@ from buddyline.protocol.messages import NodeStatus
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, SOLVER_STATUS
 from buddyline.tools.estimate import sigma_m
 from buddyline.tools.health import machine
+from buddyline.tools.health.coach import turns
 from buddyline.tools.health.finding import Finding, worst_first
 from buddyline.tools.health.words import REASONS, reason_words
 from msgspec import UNSET
@@ -196,7 +197,8 @@ def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
         share = "" if len(recent) == 1 else f" ({count} of {recent.total()})"
         tracked = picture.track_is_fresh(now_ns)
         text = f"No pose: {reason_words(reason)}{share}.{' The track goes on without.' if tracked else ''}"
-        advice = REASONS.get(reason, ("", ""))[1]
+        # Where they last were tells more than what helps as a rule.
+        advice = ", ".join(turns(picture, now_ns)) or REASONS.get(reason, ("", ""))[1]
         return [Finding("pair", "warning" if tracked else "problem", text, advice, picture.pose_ns)]
     if live or picture.pose is not None or picture.first_ns is None or now_ns - picture.first_ns <= NO_POSE_S * S_NS:
         return []
