@@ -15,8 +15,9 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix, Place
+from buddyline.solver_service.network.fixed import FixedWatch
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
-from buddyline.solver_service.track.intake import TrackIntake
+from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.stepping import HOLD_S, TOGETHER_S
@@ -37,7 +38,7 @@ REFUTED: Final = 40.0
 MOST_CHALLENGERS: Final = 3
 # A pair opens a challenger no more often than this.
 AGAIN_S: Final = 1.0
-# Fixed nodes that contradict each other so often on end are said to.
+# A pair whose poses contradict the network so often on end is said to.
 CONTRADICTIONS: Final = 10
 MEMORY_S: Final = 30.0
 # Rows come after all else of their time.
@@ -56,6 +57,8 @@ class NetFilter(TrackIntake):
         self._fixes: dict[tuple[int, int], list[tuple[float, PairFix]]] = {}
         self._challenged_s: dict[tuple[int, int], float] = {}
         self._contradicted: dict[tuple[int, int], int] = {}
+        self._watches: dict[int, FixedWatch] = {}
+        self._watched_s = -np.inf
 
     def add_node(self, node: TrackNode, place: Place | None = None, *, shines: bool = True) -> int:
         """Take a node into the network, and return its index. place: of a fixed node. shines: whether it has lamps."""
@@ -67,6 +70,7 @@ class NetFilter(TrackIntake):
         self._rejected.append(0)
         index = len(self.nodes) - 1
         if place is not None:
+            self._watches[index] = FixedWatch(node.name, place.R)
             self.main.places[index] = place
             if self.main.state is not None:
                 self.main.settle(index, self.main.t_s)
@@ -102,11 +106,24 @@ class NetFilter(TrackIntake):
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
+        self._check_fixed(t_s)
         if self.main.state is None and self.main.places:
             self.main.begin(t_s)
         for estimate in [self.main, *self.challengers]:
             estimate.take_sight(t_s, sight)
         self._judge(t_s)
+
+    def _check_fixed(self, t_s: float) -> None:
+        """Every CHECK_EVERY_S, say which fixed nodes seem to have moved."""
+        if t_s - self._watched_s < CHECK_EVERY_S:
+            return
+        self._watched_s = t_s
+        for node, watch in self._watches.items():
+            seen, sunk = newest_before(self.attitudes[node], t_s), newest_before(self.depths[node], t_s)
+            R = self.level_camera(node, seen[1]) if seen is not None and t_s - seen[0] < 1.0 else None
+            depth_m = sunk[1].depth_m if sunk is not None and t_s - sunk[0] < 1.0 else None
+            for problem in watch.judge(t_s, R, depth_m):
+                self._problems.report(problem, t_s)
 
     def _judge(self, t_s: float) -> None:
         """Follow the estimate that explains the pictures best."""
@@ -143,15 +160,15 @@ class NetFilter(TrackIntake):
 
     def _compare(self, t_s: float, fix: PairFix, one: int, two: int, *, settled: bool) -> None:
         """Open challengers where poses on end contradict the estimate: either node may be the one that is off."""
-        gap, chi2 = self.main.gap(t_s, fix, one, two)
+        _, chi2 = self.main.gap(t_s, fix, one, two)
         pair = fix.node, fix.other
         if chi2 < CONTRADICTS:
             self._contradicted[pair] = 0
             return
         self._contradicted[pair] = self._contradicted.get(pair, 0) + 1
         free = [node for node in pair if node not in self.main.places]
-        if not free:
-            self._say_contradiction(t_s, pair, math.dist(gap[:3], (0, 0, 0)), math.dist(gap[3:], (0, 0, 0)))
+        if self._contradicted[pair] >= CONTRADICTIONS:
+            self._say_contradiction(t_s, pair)
         if not settled or t_s - self._challenged_s.get(pair, -np.inf) < AGAIN_S:
             return
         self._challenged_s[pair] = t_s
@@ -166,12 +183,17 @@ class NetFilter(TrackIntake):
             if challenger.member_of(node) is not None:
                 self.challengers.append(challenger)
 
-    def _say_contradiction(self, t_s: float, pair: tuple[int, int], off_m: float, off_rad: float) -> None:
-        if self._contradicted[pair] < CONTRADICTIONS:
-            return
-        names = " and ".join(self.nodes[node].name for node in pair)
-        said = f"fixed nodes {names}: what they see of each other contradicts their places"
-        self._problems.report(f"{said}, by {off_m:.1f} m and {math.degrees(off_rad):.0f} deg", t_s)
+    def _say_contradiction(self, t_s: float, pair: tuple[int, int]) -> None:
+        fixed = [self.nodes[node].name for node in pair if node in self.main.places]
+        one, two = (self.nodes[node].name for node in pair)
+        if len(fixed) == 2:
+            said = f"fixed nodes {one} and {two}: what they see of each other contradicts their places"
+        elif fixed:
+            contradict = f"poses of {one} and {two} contradict the network"
+            said = f"{contradict}: has fixed node {fixed[0]} moved, or is it another's bar?"
+        else:
+            said = f"poses of {one} and {two} contradict the network: another's bar?"
+        self._problems.report(said, t_s)
 
 
 def _enter(estimate: NetEstimate, t_s: float, fix: PairFix) -> None:

@@ -10,7 +10,7 @@ import pytest
 from buddyline.node.sim import dive as simulation
 from buddyline.node.sim.scenario import DivePlan, Scenario
 from buddyline.node.sim.world import World
-from buddyline.protocol.messages import Candidates, LightTruth, Message, NodeInfo, NodePose, Truth
+from buddyline.protocol.messages import Candidates, FixedPlace, LightTruth, Message, NodeInfo, NodePose, Truth
 from buddyline.solver_service.config import SolveConfig, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_log
@@ -110,6 +110,7 @@ def changed(messages: list[Message], node: str, change: Callable[[NodeInfo], Nod
     ]
 
 
+@pytest.mark.slow
 def test_places_far_from_zero_cost_nothing(four: tuple[World, list[Message], list[NodePose]]) -> None:
     """Coordinates of a country's grid: thousands of kilometres."""
     _, messages, poses = four
@@ -135,6 +136,7 @@ def test_a_node_without_lamps_is_placed_and_in_no_pair(four: tuple[World, list[M
     assert sorted(core.pairs) == [("a", "c"), ("a", "d"), ("c", "d")]
 
 
+@pytest.mark.slow
 def test_absurd_values_end_nothing() -> None:
     world, messages = dive(6, 3.0)
     spoilt: list[Message] = []
@@ -160,3 +162,27 @@ def test_networks_err_as_they_say(grade: str) -> None:
     means = np.array([[one[node][:, 2].mean() for node in "bcd"] for one in found])
     assert 0.65 < means.mean() < 1.3, means
     assert all(one[node][:, 0].max() < 0.4 for one in found for node in "bcd")
+
+
+def test_a_fixed_node_that_moves_is_named() -> None:
+    """Node c, which moves, is said to be fixed where it was at the start."""
+    world, messages = dive(7, 8.0, more_nodes=("c",))
+
+    def stands(info: NodeInfo) -> NodeInfo:
+        start = world.node_truth("c", START_NS, "main")
+        return replace(info, fixed=FixedPlace(p_m=start.p_m, q_xyzw=start.q_xyzw))
+
+    _, core = solved(changed(messages, "c", stands))
+    assert core.network is not None
+    assert any("fixed node c moved" in problem for problem in core.network.problems), core.network.problems
+    _, core = solved(first_seconds(messages, 4.0))
+    assert core.network is not None
+    assert core.network.problems == []
+
+
+def test_nodes_of_two_nets_are_said() -> None:
+    _, messages = dive(8, 1.0, more_nodes=("c",), fixed_nodes=("a", "c"), imu=False)
+    messages = changed(messages, "c", lambda info: replace(info, fixed=replace(info.fixed, net="other")))
+    _, core = solved(messages)
+    assert core.network is not None
+    assert core.network.problems == ["fixed nodes name the nets main and other: all are taken for one frame"]
