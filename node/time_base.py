@@ -26,8 +26,9 @@ REMEMBER_NS: Final = 60 * S_NS
 # mid-dive must record at once. systemd gives a service 60 s to start.
 TIME_WITHIN_NS: Final = 45 * S_NS
 ASK_NS: Final = S_NS
-# "1": the kernel has set the clock from this chip at its start.
-RTC: Final = Path("/sys/class/rtc/rtc0/hctosys")
+RTC: Final = Path("/sys/class/rtc/rtc0")
+# A chip without a battery, such as a Pi 5's own, begins at 1970 with each start.
+NO_EARLIER_S: Final = 1_735_689_600
 
 
 def raw_ns() -> int:
@@ -129,7 +130,9 @@ def wait_for_time(
 
 
 def _is_set(rtc: Path) -> bool:
+    """Return whether the kernel has set the clock from this chip, and the chip has kept the time."""
     try:
-        return rtc.read_text().strip() == "1"
-    except OSError:
+        hctosys, since_epoch = ((rtc / name).read_text().strip() for name in ("hctosys", "since_epoch"))
+        return hctosys == "1" and int(since_epoch) > NO_EARLIER_S
+    except (OSError, ValueError):
         return False

@@ -98,18 +98,21 @@ class Waited:
 @pytest.mark.parametrize(
     ("answers", "chip", "waited_s", "known"),
     [
-        ([FOLLOWS], "", 0, True),
-        ([LOST, LOST, FOLLOWS], "", 2, True),
-        ([ChronyError("chronyd does not run"), FOLLOWS], "", 1, True),
-        ([LOST], "1\n", 0, True),
-        ([LOST], "0\n", 26, False),
-        ([None], "", 0, True),
+        ([FOLLOWS], None, 0, True),
+        ([LOST, LOST, FOLLOWS], None, 2, True),
+        ([ChronyError("chronyd does not run"), FOLLOWS], None, 1, True),
+        ([LOST], ("1", "1764000000"), 0, True),
+        ([LOST], ("0", "1764000000"), 26, False),
+        ([LOST], ("1", "31"), 26, False),
+        ([LOST], ("1", ""), 26, False),
+        ([None], None, 0, True),
     ],
 )
 def test_a_node_waits_for_its_time_after_the_start_of_its_machine(tmp_path, answers, chip, waited_s, known):
-    stop, rtc = Waited(), tmp_path / "hctosys"
+    stop = Waited()
     if chip:
-        rtc.write_text(chip)
+        (tmp_path / "hctosys").write_text(f"{chip[0]}\n")
+        (tmp_path / "since_epoch").write_text(f"{chip[1]}\n")
 
     def read():
         answer = answers.pop(0) if len(answers) > 1 else answers[0]
@@ -117,7 +120,7 @@ def test_a_node_waits_for_its_time_after_the_start_of_its_machine(tmp_path, answ
             raise answer
         return answer and decode_tracking(answer)
 
-    assert wait_for_time(stop, read, lambda: stop.boot_ns, rtc) is known
+    assert wait_for_time(stop, read, lambda: stop.boot_ns, tmp_path) is known
     assert stop.boot_ns == 20 * S_NS + waited_s * S_NS
     assert stop.boot_ns <= TIME_WITHIN_NS + 2 * S_NS
 
