@@ -32,6 +32,7 @@ from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import NodeStatus
+from buddyline.tools.dives import Dive
 
 from tests.disks import small_disk
 from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint, until
@@ -210,7 +211,7 @@ def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, capl
     with caplog.at_level(logging.WARNING):
         try:
             service.start()
-            until(lambda: service.outlet.sent["candidates"] > 2)
+            until(lambda: service.outlet.sent["candidates"] > 2 and service.outlet.sent["node_status"] > 0)
             clock.shift_ns = step_s * S_NS
             until(lambda: service.status_message and "in mid-dive" in service.status_message.problem)
             pictures, frames = service.outlet.sent["image"], service.outlet.sent["candidates"]
@@ -222,6 +223,12 @@ def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, capl
     with DiveLogReader(service.recorder.path) as reader:
         (said,) = [record.open().message for record in reader.records(lambda key: key.endswith("/clock_set"))]
     assert said.moved_ns == pytest.approx(step_s * S_NS, abs=MS_NS)
+    # As the commands read it, the node's clock and its uptime go on together.
+    with Dive([service.recorder.path]) as dive:
+        statuses = [one.message for one in dive.messages("node_status")]
+    begun_s = [status.stamp_ns / S_NS - status.uptime_s for status in statuses]
+    assert len(begun_s) > 1
+    assert max(begun_s) - min(begun_s) < 0.3
 
 
 @pytest.mark.parametrize("step_ns", [-3600 * S_NS, -S_NS, 0, S_NS])
