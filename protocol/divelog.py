@@ -18,6 +18,7 @@ from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.envelope import Envelope, open_envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
+from buddyline.protocol.parity import ParityWriter
 from buddyline.protocol.salvage import (
     CHANNEL_NOTE,
     MAGIC,
@@ -62,10 +63,27 @@ class Record(msgspec.Struct, frozen=True, gc=False):
         return open_envelope(self.key, self.payload, self.log_time_ns)
 
 
-class DiveLogWriter:
-    """Writes one MCAP file, which must not exist yet, in chunks of at most a second of log time."""
+class _WithParity:
+    """The stream that the MCAP writer writes to: a file, and the parity of what goes into it."""
 
-    def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None) -> None:
+    def __init__(self, file: Spool, parity: ParityWriter) -> None:
+        self._file = file
+        self._parity = parity
+        self.tell, self.flush = file.tell, file.flush
+
+    def write(self, data: bytes) -> int:
+        """Write to both."""
+        self._parity.add(data)
+        return self._file.write(data)
+
+
+class DiveLogWriter:
+    """Writes one MCAP file, which must not exist yet, in chunks of at most a second of log time.
+
+    parity: add what `buddyline repair` needs to restore damaged bytes (protocol.parity), an eighth of the file.
+    """
+
+    def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None, parity: bool = True) -> None:
         self.path = Path(path)
         try:
             self._file = Spool(self.path)
@@ -75,7 +93,9 @@ class DiveLogWriter:
             ) from None
         except OSError as error:
             raise BuddylineError(f"{self.path}: cannot be written: {error.strerror}") from error
-        self._writer = Writer(cast(IO[bytes], self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._parity = ParityWriter() if parity else None
+        stream = self._file if self._parity is None else _WithParity(self._file, self._parity)
+        self._writer = Writer(cast(IO[bytes], stream), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="buddyline", library="buddyline")
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
@@ -120,6 +140,7 @@ class DiveLogWriter:
             self._cut_ns = log_time_ns
         elif log_time_ns - self._cut_ns >= CHUNK_NS:
             self._writer.flush()
+            self._add_parity()
             self._cut_ns = log_time_ns
 
     def write_message(self, message: Message, log_time_ns: int | None = None, key: str | None = None) -> None:
@@ -143,15 +164,25 @@ class DiveLogWriter:
     def flush(self, *, sync: bool = False) -> None:
         """Finish and write the chunk; sync: also fsync. Raises OSError; the next call tries again."""
         self._writer.flush()
+        self._add_parity()
         self._cut_ns = None
         if sync:
             self._file.sync()
+
+    def _add_parity(self, *, last: bool = False) -> None:
+        """Write the parity that is due; all records before are complete."""
+        record = b"" if self._parity is None else self._parity.record(last=last)
+        if record and self._parity is not None:
+            self._parity.add(record)
+            self._file.write(record)
 
     def close(self) -> None:
         """Write the index and the end, and close the file; raise OSError."""
         if self._file.closed:
             return
         try:
+            self._writer.flush()
+            self._add_parity(last=True)
             self._writer.finish()
             self._file.flush()
             self._file.sync()

@@ -129,7 +129,7 @@ class PictureLog:
 
     def _next_file(self) -> DiveLogWriter:
         self._folder.mkdir(exist_ok=True)
-        writer = DiveLogWriter(self._folder / f"{self._number:06d}.mcap", metadata=self._metadata)
+        writer = DiveLogWriter(self._folder / f"{self._number:06d}.mcap", metadata=self._metadata, parity=False)
         self._number += 1
         return writer
 

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+import tempfile
 import time
 from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.parity import restore
 from buddyline.tools import losses
 from buddyline.tools.newfile import new_dive_log
 
@@ -21,7 +26,7 @@ SHOWN_GAPS: Final = 20
 def run(args: argparse.Namespace) -> int:
     """Repair one log; say what was lost."""
     # A wrong index would hide chunks; walking through the file finds them.
-    with DiveLogReader(args.input, trust_index=False) as reader:
+    with healed(Path(args.input), Path(args.output)) as path, DiveLogReader(path, trust_index=False) as reader:
         numbers, times_ns = array("q"), array("q")
         metadata = {**reader.metadata(), "repaired_from": Path(args.input).name}
         with new_dive_log(args.output, metadata) as writer:
@@ -33,9 +38,34 @@ def run(args: argparse.Namespace) -> int:
                 times_ns.append(min(record.log_time_ns, 2**63 - 1))
         lines = [*reader.damage, *missing(np.array(numbers, np.int64), np.array(times_ns, np.int64))]
     losses.report([f"{args.input}: {line}" for line in lines])
-    verdict = "what could be read of it" if lines else "it was whole"
+    intact = "it was whole" if path == Path(args.input) else "nothing of it is lost"
+    verdict = "what could be read of it" if lines else intact
     print(f"{args.output}: {len(numbers)} messages; {verdict}", file=sys.stderr)
     return 0
+
+
+@contextmanager
+def healed(path: Path, beside: Path) -> Iterator[Path]:
+    """Yield the log, or a copy whose damaged bytes are restored from the log's parity, and say so.
+
+    The copy is beside another path while it is used.
+    """
+    patches, lost = restore(path) if path.is_file() and path.stat().st_size else ({}, 0)
+    if lost:
+        print(f"{path}: {lost} damaged blocks are more than their parity restores", file=sys.stderr)
+    if not patches:
+        yield path
+        return
+    with tempfile.NamedTemporaryFile(dir=beside.parent, prefix=f"{beside.name}.", suffix=".part") as copy:
+        with open(path, "rb") as damaged:
+            shutil.copyfileobj(damaged, copy)
+        for offset, block in patches.items():
+            copy.seek(offset)
+            copy.write(block)
+        copy.flush()
+        size = sum(map(len, patches.values()))
+        print(f"{path}: {len(patches)} damaged blocks ({size} bytes) restored from the parity", file=sys.stderr)
+        yield Path(copy.name)
 
 
 def missing(numbers: np.ndarray, times_ns: np.ndarray) -> list[str]:

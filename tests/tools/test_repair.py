@@ -18,7 +18,7 @@ COUNT, EVERY = 100, 10
 def log(tmp_path):
     """A closed log of 100 messages in chunks of ten, and where its chunks begin."""
     path = tmp_path / "in.mcap"
-    with DiveLogWriter(path, metadata={"software": "test"}) as writer:
+    with DiveLogWriter(path, metadata={"software": "test"}, parity=False) as writer:
         for i in range(COUNT):
             message = Depth(node="ab"[i % 2], stamp_ns=i * TICK_NS, depth_m=float(i), sigma_m=0.02)
             writer.write_message(message)
