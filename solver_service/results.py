@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
-from buddyline.protocol.messages import Attitude, Candidates, Depth, NodeInfo, RelativePose
+from buddyline.protocol.messages import Attitude, Blob, Candidates, Depth, NodeInfo, RelativePose
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.direction import direction_of
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, skew
@@ -14,6 +15,9 @@ from buddyline.solver_service.sensors import SampleStream, attitude_at, depth_at
 from buddyline.solver_service.track.anchors import attitude_covariance
 from msgspec import UNSET
 from msgspec.structs import replace
+
+# Where the border cuts off a part of a light's spot, the light may be anywhere in a depth like that, either way: 1 sd.
+_CUT_SHARE: Final = 3.0**-0.5
 
 
 def rig_of(info: NodeInfo) -> Rig:
@@ -38,12 +42,16 @@ def rig_of(info: NodeInfo) -> Rig:
 
 
 def view_of(frame: Candidates) -> View:
-    """Return a frame's candidates as arrays; a missing score becomes NaN."""
+    """Return a frame's candidates as arrays; a missing score becomes NaN.
+
+    The noise of a candidate that reaches over the picture's border is widened: what it says of itself is of the part
+    inside.
+    """
     rows = [
         (
             blob.u_px,
             blob.v_px,
-            blob.sigma_px,
+            math.hypot(blob.sigma_px, _CUT_SHARE * _cut_px(blob, frame)),
             math.nan if blob.score is UNSET else blob.score,
             blob.area_px,
             1e-9 * blob.dt_ns,
@@ -52,6 +60,12 @@ def view_of(frame: Candidates) -> View:
     ]
     elsewhere = 0 if frame.elsewhere is UNSET else frame.elsewhere
     return View(np.array(rows, dtype=np.float64).reshape(-1, 6), frame.stamp_ns, elsewhere)
+
+
+def _cut_px(blob: Blob, frame: Candidates) -> float:
+    """Return how deep the picture's border cuts into a candidate: into a disk of its area."""
+    right_px, below_px = frame.width_px - 1 - blob.u_px, frame.height_px - 1 - blob.v_px
+    return max(math.sqrt(blob.area_px / math.pi) - min(blob.u_px, blob.v_px, right_px, below_px), 0.0)
 
 
 def sensed_of(attitude: SampleStream[Attitude], depth: SampleStream[Depth], stamp_ns: int) -> Sensed:

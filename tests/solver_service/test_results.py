@@ -1,10 +1,16 @@
-"""What a pose says in north-east-down: its sigmas against numeric differences and against drawn errors."""
+"""What a pose says in north-east-down: its sigmas against numeric differences and against drawn errors.
+
+And what the solver makes of candidates at the border of a picture.
+"""
+
+import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.messages import Blob, Candidates
 from buddyline.solver_service.geometry.direction import ANY_AZIMUTH_RAD, direction_of
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, rotation_exp
-from buddyline.solver_service.results import in_ned
+from buddyline.solver_service.results import in_ned, view_of
 from msgspec import UNSET
 
 from tests.tools.evaluated import pose
@@ -90,3 +96,16 @@ def test_absurd_sigmas_of_an_attitude_say_nothing():
     made = in_ned(pose(0), R_BODY_CAMERA, np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.01, 0.01, 1e200]))
     assert made.t_ned_m is UNSET
     assert made.sigma_ned_m is UNSET
+
+
+def test_a_candidate_that_the_border_cuts_is_worse_known_by_as_deep_as_the_cut():
+    area_px = math.pi * 20.0**2
+
+    def blob(u_px, v_px):
+        return Blob(u_px=u_px, v_px=v_px, sigma_px=0.6, area_px=area_px, peak=255.0, elongation=1.0, dt_ns=0)
+
+    blobs = [blob(400.0, 300.0), blob(21.0, 300.0), blob(8.0, 300.0), blob(400.0, 615.0 - 2.0)]
+    frame = Candidates(node="a", stamp_ns=1, trigger=0, seq=0, boot="t", width_px=820, height_px=616, blobs=blobs,
+                       truncated=0)  # fmt: skip
+    sigmas = [math.hypot(0.6, cut_px / math.sqrt(3.0)) for cut_px in (0.0, 0.0, 12.0, 18.0)]
+    assert view_of(frame).sigma_px == pytest.approx(sigmas)
