@@ -14,6 +14,8 @@ SILENT_S: Final = 1.5 / NODE_STATUS.rate_hz
 # All is said to be well only if each node and the solver have said something within this time. A page then shows a cut
 # within two seconds.
 WELL_S: Final = 1.6
+# An estimate of an instant this long before the newest that its nodes have said is of the past, however new it is here.
+BEHIND_S: Final = 2.0
 # When healthy nodes give no pose for NO_POSE_S, the reasons of the last REASONS_S are shown.
 NO_POSE_S: Final = 2.0
 REASONS_S: Final = 10.0

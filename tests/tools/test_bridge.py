@@ -412,6 +412,15 @@ class TestHttp:
         assert self.get(f"{path}/acoustic/filtered")["position_valid"] is False
         assert self.get(f"{path}/global")["fix_quality"] == 0
 
+    def test_a_place_that_is_behind_the_nodes_is_not_valid(self, served: tuple[Answers, str]) -> None:
+        state, address = served
+        for newest_k, valid in ((5, True), (30, False)):
+            placed = take(Placing("b"), *INFOS.values(), oriented(), attitude("b", at(newest_k)), estimate())
+            assert placed is not None
+            state.place(placed, None, None)
+            answer = self.get(f"{address}/api/v1/position/acoustic/filtered")
+            assert answer["position_valid"] is valid
+
     def test_every_key_s_last_message_is_there_and_unknown_paths_are_not(self, served: tuple[Answers, str]) -> None:
         state, address = served
         state.take(open_envelope("buddyline/node/a/status", encode(status("a", at(1))), at(1)))

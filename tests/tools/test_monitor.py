@@ -140,6 +140,17 @@ class TestHealth:
         (said,) = findings(picture, at(49))
         assert (said.level, said.text) == ("warning", "Not known to be well: nothing new from the solver.")
 
+    def test_fresh_words_about_the_past_are_not_well(self) -> None:
+        """A solver that is overloaded answers all the time, about what was seconds ago."""
+        picture = watched()
+        for k in range(30, 60):
+            for message in tick(k):
+                if not isinstance(message, RelativePose):
+                    take(picture, message, at(k))
+            take(picture, pose(k - 25), at(k))
+        (said,) = findings(picture, at(59))
+        assert said.text == "Not known to be well: what the solver says is 2 s behind the nodes."
+
     def test_clocks_that_are_apart_are_not_well(self) -> None:
         picture = watched()
         take(picture, replace(solver_status(at(29)), clock_skew_s=0.02), at(29))

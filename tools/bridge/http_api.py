@@ -19,7 +19,7 @@ from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.health import stale_after_s
+from buddyline.protocol.health import BEHIND_S, stale_after_s
 from buddyline.protocol.topics import TRACK
 from buddyline.tools.bridge.nmea import M_PER_HDOP
 from buddyline.tools.bridge.place import GeoPoint, OnEarth
@@ -78,7 +78,9 @@ class Answers:
             return self._last.get(path.removeprefix("/"))
 
     def _is_fresh(self) -> bool:
-        return self._placed is not None and self._now_ns() - self._placed[1] < stale_after_s(TRACK) * S_NS
+        if self._placed is None or self._placed[0].behind_s > BEHIND_S:
+            return False
+        return self._now_ns() - self._placed[1] < stale_after_s(TRACK) * S_NS
 
     def _acoustic(self) -> dict[str, object]:
         """Return x north, y east, z the depth (below the reference without a gauge), in metres; std: 1 sd."""

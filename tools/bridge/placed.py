@@ -34,6 +34,7 @@ class Placed:
     north-east-down, the compass's error counted. v_ned_mps, v_covariance: None where they are not known. depth_m: of
     the vehicle's own gauge. restarts: how often the estimate has begun anew. reference_yaw_rad: heading of the
     reference's body, None for the origin of a net. is_north_true: whether north is true north, not magnetic.
+    behind_s: how far stamp_ns is behind the newest attitude that has come.
     """
 
     vehicle: str
@@ -48,6 +49,7 @@ class Placed:
     reference_yaw_rad: float | None
     restarts: int
     is_north_true: bool
+    behind_s: float = 0.0
 
     @property
     def range_m(self) -> float:
@@ -113,6 +115,9 @@ class Placing:
         elif isinstance(message, Track | RelativePose) and self._net is None and self._is_ours(message):
             return self._in_pair(message)
         return None
+
+    def _newest_ns(self) -> list[int]:
+        return [stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None]
 
     def _is_ours(self, estimate: Estimate) -> bool:
         """Return whether an estimate is of our pair, and the best there is: a pose only where no track is fresh."""
@@ -243,6 +248,7 @@ class Placing:
             reference_yaw_rad=reference_yaw_rad,
             restarts=self._restarts,
             is_north_true=not is_magnetic or self._declination_rad is not None,
+            behind_s=max((newest_ns - stamp_ns for newest_ns in self._newest_ns()), default=0) / S_NS,
         )
 
 

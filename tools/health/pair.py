@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import (
+    BEHIND_S,
     CLOCK_OFF_S,
     CLOCKS_APART_S,
     HOT_DEGC,
@@ -68,12 +69,27 @@ def _unproven(picture: PairPicture, now_ns: int, live: bool) -> list[str]:
             missing.append(f"nothing new from node {end or 'a or b'}")
     if live and (picture.solver_heard_ns is None or now_ns - picture.solver_heard_ns > WELL_S * S_NS):
         missing.append("nothing new from the solver")
-    if picture.is_stale(now_ns):
+    shown = picture.shown(now_ns)
+    if shown is None or shown.stale:
         missing.append("no fresh track or pose")
+    elif (behind_s := _behind_s(picture, shown.estimate.stamp_ns)) > BEHIND_S:
+        missing.append(f"what the solver says is {behind_s:.0f} s behind the nodes")
     skew_s = UNSET if picture.solver is None else picture.solver.clock_skew_s
     if skew_s is not UNSET and abs(skew_s) > CLOCKS_APART_S:
         missing.append(f"the nodes' clocks are {abs(skew_s) * 1e3:.0f} ms apart")
     return missing
+
+
+def _behind_s(picture: PairPicture, stamp_ns: int) -> float:
+    """Return how far an estimate's time is behind the newest that its nodes have said, by the nodes' own clocks."""
+    said_ns = [
+        message.stamp_ns
+        for node in picture.end_nodes()
+        if node is not None
+        for message in (node.status, node.attitude, node.candidates[-1] if node.candidates else None)
+        if message is not None
+    ]
+    return (max(said_ns, default=stamp_ns) - stamp_ns) / S_NS
 
 
 def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
