@@ -12,8 +12,8 @@ from buddyline.solver_service.track.lights import BLOCK, in_picture, light_posit
 from buddyline.solver_service.track.stepping import HOLD_S
 
 # How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
-TURN_RADPS2: Final = 0.25
-PUSH_MPS2: Final = 0.2
+TURN_RADPS2: Final = 0.12
+PUSH_MPS2: Final = 0.1
 # A picture further ahead of the track than this is not foretold.
 FURTHEST_S: Final = 0.5
 # A light whose place is worse known than this share of the picture's width is not foretold.
