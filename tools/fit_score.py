@@ -38,7 +38,7 @@ FAR: Final = (0.6, 1.4)
 """Greatest range of a scene, as a share of the water's own: lamps that only just show count as well."""
 DARK_SHARE: Final = 0.2
 """Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
-STOPS: Final = (0.0, 0.0, -1.0, -2.0, -3.0, -5.0, -7.0, 1.0)
+STOPS: Final = (0.0, 0.0, 0.0, -1.0, -2.0, -3.0, -5.0, 1.0)
 SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
 GREY_SHARE: Final = 0.15
 DECOYS: Final = (

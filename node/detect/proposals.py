@@ -236,14 +236,10 @@ class ProposalFinder:
             self._halves[-1] = self._octaves[0].level
 
     def _fill_base(self, image: NDArray[np.uint8], base: NDArray[np.uint8]) -> None:
-        """Halve the picture down to the pyramid's base.
-
-        A picture that is halved at least twice is read on every other row only: at such a resolution the lens blurs
-        over more than two rows.
-        """
+        """Halve the picture down to the pyramid's base."""
         level = image
         halves = self._halves
-        if len(halves) > 1:
+        if row_step_of(self.base_step_px) > 1:
             height, width = halves[1].shape
             level = halve(_grey(level[: 4 * height : 2, : 4 * width]), halves[0][:height, : 2 * width])
             level = np.asarray(cv2.resize(level, (width, height), dst=halves[1]), np.uint8)
@@ -271,6 +267,22 @@ def _settle(
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def row_step_of(base_step_px: int) -> int:
+    """Return which rows of a picture are read, where a pixel of the pyramid's base has this side: all, or every other.
+
+    A picture that is halved at least twice has such a resolution that the lens blurs over more than two rows.
+    """
+    return 2 if base_step_px > 2 else 1
+
+
+def grey_into(image: NDArray[np.uint8], into: NDArray[np.uint8]) -> None:
+    """Write the grey levels of a (H, W, 3) BGR or (H, W) grey picture, or of a part of one, into an array (H, W)."""
+    if image.ndim == 2:
+        into[...] = image
+    else:
+        cv2.cvtColor(image, cv2.COLOR_BGR2GRAY, dst=into)
 
 
 def halve(image: NDArray[np.uint8], into: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from buddyline.node.detect.detection import Region
 from buddyline.node.detect.masks import Masks
-from buddyline.node.detect.proposals import ProposalFinder, Proposals
+from buddyline.node.detect.proposals import ProposalFinder, Proposals, grey_into, row_step_of
 from numpy.typing import NDArray
 
 # The sides of the tiles, px of the pyramid's base.
@@ -77,7 +77,8 @@ class RegionFinder:
             mosaic = self._mosaics.get((len(group), side_px, octaves))
             if mosaic is None:
                 finder = ProposalFinder(self._focal_px, octaves - 1, AT_LEAST * len(group))
-                mosaic = self._mosaics[len(group), side_px, octaves] = _Mosaic(finder, side_px, self._masks)
+                mosaic = _Mosaic(finder, side_px, row_step_of(self._step_px), self._masks)
+                self._mosaics[len(group), side_px, octaves] = mosaic
             found.append(mosaic.find(image, group, self._step_px << (octaves - 2), contrast_min, clutter_gain))
         return found[0] if len(found) == 1 else _joined(found)
 
@@ -106,8 +107,10 @@ class RegionFinder:
 class _Mosaic:
     """Tiles of a picture, one below the other, searched as one picture: the cost of a search is mostly fixed."""
 
-    def __init__(self, finder: ProposalFinder, side_px: int, masks: Masks | None) -> None:
+    def __init__(self, finder: ProposalFinder, side_px: int, row_step: int, masks: Masks | None) -> None:
+        """row_step: the finder reads every row_step-th row; the others stay empty."""
         self._finder = finder
+        self._row_step = row_step
         self._masks = masks
         self._side_px = side_px
         self._pixels = np.zeros((0, 0), np.uint8)
@@ -122,12 +125,13 @@ class _Mosaic:
     ) -> Proposals:
         """Find the places within the tiles' regions, of octaves with pixels of at most coarsest_px."""
         side_px = self._side_px
-        shape = (len(tiles) * side_px, side_px, *image.shape[2:])
+        shape = (len(tiles) * side_px, side_px)
         if self._pixels.shape != shape:
-            self._pixels = np.empty(shape, np.uint8)
+            self._pixels = np.zeros(shape, np.uint8)
         for i, tile in enumerate(tiles):
             u, v = tile.origin_px
-            self._pixels[i * side_px : (i + 1) * side_px] = image[v : v + side_px, u : u + side_px]
+            part = image[v : v + side_px : self._row_step, u : u + side_px]
+            grey_into(part, self._pixels[i * side_px : (i + 1) * side_px : self._row_step])
         # A place in the mosaic plus its tile's origin is the place in the picture.
         origin = np.array([tile.origin_px for tile in tiles], np.float64)
         origin[:, 1] -= np.arange(len(tiles)) * side_px

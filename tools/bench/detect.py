@@ -41,7 +41,7 @@ ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
 SEED: Final = 3
 GUIDED: Final = f"{OURS}, guided"
 # How far the track foretells a light off its place at 10 Hz, 1 sd, as a share of the picture's width.
-SIGMA: Final = 0.004
+SIGMA: Final = 0.0025
 STEP_S: Final = 3.7
 ROUNDS: Final = 5
 APRILTAGS: Final = "pupil-apriltags"
