@@ -54,6 +54,11 @@ class NetTracker:
         """The nodes that the network knows, members or not."""
         return self._nodes
 
+    def seen(self) -> set[tuple[str, str]]:
+        """Return whose lamps who may have seen: (observer, other) of all members in each other's pictures so far."""
+        pairs = self._filter.main.detection if self._filter is not None else ()
+        return {(self._nodes[observer], self._nodes[other]) for observer, other in pairs}
+
     @property
     def problems(self) -> list[str]:
         """What is wrong, and what was (it says so)."""

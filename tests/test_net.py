@@ -3,7 +3,10 @@
 import json
 
 import pytest
-from buddyline.protocol.divelog import DiveLogReader
+from buddyline.protocol.codec import encode
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import FixedPlace
+from msgspec.structs import replace
 
 from tests.processes import buddyline, recorded_solver, until
 
@@ -37,3 +40,26 @@ def test_four_nodes_on_one_hub_are_in_one_frame(dive, tmp_path):
         assert found[node]["samples"] > 20
         assert found[node]["position_m"]["median"] < 0.05
         assert found[node]["wrong"] == 0
+
+
+def test_a_tripod_of_lamps_alone_is_used_by_its_file(dive, tmp_path):
+    """Node c is fixed and has two lamps, no camera and no log: its NodeInfo comes from a file."""
+    with DiveLogReader(dive) as reader:
+        told = [record.open().message for record in reader.records(lambda key: key == "buddyline/node/c/info")]
+        true = [record.open() for record in reader.records(lambda key: key == "buddyline/net/main/truth/c")]
+    start = true[0].message
+    fixed = FixedPlace(p_m=start.p_m, q_xyzw=start.q_xyzw, sigma_m=0.3, sigma_rad=0.3)
+    (tmp_path / "c.json").write_bytes(encode(replace(told[0], role="lights", fixed=fixed)))
+    logs = []
+    for node in "abd":
+        logs.append(tmp_path / f"{node}.mcap")
+        with DiveLogReader(dive) as reader, DiveLogWriter(logs[-1]) as writer:
+            for record in reader.records(lambda key, own=f"buddyline/node/{node}/": key.startswith(own)):
+                if "truth" not in record.key:
+                    writer.write_message(record.open().message)
+    out = tmp_path / "out.mcap"
+    done = buddyline("solve", *logs, "-o", out, "--track", "filter", "--info", f"c={tmp_path / 'c.json'}", "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert {(one["node_a"], one["node_b"]) for one in told["pairs"]} == {("a", "b"), ("a", "d"), ("b", "d")}
+    assert {one["node"] for one in told["network"]} >= {"a", "b", "d"}

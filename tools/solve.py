@@ -46,12 +46,14 @@ def run(args: argparse.Namespace) -> int:
         nodes = _with_info(dive, nodes, infos, given=args.nodes is not None)
         if len(nodes) > 2 and (args.clock_offset is not None or args.clocks is not None):
             raise ConfigError("--clock-offset and --clocks are of one pair; choose it with --nodes A B")
+        # Nodes of lamps alone, or of a camera alone, are in the network, and in no pair.
+        lone = [node for node, info in infos.items() if not _is_full(info) and (node in nodes or not args.nodes)]
         core = SolverCore(
             settings,
             [pair for pair in combinations(nodes, 2) if all(_is_full(infos[node]) for node in pair)],
             chosen_curves(dive, nodes, args.clock_offset, args.clocks),
             track=track_settings(args.track, args.track_hz),
-            lone=[] if args.nodes else [node for node, info in infos.items() if not info.has_camera],
+            lone=lone,
         )
         attitudes = _attitudes(dive, args, nodes)
         began_s, tracks = time.monotonic(), defaultdict[tuple[str, ...], Tracked](Tracked)
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             for info in replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
-            envelopes = messages_of(dive, args, infos, *nodes, doing="solve")
+            envelopes = messages_of(dive, args, infos, *dict.fromkeys([*nodes, *lone]), doing="solve")
             if attitudes:
                 from buddyline.tools.attitudes import in_place_of
 
@@ -151,7 +153,7 @@ def messages_of(
     dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *nodes: str, doing: str
 ) -> Iterator[Envelope]:
     """Yield the messages for solver and output; pictures of a node without candidates are detected."""
-    raw = [node for node in nodes if node not in dive.nodes("candidates")]
+    raw = [node for node in nodes if node in dive.nodes("image") and node not in dive.nodes("candidates")]
     detector = None
     if raw:
         from buddyline.tools.detect import DiveDetector, recorded_masks

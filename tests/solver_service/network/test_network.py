@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -129,11 +129,21 @@ def test_places_far_from_zero_cost_nothing(four: tuple[World, list[Message], lis
         assert one.p_m == pytest.approx((x + 6.5e6, y + 5e5, z), abs=1e-3)
 
 
-def test_a_node_without_lamps_is_placed_and_in_no_pair(four: tuple[World, list[Message], list[NodePose]]) -> None:
-    _, messages, _ = four
-    messages = changed(first_seconds(messages, 1.0), "b", lambda info: replace(info, role="camera"))
-    _, core = solved(messages)
-    assert sorted(core.pairs) == [("a", "c"), ("a", "d"), ("c", "d")]
+@pytest.mark.parametrize("role", ["lights", "camera"])
+def test_a_fixed_node_of_lamps_or_of_a_camera_alone_is_used(role: Literal["lights", "camera"]) -> None:
+    """Node c stands on a tripod; it is in no pair, but its lamps are seen, or it sees those of others."""
+    world, messages = dive(3, 3.0, fixed_nodes=("a", "c"))
+    messages = changed(messages, "c", lambda info: replace(info, role=role))
+    if role == "lights":
+        messages = [one for one in messages if isinstance(one, NodeInfo) or getattr(one, "node", "") != "c"]
+    poses, core = solved(messages)
+    assert sorted(core.pairs) == [("a", "b"), ("a", "d"), ("b", "d")]
+    assert core.network is not None
+    seen = core.network.seen()
+    assert (("b", "c") in seen, ("c", "b") in seen) == (role == "lights", role == "camera")
+    found = errors(world, poses)
+    assert sorted(found) == ["a", "b", "c", "d"]
+    assert all(np.median(found[node][:, 0]) < 0.05 for node in "bd")
 
 
 @pytest.mark.slow
