@@ -191,6 +191,19 @@ def test_gps_in_height_is_apart_from_gps_on_the_map():
     assert math.hypot(*adjusted.positions["0"].sigmas_m[:2]) > 10
 
 
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        (Known(from_="0", to="x1", distance_m=3.0), "no leg has station x1"),
+        (Known(from_="0", to="1"), "give distance_m"),
+    ],
+)
+def test_a_known_line_that_says_nothing_is_refused(known, said):
+    legs = world.readings_of(world.line(np.random.default_rng(4), 3), np.random.default_rng(1))
+    with pytest.raises(BuddylineError, match=said):
+        adjust(world.project_of(legs, known=[known]))
+
+
 def test_what_nothing_determines_is_a_known_error():
     with pytest.raises(BuddylineError, match="nothing observes"):
         normal.Normal((np.array([0]), np.array([0])), np.array([1.0]), np.array([1.0]), np.array([0, -1]))

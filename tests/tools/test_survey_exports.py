@@ -220,6 +220,8 @@ def test_tables_and_geojson_hold_every_leg_and_station():
     legs = list(csv.DictReader(io.StringIO(tables.legs_csv(Sheet(project, adjusted)))))
     assert [row["from"] for row in legs] == [leg.from_ for leg in [*project.leg, point]]
     assert legs[3]["alarms"].startswith("field")
+    # A loop checks its distances, but not to the centimetre.
+    assert all(0.05 < float(row["detectable_m"]) < 5.0 for row in legs[:14])
     stations = {row["name"]: row for row in csv.DictReader(io.StringIO(tables.stations_csv(Sheet(project, adjusted))))}
     assert stations["amphora"]["kind"] == "point"
     assert float(stations["0"]["latitude_deg"]) == pytest.approx(45.5, abs=1e-7)

@@ -95,6 +95,11 @@ class Survey:
         for name in self.fixed:
             if name not in stations:
                 raise BuddylineError(f"fix of {name!r}: no leg has this station; known: {', '.join(sorted(stations))}")
+        for one in project.known:
+            if missing := {one.from_, one.to} - stations:
+                raise ConfigError(f"known line {one.from_}-{one.to}: no leg has station {', '.join(sorted(missing))}")
+            if one.distance_m is UNSET and one.azimuth_deg is UNSET:
+                raise ConfigError(f"known line {one.from_}-{one.to}: give distance_m, azimuth_deg or both")
         azimuths = any(one.azimuth_deg is not UNSET for one in project.known)
         if project.adjust.compass == "ignore" and len(self.fixed) < 2 and not azimuths:
             raise ConfigError('adjust.compass = "ignore": north needs a [[known]] azimuth_deg or two fixed points')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from buddyline.tools.survey.assembly import Fixed
@@ -13,6 +14,9 @@ from buddyline.tools.survey.lines import Line, bearing_of
 from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET
+
+# Survex refuses, as a warning, sights that differ by three sd of their difference.
+SEEN_SIGMAS: Final = 2.5
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,9 @@ class Sheet:
             0.0 if read is None else math.remainder(read - azimuth_deg - turn_deg, 360)
             for read, turn_deg in ((fore_deg, 0.0), (back_deg, 180.0))
         )
-        if both and number not in survey.carried:
+        sigma_deg = math.degrees(line.measures.azimuth[1]) * (math.sqrt(2) if both else 1.0)
+        near = abs(off_deg[0] - off_deg[1]) < SEEN_SIGMAS * math.sqrt(2) * sigma_deg
+        if both and near and number not in survey.carried:
             # Their mean is corrected; what the sights differ by stays to be seen.
             off_deg = (0.5 * (off_deg[0] + off_deg[1]),) * 2
         distance_m, remark, scale = leg.distance_m, remark_on(leg), line.measures.distance[0] / leg.distance_m
@@ -174,7 +180,7 @@ class Sheet:
             clino_deg=math.degrees(math.asin(max(-1.0, min(1.0, line.rise_m / (distance_m * scale))))),
             depth_from_m=depths[0],
             depth_to_m=depths[1],
-            compass_sigma_deg=math.degrees(line.measures.azimuth[1]) * (math.sqrt(2) if both else 1.0),
+            compass_sigma_deg=sigma_deg,
             by_clino=line.by_clino,
             held=held,
             looped=looped,

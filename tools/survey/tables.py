@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.connected import station_depths
+from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.geodesy import leg_date
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
@@ -44,7 +45,13 @@ def _csv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> str:
 
 
 def legs_csv(sheet: Sheet) -> str:
-    """Return every leg and point with all its readings; `used` says whether it took part."""
+    """Return every leg and point with all its readings; `used` says whether it took part.
+
+    detectable_m: the least error of its distance that its residual would show; empty where nothing checks it.
+    """
+    adjusted = sheet.adjusted
+    errors_m, row_of = detectable(adjusted.solution), adjusted.solution.observations.rows
+    least_m = {id(leg): float(errors_m[row_of[n, "distance"]]) for n, leg in enumerate(adjusted.survey.legs)}
     chi2 = {id(one.leg): one.chi2 for one in sheet.adjusted.residuals}
     left_out = {id(leg): why for leg, why in sheet.adjusted.left_out}
     rows = []
@@ -52,9 +59,11 @@ def legs_csv(sheet: Sheet) -> str:
         why, value = left_out.get(id(leg), ""), chi2.get(id(leg))
         row = to_builtins(leg) | {"disturbed": " ".join(leg.disturbed), "alarms": "; ".join(leg.alarms)}
         row |= {"used": "no" if why else "yes", "why_not": why}
-        rows.append(row | {"residual_chi2": "" if value is None else f"{value:.2f}"})
+        row["residual_chi2"] = "" if value is None else f"{value:.2f}"
+        shown_m = least_m.get(id(leg), math.inf)
+        rows.append(row | {"detectable_m": f"{shown_m:.3f}" if math.isfinite(shown_m) else ""})
     fields = [name for name in Leg.__struct_encode_fields__ if name not in ("unused", "alarms", "disturbed")]
-    return _csv([*fields, "disturbed", "alarms", "used", "why_not", "residual_chi2"], rows)
+    return _csv([*fields, "disturbed", "alarms", "used", "why_not", "residual_chi2", "detectable_m"], rows)
 
 
 def _station_rows(sheet: Sheet) -> list[dict[str, Any]]:

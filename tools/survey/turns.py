@@ -69,7 +69,8 @@ def _turn(
 ) -> tuple[float, float, float, float] | None:
     """Return the angle (rad, whole turns included), its time (s), and the 1 sd of both rests' sights (rad).
 
-    The last is the random walk, rad^2/s, that the sights show during the rests.
+    The last is the random walk, rad^2/s, that the sights show during the rests: a walk over T has a variance of its
+    rate times T / 6, beside the white noise that neighbours differ by.
     """
     imu = node.imu
     part = imu.between(int(stamps_ns[before[0]]), int(stamps_ns[after[-1]]))
@@ -101,21 +102,11 @@ def _turn(
         )
     )
     walks = [
-        _walk(times_s[which], one)
+        6 * float(one.var(ddof=1) - 0.5 * (np.diff(one) ** 2).mean()) / float(np.ptp(times_s[which]))
         for one, which in zip(azimuths, (before, after), strict=True)
         if len(one) > LEAST_SIGHTS
     ]
     return turned, float(times_s[after].mean() - times_s[before].mean()), scatter, float(np.mean(walks or [0.0]))
-
-
-def _walk(times_s: Floats, azimuths: Floats) -> float:
-    """Return the rate of a random walk, rad^2/s, beside white noise, by which neighbours differ.
-
-    About its trend, which the zero explains, a walk over T has a variance of its rate times T / 15.
-    """
-    away = azimuths - np.polyval(np.polyfit(times_s - times_s[0], azimuths, 1), times_s - times_s[0])
-    white = 0.5 * float((np.diff(away) ** 2).mean())
-    return 15 * (float(away @ away) / (len(away) - 2) - white) / float(np.ptp(times_s))
 
 
 def _levelling(up: Floats) -> Floats:
