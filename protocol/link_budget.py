@@ -12,6 +12,8 @@ from buddyline.protocol.topics import Topic
 # A link is full if so many bytes, more than a packet, wait in each observation of this time.
 FULL_BYTES: Final = 2048
 FULL_S: Final = 0.3
+# Longer than a lost packet holds up a connection, as a rule.
+BEHIND_S: Final = 1.0
 # It is then given less than was sent, not again before the link can have reacted, and more again while nothing waits.
 AGAIN_S: Final = 1.0
 LESS: Final = 0.8
@@ -71,6 +73,19 @@ class LinkBudget:
                 self._tokens = max(self._tokens - cost, -self._limit)
             self._offered += cost
             self._sent[topic.name] += 1
+            return True
+
+    def admits_copy(self, size_bytes: int, now_s: float) -> bool:
+        """Return whether to send a copy of a message as a datagram; if so, count it as sent.
+
+        A copy only counts as the next message: behind a full connection it would take that one's room for nothing.
+        """
+        with self._lock:
+            if self._limit is None or now_s - self._clear_s > BEHIND_S:
+                return False
+            self._refill(now_s, self._limit)
+            self._tokens = max(self._tokens - size_bytes - OVERHEAD_BYTES, -self._limit)
+            self._offered += size_bytes + OVERHEAD_BYTES
             return True
 
     def observe(self, state: TcpState, now_s: float) -> None:

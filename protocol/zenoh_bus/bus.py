@@ -173,7 +173,7 @@ class ZenohBus(Bus):
 
         def hurry(payload: bytes, source: zenoh.SourceInfo) -> None:
             self._link.flush()
-            if self._budget.bytes_per_s is not None and self._link.is_long:
+            if self._link.is_long and self._budget.admits_copy(len(payload), time.monotonic()):
                 self._datagrams.open()
                 if self._datagrams.session is not None:
                     self._datagrams.session.put(key, payload, source_info=source, attachment=COPY, **settings)

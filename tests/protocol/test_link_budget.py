@@ -77,3 +77,16 @@ def test_a_link_that_recovers_carries_everything_again() -> None:
     sent, _ = run(1e6, 240.0, budget, start_s=20.0)
     assert budget.bytes_per_s is None
     assert sent["imu"] == 12000
+
+
+def test_copies_go_on_a_slow_link_that_is_not_behind() -> None:
+    budget = LinkBudget()
+    run(1e6, 5.0, budget)
+    assert not budget.admits_copy(1000, 5.0)
+    run(12e3, 20.0, budget, start_s=5.0)
+    for step in range(20):
+        budget.observe(TcpState(0, 0, 0, 0, 0.4), 25.0 + step / 10)
+    assert budget.admits_copy(1000, 27.0)
+    for step in range(20):
+        budget.observe(TcpState(0, 4096, 0, 0, 0.4), 27.0 + step / 10)
+    assert not budget.admits_copy(1000, 29.0)
