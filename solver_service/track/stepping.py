@@ -23,7 +23,7 @@ from buddyline.solver_service.track.lights import (
     residuals,
 )
 from buddyline.solver_service.track.smoother import Path
-from buddyline.solver_service.track.state import GYRO_BIAS, MOUNT, MOVING, NAV, PHI, SIZE, State
+from buddyline.solver_service.track.state import CLOCK, GYRO_BIAS, MOUNT, MOVING, NAV, PHI, R_, SIZE, V_, State
 from buddyline.solver_service.track.strapdown import (
     Increment,
     Noise,
@@ -219,6 +219,7 @@ class TrackSteps(TrackIntake):
         observer = sight.node
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
+        sight = _widened(sight, H, estimate.covariance)
         detection = estimate.detection[observer]
         wide = estimate.covariance[:3, :3].trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
         if wide:
@@ -393,3 +394,17 @@ class TrackSteps(TrackIntake):
         after, F = propagate(estimate.state, parts, span_s)
         Q, walk, _ = process_noise(after, parts, self._noises(t_s), estimate.shaking.variances, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)
+
+
+def _widened(sight: Sight, H: Floats, P: Floats) -> Sight:
+    """Give a picture whose sigmas hold what its Jacobians H (K, L, 2, C) leave out of the clock.
+
+    In A's pictures B stands at r + c v. Where both the clock c and the velocity v are unknown their product's variance,
+    var c var v + cov(c, v)^2, is no part of H P H^T: a track would believe an offset within its first second.
+    """
+    if sight.node or not len(H):
+        return sight
+    unknown = P[CLOCK, CLOCK] * P[V_, V_] + np.outer(P[V_, CLOCK], P[V_, CLOCK])
+    by_place = H[0, 0, :, R_]
+    variance_px2 = 0.5 * float(np.trace(by_place @ unknown @ by_place.T))
+    return replace(sight, sigma_px=np.sqrt(sight.sigma_px**2 + variance_px2))
