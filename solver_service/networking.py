@@ -13,7 +13,7 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Attitude, Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
-from buddyline.solver_service.network.estimate import NetRow, Place
+from buddyline.solver_service.network.estimate import KnownPlace, NetRow
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
@@ -155,7 +155,7 @@ class NetTracker:
             # What it told before the network knew it.
             self._feed(self._filter, len(self._nodes) - 1, self._streams[node], self._taken_ns - S_NS, self._taken_ns)
 
-    def _place(self, info: NodeInfo) -> Place | None:
+    def _place(self, info: NodeInfo) -> KnownPlace | None:
         if info.fixed is UNSET:
             return None
         named = {one.fixed.net for one in self._infos.values() if one.fixed is not UNSET}
@@ -166,7 +166,7 @@ class NetTracker:
             # Coordinates may be of a whole country: the estimator counts from the first fixed node.
             self._zero_m = np.array(info.fixed.p_m)
         R = quat_to_matrix(np.array(info.fixed.q_xyzw))
-        return Place(np.array(info.fixed.p_m) - self._zero_m, R, info.fixed.sigma_m, info.fixed.sigma_rad)
+        return KnownPlace(np.array(info.fixed.p_m) - self._zero_m, R, info.fixed.sigma_m, info.fixed.sigma_rad)
 
     def _feed(self, track: NetFilter, index: int, stream: NodeStream, start_ns: int, end_ns: int) -> None:
         stamps_ns, values = stream.imu.between(start_ns, end_ns)

@@ -12,7 +12,7 @@ from buddyline.node.sim.randomness import Sway, generator
 from buddyline.node.sim.rig import R_BODY_CAMERA
 from buddyline.node.sim.rotation import Vector
 from buddyline.node.sim.scenario import InertialGrade
-from buddyline.node.sim.trajectory import Motion
+from buddyline.node.sim.trajectory import NodesMotion
 from buddyline.protocol.clock import MS_NS, S_NS
 
 GRAVITY_MPS2: Final = 9.80665
@@ -60,7 +60,9 @@ class InertialUnit:
     lever_m, stated_lever_m: (3,), its true place and the one in NodeInfo, in the camera frame.
     """
 
-    def __init__(self, seed: int, index: int, motion: Motion, grade: InertialGrade, heading_off_rad: float) -> None:
+    def __init__(
+        self, seed: int, index: int, motion: NodesMotion, grade: InertialGrade, heading_off_rad: float
+    ) -> None:
         rng = generator(seed, "inertial", index)
         self._grade = GRADES[grade]
         self._motion, self._seed, self._index = motion, seed, index

@@ -15,7 +15,7 @@ from buddyline.node.sim.rotation import Matrix, Vector
 from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.tags import SeenTag
 from buddyline.node.sim.team import TeamMotion
-from buddyline.node.sim.trajectory import Motion, PairMotion, Placement
+from buddyline.node.sim.trajectory import NodesMotion, PairMotion, Placement
 
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0
@@ -108,7 +108,7 @@ class Scene:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.motion: Motion = TeamMotion(scenario) if scenario.is_team else PairMotion(scenario)
+        self.motion: NodesMotion = TeamMotion(scenario) if scenario.is_team else PairMotion(scenario)
         nodes = scenario.nodes
         self._dead = {
             (i, s) for i, node in enumerate(nodes) for s in (LEFT, RIGHT) if _named(node, s) in scenario.dead_lamps

@@ -28,7 +28,7 @@ class Placement:
     position_ned_m: Vector
 
 
-class Motion(Protocol):
+class NodesMotion(Protocol):
     """Where each node of a scenario is at any time."""
 
     def placement(self, index: int, t_s: float) -> Placement:

@@ -71,7 +71,7 @@ SKIP_S: Final = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class KnownPlace:
     """Where a fixed node stands in the net's frame: p_m (3,), R (3, 3) camera to net, and how well it is known."""
 
     p_m: Floats
@@ -127,7 +127,7 @@ class NetEstimate:
 
     def __init__(self, intake: TrackIntake) -> None:
         self.intake = intake
-        self.places: dict[int, Place] = {}
+        self.places: dict[int, KnownPlace] = {}
         self.dark: set[int] = set()
         self.members: list[Member] = []
         self.state: NetState | None = None

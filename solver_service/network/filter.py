@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
-from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix, Place
+from buddyline.solver_service.network.estimate import CONTRADICTS, KnownPlace, NetEstimate, NetRow, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
@@ -60,7 +60,7 @@ class NetFilter(TrackIntake):
         self._watches: dict[int, FixedWatch] = {}
         self._watched_s = -np.inf
 
-    def add_node(self, node: TrackNode, place: Place | None = None, *, shines: bool = True) -> int:
+    def add_node(self, node: TrackNode, place: KnownPlace | None = None, *, shines: bool = True) -> int:
         """Take a node into the network, and return its index. place: of a fixed node. shines: whether it has lamps."""
         self.nodes.append(node)
         self.samples.append(Samples())

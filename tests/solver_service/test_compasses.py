@@ -29,8 +29,10 @@ def judged(gap_deg, learned_deg=None, *, follows=False):
 def test_what_two_compasses_can_explain(sign):
     agrees, neither, contradicts = (True, False), (False, False), (False, True)
     assert judged(20 * sign) == agrees
-    # Steel beside one of them, or a third's bar.
-    assert judged(30 * sign) == contradicts
+    # Steel beside one of them.
+    assert judged(30 * sign) == agrees
+    # More of it, or a third's bar.
+    assert judged(40 * sign) == contradicts
     assert judged(156 * sign) == contradicts
     # Learned: it is believed, and left for what follows from earlier poses alone.
     assert judged(80 * sign, 82 * sign) == agrees

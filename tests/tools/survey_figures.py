@@ -68,8 +68,6 @@ def measure(campaign, seed, directory, figures):
         4.0,
         disturb=lambda _, station: bad.get(station, 0.0),
         pause_s=pause_s,
-        # It refuses poses that disturbed compasses contradict.
-        unchecked=("attitude",) if campaign.disturbed else (),
     )
     derived = Derived()
     derived.add(of_messages(messages), SurveySettings(), AlarmSettings())

@@ -218,17 +218,15 @@ class _Node:
         )
 
 
-def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s=0.0, unchecked=()):
+def dive(course, rng, flaws=None, rest_s=10.0, swim_s=8.0, disturb=None, pause_s=0.0):
     """Return all messages of a leapfrog survey along a course, poses and rejections of the true solver included.
 
     disturb: of a node's index and a station's, to its compass's error there (degrees). After each rest the nodes
-    see nothing of each other for swim_s, and for pause_s more, of which there are no messages. unchecked: checks that
-    the solver leaves out.
+    see nothing of each other for swim_s, and for pause_s more, of which there are no messages.
     """
     flaws = flaws or Flaws()
     nodes = [_Node(rng, 0, flaws), _Node(rng, 1, flaws)]
-    checks = [check for check in SolveConfig().checks if check not in unchecked]
-    core = SolverCore(SolveConfig(checks=checks).settings("test"), [("a", "b")])
+    core = SolverCore(SolveConfig().settings("test"), [("a", "b")])
     out = []
 
     def take(*messages):

@@ -219,7 +219,7 @@ def test_a_disturbed_field_is_noticed_and_its_compass_not_used():
     def disturb(index, number):
         return 15.0 if (index, number) == (1, 3) else 0.0
 
-    found = derived(world.dive(course, rng, flaws, rest_s=7.0, swim_s=1.0, disturb=disturb, unchecked=("attitude",)))
+    found = derived(world.dive(course, rng, flaws, rest_s=7.0, swim_s=1.0, disturb=disturb))
     # Node b stands at station 3 in legs 2-3 and 3-4.
     assert [leg.disturbed for leg in found.legs] == [[], [], ["b"], ["b"], []]
     leg = found.legs[2]

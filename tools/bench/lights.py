@@ -73,7 +73,7 @@ class Light:
 
 
 @dataclass(slots=True)
-class Seen:
+class SeenLights:
     """What was found in the pictures of one water. scores: of all candidates; lamp: whether each is one, of anyone."""
 
     pictures: int = 0
@@ -112,7 +112,7 @@ def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     if args.scenes < 1 or args.seconds <= FIRST_COUNTED * PERIOD_NS / S_NS or args.strange < 0 or args.seed < 0:
         raise BuddylineError("--scenes: at least 1; --seconds: above 1; --strange, --seed: 0 or more")
     cv2.setNumThreads(1)
-    seen = {water: Seen() for water in args.environment}
+    seen = {water: SeenLights() for water in args.environment}
     for water, found in seen.items():
         for seed in range(args.seed, args.seed + args.scenes):
             for blobs, lights, of_lamp in look(water, seed, args.seconds, args.strange, scene=args.scene):
@@ -208,7 +208,7 @@ CLASSES: Final[Mapping[str, Callable[[Light], bool]]] = {
 """Classes of lights, by name: whether one belongs to it."""
 
 
-def _of_water(water: str, seen: Seen) -> dict[str, Any]:
+def _of_water(water: str, seen: SeenLights) -> dict[str, Any]:
     lights = seen.lights
     return {
         "water": water,

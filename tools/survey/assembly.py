@@ -67,7 +67,7 @@ class Assembly:
     turns_rad: Sequence[float]
 
 
-class _Gauges:
+class _GaugeReadings:
     """Terms of depth readings."""
 
     def __init__(self, of: Observations, legs: Sequence[Leg], tides: Sequence[int]) -> None:
@@ -134,7 +134,7 @@ def depths_alone(legs: Sequence[Leg], tides: Sequence[int]) -> Assembly:
 
 
 def _add_depths(to: Assembly, tides: Sequence[int], level_m: float, *, free_level: bool = False) -> None:
-    of, gauges = to.observations, _Gauges(to.observations, to.legs, tides)
+    of, gauges = to.observations, _GaugeReadings(to.observations, to.legs, tides)
     for number, (leg, (start, end)) in enumerate(zip(to.legs, to.ends, strict=True)):
         for what, name, node, depth in (
             ("depth_from", start, leg.from_node, from_depth(leg)),
@@ -217,7 +217,7 @@ def assemble(
 
 def _add_rises(to: Assembly, tides: Sequence[int]) -> None:
     """Let each leg keep the difference of its own two readings."""
-    of, gauges = to.observations, _Gauges(to.observations, to.legs, tides)
+    of, gauges = to.observations, _GaugeReadings(to.observations, to.legs, tides)
     for number, (leg, names) in enumerate(zip(to.legs, to.ends, strict=True)):
         depths = from_depth(leg), to_depth(leg)
         if depths[0] is None or depths[1] is None:

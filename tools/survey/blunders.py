@@ -212,7 +212,7 @@ def _size(solution: Solution, after: Solution, suspect: _Suspect) -> tuple[float
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _Identified:
     suspect: _Suspect
     change: Change
     cause: str
@@ -220,7 +220,7 @@ class _Judged:
     same: bool
 
 
-def _identified(survey: Survey, taken: Change, suspect: _Suspect) -> _Judged:
+def _identified(survey: Survey, taken: Change, suspect: _Suspect) -> _Identified:
     """Try a stay at a misnamed station: return the station that its place is, if it has a name already."""
     after = survey.adjust(taken.with_(suspect.change), linear=True)
     new = next(iter(suspect.change.names.values()))
@@ -233,5 +233,5 @@ def _identified(survey: Survey, taken: Change, suspect: _Suspect) -> _Judged:
         change = Change(names=dict.fromkeys(suspect.visit, name))
         joined = survey.adjust(taken.with_(change), linear=True)
         if joined.chi2 - after.chi2 < SAME_CHI2:
-            return _Judged(suspect, change, f"{suspect.cause}: it is {name}", joined, same=True)
-    return _Judged(suspect, suspect.change, f"{suspect.cause}: it is another place", after, same=False)
+            return _Identified(suspect, change, f"{suspect.cause}: it is {name}", joined, same=True)
+    return _Identified(suspect, suspect.change, f"{suspect.cause}: it is another place", after, same=False)

@@ -18,7 +18,7 @@ DETECTABLE: Final = 4.13
 
 
 @dataclass(frozen=True)
-class Fit:
+class SurveyFit:
     """chi2 of all observations, and how many they are more than unknowns; chance: of a larger one if all is right.
 
     instruments: by name, value, 1 sd and unit.
@@ -53,7 +53,7 @@ def chance_of(chi2: float, freedom: int) -> float:
     return 1 - NormalDist().cdf(((chi2 / freedom) ** (1 / 3) - 1 + spread) / math.sqrt(spread))
 
 
-def fit_of(solution: Solution) -> Fit:
+def fit_of(solution: Solution) -> SurveyFit:
     """Return the tests of an adjustment. Unknowns with a prior are observed by it as well."""
     of = solution.observations
     names = [name for name in of.names if not name.startswith("sight ")]
@@ -64,7 +64,7 @@ def fit_of(solution: Solution) -> Fit:
         scale, unit = _unit(name)
         instruments[name] = scale * float(solution.x[column]), scale * sigma, unit
     freedom = solution.freedom
-    return Fit(solution.chi2, freedom, chance_of(solution.chi2, freedom), instruments)
+    return SurveyFit(solution.chi2, freedom, chance_of(solution.chi2, freedom), instruments)
 
 
 def _unit(name: str) -> tuple[float, str]:

@@ -17,7 +17,7 @@ from buddyline.tools.survey.assembly import (
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.blunders import Blunder, find_blunders
 from buddyline.tools.survey.connected import Survey, held_depths
-from buddyline.tools.survey.fit import Fit, fit_of
+from buddyline.tools.survey.fit import SurveyFit, fit_of
 from buddyline.tools.survey.geodesy import Grid, grid_of
 from buddyline.tools.survey.lines import Line, line_of, measures_of
 from buddyline.tools.survey.observations import Solution
@@ -113,7 +113,7 @@ class Adjusted:
         return find_blunders(self.survey)
 
     @cached_property
-    def fit(self) -> Fit:
+    def fit(self) -> SurveyFit:
         """The global test and the instruments."""
         return fit_of(self.solution)
 
