@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.alignment import ClockAlignment
+from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.closed_form import closed_form
@@ -115,7 +116,7 @@ def test_a_dive_with_a_clock_that_is_off():
     core.flush()
     found = core.pairs["a", "b"].alignment.estimate()
     assert abs(found.offset_s - 0.05) < 4 * found.sigma_s + 0.005
-    corrected = SolverCore(Settings(), [("a", "b")], {"b": 50_000_000})
+    corrected = SolverCore(Settings(), [("a", "b")], {"b": ClockCurve.constant(0.05)})
     results = [result for message in messages for result in corrected.handle(message)]
     assert corrected.counts["solved"] >= core.counts["solved"] * 0.9
     # B's pictures were taken 50 ms before A's, and are now known to have been.

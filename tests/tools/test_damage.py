@@ -113,6 +113,12 @@ def test_damage_is_named_and_what_is_left_is_used(run, name, damage, tmp_path):
     status, err, _ = run(name, damage)
     assert "Traceback" not in err
     path = tmp_path / ("pictures.mcap" if "PICTURES" in COMMANDS[name] else "in.mcap")
+    if name == "repair" and damage in ("corrupted", "foreign"):
+        # The head of a log, or 200 bytes of it, are what its parity restores.
+        assert status == 0
+        assert "restored from the parity" in err
+        assert "nothing of it is lost" in err
+        return
     if damage in ("empty", "foreign"):
         assert status == 2
         assert f"{path}: is " in err
