@@ -129,7 +129,7 @@ class Settings:
     range_min_m: float = 0.8
     range_max_m: float = 30.0
     min_probability: float = 0.9
-    min_oriented_probability: float = 0.99
+    min_oriented_probability: float = 0.95
     gate_sigma: float = 4.5
     speed_mps: float = 0.2
     turn_radps: float = 0.2

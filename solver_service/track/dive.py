@@ -288,8 +288,8 @@ def in_order(record: NodeRecord) -> NodeRecord:
 
 def _parted(record: NodeRecord) -> NodeRecord:
     """Give a record with the fast part of its inertial samples."""
-    values = np.hstack((record.accel_mps2, record.gyro_radps))
-    return replace(record, fast=fast_part(record.imu_stamps_ns, values))
+    of_each = [fast_part(record.imu_stamps_ns, values) for values in (record.accel_mps2, record.gyro_radps)]
+    return replace(record, fast=np.hstack(of_each))
 
 
 def last_ns(records: Records) -> int:

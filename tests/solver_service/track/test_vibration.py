@@ -97,8 +97,8 @@ def test_a_unit_that_shakes_alone_costs_little_once_the_lights_have_told_so() ->
     assert np.median(bad.errors_m) < 1.35 * np.median(good.errors_m)
     assert bad.nees < 1.6
     a, b = map(in_order, dive.records)
-    columns = np.hstack((b.accel_mps2, b.gyro_radps))
-    records = a, replace(b, fast=fast_part(b.imu_stamps_ns, columns))
+    parts = [fast_part(b.imu_stamps_ns, values) for values in (b.accel_mps2, b.gyro_radps)]
+    records = a, replace(b, fast=np.hstack(parts))
     track = TrackFilter(a.node, b.node, keep_s=np.inf)
     pass_over(track, records, dive.fixes)
     assert track.main is not None
