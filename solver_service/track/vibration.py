@@ -19,8 +19,8 @@ from buddyline.solver_service.track.inputs import Stamps
 # The fast part begins here, and is made by a window of so long on either side.
 FAST_HZ: Final = 1.5
 HALF_WINDOW_S: Final = 1.5
-# Less than so many times the samples' white noise (variances) is no shaking: taken off, it would leave less noise than is
-# counted.
+# Less than so many times the samples' white noise (variances) is no shaking: taken off, it would leave less noise than
+# is counted.
 LEAST_SHAKING: Final = 4.0
 # Samples further apart than this many periods are of two runs; a run of less than a window has no fast part.
 BROKEN: Final = 1.5
