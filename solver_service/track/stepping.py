@@ -219,7 +219,9 @@ class TrackSteps(TrackIntake):
         observer = sight.node
         camera = self.nodes[observer].rig.camera
         X, y, H = self._compared(sight, estimate.state, estimate.rates_radps, sight.t_s - estimate.t_s)
-        sight = _widened(sight, H, estimate.covariance)
+        # Starts are weighed by their evidence: one that doubts its own clock must not explain more with it.
+        if estimate.confirmed:
+            sight = _widened(sight, H, estimate.covariance)
         detection = estimate.detection[observer]
         wide = estimate.covariance[:3, :3].trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
         if wide:
