@@ -25,7 +25,7 @@ from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
-from buddyline.protocol.topics import INFO, TOPICS, parse_key
+from buddyline.protocol.topics import INFO, NET_POSE, TOPICS, parse_key
 from buddyline.tools import losses
 from buddyline.tools.clock_sets import ClockSets
 from buddyline.tools.progress import Progress
@@ -226,6 +226,15 @@ def open_each(paths: Sequence[str], stack: ExitStack) -> list[Dive]:
     with_content, left_out = _without_empty(_distinct(paths))
     losses.report(left_out)
     return [stack.enter_context(Dive([path])) for path in with_content]
+
+
+def first_with_net(logs: Sequence[Dive]) -> Dive:
+    """Return the first log that has poses of a net; raise BuddylineError if none has."""
+    for log_of_net in logs:
+        if log_of_net.ids(NET_POSE.name):
+            return log_of_net
+    names = ", ".join(one.name for one in logs)
+    raise BuddylineError(f"{names}: no poses of a net in it; solve it with three nodes or a fixed one")
 
 
 def _distinct(paths: Sequence[str] | Sequence[Path]) -> list[Path]:

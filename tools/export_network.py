@@ -15,7 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo, NodePose
 from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.columns import in_order
-from buddyline.tools.dives import open_each
+from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
 
 _CSV: Final = (
@@ -23,7 +23,7 @@ _CSV: Final = (
     *("v_north_mps", "v_east_mps", "v_down_mps", "sd_north_m", "sd_east_m", "sd_down_m"),
     *("sd_w_north_rad", "sd_w_east_rad", "sd_w_down_rad", "age_s"),
 )
-# TRC programs take y for up: x north, y up, z east.
+# Motion capture programs take y for up: x north, y up, z east.
 _NORTH_UP_EAST: Final = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
 
 
@@ -49,13 +49,8 @@ def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
     """Read the poses of the first log that has any, by time, and all nodes' calibrations."""
     with ExitStack() as stack:
         logs = open_each(paths, stack)
-        telling = next((log for log in logs if log.ids(NET_POSE.name)), None)
-        if telling is None:
-            raise BuddylineError(
-                f"{', '.join(paths)}: no poses of a net in it; solve it with three nodes or a fixed one"
-            )
         of_node: dict[str, list[NodePose]] = {}
-        for envelope in telling.messages(NET_POSE.name):
+        for envelope in first_with_net(logs).messages(NET_POSE.name):
             if isinstance(envelope.message, NodePose):
                 of_node.setdefault(envelope.message.node, []).append(envelope.message)
         infos: dict[str, NodeInfo] = {}
@@ -85,7 +80,7 @@ def _csv_lines(poses: Sequence[NodePose]) -> Iterator[str]:
 
 
 def _trc_lines(poses: Sequence[NodePose], infos: dict[str, NodeInfo], name: str) -> Iterator[str]:
-    """Yield a TRC file: of each node its camera's centre and its lamps, in mm; a marker that is not known is empty."""
+    """Yield the lines of a TRC file, mm. Markers: each node's camera and lamps; empty where the node has no pose."""
     nodes = sorted({pose.node for pose in poses})
     marked = {node: _markers(node, infos.get(node)) for node in nodes}
     names = [marker for node in nodes for marker, _ in marked[node]]

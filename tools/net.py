@@ -1,4 +1,4 @@
-"""`buddyline net init`: where nodes on tripods stand, out of a short dive, as lines for their configurations."""
+"""`buddyline net init`: find where nodes on tripods stand, from a short dive; lines for their configurations."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ log = logging.getLogger(__name__)
 # A node whose place scatters by more than this, RMS, does not stand still.
 STILL_M: Final = 0.05
 STILL_RAD: Final = 0.03
-# Rows of the network are correlated over about a second.
+# Errors of the network's poses are correlated over about a second.
 INDEPENDENT_S: Final = 1.0
 RATE_HZ: Final = 10.0
-LEAST_M, LEAST_RAD = 0.002, 0.001
+# No place is stated better than this, 1 sd.
+LEAST_M: Final = 0.002
+LEAST_RAD: Final = 0.001
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         required=True,
         metavar="NODE",
-        help="a node that stood still, repeatable; the first is the frame's origin, and says where north is",
+        help="a node that stood still, repeatable; the first is the origin, and its compass says where north is",
     )
     parser.add_argument("--net", default="main", help="the frame's name; default: main")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="write NODE.toml files there; must be empty")
@@ -48,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """Where a node stood: its place, and how many rows it is the mean of."""
+    """Where a node stood. rows: how many poses the place is the mean of."""
 
     place: FixedPlace
     rows: int
@@ -57,6 +59,7 @@ class Stand:
 def run(args: argparse.Namespace) -> int:
     """Find the places and print them; return 0."""
     from buddyline.tools.newfile import new_folder
+    from msgspec import to_builtins
 
     if args.output is not None:
         new_folder(args.output)
@@ -67,11 +70,7 @@ def run(args: argparse.Namespace) -> int:
             (args.output / f"{node}.toml").write_text(text)
             log.info("%s: append it to the configuration of node %s", args.output / f"{node}.toml", node)
     if args.json:
-        places = {
-            node: {"net": one.place.net, "p_m": one.place.p_m, "q_xyzw": one.place.q_xyzw, "sigma_m": one.place.sigma_m}
-            for node, one in stands.items()
-        }
-        print(json.dumps(places))
+        print(json.dumps({node: to_builtins(one.place) for node, one in stands.items()}))
     elif args.output is None:
         print("\n".join(texts.values()), end="")
     return 0
@@ -102,7 +101,7 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
             elif isinstance(envelope.message, Depth) and envelope.message.node == origin:
                 depths.append(envelope.message.depth_m)
         if not attitudes:
-            raise BuddylineError(f"{dive.name}: no attitude of node {origin}, which is to say where north is")
+            raise BuddylineError(f"{dive.name}: no attitude of node {origin}: its compass must say where north is")
         R_body_camera = quat_to_matrix(np.array(infos[origin].q_body_camera_xyzw))
         R = _mean_rotation(np.array(attitudes)) @ R_body_camera
         port_m = float((R @ np.array(infos[origin].depth_port_m))[2])
@@ -189,6 +188,6 @@ def _toml(node: str, stand: Stand) -> str:
     p = ", ".join(f"{value:.4f}" for value in place.p_m)
     q = ", ".join(f"{value:.6f}" for value in place.q_xyzw)
     return (
-        f"# node {node}, out of {stand.rows} rows\n[fixed]\nnet = {json.dumps(place.net)}\n"
+        f"# node {node}, from {stand.rows} poses\n[fixed]\nnet = {json.dumps(place.net)}\n"
         f"p_m = [{p}]\nq_xyzw = [{q}]\nsigma_m = {place.sigma_m:.4f}\nsigma_rad = {place.sigma_rad:.5f}\n"
     )

@@ -86,9 +86,9 @@ class Scenario:
     miss_share: share of lights that give no candidate. false_lights: false candidates in each picture.
     other_lamps: other divers' lamps in the water. tags: whether each node carries two AR tags.
     interruptions: whether nodes look away and things pass before lights. clock_offset_ns: B's clock minus A's at
-    the start. clock_drift: what B's clock gains, s a second. magnetometer_off_rad: constant error of B's heading that
-    its sigma does not include. inertial: quality of the inertial units. dead_lamps: lights that are dark for the whole
-    dive, such as "b.left".
+    the start. clock_drift: what B's clock gains, s a second. Further nodes have B's clock. magnetometer_off_rad:
+    constant error of B's heading that its sigma does not include. inertial: quality of the inertial units.
+    dead_lamps: lights that are dark for the whole dive, such as "b.left".
     pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
     in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
     strobe_s: time between the flashes of a third diver's strobe between the nodes; 0: none.

@@ -1,4 +1,4 @@
-"""The motion of more than two nodes, some of which may be fixed: two groups that face each other."""
+"""The motion of more than two nodes, or of nodes some of which are fixed: two groups that face each other."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from buddyline.node.sim.trajectory import CLEARANCE_M, MARGIN_RAD, SPEED_MPS, Pl
 
 # Between neighbours of a group: two bars side by side do not cover each other.
 SPACING_M: Final = 1.3
-# The groups are so many spacings apart, at least: nearer, a camera does not hold a whole group.
-NEAREST_SPACINGS: Final = 3.0
+# The groups are at least so many of their widths apart: nearer, a camera does not hold a whole group.
+NEAREST_WIDTHS: Final = 3.0
 DRIFT_M: Final = 0.2
 
 
 class TeamMotion:
     """Nodes 0, 2, 4, ... stay and sway; nodes 1, 3, 5, ... move away and back, and circle in front of them.
 
-    Each node looks at the middle of the other group, so it sees the other group's nodes, and of its own group none.
+    Each node looks at the middle of the other group: it sees that group's nodes, and none of its own group.
     Fixed nodes do not move. Times in seconds since the start.
     """
 
@@ -43,7 +43,7 @@ class TeamMotion:
         self._sizes = sizes
         half_group_m = SPACING_M * (max(sizes) - 1) / 2 + 0.55 * max(scenario.baseline_m(i) for i in range(2))
         self._half_group_m = half_group_m
-        self._near_m = max(scenario.range_min_m, NEAREST_SPACINGS * SPACING_M * (max(sizes) - 1))
+        self._near_m = max(scenario.range_min_m, NEAREST_WIDTHS * SPACING_M * (max(sizes) - 1))
         self._far_m = max(scenario.far_m, self._near_m + 0.5)
         self._cycle_s = max(math.pi * (self._far_m - self._near_m) / SPEED_MPS, 20.0)
         cameras = [scenario.camera(i) for i in range(2)]
@@ -75,7 +75,7 @@ class TeamMotion:
         )
 
     def _centre_m(self, group: int, t_s: float | None) -> Vector:
-        """Return the middle of a group in NED; t_s: None for where the fixed nodes of the group stand about."""
+        """Return the middle of a group in NED at t_s; for None its mean place, around which its fixed nodes stand."""
         water = self._scenario.water
         if group == 0:
             return np.array([0.0, 0.0, water.depth_m])
@@ -93,9 +93,7 @@ class TeamMotion:
         )
         flat_m = math.sqrt(max(range_m**2 - climb_m**2, 0.0))
         bearing = self._heading_rad + azimuth
-        return np.array(
-            [flat_m * math.cos(bearing), flat_m * math.sin(bearing), water.depth_m - climb_m],
-        )
+        return np.array([flat_m * math.cos(bearing), flat_m * math.sin(bearing), water.depth_m - climb_m])
 
     def _offset_m(self, index: int) -> Vector:
         """Return a node's place in its group, NED."""

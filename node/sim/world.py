@@ -1,7 +1,8 @@
 """The simulated world of nodes: a function of (scenario, node, time).
 
 Two processes with the same Scenario see the same world, at any time and in any order.
-Stamps are on the given node's own clock (B's is off by Scenario.clock_offset_ns). Stamps of the truth are on A's.
+Stamps are on the given node's own clock (all but A's are off by Scenario.clock_offset_ns). Stamps of the truth are on
+A's.
 """
 
 from __future__ import annotations

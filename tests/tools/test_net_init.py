@@ -1,4 +1,4 @@
-"""`buddyline net init`: where nodes on tripods stand, out of a short dive."""
+"""`buddyline net init`: where nodes on tripods stand, from a short dive."""
 
 import json
 import tomllib
@@ -57,4 +57,6 @@ def test_a_node_that_is_not_in_the_dive_is_named(dive, capsys):
 
 def test_one_node_alone_is_the_origin(dive, capsys):
     assert main(["net", "init", str(dive[0]), "--still", "c", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["c"]["p_m"][:2] == [0.0, 0.0]
+    place = json.loads(capsys.readouterr().out)["c"]
+    assert place["p_m"][:2] == [0.0, 0.0]
+    assert place["sigma_m"] > 0.0 < place["sigma_rad"]

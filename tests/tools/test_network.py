@@ -93,6 +93,14 @@ def test_where_a_node_is_the_origin_places_count_from_its_true_place(tmp_path, c
     assert found["b"]["position_m"]["rmse"] == pytest.approx(0.01)
 
 
+def test_without_the_truth_of_the_origin_places_do_not_count(tmp_path, capsys):
+    messages = [pose("b", 0, (6.0, 1.0, 5.0), mode="truth", sigma_m=0.0)]
+    messages += [pose("a", 0, (0.0, 0.0, 0.0), sigma_m=0.0), pose("b", 0, (4.0, 1.0, 0.0))]
+    assert main(["evaluate", write(tmp_path / "net.mcap", *messages), "--net", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["network"]
+    assert (found["node"], found["samples"], found["wrong"]) == ("b", 0, 0)
+
+
 def test_export_csv_has_a_row_for_each_node_and_time(solved, capsys):
     assert main(["export", solved, "--format", "csv", "--what", "net"]) == 0
     out, err = capsys.readouterr()

@@ -12,7 +12,7 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodePose
 from buddyline.protocol.topics import NET_POSE, NET_TRUTH, POSE, REJECTED
-from buddyline.tools.dives import open_each
+from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import conjugate, multiply, normalized, rotation_vector
 from buddyline.tools.evaluation.statistics import Stats
 from buddyline.tools.evaluation.truth import PoseHistory
@@ -27,8 +27,8 @@ WRONG_SIGMAS: Final = 3.0
 class NodeFigures:
     """The figures of one node. samples: number with truth. sigma_m: RMS of the stated sigma of the place, all axes.
 
-    covered: share of the net's samples at which the node was told. nees6: mean 6 if the covariance is true. wrong: see
-    WRONG_M.
+    covered: share of the net's samples at which the node has a pose. nees6: mean 6 if the covariance is true. wrong: of
+    the samples, see WRONG_M.
     """
 
     net: str
@@ -47,13 +47,14 @@ class NodeFigures:
 def network_figures(poses: Sequence[NodePose], truths: Sequence[NodePose]) -> list[NodeFigures]:
     """Return the figures of each net's nodes that have truth, by net and node.
 
-    Where one node is the origin, which moves with it, places count from its true place.
+    Where one node is the origin, which moves with it, places count from its true place; without its truth they do not
+    count.
     """
     of_truth: dict[tuple[str, str], list[NodePose]] = defaultdict(list)
     for truth in truths:
         of_truth[truth.net, truth.node].append(truth)
     # The truth of a simulated dive has one net; the estimate may have another name.
-    by_node = {node: _history(found) for (_, node), found in of_truth.items()}
+    by_node = {node: PoseHistory.of_node(found) for (_, node), found in of_truth.items()}
     own: dict[tuple[str, str], list[NodePose]] = defaultdict(list)
     stamps: dict[str, set[int]] = defaultdict(set)
     origins: dict[tuple[str, int], str] = {}
@@ -69,12 +70,6 @@ def network_figures(poses: Sequence[NodePose], truths: Sequence[NodePose]) -> li
     ]
 
 
-def _history(found: Sequence[NodePose]) -> PoseHistory:
-    return PoseHistory(
-        [one.stamp_ns for one in found], np.array([one.p_m for one in found]), np.array([one.q_xyzw for one in found])
-    )
-
-
 def _figures(
     net: str,
     node: str,
@@ -86,15 +81,19 @@ def _figures(
     rows = []
     for pose in poses:
         true = truth[node].at(pose.stamp_ns)
-        origin = origins.get((net, pose.stamp_ns))
-        zero = truth[origin].at(pose.stamp_ns) if origin in truth and origin is not None else None
+        zero_m = np.zeros(3)
+        if (origin := origins.get((net, pose.stamp_ns))) is not None:
+            true_origin = truth[origin].at(pose.stamp_ns) if origin in truth else None
+            if true_origin is None:
+                continue
+            zero_m = true_origin[0]
         if true is None:
             continue
-        off_m = true[0] - (zero[0] if zero is not None else 0.0) - pose.p_m
+        off_m = true[0] - zero_m - pose.p_m
         q = multiply(true[1], conjugate(normalized(np.array(pose.q_xyzw))))
         off = np.concatenate((off_m, rotation_vector(q)))
         P = np.array(pose.covariance).reshape(6, 6)
-        # What truth is rounded by, and the origin's place, which is known exactly.
+        # For the rounding of the truth; and the origin's own covariance is zero.
         nees = off @ np.linalg.solve(P + 1e-10 * np.eye(6), off)
         rows.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:]), nees, np.sqrt(max(np.trace(P[:3, :3]), 0.0))))
     e = np.array(rows).reshape(-1, 4)
@@ -118,13 +117,8 @@ def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list
     """Read the poses of all nodes, of the first log that has any, and their truth; raise BuddylineError for none."""
     with ExitStack() as stack:
         logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
-        named = ", ".join([*paths, *truth_paths])
-        telling = next((log for log in logs if log.ids(NET_POSE.name)), None)
-        if telling is None:
-            raise BuddylineError(
-                f"{', '.join(paths)}: no poses of a net in it; solve it with three nodes or a fixed one"
-            )
-        poses = [one.message for one in telling.messages(NET_POSE.name) if isinstance(one.message, NodePose)]
+        solved = first_with_net(logs)
+        poses = [one.message for one in solved.messages(NET_POSE.name) if isinstance(one.message, NodePose)]
         truths = [
             one.message
             for log in [*truth_logs, *logs]
@@ -132,6 +126,7 @@ def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list
             if isinstance(one.message, NodePose)
         ]
     if not truths:
+        named = ", ".join([*paths, *truth_paths])
         raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")
     return poses, truths
 

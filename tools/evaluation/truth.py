@@ -53,6 +53,15 @@ class PoseHistory:
         q = np.array([sample.q_ned_body_xyzw for sample in samples]).reshape(-1, 4)
         return cls([sample.stamp_ns for sample in samples], np.zeros((len(samples), 3)), q)
 
+    @classmethod
+    def of_node(cls, poses: Sequence[NodePose]) -> PoseHistory:
+        """Return one node's camera over time, as its poses give it; there is at least one."""
+        return cls(
+            [pose.stamp_ns for pose in poses],
+            np.array([pose.p_m for pose in poses]),
+            np.array([pose.q_xyzw for pose in poses]),
+        )
+
     def at(self, stamp_ns: int) -> tuple[Floats, Floats] | None:
         """Return t (3,) and q (4,) at stamp_ns; None if no sample is near enough."""
         after = bisect_left(self.stamps_ns, stamp_ns)
@@ -88,11 +97,7 @@ def ned_of_camera(
 ) -> PoseHistory | None:
     """Return a camera's poses in NED over time: the true ones if there are any, else from the measured attitudes."""
     if truths:
-        return PoseHistory(
-            [truth.stamp_ns for truth in truths],
-            np.array([truth.p_m for truth in truths]),
-            np.array([truth.q_xyzw for truth in truths]),
-        )
+        return PoseHistory.of_node(truths)
     if info is None or not attitudes:
         return None
     body = PoseHistory.of_attitudes(attitudes)
