@@ -57,6 +57,7 @@ class Command:
         return status
 
 
+# In the order of use: to begin, to set up, while it runs, after a dive, a survey, experiments.
 COMMANDS: Final = (
     Command(
         "demo",
@@ -65,16 +66,22 @@ COMMANDS: Final = (
     ),
     Command("sample", "write a small dive, to try the other commands on", ("sample", "sample dive.mcap")),
     Command(
+        "plan",
+        "say how far two nodes will measure well, by camera, lights and visibility",
+        ("plan --baseline 0.88 --visibility 6 --camera a.toml",),
+    ),
+    Command(
         "init",
         "write a commented configuration of a node, a hub or a solver to start from",
         ("init node --node a --connect tls/192.168.2.1:7447", "init solver"),
     ),
-    Command("hub", "run the hub that all others connect to", ("hub",)),
     Command(
         "keys",
         "make keys and certificates, so that the hub may listen beyond this machine",
         ("keys init --hub 192.168.2.1", "keys node a", "keys solver"),
     ),
+    Command("hub", "run the hub that all others connect to", ("hub",)),
+    Command("solver", "run the solver: candidates in, poses and track out", ("solver",), "solver_service.__main__"),
     Command("node", "run one node: camera, sensors, detector, log", ("node --config a.toml",), "node.__main__"),
     Command(
         "install-service",
@@ -92,60 +99,10 @@ COMMANDS: Final = (
         ("doctor --config a.toml", "doctor", "doctor --config a.toml --json"),
         "tools.doctor.command",
     ),
-    Command("solver", "run the solver: candidates in, poses out", ("solver",), "solver_service.__main__"),
-    Command(
-        "play",
-        "send stored dives over the bus, as if they happened now",
-        ("play a.mcap b.mcap", "play dive.mcap --speed 4 --start 10 --end 60"),
-    ),
-    Command("record", "record the bus into a dive log", ("record topside.mcap",)),
-    Command(
-        "repair", "make a proper log from a damaged one, and say what was lost", ("repair cut.mcap -o whole.mcap",)
-    ),
-    Command(
-        "backfill",
-        "complete a topside recording from the nodes' own logs",
-        ("backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
-    ),
-    Command(
-        "detect",
-        "find light candidates in stored pictures or a dive's pictures",
-        ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap"),
-    ),
-    Command(
-        "tune",
-        "propose detector values for a site, and show the pictures they were judged on",
-        ("tune dive.mcap", "tune pictures/ --draw judged/", "tune --fit without_lamps/ > score.toml"),
-    ),
-    Command(
-        "solve",
-        "solve stored dives offline",
-        ("solve a.mcap b.mcap -o poses.mcap", "solve dive.mcap -o p.mcap --checks range"),
-    ),
-    Command(
-        "after",
-        "after a dive: from the nodes' folders to poses, track and report at once",
-        ("after a/ b/ -o dive/",),
-    ),
-    Command(
-        "align",
-        "find offset and drift of two nodes' clocks from a dive in which they moved",
-        ("align a.mcap b.mcap",),
-    ),
     Command(
         "calibrate",
-        "calibrate camera, lights, magnetometer or clocks, and say whether the result is good",
+        "calibrate camera, lights, magnetometer, gyroscope or clocks, and say whether the result is good",
         ("calibrate board -o board.pdf", "calibrate camera pictures/", "calibrate clock"),
-    ),
-    Command(
-        "simulate",
-        "make a dive with known truth",
-        ("simulate dive.mcap --environment basin --seconds 60", "simulate dive.mcap --images"),
-    ),
-    Command(
-        "evaluate",
-        "measure poses and candidates against truth",
-        ("evaluate poses.mcap --truth dive.truth.mcap",),
     ),
     Command(
         "net",
@@ -161,6 +118,71 @@ COMMANDS: Final = (
         ("monitor", "monitor --connect tcp/192.168.2.1:7447 --open"),
         "tools.monitor.live",
     ),
+    Command("record", "record the bus into a dive log", ("record topside.mcap",)),
+    Command(
+        "mark",
+        "name a station or a point of a running dive",
+        ('mark T4 --node b --note "flake"',),
+        "tools.survey.mark",
+    ),
+    Command(
+        "ros2",
+        "show poses, track, pictures, sensors and problems to ROS 2 (rmw_zenoh)",
+        ("ros2", "ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
+    ),
+    Command(
+        "bridge",
+        "say where a vehicle is to an autopilot (MAVLink), a chart plotter (NMEA 0183) or a program (HTTP)",
+        (
+            "bridge --vehicle b --mavlink 192.168.2.2:14660",
+            "bridge --vehicle b --place 47.12,9.65 --nmea 127.0.0.1:10110 --http 127.0.0.1:8082",
+        ),
+        "tools.bridge.command",
+    ),
+    Command(
+        "play",
+        "send stored dives over the bus, as if they happened now",
+        ("play a.mcap b.mcap", "play dive.mcap --speed 4 --start 10 --end 60"),
+    ),
+    Command(
+        "after",
+        "from the nodes' folders to clocks, poses, track and report, all at once after a dive",
+        ("after a/ b/ -o dive/",),
+    ),
+    Command(
+        "repair", "make a proper log from a damaged one, and say what was lost", ("repair cut.mcap -o whole.mcap",)
+    ),
+    Command(
+        "backfill",
+        "complete a topside recording from the nodes' own logs",
+        ("backfill topside.mcap a.mcap b.mcap -o dive.mcap",),
+    ),
+    Command(
+        "align",
+        "find offset and drift of two nodes' clocks from a dive in which they moved",
+        ("align a.mcap b.mcap",),
+    ),
+    Command(
+        "detect",
+        "find light candidates in stored pictures or a dive's pictures",
+        ("detect photos/ --draw marked/", "detect dive.mcap -o candidates.mcap"),
+    ),
+    Command(
+        "tune",
+        "propose detector values for a site, and show the pictures they were judged on",
+        ("tune dive.mcap", "tune pictures/ --draw judged/", "tune --fit without_lamps/ > score.toml"),
+    ),
+    Command(
+        "solve",
+        "find the poses and the track of stored dives",
+        ("solve a.mcap b.mcap -o poses.mcap", "solve dive.mcap -o p.mcap --checks range"),
+    ),
+    Command(
+        "evaluate",
+        "measure the errors of poses, track and candidates against truth",
+        ("evaluate poses.mcap --truth dive.truth.mcap",),
+    ),
+    Command("export", "write poses or the track for other programs", ("export poses.mcap --format tum -o poses.tum",)),
     Command(
         "view",
         "look at a stored dive in the browser, from any moment on",
@@ -174,18 +196,15 @@ COMMANDS: Final = (
         "tools.monitor.report",
     ),
     Command(
-        "ros2",
-        "show attitudes, depths, poses and transforms to ROS 2 (rmw_zenoh)",
-        ("ros2", "ros2 --connect tcp/192.168.2.1:7447 --domain 7"),
+        "survey",
+        "make legs and stations from solved dives, adjust them, and write files for surveyors",
+        ("survey legs cave.toml --dive solved.mcap a.mcap b.mcap", "survey export cave.toml --format svx"),
+        "tools.survey.command",
     ),
     Command(
-        "bridge",
-        "say where a vehicle is to an autopilot (MAVLink), a chart plotter (NMEA 0183) or a program (HTTP)",
-        (
-            "bridge --vehicle b --mavlink 192.168.2.2:14660",
-            "bridge --vehicle b --place 47.12,9.65 --nmea 127.0.0.1:10110 --http 127.0.0.1:8082",
-        ),
-        "tools.bridge.command",
+        "simulate",
+        "make a dive with known truth",
+        ("simulate dive.mcap --environment basin --seconds 60", "simulate dive.mcap --images"),
     ),
     Command(
         "artag",
@@ -198,24 +217,6 @@ COMMANDS: Final = (
         ("experiments -o report/ --quick", "experiments -o report/ --tag-video test_vid.mp4"),
         "tools.experiments.command",
     ),
-    Command(
-        "plan",
-        "say how far two nodes will measure well, by camera, lights and visibility",
-        ("plan --baseline 0.88 --visibility 6 --camera a.toml",),
-    ),
-    Command(
-        "mark",
-        "name a station or a point of a running dive",
-        ('mark T4 --node b --note "flake"',),
-        "tools.survey.mark",
-    ),
-    Command(
-        "survey",
-        "make legs and stations from solved dives, adjust them, and write files for surveyors",
-        ("survey legs cave.toml --dive solved.mcap a.mcap b.mcap", "survey export cave.toml --format svx"),
-        "tools.survey.command",
-    ),
-    Command("export", "write poses for other programs", ("export poses.mcap --format tum -o poses.tum",)),
 )
 
 
