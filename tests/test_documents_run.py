@@ -1,7 +1,7 @@
 """The commands in the documents work as they stand: each document's are run in order, in a folder of its own.
 
 Addresses are replaced, and what would take long is shortened. What needs hardware, another machine, root or a person is
-left out by name; a command that is neither run nor left out fails here.
+left out by name. Every other command of the programs in COMMAND must end well.
 """
 
 from __future__ import annotations
