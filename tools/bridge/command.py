@@ -267,7 +267,7 @@ def _receiver(option: str, text: str) -> socket.socket:
         receiver.bind((host, port))
     except OSError as error:
         receiver.close()
-        raise BuddylineError(f"{option} {text}: cannot listen: {error.strerror}") from error
+        raise BuddylineError(f"{option} {text}: {error.strerror}; give another address or port") from error
     receiver.settimeout(0.5)
     return receiver
 

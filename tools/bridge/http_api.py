@@ -59,7 +59,7 @@ class Answers:
         with self._lock:
             if path in ("/api", "/api/v1/version"):
                 return {"version": "v1"}
-            if path in ("/api/v1/about",):
+            if path == "/api/v1/about":
                 return {
                     "chipid": "",
                     "hardware_revision": 0,
@@ -174,8 +174,8 @@ class HttpApi:
     def __init__(self, host: str, port: int, state: Answers) -> None:
         try:
             self._server = _Server((host, port), state)
-        except (OSError, OverflowError) as error:
-            raise BuddylineError(f"--http {host}:{port}: cannot be served: {error}") from error
+        except OSError as error:
+            raise BuddylineError(f"--http {host}:{port}: {error.strerror}; give another address or port") from error
         self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(target=self._server.serve_forever, name="http", daemon=True)
         self._thread.start()

@@ -92,7 +92,7 @@ class MavlinkTranslation:
         if placed.v_ned_mps is not None:
             v_body = (R.T @ placed.v_ned_mps).tolist()
         if placed.v_covariance is not None:
-            whole = np.full((6, 6), 0.0)
+            whole = np.zeros((6, 6))
             whole[:3, :3] = R.T @ placed.v_covariance @ R
             v_covariance = _upper(whole)
         return self._link.odometry_encode(

@@ -7,7 +7,7 @@ under a boat), or the origin of a net. Camera frames become body frames here, an
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -43,12 +43,12 @@ class Placed:
     p_ned_m: Floats
     R_ned_body: Floats
     covariance: Floats
-    v_ned_mps: Floats | None
-    v_covariance: Floats | None
-    depth_m: float | None
-    reference_yaw_rad: float | None
-    restarts: int
     is_north_true: bool
+    v_ned_mps: Floats | None = None
+    v_covariance: Floats | None = None
+    reference_yaw_rad: float | None = None
+    depth_m: float | None = None
+    restarts: int = 0
     behind_s: float = 0.0
 
     @property
@@ -70,6 +70,21 @@ class Placed:
     def confidence(self) -> float:
         """1 for a position without error, 0 for one that is worth nothing."""
         return max(0.0, 1.0 - self.sigma_m / (WORTHLESS_SHARE * max(self.range_m, MIN_RANGE_M)))
+
+    def with_true_north(self, declination_rad: float) -> Placed:
+        """Return the same place from true north, for a place from magnetic north."""
+        turn = _about_down(declination_rad)
+        both = np.kron(np.eye(2), turn)
+        return replace(
+            self,
+            p_ned_m=turn @ self.p_ned_m,
+            R_ned_body=turn @ self.R_ned_body,
+            covariance=both @ self.covariance @ both.T,
+            is_north_true=True,
+            v_ned_mps=None if self.v_ned_mps is None else turn @ self.v_ned_mps,
+            v_covariance=None if self.v_covariance is None else turn @ self.v_covariance @ turn.T,
+            reference_yaw_rad=None if self.reference_yaw_rad is None else self.reference_yaw_rad + declination_rad,
+        )
 
 
 class Placing:
@@ -115,9 +130,6 @@ class Placing:
         elif isinstance(message, Track | RelativePose) and self._net is None and self._is_ours(message):
             return self._in_pair(message)
         return None
-
-    def _newest_ns(self) -> list[int]:
-        return [stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None]
 
     def _is_ours(self, estimate: Estimate) -> bool:
         """Return whether an estimate is of our pair, and the best there is: a pose only where no track is fresh."""
@@ -174,17 +186,19 @@ class Placing:
             v_mps = sign * (R_ned_a @ np.array(estimate.v_a_b_mps))
             v_covariance = R_ned_a @ np.array(estimate.v_covariance).reshape(3, 3) @ R_ned_a.T
         at_reference = R_ned_body_a if is_b else R_ned_body_b
-        info = info_a
-        return self._placed(
-            estimate.node_a if is_b else estimate.node_b,
-            estimate.stamp_ns,
-            sign * p_m,
-            R_ned_body_b if is_b else R_ned_body_a,
-            covariance,
-            v_mps,
-            v_covariance,
-            math.atan2(at_reference[1, 0], at_reference[0, 0]),
-            is_magnetic=info.declination_rad == 0.0,
+        return self._finished(
+            Placed(
+                vehicle=self.vehicle,
+                reference=estimate.node_a if is_b else estimate.node_b,
+                stamp_ns=estimate.stamp_ns,
+                p_ned_m=sign * p_m,
+                R_ned_body=R_ned_body_b if is_b else R_ned_body_a,
+                covariance=covariance,
+                is_north_true=info_a.declination_rad != 0.0,
+                v_ned_mps=v_mps,
+                v_covariance=v_covariance,
+                reference_yaw_rad=math.atan2(at_reference[1, 0], at_reference[0, 0]),
+            )
         )
 
     def _in_net(self, pose: NodePose) -> Placed | None:
@@ -193,63 +207,37 @@ class Placing:
             self.why = f"the calibration of node {self.vehicle} is not known"
             return None
         R_ned_body = quat_to_matrix(np.array(pose.q_xyzw)) @ quat_to_matrix(np.array(info.q_body_camera_xyzw)).T
-        return self._placed(
-            pose.net,
-            pose.stamp_ns,
-            np.array(pose.p_m),
-            R_ned_body,
-            np.array(pose.covariance).reshape(6, 6),
-            np.array(pose.v_mps),
-            None,
-            None,
-            is_magnetic=info.declination_rad == 0.0,
+        return self._finished(
+            Placed(
+                vehicle=self.vehicle,
+                reference=pose.net,
+                stamp_ns=pose.stamp_ns,
+                p_ned_m=np.array(pose.p_m),
+                R_ned_body=R_ned_body,
+                covariance=np.array(pose.covariance).reshape(6, 6),
+                is_north_true=info.declination_rad != 0.0,
+                v_ned_mps=np.array(pose.v_mps),
+            )
         )
 
-    def _placed(
-        self,
-        reference: str,
-        stamp_ns: int,
-        p_m: Floats,
-        R_ned_body: Floats,
-        covariance: Floats,
-        v_mps: Floats | None,
-        v_covariance: Floats | None,
-        reference_yaw_rad: float | None,
-        *,
-        is_magnetic: bool,
-    ) -> Placed | None:
+    def _finished(self, placed: Placed) -> Placed | None:
+        """Return a place by true north if that is known, with depth, restarts and age; None if it cannot be used."""
+        stamp_ns = placed.stamp_ns
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             return None
         if self._last_ns is not None and stamp_ns - self._last_ns > stale_after_s(TRACK) * S_NS:
             self._restarts += 1
         self._last_ns = stamp_ns
-        if is_magnetic and self._declination_rad is not None:
-            turn = _about_down(self._declination_rad)
-            both = np.kron(np.eye(2), turn)
-            p_m, R_ned_body, covariance = turn @ p_m, turn @ R_ned_body, both @ covariance @ both.T
-            v_mps = None if v_mps is None else turn @ v_mps
-            v_covariance = None if v_covariance is None else turn @ v_covariance @ turn.T
-            if reference_yaw_rad is not None:
-                reference_yaw_rad += self._declination_rad
-        if not all(np.isfinite(values).all() for values in (p_m, R_ned_body, covariance)):
+        if not placed.is_north_true and self._declination_rad is not None:
+            placed = placed.with_true_north(self._declination_rad)
+        if not all(np.isfinite(values).all() for values in (placed.p_ned_m, placed.R_ned_body, placed.covariance)):
             self.why = "the estimate is out of numeric range"
             return None
         self.why = ""
-        return Placed(
-            vehicle=self.vehicle,
-            reference=reference,
-            stamp_ns=stamp_ns,
-            p_ned_m=p_m,
-            R_ned_body=R_ned_body,
-            covariance=covariance,
-            v_ned_mps=v_mps,
-            v_covariance=v_covariance,
-            depth_m=self._depth_m,
-            reference_yaw_rad=reference_yaw_rad,
-            restarts=self._restarts,
-            is_north_true=not is_magnetic or self._declination_rad is not None,
-            behind_s=max((newest_ns - stamp_ns for newest_ns in self._newest_ns()), default=0) / S_NS,
+        newest_ns = max(
+            (stream.newest_ns for stream in self._attitudes.values() if stream.newest_ns is not None), default=stamp_ns
         )
+        return replace(placed, depth_m=self._depth_m, restarts=self._restarts, behind_s=(newest_ns - stamp_ns) / S_NS)
 
 
 def _about_down(angle_rad: float) -> Floats:
