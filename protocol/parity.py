@@ -5,7 +5,7 @@ checksums of all blocks, which say where the damage is. As many damaged blocks o
 there are sound parity blocks. Bytes that were inserted or removed are not found.
 
 A systematic code with a Cauchy matrix over GF(256): J. Bloemer et al., "An XOR-based erasure-resilient coding scheme",
-1995. numpy alone: the known libraries are either pure Python, slow on a Pi, or of another licence.
+1995.
 """
 
 from __future__ import annotations
