@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -120,20 +121,23 @@ def test_the_readmes_python_program_prints_state_and_track(endpoint: str) -> Non
         publish(bus, *LAST)
         until(lambda: len(answers(session, "buddyline/**")) == len(LAST))
         tracks = bus.publisher(topics.TRACK, "a", "b")
-        with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as child:
-            lines = [child.stdout.readline() for _ in LAST]  # type: ignore[union-attr]
-            assert sorted(line.split()[0] for line in lines) == sorted(key_of(message) for message in LAST)
-            stop = threading.Event()
+        stop = threading.Event()
 
-            def keep_on() -> None:
-                while not stop.wait(0.02):
-                    tracks.put(track(6))
+        def keep_on() -> None:
+            while not stop.wait(0.02):
+                tracks.put(track(6))
 
-            thread = threading.Thread(target=keep_on)
-            thread.start()
+        thread = threading.Thread(target=keep_on)
+        # With Python's usual buffer: its lines must come at once by the program's own doing.
+        usual = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+        with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, env=usual) as child:
             try:
+                lines = [child.stdout.readline() for _ in LAST]  # type: ignore[union-attr]
+                assert sorted(line.split()[0] for line in lines) == sorted(key_of(message) for message in LAST)
+                thread.start()
                 assert child.stdout.readline() == "a b [0.0, 0.0, 3.0] 3.0\n"  # type: ignore[union-attr]
             finally:
-                stop.set()
-                thread.join()
                 child.kill()
+                stop.set()
+                if thread.is_alive():
+                    thread.join()
