@@ -49,7 +49,7 @@ class SolverCore:
     chosen: the pairs to solve; None for every pair of nodes that appear, A before B in the alphabet. clocks: each
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
     estimate the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of
-    the network beside those of the chosen pairs. network: follows all nodes in one frame; None for no track. unused:
+    the network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
     number of messages of each node that is not used.
     """
 
@@ -189,7 +189,7 @@ class SolverCore:
         if stream is None:
             return ()
         if isinstance(message, NodeInfo) and not (message.has_camera and message.has_lights):
-            # Two nodes form a pair that see each other.
+            # Only nodes that can see each other form a pair.
             self._single.add(stream.node)
         formed = self._chosen is not None or stream.node in self._pairs_of or stream.node in self._single
         if isinstance(message, NodeInfo | Candidates) and not formed:

@@ -1,7 +1,7 @@
 """The network out of all nodes' streams: what its estimator is given, when, and the messages that it makes.
 
-The estimator is in `network/`. A network is made of three or more nodes, or where a node is fixed. Everything here is
-a function of the messages so far, as for a pair's track (tracking.py).
+The estimator is in `network/`. A network begins with three nodes, or with any number if one is fixed. Everything here
+is a function of the messages so far, as for a pair's track (tracking.py).
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from buddyline.solver_service.tracking import STOPPED_NS, TrackSettings, fix_of,
 from msgspec import UNSET
 
 NET: Final = "main"
-# A network's rows are as many as the track's, but no more than this: each is of all nodes.
+# Rows come at the track's rate, but at no more than this: each instant has a row of every node.
 MOST_HZ: Final = 20.0
 
 
 class NetTracker:
-    """Follows all nodes in one frame. streams: by node; those that come later are taken, too."""
+    """Follows all nodes in one frame. streams: by node; nodes may be added to it later."""
 
     def __init__(self, streams: Mapping[str, NodeStream], settings: TrackSettings) -> None:
         self._streams = streams
@@ -55,7 +55,7 @@ class NetTracker:
         return self._nodes
 
     def seen(self) -> set[tuple[str, str]]:
-        """Return whose lamps who may have seen: (observer, other) of all members in each other's pictures so far."""
+        """Return the pairs (observer, other) where the observer's pictures were searched for the other's lamps."""
         pairs = self._filter.main.detection if self._filter is not None else ()
         return {(self._nodes[observer], self._nodes[other]) for observer, other in pairs}
 
@@ -152,7 +152,7 @@ class NetTracker:
             self._infos[node] = info
             self._nodes.append(node)
             self._filter.add_node(track_node_of(info, rig), self._place(info), shines=info.has_lights)
-            # What it told before the network knew it.
+            # Its messages of the last second, from before it was known here.
             self._feed(self._filter, len(self._nodes) - 1, self._streams[node], self._taken_ns - S_NS, self._taken_ns)
 
     def _place(self, info: NodeInfo) -> KnownPlace | None:
@@ -179,7 +179,7 @@ class NetTracker:
             track.add_frame(index, frame_of(view_of(frame)))
 
     def _attitude(self, message: Attitude, index: int) -> AttitudeSeen:
-        """Return an attitude from the north of the first node's attitudes, which another declination may have."""
+        """Return an attitude relative to the first node's north: the nodes' declinations may differ."""
         R = quat_to_matrix(np.array(message.q_ned_body_xyzw))
         first, own = (self._infos[self._nodes[i]].declination_rad for i in (0, index))
         if first != own:

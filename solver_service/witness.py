@@ -18,12 +18,12 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.compasses import Contradiction
 
-# So long the witnesses are remembered, and so many are the fewest that are believed.
+# Witnesses are remembered for this time. Fewer than this are not believed.
 MEMORY_NS: Final = 30 * S_NS
 FEWEST: Final = 15
 # Two lights from equal range are a chance that passes with the motion: so large a share of the triggers must show it.
 LEAST_SHARE: Final = 0.3
-# The contradiction scatters by so small a share of what a third's bar would have made it change by.
+# Scatter of the contradiction, at most, as a share of the change that a third's bar would have caused.
 MOST_SCATTER: Final = 0.35
 
 

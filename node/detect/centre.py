@@ -48,8 +48,8 @@ _CORE_SHARE, _LEAN_SD = 0.3, 3.0
 # The terms of sigma, fitted by maximum likelihood to the errors in rendered pictures: this project's simulator at the
 # scene's exposure and at the lamps', as it is, as JPEG, and through a Bayer mosaic; and the dives kept for tuning.
 _FLOOR_PX: Final = 0.004
-# Scale of the least squares' own sigma, where it is multiplied by the misfit of the model. The second is for lights
-# with a clipped core: the samples around it are far from the source.
+# Scale of the least squares' own sigma, beside the root of the model's misfit. The second is for lights with a clipped
+# core: the samples around it are far from the source.
 _MISFIT_SCALE, _MISFIT_SCALE_CLIPPED = 0.5, 0.9
 _GROWTH_SCALE: Final = 1.4
 # Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
@@ -188,9 +188,10 @@ class _Equations:
 
         The prior on the step has the mean prior_px (N, 2) and the variance prior_px2 (N,); the prior on the lean has
         the mean 0. The equations are solved twice: samples that the first solution does not explain (an obstacle,
-        another light) have less weight in the second. The variance is that of the least squares times the misfit, which
-        is the mean squared residual over the variance that was assumed: noise, JPEG and other lights show in it. The
-        uncertainty of the growth is added. unclipped: (N,), as in Lights.
+        another light) have less weight in the second. The variance is that of the least squares times the misfit and
+        a fitted scale. The misfit is the mean squared residual of the first solution over the variance that was
+        assumed: noise, JPEG and other lights show in it. The uncertainty of the growth is added. unclipped: (N,), as in
+        Lights.
         """
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2

@@ -3,10 +3,10 @@
 Two nodes that look at a third party's two lights from equal range get a pose that passes range, twist, tilt and depth.
 In that pose they face each other. By their compasses their lines of sight are theta apart, so the headings are 180
 degrees minus theta off the pose, whatever the fields of view. A compass beside steel gives a gap, too, and one trigger
-cannot tell which of the two it is. A small gap is steel's: where theta is above 140 degrees, the third stands between
-them, and they see each other as well. A gap that neither noise, steel nor what has been learned of the compasses
-explains contradicts the pose, until the motion has shown that the compasses are off (`witness.py`). A pose that follows
-from earlier ones needs no such witness: a diver passes by steel.
+cannot tell which of the two it is. A small gap, of up to some 30 degrees, is taken for steel's. For such a gap a third
+would have to stand almost between the two nodes, and they would then see each other as well. A gap that noise, steel
+and what has been learned of the compasses do not explain contradicts the pose, until the motion has shown that the
+compasses are off (`witness.py`). A pose that follows from earlier ones needs no such witness: a diver passes by steel.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from buddyline.solver_service.geometry.observation import Heading
 # Two compasses disagree by no more than this: one near steel points aside, not backwards. The rest of a quarter turn is
 # for the noise of a reading.
 MOST_APART_RAD: Final = math.radians(100.0)
-# What steel and iron add to the gap, 1 sd, beyond what the compasses state and what was learned where the divers came
-# from: stations by a wreck or in a mine are 10 to 25 degrees off.
+# What steel and iron add to the gap, 1 sd. The compasses do not state it, and what was learned at one place does not
+# hold at the next: stations by a wreck or in a mine are 10 to 25 degrees off.
 STEEL_RAD: Final = math.radians(10.0)
-# Squared sigmas of a gap that noise explains. If one pose of four lights in a hundred is of a third's bar, and their
-# gaps are spread evenly, then one in twenty-five with this gap is.
+# Squared sigmas of a gap that noise and steel explain. If one pose of four lights in a hundred is of a third's bar, and
+# their gaps are spread evenly, then one in fourteen with this gap is (noise of 7 degrees, and steel).
 EXPLAINED_CHI2: Final = 9.0
 
 
@@ -33,8 +33,8 @@ class HeadingGap:
     """How a pose compares with both headings.
 
     gap_rad: what to add to B's heading so that both agree with the pose. variance: the pose's part in the gap's
-    variance, rad^2. azimuth_rad: of the line of sight, by A's heading. agrees: whether noise explains the gap, with
-    steel, or about the bias that was learned. contradicts: whether it speaks against the pose.
+    variance, rad^2. azimuth_rad: of the line of sight, by A's heading. agrees: whether noise and steel explain the gap,
+    or where a bias was learned, its difference from that. contradicts: whether it speaks against the pose.
     """
 
     gap_rad: float

@@ -119,9 +119,9 @@ class Settings:
     """How triggers are solved.
 
     checks: what may speak for or against a hypothesis. min_probability: of the published pose, against chance and
-    every other; min_oriented_probability: where both attitudes speak, and a right pose is mostly certain. gate_sigma:
-    both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior knows none (1 sd);
-    skew_sigma_s: how well the clocks agree (1 sd).
+    every other; min_oriented_probability: the same where both attitudes speak, because a right pose is then mostly
+    certain. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior
+    knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
     """
 
     method: Method = "refined"
