@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
 
-# The error state. A's part comes first where a quantity belongs to a node.
+# Where each error stands in the error state: R_ is the position r's, not a rotation R's, which is PHI. A's part comes
+# first where a quantity belongs to a node.
 R_: Final = slice(0, 3)
 V_: Final = slice(3, 6)
 PHI: Final = (slice(6, 9), slice(9, 12))

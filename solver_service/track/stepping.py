@@ -51,8 +51,8 @@ WITHOUT_RAD: Final = 0.03
 # Beyond this chi^2 (3 degrees of freedom, a chance of 0.01) a node without a unit is taken to have begun to turn, by
 # at most so much: a head turned by 45 degrees in a second speeds up by 4 rad/s^2.
 STARTLED: Final = 11.3
-# A turn shows as residuals of one sign before any single one is that large: they are summed, each older one by LASTING
-# less. The sum's variance is SUMMED times one residual's.
+# A turn shows as residuals of one sign before any single one is that large: they are summed, each with LASTING of the
+# next one's weight. The sum's variance is SUMMED times one residual's.
 LASTING: Final = 0.6
 SUMMED: Final = 1.0 / (1.0 - LASTING**2)
 MOST_GAP_RATE: Final = 4.0
@@ -402,7 +402,7 @@ def _widened(sight: Sight, H: Floats, P: Floats) -> Sight:
     """Give a picture whose sigmas hold what its Jacobians H (K, L, 2, C) leave out of the clock.
 
     In A's pictures B stands at r + c v. Where both the clock c and the velocity v are unknown their product's variance,
-    var c var v + cov(c, v)^2, is no part of H P H^T: a track would believe an offset within its first second.
+    var c var v + cov(c, v)^2, is no part of H P H^T: a track would believe a wrong offset within its first second.
     """
     if sight.node or not len(H):
         return sight

@@ -19,8 +19,8 @@ from buddyline.solver_service.track.inputs import Stamps
 # The fast part begins here, and is made by a window of so long on either side.
 FAST_HZ: Final = 1.5
 HALF_WINDOW_S: Final = 1.5
-# Less than so many times the samples' white noise (variances) is no shaking: taken off, it would leave less noise than
-# is counted.
+# A fast part of less than so many times the variance of the samples' white noise is taken to be that noise: taken off,
+# it would leave less noise than is counted.
 LEAST_SHAKING: Final = 4.0
 # Samples further apart than this many periods are of two runs; a run of less than a window has no fast part.
 BROKEN: Final = 1.5
@@ -31,7 +31,7 @@ SHARES: Final = 4
 def fast_part(stamps_ns: Stamps, values: Floats) -> Floats:
     """Give what is faster than FAST_HZ in a sensor's samples (N, C) in order of time.
 
-    0 where samples are too few to tell, and where the fast part is no more than white noise.
+    0 where samples are too few to tell, and throughout where it is hardly more than white noise (LEAST_SHAKING).
     """
     fast = np.zeros_like(values)
     if len(stamps_ns) < 3:
@@ -60,7 +60,7 @@ def fast_part(stamps_ns: Stamps, values: Floats) -> Floats:
 
 
 def _white_variance(values: Floats) -> float:
-    """Give the white noise of samples (N, C), mean over the columns, by their third differences."""
+    """Give the white noise of samples (N, C) as a variance, mean over the columns, by their third differences."""
     third = np.abs(np.diff(values, 3, axis=0)) / np.sqrt(20.0)
     return float(((np.median(third, axis=0) / 0.6745) ** 2).mean()) if len(third) else 0.0
 

@@ -28,6 +28,14 @@ def test_slow_motion_has_no_fast_part_and_shaking_is_all_fast() -> None:
     assert np.abs(fast_part(STAMPS_NS, wave(4.0)) - wave(4.0))[INNER].max() < 0.01
 
 
+@pytest.mark.parametrize(("shaken_by", "parted"), [(0.0, False), (1.0, False), (3.0, True)])
+def test_what_is_no_more_than_white_noise_is_left(shaken_by: float, parted: bool) -> None:
+    """Shaking of variance shaken_by^2, the noise's being 1."""
+    noise = np.random.default_rng(9).normal(0.0, 1.0, (len(STAMPS_NS), 3))
+    values = 20.0 * wave(0.3) + noise + np.sqrt(2.0) * shaken_by * wave(4.0)
+    assert bool(fast_part(STAMPS_NS, values).any()) is parted
+
+
 def test_runs_on_both_sides_of_a_gap_are_parted_by_themselves() -> None:
     values = wave(0.4) + 0.1 * wave(5.0)
     keep = np.ones(len(values), dtype=bool)

@@ -1,0 +1,122 @@
+"""What a step and a picture count as unknown: a sudden turn, and the clock while the velocity is unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
+from buddyline.solver_service.track import stepping
+from buddyline.solver_service.track.estimate import Estimate
+from buddyline.solver_service.track.filter import TrackFilter
+from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
+from buddyline.solver_service.track.state import CLOCK, MOVING, SIZE, V_, State
+from buddyline.solver_service.track.stepping import HOLD_S, _widened
+from buddyline.solver_service.track.strapdown import Noise
+
+from tests.solver_service.track.dives import Setting, filter_of, make
+from tests.solver_service.track.test_track_jacobians import LIGHTS_M, a_state
+
+SIGMA_RAD = 0.02
+STEP_S = 0.05
+
+
+def of_light(state: State, sight: Sight) -> tuple[Floats, Floats]:
+    """Give the residual (2,) and Jacobian (2, SIZE) of one light in A's picture, nobody turning."""
+    X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), sight.dt_s)
+    y, H = residuals(sight.bearings, sight.tangents, X, D)
+    full = np.zeros((2, SIZE))
+    full[:, COLUMNS] = H[0, 0]
+    return y[0, 0], full
+
+
+def test_a_picture_of_a_counts_the_product_of_clock_and_velocity_errors() -> None:
+    """Gauss-Hermite's three points are exact for the squares of such products."""
+    state = replace(a_state(2), clock_s=0.0)
+    rig = make(1, Setting(seconds=1.0)).records[0].node.rig
+    X, D = light_positions(state, 0, LIGHTS_M, np.zeros((2, 3)), np.zeros(1))
+    pixel = np.array((409.5, 307.5)) + 900.0 * X[0, 0, :2] / X[0, 0, 2]
+    sight = sight_of(rig, 0, 0, 0.0, pixel[None], np.array((0.7,)), np.zeros(1))
+    y0, H0 = of_light(state, sight)
+    of_errors = np.r_[CLOCK, V_]
+    P = np.zeros((SIZE, SIZE))
+    root = np.diag((0.02, 0.4, 0.6, 0.5))
+    root[1:, 0] = 0.3, -0.2, 0.4
+    P[np.ix_(of_errors, of_errors)] = root @ root.T
+    left_out, weights = [], []
+    for points in product(((-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6)), repeat=4):
+        error = np.zeros(SIZE)
+        error[of_errors] = root @ np.array([point for point, _ in points])
+        left_out.append(of_light(state.plus(error), sight)[0] - y0 + H0 @ error)
+        weights.append(np.prod([weight for _, weight in points]))
+    mean = np.average(left_out, axis=0, weights=weights)
+    variance = float(np.average((np.array(left_out) - mean) ** 2, axis=0, weights=weights).mean())
+    H = residuals(sight.bearings, sight.tangents, X, D)[1]
+    widened = _widened(sight, H, P)
+    assert widened.sigma_px**2 - 0.7**2 == pytest.approx(variance, rel=0.03)
+    assert variance > 1.0
+    of_b = replace(sight, node=1)
+    assert _widened(of_b, H, P) is of_b
+
+
+def test_a_start_does_not_doubt_its_clock_and_a_confirmed_track_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    dive = make(1, Setting(seconds=3.0))
+    track = filter_of(dive.records, dive.fixes)
+    confirmed = []
+
+    def noted(sight: Sight, H: Floats, P: Floats) -> Sight:
+        assert track.main is not None
+        confirmed.append(track.main.confirmed)
+        return _widened(sight, H, P)
+
+    monkeypatch.setattr(stepping, "_widened", noted)
+    frames = sorted(frame.stamp_ns for record in dive.records for frame in record.frames)
+    track.advance(frames[4])
+    assert track.main is not None
+    assert track.main.told_by != [0, 0]
+    assert not track.main.confirmed
+    track.advance(frames[-1])
+    assert len(confirmed) > 20
+    assert all(confirmed)
+
+
+class Told:
+    """Attitude messages of one node: one of a certain attitude at every time."""
+
+    def __init__(self, R_level_camera: Floats) -> None:
+        self.R_level_camera = R_level_camera
+
+    def at(self, t_s: float, known_s: float) -> tuple[Floats, Floats]:
+        assert known_s == t_s + HOLD_S
+        return self.R_level_camera, np.full(3, SIGMA_RAD**2)
+
+
+def startled(offs: Floats) -> list[bool]:
+    """Say after which attitudes of B, off their prediction by offs (N, 3) sigmas, it is taken to have begun to turn."""
+    dive = make(1, Setting(seconds=1.0))
+    track = TrackFilter(dive.records[0].node, dive.records[1].node)
+    state = replace(a_state(4), mount_rad=np.zeros((2, 3)))
+    estimate = Estimate(0.0, state, np.zeros((SIZE, SIZE)), 0.0, without=[False, True])
+    still = Noise(0.0, 0.0, gap_rate_radps=0.0, gap_tilt_rad=0.0, gap_heading_rad=0.0)
+    F = np.eye(SIZE)[:MOVING]
+    found = []
+    for off in offs:
+        track.turning[1] = Told(rotation_exp(SIGMA_RAD * off) @ state.R[1])  # type: ignore[call-overload]
+        found.append(track._startled(estimate, state, F, 1, still, STEP_S).gap_rate_radps > 0.0)
+    return found
+
+
+def test_a_turn_that_each_attitude_hides_is_found_by_their_sum() -> None:
+    off = np.array((2.4, 0.0, 0.0))
+    assert startled(np.array((off, off, off))) == [False, False, True]
+    assert startled(np.array((off, -off, off, -off, off, -off))) == [False] * 6
+    # What a turn has explained is not counted again.
+    assert startled(np.array(((8.0, 0.0, 0.0), (0.0, 0.0, 0.0)))) == [True, False]
+
+
+def test_attitudes_that_are_only_noisy_seldom_startle() -> None:
+    """A single one does by a chance of 0.01, their sum by another."""
+    rng = np.random.default_rng(6)
+    assert 0.005 < np.mean(startled(rng.normal(0.0, 1.0, (4000, 3)))) < 0.025
