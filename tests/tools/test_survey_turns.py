@@ -79,9 +79,25 @@ def test_gyroscopes_carry_azimuths_past_disturbed_compasses(seed):
     without, with_them = adjust(project), adjust(replace(project, turn=turns))
     assert errors_deg(with_them, course).std() < 0.3 * errors_deg(without, course).std()
     assert errors_deg(with_them, course).std() < 0.6
+    # Disturbed compasses are no reason to suspect an instrument.
+    assert not with_them.blunders
     # Centering and the gyroscopes' zeros are in the sds.
     sigma = with_them.solution.unknown("gyroscope of a in dive 1: zero")[1]
     assert math.degrees(sigma) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_gyroscopes_that_feel_no_turn_are_named_and_not_the_compasses(seed):
+    rng = np.random.default_rng(seed)
+    course = world.line(rng, 4)
+    legs = world.readings_of(course, rng, compass_deg=1.5)
+    turns = [replace(one, angle_deg=rng.normal(0, 5.0), sigma_deg=5.0) for one in turned(course, legs, rng)]
+    blunders = adjust(world.project_of(legs, turn=turns)).blunders
+    assert blunders
+    for blunder in blunders:
+        assert blunder.cause.startswith("gyroscope")
+        assert blunder.cause not in blunder.others
+        assert "180 deg" not in blunder.text
 
 
 def test_a_known_azimuth_gives_north_without_any_compass():

@@ -61,7 +61,8 @@ class Blunder:
         """The cause and its size; what would explain it as well."""
         size = f"{self.off:.1%}" if not self.unit else f"{self.off:.2f} {self.unit}" if self.unit == "m" else ""
         size = size or f"{self.off:.1f} {self.unit}"
-        wrong = "turned by 180 deg" if self.unit == "deg" and self.off > HALF_TURN_DEG else f"off by {size}"
+        backwards = "compass" in self.cause and self.off > HALF_TURN_DEG
+        wrong = "turned by 180 deg" if backwards else f"off by {size}"
         said = self.cause if self.cause.startswith("station name") else f"{self.cause} is {wrong}"
         return f"{said}, chi2 {self.chi2:.0f}" + (f" (or {'; '.join(self.others)})" if self.others else "")
 
@@ -111,10 +112,10 @@ def find_blunders(survey: Survey) -> list[Blunder]:
         as_good = [
             one
             for one in suspects
-            if one is not best and one.score >= AS_GOOD * best_score and (best.visit or not one.visit)
+            if one.cause != best.cause and one.score >= AS_GOOD * best_score and (best.visit or not one.visit)
         ]
         legs = dict.fromkeys(name for one in (best, *as_good) for name in one.legs)
-        others = tuple(one.cause for one in as_good[:MOST_OTHERS])
+        others = tuple(dict.fromkeys(one.cause for one in as_good))[:MOST_OTHERS]
         found.append(Blunder(cause, tuple(legs), off, unit, solution.chi2 - after.chi2, others))
         taken, solution = taken.with_(change), after
     return found

@@ -165,9 +165,10 @@ class Observations:
                 if not linear:
                     model.turn_to(x)
                     misfit, at, values = model.linear(x)
-        weights = model.weights(misfit)
+        # Residuals are judged by the weights that they come from: a linear step counts robust observations in full.
+        weights = model.sigma**-2 if linear else model.weights(misfit)
         # The last step was too short to turn the rows, but robust weights may have changed.
-        if normal is None or model.robust.any():
+        if normal is None or (model.robust.any() and not linear):
             normal = Normal(at, values, weights, model.blocks)
         return Solution(self, model, x, misfit, at, values, weights, normal)
 
