@@ -16,6 +16,7 @@ from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
 from buddyline.tools.export_formats import FORMATS
 from buddyline.tools.pairs import add_pair_argument
+from buddyline.tools.quantity import above_zero
 
 DIVE: Final = "one dive: its log, or each node's own"
 
@@ -43,7 +44,7 @@ def _json(parser: argparse.ArgumentParser, text: str) -> None:
 
 
 def _seconds(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
 def _two_nodes(parser: argparse.ArgumentParser) -> None:

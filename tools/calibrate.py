@@ -15,6 +15,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.newfile import check_new, write_new
+from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     import numpy as np
@@ -109,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     clock.add_argument(
         "dives", nargs="*", metavar="DIVE.mcap", help="a dive's logs, every node's; default: the nodes that run now"
     )
-    clock.add_argument("--seconds", type=float, default=10.0, metavar="S", help="listen for this long; default 10")
+    clock.add_argument("--seconds", type=above_zero, default=10.0, metavar="S", help="listen for this long; default 10")
     clock.add_argument(
         "--nodes", nargs=2, metavar=("A", "B"), help="this pair alone; default: all that hear each other"
     )

@@ -20,6 +20,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.service import Service
 from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
+from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.messages import Message
@@ -34,10 +35,10 @@ LOOK_S: Final = 0.1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="end after this long; default: at Ctrl-C")
     parser.add_argument("--environment", default="cavern", choices=ENVIRONMENTS, help="default: cavern")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: 1")
-    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="triggers a second; default: 10")
+    parser.add_argument("--rate", type=above_zero, default=10.0, metavar="HZ", help="triggers a second; default: 10")
     parser.add_argument(
         "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...; each renders its pictures; default: 2"
     )

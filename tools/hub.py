@@ -14,6 +14,7 @@ from buddyline.protocol.messages import NodeId
 from buddyline.protocol.security import HUB, Tls, check_identity
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
+from buddyline.tools.quantity import above_zero
 from msgspec import field
 from msgspec.structs import replace
 
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="FILE.toml", help="the hub's configuration")
     parser.add_argument("--listen", metavar="ENDPOINT", help=f"default: {DEFAULT_ENDPOINT}")
     parser.add_argument("--insecure", action="store_true", help="listen beyond this machine without TLS")
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this long")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long")
 
 
 def load_hub_config(path: str | None) -> HubConfig:

@@ -239,3 +239,13 @@ def test_a_terminal_limited_to_ascii_is_no_error(words):
 def test_exit_status_of_the_real_program(tmp_path):
     assert buddyline("--version").returncode == 0
     assert buddyline("solve", "none.mcap", "-o", tmp_path / "x.mcap").returncode == 2
+
+
+@pytest.mark.parametrize(
+    "words", [("demo", "--seconds", "-1"), ("demo", "--rate", "0"), ("record", "x.mcap", "--seconds", "nan")]
+)
+def test_a_number_that_must_be_above_zero_is_named(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([*words])
+    assert ended.value.code == 2
+    assert f"{words[-1]}: give a number above 0" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -57,13 +58,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "needed), GPS_INPUT (with --place or --boat); default: odometry",
     )
     out.add_argument("--system", type=int, default=1, metavar="ID", help="the vehicle's MAVLink system; default: 1")
-    out.add_argument("--rate", type=float, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s")
+    out.add_argument(
+        "--rate", type=above_zero, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s"
+    )
     out.add_argument(
         "--set-origin", action="store_true", help="give the autopilot the reference's place as its origin, once"
     )
     out.add_argument("--nmea", metavar="HOST:PORT", help="a chart plotter, by UDP")
     out.add_argument("--http", metavar="HOST:PORT", help="serve JSON there, in the manner of Water Linked's UGPS")
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="end after this long; default: at Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if args.reference == args.vehicle:
         raise BuddylineError(f"--reference {args.reference}: is the vehicle itself")
     if not (args.mavlink or args.nmea or args.http):
-        raise BuddylineError("bridge: give --mavlink, --nmea or --http")
+        raise BuddylineError("give --mavlink, --nmea or --http")
     if args.place and args.boat:
         raise BuddylineError("--place and --boat: give one of them")
     kinds = tuple(args.messages.split(","))

@@ -15,6 +15,7 @@ from buddyline.protocol import topics
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.pairs import add_pair_argument
+from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_page_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare how long and where the page is served."""
-    parser.add_argument("--seconds", type=float, metavar="S", help="end after this long; default: at Ctrl-C")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="end after this long; default: at Ctrl-C")
     parser.add_argument(
         "--host",
         default=DEFAULT_HOST,

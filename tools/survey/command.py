@@ -14,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import SURVEYOR
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments
+from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     from buddyline.tools.survey.network import Adjusted
@@ -81,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
     watch = add("publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch, "watch")
     add_client_arguments(watch, SURVEYOR)
-    watch.add_argument("--seconds", type=float, metavar="S", help="stop after this long; default: at Ctrl-C")
+    watch.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long; default: at Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
+from buddyline.tools.quantity import above_zero
 from buddyline.tools.survey.marks import KINDS, stamp_ns_of, time_of
 from buddyline.tools.survey.project import STATION_NAME
 
@@ -28,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
     add_client_arguments(parser, SURVEYOR)
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="give up after this long without a hub; default: wait for it"
+        "--seconds", type=above_zero, metavar="S", help="give up after this long without a hub; default: wait for it"
     )
     parser.add_argument(
         "--linger", type=float, default=1.0, metavar="S", help="stay on the bus for this long; default: 1"
