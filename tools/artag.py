@@ -14,13 +14,13 @@ from buddyline.node.drivers.stored import PictureError, decode_picture
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, CompressedImage, NodeInfo, RelativePose
-from buddyline.protocol.topics import ARTAG, check_node_id
+from buddyline.protocol.topics import ARTAG
 from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized, rotate
 from buddyline.tools.evaluation.truth import PoseHistory
 from buddyline.tools.newfile import new_dive_log
-from buddyline.tools.solve import COPIED, pair_of
+from buddyline.tools.solve import COPIED, node_files, pair_of
 from buddyline.tools.tags.detection import TagFinder
 from buddyline.tools.tags.layout import Layout, layout_of, load_layout
 from buddyline.tools.tags.pose import TagPose, readings_of, tag_pose
@@ -169,10 +169,9 @@ def run(args: argparse.Namespace) -> int:
 def layouts(name: str, infos: dict[str, NodeInfo], nodes: tuple[str, str], given: list[str]) -> dict[str, Layout]:
     """Return the tags of both nodes: of `--tags NODE=FILE`, else of NodeInfo; raise if there are none."""
     chosen: dict[str, Layout] = {}
-    for text in given:
-        node, equals, path = text.partition("=")
-        if not equals or check_node_id(node) not in nodes:
-            raise BuddylineError(f"--tags {text}: give NODE=FILE, a node of {' and '.join(nodes)}")
+    for node, path in node_files("--tags", given):
+        if node not in nodes:
+            raise BuddylineError(f"--tags {node}={path}: is of neither {' nor '.join(nodes)}")
         chosen[node] = load_layout(path)
     for node in nodes:
         info = infos.get(node)

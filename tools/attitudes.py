@@ -14,8 +14,9 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.envelope import Envelope, envelope_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Imu
-from buddyline.protocol.topics import IMU, check_node_id
+from buddyline.protocol.topics import IMU
 from buddyline.tools.dives import Dive
+from buddyline.tools.solve import node_files
 
 log = logging.getLogger(__name__)
 
@@ -57,13 +58,10 @@ def in_place_of(envelopes: Iterator[Envelope], attitudes: Sequence[Envelope]) ->
 
 def _given(given: Sequence[str]) -> dict[str, NodeConfig]:
     found = {}
-    for text in given:
-        node, equals, path = text.partition("=")
-        if not equals:
-            raise ConfigError(f"--attitude-again {text}: give NODE=FILE.toml")
+    for node, path in node_files("--attitude-again", given):
         config = load_node_config(path)
-        if config.node != check_node_id(node):
-            raise ConfigError(f"--attitude-again {text}: the file is of node {config.node}")
+        if config.node != node:
+            raise ConfigError(f"--attitude-again {node}={path}: the file is of node {config.node}")
         found[node] = config
     return found
 

@@ -13,7 +13,7 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.messages import ClockBeacon, HeardClock
-from buddyline.protocol.topics import CLOCK, parse_key
+from buddyline.protocol.topics import CLOCK
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.tools.calibration.clock import LIMIT_S, OffsetEstimate, OneWayTimes, estimate, windows
 from buddyline.tools.dives import Dive
@@ -81,7 +81,7 @@ class Ties:
 
 def beacon_curves(dive: Dive, nodes: Sequence[str]) -> list[BeaconCurve]:
     """Return the clocks of all nodes but the first, as far as beacons tell them."""
-    if CLOCK.name not in {topic for key in dive.keys if (topic := _topic(key))}:
+    if not dive.nodes(CLOCK.name):
         return []
     beacons = [
         envelope.message
@@ -162,11 +162,6 @@ def _steadied(beacon: ClockBeacon, ties: dict[str, Ties]) -> ClockBeacon:
 
 def _moved(ties: Ties, stamp_ns: int) -> int:
     return max(int(ties.steady_ns(np.array([stamp_ns], np.int64))[0]), 0)
-
-
-def _topic(key: str) -> str:
-    parsed = parse_key(key)
-    return parsed[0].name if parsed else ""
 
 
 def chosen_curves(

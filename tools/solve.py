@@ -102,15 +102,21 @@ def _is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:
 def replacements(given: list[str]) -> dict[str, NodeInfo]:
     """Read the calibrations of `--info NODE=FILE`."""
     replaced = {}
+    for node, path in node_files("--info", given):
+        info = load_info(path)
+        if info.node != node:
+            raise ConfigError(f"--info {node}={path}: the file describes node {info.node}")
+        replaced[node] = info
+    return replaced
+
+
+def node_files(option: str, given: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yield the node and the file's name of each NODE=FILE of an option; raise ConfigError where one is not that."""
     for text in given:
         node, equals, path = text.partition("=")
         if not equals:
-            raise ConfigError(f"--info {text}: give NODE=FILE")
-        info = load_info(path)
-        if info.node != check_node_id(node):
-            raise ConfigError(f"--info {text}: the file describes node {info.node}")
-        replaced[node] = info
-    return replaced
+            raise ConfigError(f"{option} {text}: give NODE=FILE")
+        yield check_node_id(node), path
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:

@@ -67,7 +67,7 @@ def test_recorded_attitudes_are_replaced_and_missing_ones_made(folder, tmp_path)
     ("words", "said"),
     [
         ((), "no configuration of node b: --attitude-again b=FILE.toml"),
-        (("b.toml",), "give NODE=FILE.toml"),
+        (("b.toml",), "give NODE=FILE"),
         (("a=b.toml",), "the file is of node b"),
     ],
 )
