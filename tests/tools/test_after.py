@@ -1,12 +1,20 @@
 """From the nodes' folders to a solved dive and its report."""
 
+import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from buddyline.node.sim.dive import messages
+from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.world import World
+from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.messages import RelativePose
 from buddyline.tools.after import logs_in, outings
 from buddyline.tools.cli import main
+from buddyline.tools.dives import Dive
 
 LOGS = Path(__file__).parents[1] / "data" / "golden"
 
@@ -27,6 +35,21 @@ def moved(source, target, hours):
             writer.write(record.key, record.payload, record.log_time_ns + hours * 3_600_000_000_000)
 
 
+def corrections(folders, out):
+    """Give the times (s) of the poses of both `after` and a plain `solve`, and how far `after` moved B's stamps (s)."""
+    logs, without = [str(path) for path in logs_in([folders / "a", folders / "b"])], folders / "without.mcap"
+    assert main(["solve", *logs, "--track", "none", "--clock-offset", "0", "-o", str(without)]) == 0
+    poses = []
+    for path in (out / "solved.mcap", without):
+        with Dive([path]) as dive:
+            found = [one.message for one in dive.messages("pose")]
+        poses.append({one.trigger: one for one in found if isinstance(one, RelativePose)})
+    moved, unmoved = poses
+    common = sorted(moved.keys() & unmoved.keys())
+    times_ns = np.array([unmoved[k].stamp_ns for k in common])
+    return times_ns / S_NS, np.array([moved[k].skew_ns - unmoved[k].skew_ns for k in common]) / S_NS
+
+
 def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     out = folders / "dive"
     assert main(["after", str(folders / "a"), str(folders / "b"), "-o", str(out)]) == 0
@@ -39,9 +62,39 @@ def test_a_dive_s_folders_become_poses_track_and_report(folders, capsys):
     }
     with DiveLogReader(out / "solved.mcap") as reader:
         assert {"buddyline/pair/a/b/pose", "buddyline/pair/a/b/track"} <= set(reader.keys)
+    _, moved_s = corrections(folders, out)
+    told = json.loads((out / "clocks.json").read_text())
+    assert moved_s == pytest.approx(told["offset_s"], abs=1e-6)
+    assert abs(told["offset_s"] - 0.03) < 3 * told["sigma_s"]
+    assert len(moved_s) > 30
     capsys.readouterr()
     assert main(["after", str(folders / "a"), "-o", str(out)]) == 2
     assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_drift_that_the_dive_tells_is_taken_out(tmp_path):
+    """No beacons: B's clock starts 20 ms ahead and gains 150 us a second; with precise fixes two minutes tell it."""
+    drift, start_s = 150e-6, 1_764_000_000
+    scenario = Scenario(
+        seed=8, start_ns=start_s * S_NS, interruptions=False, clock_offset_ns=20 * MS_NS, clock_drift=drift,
+        sigma_px=0.15, gross_share=0.0, miss_share=0.0, false_lights=0,
+    )  # fmt: skip
+    dive = [message for _, _, message in messages(World(scenario), DivePlan(seconds=130.0, rate_hz=4.0, imu=True))]
+    for node in "ab":
+        (tmp_path / node).mkdir()
+        with DiveLogWriter(tmp_path / node / f"{node}.mcap", metadata={"node": node}) as writer:
+            for message in dive:
+                if getattr(message, "node", "") == node:
+                    writer.write_message(message)
+    out = tmp_path / "dive"
+    assert main(["after", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(out)]) == 0
+    times_s, moved_s = corrections(tmp_path, out)
+    left_s = moved_s - (0.02 + drift * (times_s - start_s))
+    assert len(left_s) > 300
+    # Without the drift 15 ms would be left between start and end, without both 20 ms at the start.
+    assert np.ptp(left_s) < 0.005
+    assert np.abs(left_s).max() < 0.005
 
 
 def test_each_dive_has_its_folder_and_a_log_without_a_partner_is_left_out(folders):
