@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.node.chrony import ChronyError, Tracking, read_tracking
-from buddyline.node.drivers.readout import boottime_ns, wall_offset_ns
+from buddyline.node.drivers.readout import boottime_ns, clock_offset_ns
 from buddyline.protocol.clock import MS_NS, S_NS
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class NodeClock:
 
     def start(self) -> None:
         """Take the system clock's time, before anything has been stamped."""
-        self._offset_ns = wall_offset_ns(self._boottime, self._wall)
+        self._offset_ns = clock_offset_ns(self._boottime, self._wall)
 
     def now_ns(self) -> int:
         """Return the present time."""
@@ -71,17 +71,17 @@ class NodeClock:
 
     def reading(self) -> tuple[int, int]:
         """Return the present time, and CLOCK_MONOTONIC_RAW at the same instant."""
-        raw_from_boottime_ns = wall_offset_ns(self._boottime, self._raw)
+        raw_from_boottime_ns = clock_offset_ns(self._boottime, self._raw)
         now_ns = self._boottime()
         return now_ns + self._offset_ns, now_ns + raw_from_boottime_ns
 
     def follow(self) -> int:
         """Follow a step of the system clock; return by how much this clock was set, 0 if it was not."""
-        moved_ns = wall_offset_ns(self._boottime, self._wall) - self._offset_ns
+        moved_ns = clock_offset_ns(self._boottime, self._wall) - self._offset_ns
         if abs(moved_ns) <= STEP_NS:
             return 0
         # Again: a thread can be interrupted in each of the tries.
-        moved_ns = wall_offset_ns(self._boottime, self._wall) - self._offset_ns
+        moved_ns = clock_offset_ns(self._boottime, self._wall) - self._offset_ns
         if abs(moved_ns) <= STEP_NS:
             return 0
         self._offset_ns += moved_ns

@@ -32,12 +32,10 @@ def again(dive: Dive, given: Sequence[str], nodes: Sequence[str]) -> list[Envelo
         if isinstance(envelope.message, Imu) and envelope.message.node in nodes:
             samples[envelope.message.node].append(envelope.message)
     for node in configs:
-        if node in nodes and not samples[node]:
+        if node in nodes and node not in samples:
             log.warning("%s: no inertial samples of node %s: its attitudes stay as they are", dive.name, node)
     found: list[Envelope] = []
     for node, taken in samples.items():
-        if not taken:
-            continue
         if node not in configs:
             raise BuddylineError(f"{dive.name}: no configuration of node {node}: --attitude-again {node}=FILE.toml")
         taken.sort(key=lambda one: one.stamp_ns)

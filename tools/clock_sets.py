@@ -168,13 +168,17 @@ def _log_of(reader: DiveLogReader) -> _Log:
     return _Log(reader, node if nodes == {node} else "", _eras(reader))
 
 
+def _is_clock_set(key: str) -> bool:
+    parsed = parse_key(key)
+    return parsed is not None and parsed[0] is CLOCK_SET
+
+
 def _eras(reader: DiveLogReader) -> dict[str, list[Era]]:
     """Return the eras of the clocks that were set in a log, by node."""
-    if not any(parsed[0] is CLOCK_SET for parsed in map(parse_key, reader.keys) if parsed):
+    if not any(map(_is_clock_set, reader.keys)):
         return {}
     found: dict[str, list[tuple[int, ClockSet]]] = {}
-    records = reader.records(lambda key: (parsed := parse_key(key)) is not None and parsed[0] is CLOCK_SET)
-    for record, envelope in _opened(records, lambda key, error: None):
+    for record, envelope in _opened(reader.records(_is_clock_set), lambda key, error: None):
         if isinstance(envelope.message, ClockSet):
             found.setdefault(envelope.message.node, []).append((record.sequence, envelope.message))
     return {node: _eras_of(reader, node, sorted(sets, key=lambda one: one[0])) for node, sets in found.items()}

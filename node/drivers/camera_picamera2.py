@@ -24,8 +24,8 @@ from buddyline.node.drivers.readout import (
     LineTimer,
     Readout,
     boottime_ns,
+    clock_offset_ns,
     first_line_ns,
-    wall_offset_ns,
 )
 from buddyline.node.drivers.samples import AbsentError, DeviceError
 from buddyline.node.trigger import FollowerWatch, FrameChooser, PhaseLock, frames_per_trigger
@@ -265,7 +265,7 @@ class Picamera2Camera:
             self._measure_line(metadata)
             readout = self._readout(tuple(metadata.get("ScalerCrop", self._mode_crop)))
             stamp_ns = readout.middle_ns(metadata["SensorTimestamp"], metadata["ExposureTime"])
-            stamp_ns += wall_offset_ns(self._boottime, self._clock.now_ns)
+            stamp_ns += clock_offset_ns(self._boottime, self._clock.now_ns)
             exposure = exposure_of(metadata)
             steady_ns = self._ask_exposure(stamp_ns, exposure)
             self._keep_phase(steady_ns)

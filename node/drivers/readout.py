@@ -35,18 +35,18 @@ def boottime_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def wall_offset_ns(boottime: Callable[[], int], wall: Callable[[], int]) -> int:
-    """Return the wall clock minus CLOCK_BOOTTIME.
+def clock_offset_ns(boottime: Callable[[], int], other: Callable[[], int]) -> int:
+    """Return another clock minus CLOCK_BOOTTIME.
 
-    The wall clock is read between two readings of the other; of a few tries the quickest counts, because a thread
+    The other clock is read between two readings of CLOCK_BOOTTIME; of a few tries the quickest counts, because a thread
     can be interrupted in between.
     """
     best_ns, offset_ns = None, 0
     for _ in range(BRACKET_TRIES):
-        before_ns, wall_ns, after_ns = boottime(), wall(), boottime()
+        before_ns, other_ns, after_ns = boottime(), other(), boottime()
         width_ns = after_ns - before_ns
         if best_ns is None or width_ns < best_ns:
-            best_ns, offset_ns = width_ns, wall_ns - (before_ns + after_ns) // 2
+            best_ns, offset_ns = width_ns, other_ns - (before_ns + after_ns) // 2
         if width_ns <= BRACKET_NS:
             break
     return offset_ns

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from buddyline.node.drivers.samples import ImuSample
+from buddyline.protocol.messages import Imu
 from numpy.typing import NDArray
 
 RATE_HZ = 100
@@ -26,6 +27,15 @@ class Dive:
     R_ned_body: Array
     samples: list[ImuSample]
     disturbed: NDArray[np.bool_]
+
+
+def log_of(dive: Dive) -> list[Imu]:
+    """Give the samples as a node's log has them."""
+    found = []
+    for s in dive.samples:
+        accel_mps2, gyro_radps, mag_t = (tuple(each.tolist()) for each in (s.accel_mps2, s.gyro_radps, s.mag_t))
+        found.append(Imu(node="a", stamp_ns=s.stamp_ns, accel_mps2=accel_mps2, gyro_radps=gyro_radps, mag_t=mag_t))
+    return found
 
 
 def field_ned_t() -> Array:

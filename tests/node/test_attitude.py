@@ -12,7 +12,6 @@ from buddyline.node.attitude import VqfAttitude, attitudes, ned_of_enu, quaterni
 from buddyline.node.drivers.samples import ImuSample
 from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Imu
 
 from tests.node import swell
 
@@ -156,19 +155,9 @@ def test_calibration_is_applied():
 
 def test_a_log_gives_right_headings_with_a_later_calibration():
     dive = swell.simulate(8.0, calibrated=False)
-    log = [
-        Imu(
-            node="a",
-            stamp_ns=s.stamp_ns,
-            accel_mps2=tuple(s.accel_mps2.tolist()),
-            gyro_radps=tuple(s.gyro_radps.tolist()),
-            mag_t=tuple(s.mag_t.tolist()),
-        )
-        for s in dive.samples
-    ]
     A = np.array([[1.1, 0.03, 0.0], [0.03, 0.95, -0.02], [0.0, -0.02, 1.04]])
     later = MagnetometerCalibration(np.array([8e-6, -12e-6, 5e-6]), np.linalg.inv(A))
-    found = list(attitudes(log, VqfAttitude(later, HERE)))
+    found = list(attitudes(swell.log_of(dive), VqfAttitude(later, HERE)))
     assert {message.node for message in found} == {"a"}
     R = np.array([matrix(message.q_ned_body_xyzw) for message in found])
     errors = swell.matrix_to_vector(np.einsum("nij,nkj->nik", R, dive.R_ned_body[-len(found) :]))

@@ -4,25 +4,11 @@ import numpy as np
 import pytest
 from buddyline.node.attitude import VqfAttitude, attitudes, quaternion_to_matrix
 from buddyline.node.attitude_again import attitudes_again
-from buddyline.protocol.messages import Imu
 
 from tests.node import swell
 from tests.node.test_attitude import HERE, SOUND
 
 pytest.importorskip("vqf", reason="vqf is not installed: make install EXTRAS=pi")
-
-
-def log_of(dive):
-    return [
-        Imu(
-            node="a",
-            stamp_ns=s.stamp_ns,
-            accel_mps2=tuple(s.accel_mps2.tolist()),
-            gyro_radps=tuple(s.gyro_radps.tolist()),
-            mag_t=tuple(s.mag_t.tolist()),
-        )
-        for s in dive.samples
-    ]
 
 
 def errors_of(found, dive):
@@ -53,7 +39,7 @@ def estimator():
 def test_both_ways_are_better_than_one_or_as_good(conditions, heading, tilt):
     """By the given factors; where one way is good, both are about as good."""
     dive = swell.simulate(60.0, seed=2, **conditions)
-    log = log_of(dive)
+    log = swell.log_of(dive)
     once, _ = errors_of(list(attitudes(log, estimator())), dive)
     found = attitudes_again(log, estimator())
     both, sigmas = errors_of(found, dive)
@@ -67,7 +53,7 @@ def test_both_ways_are_better_than_one_or_as_good(conditions, heading, tilt):
 
 def test_stamps_rise_and_nothing_comes_of_nothing():
     assert attitudes_again([], estimator()) == []
-    log = log_of(swell.simulate(8.0))
+    log = swell.log_of(swell.simulate(8.0))
     stamps = [one.stamp_ns for one in attitudes_again(log, estimator())]
     assert np.all(np.diff(stamps) > 0)
     assert attitudes_again(log[:5], estimator()) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
-from buddyline.node.drivers.readout import LineTimer, Readout, boottime_ns, first_line_ns, wall_offset_ns
+from buddyline.node.drivers.readout import LineTimer, Readout, boottime_ns, clock_offset_ns, first_line_ns
 
 FULL = (0, 0, 3280, 2464)
 
@@ -89,14 +89,14 @@ class Ticking:
 def test_offset_is_taken_from_the_tightest_bracket():
     """An interruption of a millisecond before the second reading would put the offset off by half of that."""
     calm = Ticking([])
-    assert wall_offset_ns(calm.boottime, calm.wall) == 7_000_000_000
+    assert clock_offset_ns(calm.boottime, calm.wall) == 7_000_000_000
     interrupted = Ticking([1000, 1_000_000])
-    assert abs(wall_offset_ns(interrupted.boottime, interrupted.wall) - 7_000_000_000) < 1000
+    assert abs(clock_offset_ns(interrupted.boottime, interrupted.wall) - 7_000_000_000) < 1000
 
 
 def test_a_machine_that_is_always_interrupted_still_gets_an_answer():
     busy = Ticking([100_000] * 20)
-    assert abs(wall_offset_ns(busy.boottime, busy.wall) - 7_000_000_000) < 100_000
+    assert abs(clock_offset_ns(busy.boottime, busy.wall) - 7_000_000_000) < 100_000
 
 
 def test_boottime_advances():
