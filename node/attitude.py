@@ -39,7 +39,7 @@ MAX_BIAS_DPS: Final = 5.0
 MAX_BIAS_SIGMA_DPS: Final = 0.5
 # Time in which the bias moves by 0.1 deg/s: 0.05 deg/s per K, 25 K from deck to water, time constant 120 s.
 BIAS_FORGETTING_S: Final = 10.0
-# Of a new temperature: a chip that counts whole degrees must not step the bias.
+# Weight of a new temperature in the smoothed one: a chip that counts whole degrees must not step the bias.
 WARMTH_SHARE: Final = 0.2
 GAP_S: Final = 0.2
 LONG_GAP_S: Final = 5.0

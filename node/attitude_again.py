@@ -19,7 +19,7 @@ from buddyline.protocol.messages import Attitude, Imu
 from msgspec.structs import replace
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
-# Of the least sigma of a dive, which both directions state once they have settled.
+# The error that both directions have in common, as a share of the dive's least sigma.
 COMMON: Final = 0.95
 
 
@@ -35,8 +35,9 @@ def attitude_estimator(config: NodeConfig, at_ns: int) -> VqfAttitude:
 def attitudes_again(samples: Sequence[Imu], estimator: VqfAttitude) -> list[Attitude]:
     """Return an attitude for each sample but the last few; samples in order of time, of one node.
 
-    The way back starts with all that the way there has found; the way there, if it found no rest, is gone once more.
-    sigma_rad is the smaller of both ways', not less: magnetometer, accelerometer and mount are the same in both.
+    The backward pass starts with all that the forward pass has learned. Where the forward pass found no rest at its
+    start, it is done again after the backward one. sigma_rad is the smaller one of both passes, not less: both have the
+    same magnetometer, accelerometer and mount.
     """
     if not samples:
         return []
@@ -76,9 +77,9 @@ def _reversed(samples: Sequence[Imu], ends_ns: int) -> list[Imu]:
 
 
 def _mean(one: Attitude, other: Attitude, common_rad: Vector) -> Attitude:
-    """Return the mean of two attitudes of one instant, by what each is less sure of than the other.
+    """Return the mean of two attitudes of one instant, weighted by the part of their errors that is not common.
 
-    common_rad: the part of both sigmas, about N, E, D, that does not count: both have the same error there.
+    common_rad: sigma of the common error, about N, E, D.
     """
     a, b = (np.array(each.sigma_rad) for each in (one, other))
     share = (a**2 - common_rad**2) / (a**2 + b**2 - 2 * common_rad**2)

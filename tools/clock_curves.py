@@ -26,8 +26,9 @@ log = logging.getLogger(__name__)
 # A smaller offset moves a light by less than its noise, whatever its sigma.
 LEAST_OFFSET_S: Final = 0.001
 EVERY_NS: Final = 10 * S_NS
-# Beacons tell the drift where they are this long apart, and a dive's clocks where no more of it lies outside them.
+# The first and the last estimate tell the drift where they are at least this far apart.
 MIN_SPAN_NS: Final = 60 * S_NS
+# Beacons cover a dive that begins and ends less than this outside of them.
 OUTSIDE_NS: Final = 120 * S_NS
 
 
@@ -45,9 +46,9 @@ class BeaconCurve:
 
 
 class Ties:
-    """A node's stamps and the raw clock at the same instants, which nothing sets or slews.
+    """Instants at which both a node's stamp and its raw clock are known; nothing sets or slews the raw clock.
 
-    Steady time is the raw clock, moved so that it is the last stamp at the last tie.
+    Steady time is the raw clock, moved so that it equals the stamp at the last tie.
     """
 
     def __init__(self, stamps_ns: Sequence[int], raws_ns: Sequence[int]) -> None:
