@@ -68,7 +68,7 @@ class Publisher(ABC):
         return self.put_bytes(encode(message))
 
     def put_bytes(self, payload: bytes) -> bool:
-        """Send an encoded message; return False if its size, the rate cap or a closed bus prevents it."""
+        """Send an encoded message; return False if its size, the rate cap, a slow link or a closed bus prevents it."""
         if len(payload) > self.topic.max_bytes:
             if not self._warned:
                 log.warning("%s: %d bytes, at most %d: not sent", self.key, len(payload), self.topic.max_bytes)
