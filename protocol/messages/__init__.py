@@ -1,0 +1,88 @@
+"""The messages of the bus and of dive logs, as validated structures.
+
+`codec.decode` checks types, lengths, finite numbers, unit quaternions, and that blobs are inside their picture.
+"""
+
+from buddyline.protocol.messages.fields import (
+    NODE_ID_PATTERN,
+    Count,
+    Message,
+    NodeId,
+    NonNegative,
+    Positive,
+    Quaternion,
+    StampNs,
+    Vector3,
+)
+from buddyline.protocol.messages.frame import (
+    MAX_BLOBS,
+    Blob,
+    Candidates,
+    CompressedImage,
+    Expect,
+    ExpectedLight,
+    FoxgloveTime,
+    LightTruth,
+    TrueLight,
+)
+from buddyline.protocol.messages.net import NodePose
+from buddyline.protocol.messages.node import (
+    MAX_HEARD,
+    ArTag,
+    Attitude,
+    CameraModel,
+    ClockBeacon,
+    ClockSet,
+    Depth,
+    FixedPlace,
+    HeardClock,
+    Imu,
+    Mark,
+    NodeInfo,
+    NodeStatus,
+    Role,
+)
+from buddyline.protocol.messages.pair import Reason, Rejected, RelativePose, SolverStatus, Track, TrackMode, Truth
+
+__all__ = [
+    "MAX_BLOBS",
+    "MAX_HEARD",
+    "NODE_ID_PATTERN",
+    "ArTag",
+    "Attitude",
+    "Blob",
+    "CameraModel",
+    "Candidates",
+    "ClockBeacon",
+    "ClockSet",
+    "CompressedImage",
+    "Count",
+    "Depth",
+    "Expect",
+    "ExpectedLight",
+    "FixedPlace",
+    "FoxgloveTime",
+    "HeardClock",
+    "Imu",
+    "LightTruth",
+    "Mark",
+    "Message",
+    "NodeId",
+    "NodeInfo",
+    "NodePose",
+    "NodeStatus",
+    "NonNegative",
+    "Positive",
+    "Quaternion",
+    "Reason",
+    "Rejected",
+    "RelativePose",
+    "Role",
+    "SolverStatus",
+    "StampNs",
+    "Track",
+    "TrackMode",
+    "TrueLight",
+    "Truth",
+    "Vector3",
+]
