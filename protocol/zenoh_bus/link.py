@@ -109,10 +109,11 @@ class Link:
                 connection.bear_losses()
             self.is_long = state.min_rtt_s > LONG_RTT_S
             self._budget.observe(state, now_s)
-            if state.received - state.unread != read or not state.unread:
-                if state.received - state.unread != read:
-                    self._heard_s = now_s
-                read, changed_s = state.received - state.unread, now_s
+            read_before, read = read, state.received - state.unread
+            if read != read_before:
+                self._heard_s = now_s
+            if read != read_before or not state.unread:
+                changed_s = now_s
             elif now_s - changed_s > UNREAD_S:
                 log.warning("nobody reads what the hub sends for %.1f s: connecting again", now_s - changed_s)
                 connection.cut()
