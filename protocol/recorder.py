@@ -30,9 +30,10 @@ class RecordError(BuddylineError):
 class Recorder:
     """Writes payloads into a dive log and syncs it every second.
 
-    While the disk is slow or refuses to write, messages wait in memory. Beyond 64 MB the oldest pictures are dropped
-    first, then the oldest messages; `dropped` counts them. `error`: why nothing can be written; None if it can. After
-    an error the thread tries again until `close`. pictures: receives the pictures, in place of the log.
+    While the disk is slow or refuses to write, messages wait in memory. Beyond 64 MB, besides what is being written,
+    the oldest pictures are dropped first, then the oldest messages; `dropped` counts them. `error`: why nothing can be
+    written; None if it can. After an error the thread tries again until `close`. pictures: receives the pictures, in
+    place of the log.
     """
 
     def __init__(
