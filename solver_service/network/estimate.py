@@ -1,4 +1,4 @@
-"""One estimate of a network: its members, how they move, and what sensors and lights add."""
+"""One estimate of a network: its members, how they move, and what their sensors and lights say."""
 
 from __future__ import annotations
 
@@ -48,25 +48,25 @@ from buddyline.solver_service.track.stepping import (
 )
 from buddyline.solver_service.track.strapdown import Increment, Noise, integrate
 
-# A node is told once its lights explain the pictures better than clutter by this; it leaves below GIVEN_UP, or where it
-# has not been confirmed for so long.
+# A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below
+# GIVEN_UP, or when it has not been confirmed within PATIENCE_S.
 CONFIRMED: Final = 25.0
 GIVEN_UP: Final = -15.0
 PATIENCE_S: Final = 4.0
 # Beyond this chi^2 a pose (6 degrees of freedom) or an attitude (3) contradicts the network.
 CONTRADICTS: Final = 33.0
-# A node is told while its position is better than this, 1 sd, or than a share of its distance from the frame's zero,
-# and leaves after so long without a light when it is worse than LOST_M.
+# A node's pose is given while its position is better than TOLD_M, 1 sd, or than a share of its distance from the
+# frame's zero. A node leaves after LOST_S without a light when its position is worse than LOST_M.
 TOLD_M: Final = 0.5
 TOLD_SHARE: Final = 0.1
 LOST_S: Final = 3.0
 LOST_M: Final = 1.5
-# Further outside of a picture, a bar is not looked for in it.
+# A bar whose lights are further outside of a picture than this is not looked for in it.
 OUTSIDE_PX: Final = 60.0
-# What iron near a compass, or haste, adds to an attitude's sigmas (roll, pitch, yaw) when a join is checked.
+# What iron near a compass, or acceleration, adds to an attitude's sigmas (roll, pitch, yaw) when a join is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 FREE_HEADING: Final = 1e6
-# Lights of the trigger whose pose made a node a member tell nothing new of it.
+# For so long after a pose made a node a member, its lights are not used: they are those of the pose.
 SKIP_S: Final = 0.02
 
 
@@ -103,8 +103,11 @@ class NetRow:
 
 @dataclass(eq=False)
 class Member:
-    """What is known of a member beside its state. light_s: when a light last told of it. skip_s: lights before that
-    made it a member. evidence: log odds over clutter since then."""
+    """What is known of a member beside its state.
+
+    light_s: time of the last light that was used of it, or in its pictures. skip_s: earlier lights are not used, for
+    they made it a member. evidence: log odds over clutter since it joined. without: it has no inertial unit now.
+    """
 
     node: int
     since_s: float
@@ -121,8 +124,8 @@ class NetEstimate:
     """One estimate. intake: what all nodes have told. places: of the fixed nodes, by index. dark: nodes without lamps.
 
     members, state, covariance, rates_radps, t_s: as they are now. evidence: log odds over clutter of all pictures so
-    far. detection: by observer and other node, how likely each of its lights is found. surprise, told: chi^2 of the
-    lights used, and of how many residuals.
+    far. detection: by observer and other node, how likely each of its lights is found. surprise: chi^2 of all lights
+    used; told: the number of their residuals.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
@@ -252,7 +255,7 @@ class NetEstimate:
         return noise if stated is None else replace(noise, gap_tilt_rad=stated[0], gap_heading_rad=stated[1])
 
     def _moved(self, to_s: float) -> tuple[NetState, Move, Floats, list[bool], Floats]:
-        """Give the state at to_s, the step there, turn rates, who has no inertial unit now, and what shaking draws."""
+        """Give the state at to_s, the step to it, turn rates, who is without inertial unit, and what shaking adds."""
         assert self.state is not None
         state, n = self.state, len(self.state)
         F, Q = np.tile(np.eye(BLOCK), (n, 1, 1)), np.zeros((n, BLOCK, BLOCK))
@@ -268,7 +271,7 @@ class NetEstimate:
             noise = self._noise_of(member.node, to_s)
             after, F[i], Q[i], drawn[i] = moved_member(state, i, part, noise, shaking[i], to_s - self.t_s)
             if part.without != member.without:
-                # The unit has stopped, or come back: what stands in place of its constants is told anew.
+                # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
                 Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
                 Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
             without[i] = part.without
@@ -453,7 +456,7 @@ class NetEstimate:
         self.told += len(rows_y)
 
     def _judge(self) -> None:
-        """Confirm members, and let those go of which nothing tells."""
+        """Confirm members, and remove those of which no light tells any more."""
         for index in range(len(self.members) - 1, -1, -1):
             member = self.members[index]
             if member.node in self.places:
@@ -505,7 +508,7 @@ class NetEstimate:
         return True
 
     def join(self, t_s: float, fix: PairFix, index: int, node: int) -> None:
-        """Make a node a member, at the pose that a member has of it.
+        """Make a node a member at a pose of it from a member; not where its attitude contradicts that pose.
 
         p_j = p_i + R_i t, R_j = R_i R_ab: dp_j = dp_i + R_i e_t + [p_j]x R_i e_w, phi_j = phi_i + R_i e_w.
         """

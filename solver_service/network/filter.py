@@ -1,8 +1,8 @@
 """The causal filter of a network: messages in the order of time, who joins, which estimate is followed, rows.
 
-A fixed node is a member from the start; any other joins when a few poses in a row place it beside a member. Poses on
-end that contradict the network open challengers, in which the node in question stands where these poses say: the one
-that explains the pictures best is followed. Without fixed nodes the frame moves with the first member.
+A fixed node is a member from the start; any other joins when a few poses in a row place it beside a member. Several
+poses in a row that contradict the network open challengers, in which the node in question stands where these poses say.
+The estimate that explains the pictures best is followed. Without fixed nodes the frame moves with the first member.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.stepping import HOLD_S, TOGETHER_S
 from buddyline.solver_service.track.turning import Turning
 
-# So many poses of one pair in a row, no further apart in time than this, and each in reach of the one before, place a
-# node: a single one may be wrong.
+# FIXES_TO_JOIN poses of one pair in a row, no further apart in time than JOIN_WITHIN_S, and each in reach of the one
+# before, place a node: a single one may be wrong.
 FIXES_TO_JOIN: Final = 3
 JOIN_WITHIN_S: Final = 1.5
 REACH_MPS: Final = 1.5
@@ -38,7 +38,7 @@ REFUTED: Final = 40.0
 MOST_CHALLENGERS: Final = 3
 # A pair opens a challenger no more often than this.
 AGAIN_S: Final = 1.0
-# A pair whose poses contradict the network so often on end is said to.
+# A pair is reported after so many poses in a row that contradict the network.
 CONTRADICTIONS: Final = 10
 MEMORY_S: Final = 30.0
 # Rows come after all else of their time.

@@ -9,7 +9,7 @@ from typing import Final
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log
 
 # Attitude filters err by a degree or two in tilt, and by several in heading, near iron by more; gauges drift, and the
-# tide rises by a metre in hours. A node counts as moved after so many judgements on end.
+# tide rises by a metre in hours. A node counts as moved after ON_END judgements in a row.
 TILTED_RAD: Final = math.radians(8.0)
 TURNED_RAD: Final = math.radians(20.0)
 SUNK_M: Final = 0.3
@@ -19,7 +19,7 @@ ON_END: Final = 3
 
 @dataclass(eq=False)
 class FixedWatch:
-    """Follows one fixed node. R (3, 3): of its place, camera to net. found: how often on end each fault was found."""
+    """Follows one fixed node. R (3, 3): of its place, camera to net. found: how often in a row each fault was found."""
 
     name: str
     R: Floats

@@ -38,7 +38,7 @@ BLOCK: Final = 30
 MOVING: Final = 15
 """The first errors of a block, which a step moves; the others are constants or walk slowly."""
 
-# Clocks that chrony keeps are nearer than this, 1 sd; `align` and `--clock-offset` bring others so near.
+# Clocks kept by chrony differ by less than this, 1 sd; so do others after `align` or `--clock-offset`.
 CLOCK_S: Final = 0.01
 # Each depth gauge's own offset, and the distance of the frame's zero from the surface, 1 sd.
 GAUGE_M: Final = 0.1
@@ -47,11 +47,11 @@ DATUM_M: Final = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class NetState:
-    """Members (n) in the net's frame, z down. Error 0 is that of the datum; node i has errors 1 + 30 i to 31 + 30 i.
+    """Members (n) in the net's frame, z down. Error 0 is the datum's; the errors of node i are `block(i)`.
 
     p_m, v_mps (n, 3): cameras. R (n, 3, 3): camera to net. shake_rad, shove_mps (n, 3): shaking, as in the track's
     State, each node's own. gyro_bias_radps, accel_bias_mps2, mount_rad, lever_m (n, 3), delay_s (n,): of the inertial
-    units, camera axes. clock_s (n,): each clock minus the net's. gauge_m (n,): what each depth gauge shows too much.
+    units, camera axes. clock_s (n,): each clock minus the net's. gauge_m (n,): by how much each gauge reads too deep.
     datum_m: depth of the frame's zero.
     """
 
