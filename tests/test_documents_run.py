@@ -28,6 +28,7 @@ DOCUMENTS = (
     "README.md",
     "docs/tutorial.md",
     "docs/dives.md",
+    "docs/network.md",
     "docs/security.md",
     "node/README.md",
     "tools/survey/README.md",
@@ -45,6 +46,7 @@ LEFT_OUT = {
 }
 SHORTER = {
     r"demo --seconds 30": "demo --seconds 8",
+    r"--rate 4$": "--rate 4 --seconds 8",
     r"--images --imu$": "--images --imu --seconds 4 --rate 5",
     r"--speed 4$": "--speed 0",
 }

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import PATIENCE_S, REPOSITORY
+from tests.processes import PATIENCE_S
+from tests.wheels import copy_sources
 
 pytestmark = [
     pytest.mark.slow,
@@ -26,17 +27,7 @@ class Checkout:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        listed = subprocess.run(
-            ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-            cwd=REPOSITORY,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        for name in listed.stdout.split("\0"):
-            if name and not name.startswith("tests/") and (REPOSITORY / name).is_file():
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(REPOSITORY / name, folder / name)
+        copy_sources(folder)
         self.git("init", "--quiet")
         self.commit()
 

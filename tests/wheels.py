@@ -1,6 +1,7 @@
 """Our wheel, built from the files that git knows."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -17,15 +18,21 @@ def run(*words, cwd):
     return subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, cwd=cwd, env=environment)
 
 
+def copy_sources(folder):
+    """Copy the files that git knows, but no tests, into a folder."""
+    listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=REPOSITORY)
+    assert listed.returncode == 0, listed.stderr
+    for name in listed.stdout.split("\0"):
+        if name and not name.startswith("tests/") and (REPOSITORY / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(REPOSITORY / name, folder / name)
+
+
 def build(folder):
     """Build the wheel in a folder; skip where setuptools cannot be fetched."""
     # A copy: setuptools leaves its own folders beside the sources.
     sources = folder / "sources"
-    listed = run("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard", cwd=REPOSITORY)
-    for name in listed.stdout.split("\0"):
-        if name and not name.startswith("tests/") and (REPOSITORY / name).is_file():
-            (sources / name).parent.mkdir(parents=True, exist_ok=True)
-            (sources / name).write_bytes((REPOSITORY / name).read_bytes())
+    copy_sources(sources)
     done = run(*PIP, "wheel", "--no-deps", "--quiet", "-w", folder, sources, cwd=folder)
     if "Could not find a version that satisfies the requirement setuptools" in done.stderr:
         pytest.skip("no wheel can be built: setuptools cannot be fetched from here")
