@@ -17,6 +17,7 @@ import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import open_envelope
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message, NodePose
 from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.coverage import Coverage
@@ -326,3 +327,11 @@ def test_the_states_are_told_apart_by_who_sees_no_green_or_no_red() -> None:
         for i, one in enumerate(shown):
             for other in shown[:i]:
                 assert np.linalg.norm(lab(one, kind) - lab(other, kind)) >= 40, (kind, one, other)
+
+
+@pytest.mark.parametrize(
+    ("host", "port", "fault"), [("127.0.0.1", 70000, "--port 70000"), ("192.0.2.1", 0, "give another address or port")]
+)
+def test_an_address_that_cannot_be_is_refused(host: str, port: int, fault: str) -> None:
+    with pytest.raises(BuddylineError, match=fault):
+        open_listener(host, port)

@@ -115,23 +115,26 @@ def open_listener(host: str, port: int) -> socket.socket:
         raise BuddylineError(
             f"the page needs websockets, which is not installed ({error.name}): make install EXTRAS=monitor"
         ) from error
+    if not 0 <= port < 65536:
+        raise BuddylineError(f"--port {port}: 0 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     wanted = [0] if port == 0 else range(port, min(port + PORTS_TRIED, 65536))
-    fault: Exception | None = None
+    fault: OSError | None = None
     for each in wanted:
         listener = socket.socket(family, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((host, each))
             listener.listen(64)
-        except (OSError, OverflowError) as failed:
+        except OSError as failed:
             listener.close()
             fault = fault or failed
             continue
         if each != port:
             log.warning("port %d is in use: the page is on port %d", port, listener.getsockname()[1])
         return listener
-    raise BuddylineError(f"--host {host} --port {port}: cannot be served: {fault}") from fault
+    assert fault is not None
+    raise BuddylineError(f"--host {host} --port {port}: {fault.strerror}; give another address or port") from fault
 
 
 def is_local(host: str) -> bool:
