@@ -16,7 +16,7 @@ from buddyline.solver_service.track.anchors import attitude_covariance
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# Where the border cuts off a part of a light's spot, the light may be anywhere in a depth like that, either way: 1 sd.
+# Where the border cuts a light, the light may be off by up to the depth of the cut, either way: 1 sd over that depth.
 _CUT_SHARE: Final = 3.0**-0.5
 
 
@@ -44,8 +44,7 @@ def rig_of(info: NodeInfo) -> Rig:
 def view_of(frame: Candidates) -> View:
     """Return a frame's candidates as arrays; a missing score becomes NaN.
 
-    The noise of a candidate that reaches over the picture's border is widened: what it says of itself is of the part
-    inside.
+    The sigma of a candidate that reaches over the picture's border is widened: its own is of the part inside alone.
     """
     rows = [
         (
@@ -63,7 +62,7 @@ def view_of(frame: Candidates) -> View:
 
 
 def _cut_px(blob: Blob, frame: Candidates) -> float:
-    """Return how deep the picture's border cuts into a candidate: into a disk of its area."""
+    """Return how deep the picture's border cuts into a candidate, taken as a disk of its area."""
     right_px, below_px = frame.width_px - 1 - blob.u_px, frame.height_px - 1 - blob.v_px
     return max(math.sqrt(blob.area_px / math.pi) - min(blob.u_px, blob.v_px, right_px, below_px), 0.0)
 

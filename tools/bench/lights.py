@@ -42,14 +42,18 @@ ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin", "day_reef")
 PERIOD_NS: Final = S_NS // 5
 FIRST_SEED: Final = 5000
 FIRST_COUNTED: Final = 5
+"""Number of each scene's first picture that counts: those of the first second do not."""
 CLOSE_PX: Final = 2.0
+"""A light with a candidate this near counts as found in the share `within 2 px`."""
 NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
 """A candidate is near a lamp within 3 px or 1 % of the width, the greater."""
 FIRST: Final = 3
+"""So many candidates, the likeliest, should have both lights."""
 BEYOND: Final = 11.83
 """Squared error over the variance per axis that 99.73 % of the errors do not exceed."""
 RANGES_M: Final = (0.0, 2.0, 3.0, 5.0, 50.0)
 UNCLIPPED: Final = 240.0
+"""A candidate whose peak is below this grey level counts as not clipped."""
 
 
 @dataclass(frozen=True, slots=True)
