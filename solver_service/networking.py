@@ -13,7 +13,8 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Attitude, Message, NodeInfo, NodePose, Rejected, RelativePose, TrackMode
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
-from buddyline.solver_service.network.estimate import KnownPlace, NetRow
+from buddyline.solver_service.network.belief import KnownPlace
+from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream

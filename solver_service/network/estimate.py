@@ -1,4 +1,4 @@
-"""One estimate of a network: its members, how they move, and what their sensors and lights say."""
+"""One estimate of a network: what lights say, who joins and leaves, and the poses that it gives."""
 
 from __future__ import annotations
 
@@ -9,44 +9,18 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
+from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
-from buddyline.solver_service.network.motion import Move, as_first_of_pair, moved_member
-from buddyline.solver_service.network.shaking import NetShaking
 from buddyline.solver_service.network.sights import columns, light_positions
-from buddyline.solver_service.network.state import (
-    BLOCK,
-    CLOCK,
-    DATUM_M,
-    GAUGE,
-    GYRO_BIAS,
-    MOUNT,
-    MOVING,
-    P_,
-    PHI,
-    V_,
-    NetState,
-    block,
-    blocks,
-    lone,
-)
+from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import weigh
-from buddyline.solver_service.track.inputs import AttitudeSeen, FixSeen, TrackNode
+from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight, in_picture, pixel_of, residuals
 from buddyline.solver_service.track.start import tilt_of
-from buddyline.solver_service.track.stepping import (
-    ATTITUDE_EVERY_S,
-    EDGE_PX,
-    HOLD_S,
-    MAX_DELAY_S,
-    TICK_S,
-    TOGETHER_S,
-    WITHOUT_RAD,
-    WITHOUT_RADPS,
-)
-from buddyline.solver_service.track.strapdown import Increment, Noise, integrate
+from buddyline.solver_service.track.stepping import EDGE_PX, HOLD_S, TICK_S, TOGETHER_S
 
 # A node is confirmed once its lights explain the pictures better than clutter by this (log odds). It leaves below
 # GIVEN_UP, or when it has not been confirmed within PATIENCE_S.
@@ -65,19 +39,8 @@ LOST_M: Final = 1.5
 OUTSIDE_PX: Final = 60.0
 # What iron near a compass, or acceleration, adds to an attitude's sigmas (roll, pitch, yaw) when a join is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
-FREE_HEADING: Final = 1e6
 # For so long after a pose made a node a member, its lights are not used: they are those of the pose.
 SKIP_S: Final = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class KnownPlace:
-    """Where a fixed node stands in the net's frame: p_m (3,), R (3, 3) camera to net, and how well it is known."""
-
-    p_m: Floats
-    R: Floats
-    sigma_m: float
-    sigma_rad: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,46 +64,18 @@ class NetRow:
     age_s: float
 
 
-@dataclass(eq=False)
-class Member:
-    """What is known of a member beside its state.
+class NetEstimate(NetBelief):
+    """One estimate of the network: a belief that also takes lights, lets nodes join and leave, and gives rows.
 
-    light_s: time of the last light that was used of it, or in its pictures. skip_s: earlier lights are not used, for
-    they made it a member. evidence: log odds over clutter since it joined. without: it has no inertial unit now.
-    """
-
-    node: int
-    since_s: float
-    confirmed: bool
-    light_s: float
-    skip_s: float = -np.inf
-    evidence: float = 0.0
-    attitude_s: float = -np.inf
-    depth_s: float = -np.inf
-    without: bool = False
-
-
-class NetEstimate:
-    """One estimate. intake: what all nodes have told. places: of the fixed nodes, by index. dark: nodes without lamps.
-
-    members, state, covariance, rates_radps, t_s: as they are now. evidence: log odds over clutter of all pictures so
-    far. detection: by observer and other node, how likely each of its lights is found. surprise: chi^2 of all lights
-    used; told: the number of their residuals.
+    dark: nodes without lamps. start_s: when a challenger began. evidence: log odds over clutter of all pictures so far.
+    detection: by observer and other node, how likely each of its lights is found.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
-        self.intake = intake
-        self.places: dict[int, KnownPlace] = {}
+        super().__init__(intake)
         self.dark: set[int] = set()
-        self.members: list[Member] = []
-        self.state: NetState | None = None
-        self.covariance: Floats = np.zeros((0, 0))
-        self.rates_radps: Floats = np.zeros((0, 3))
-        self.shaking = NetShaking.of_none()
-        self.t_s = -np.inf
         self.start_s = -np.inf
         self.evidence = 0.0
-        self.surprise, self.told = 0.0, 0
         self.detection: dict[tuple[int, int], Floats] = {}
 
     def copied(self) -> NetEstimate:
@@ -150,238 +85,11 @@ class NetEstimate:
         other.detection = {pair: of.copy() for pair, of in self.detection.items()}
         return other
 
-    @property
-    def nodes(self) -> Sequence[TrackNode]:
-        """All nodes, members or not."""
-        return self.intake.nodes
-
-    def member_of(self, node: int) -> int | None:
-        """Return a node's place among the members, None where it is none."""
-        return next((i for i, member in enumerate(self.members) if member.node == node), None)
-
-    @property
-    def anchor(self) -> int | None:
-        """The member that the frame moves with; None where a fixed node holds it."""
-        return 0 if not self.places else None
-
-    # Members
-
-    def begin(self, t_s: float) -> None:
-        """Make the fixed nodes members."""
-        self.t_s = t_s
-        for node in sorted(self.places):
-            self.settle(node, t_s)
-
-    def settle(self, node: int, t_s: float) -> None:
-        """Make a fixed node a member, at its place."""
-        place = self.places[node]
-        state, variances = lone(self.nodes[node], place.p_m, place.R)
-        own = np.diag(variances)
-        cross = skew(place.p_m)
-        own[V_, V_] = 0.0
-        own[PHI, PHI] = place.sigma_rad**2 * np.eye(3)
-        own[P_, PHI] = place.sigma_rad**2 * cross
-        own[PHI, P_] = own[P_, PHI].T
-        own[P_, P_] = place.sigma_m**2 * np.eye(3) + place.sigma_rad**2 * cross @ cross.T
-        self._add(Member(node, t_s, confirmed=True, light_s=-np.inf), state, own)
-
-    def _add(self, member: Member, state: NetState, own: Floats, across: Floats | None = None) -> None:
-        """Add a member with its covariance (BLOCK, BLOCK), and that with the errors so far (N, BLOCK)."""
-        if self.state is None:
-            self.state, self.covariance = state, np.array(((DATUM_M**2,),))
-            # The net's clock is the first member's.
-            own[CLOCK, :] = own[:, CLOCK] = 0.0
-        else:
-            self.state = self.state.joined(state)
-        N = len(self.covariance)
-        P = np.zeros((N + BLOCK, N + BLOCK))
-        P[:N, :N], P[N:, N:] = self.covariance, own
-        if across is not None:
-            P[:N, N:], P[N:, :N] = across, across.T
-        self.covariance = P
-        self.members.append(member)
-        self.shaking = self.shaking.joined()
-        self.rates_radps = np.concatenate((self.rates_radps, np.zeros((1, 3))))
-
     def remove(self, index: int) -> None:
-        """Let a member go."""
-        gone = self.members[index]
-        kept = [i for i in range(len(self.members)) if i != index]
-        if self.state is None:
-            return
-        was_anchor = self.anchor == index
-        self.members = [self.members[i] for i in kept]
-        self.detection = {pair: of for pair, of in self.detection.items() if gone.node not in pair}
-        if not self.members:
-            self.state, self.covariance, self.rates_radps = None, np.zeros((0, 0)), np.zeros((0, 3))
-            self.shaking = NetShaking.of_none()
-            return
-        if was_anchor:
-            # The frame moves with another node from now on.
-            self._anchor(kept[0])
-        chosen = blocks(kept)
-        self.state = self.state.chosen(kept)
-        self.covariance = self.covariance[np.ix_(chosen, chosen)]
-        self.rates_radps = self.rates_radps[kept]
-        self.shaking = self.shaking.chosen(kept)
-
-    def _anchor(self, index: int) -> None:
-        if self.state is None:
-            return
-        n = len(self.state)
-        p, v = self.state.p_m[index], self.state.v_mps[index]
-        move = Move(np.broadcast_to(np.eye(BLOCK), (n, BLOCK, BLOCK)), np.zeros((n, BLOCK, BLOCK)), index, p, v)
-        self.state = replace(self.state, p_m=self.state.p_m - p, v_mps=self.state.v_mps - v)
-        self.covariance = move.covariance(self.covariance)
-
-    # Motion
-
-    def _increment(self, state: NetState, index: int, from_s: float, to_s: float) -> Increment:
-        samples = self.intake.samples[self.members[index].node]
-        shift = min(max(float(state.delay_s[index]), -MAX_DELAY_S), MAX_DELAY_S)
-        known_s = to_s + HOLD_S
-        grid, values, told, _ = samples.between(from_s + shift, to_s + shift, known_s)
-        without = not told.any() and not samples.near(to_s + shift, known_s)
-        if without:
-            values = np.zeros_like(values)
-        slow = [samples.slow_rate(each_s, known_s) for each_s in (from_s + shift, to_s + shift)]
-        ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
-        part = integrate(as_first_of_pair(state, index), 0, grid, values[:, :3], values[:, 3:], told, np.stack(ends))
-        return replace(part, without=True) if without else part
-
-    def _noise_of(self, node: int, t_s: float) -> Noise:
-        noise = self.intake.samples[node].noise(t_s)
-        stated = self.intake.turning[node].stated(t_s)
-        return noise if stated is None else replace(noise, gap_tilt_rad=stated[0], gap_heading_rad=stated[1])
-
-    def _moved(self, to_s: float) -> tuple[NetState, Move, Floats, list[bool], Floats]:
-        """Give the state at to_s, the step to it, turn rates, who is without inertial unit, and what shaking adds."""
-        assert self.state is not None
-        state, n = self.state, len(self.state)
-        F, Q = np.tile(np.eye(BLOCK), (n, 1, 1)), np.zeros((n, BLOCK, BLOCK))
-        names = ("p_m", "v_mps", "R", "shake_rad", "shove_mps")
-        fields = {name: getattr(state, name).copy() for name in names}
-        rates, without = np.zeros((n, 3)), [False] * n
-        shaking = self.shaking.variances
-        drawn = np.zeros((n, 2, MOVING, MOVING))
-        for i, member in enumerate(self.members):
-            if member.node in self.places:
-                continue
-            part = self._increment(state, i, self.t_s, to_s)
-            noise = self._noise_of(member.node, to_s)
-            after, F[i], Q[i], drawn[i] = moved_member(state, i, part, noise, shaking[i], to_s - self.t_s)
-            if part.without != member.without:
-                # The unit has stopped, or come back: these errors now stand for something else, and are unknown.
-                Q[i, GYRO_BIAS, GYRO_BIAS] += WITHOUT_RADPS**2 * np.eye(3)
-                Q[i, MOUNT, MOUNT] += WITHOUT_RAD**2 * np.eye(3)
-            without[i] = part.without
-            rates[i] = part.rate_radps
-            for name in names:
-                fields[name][i] = after[name]
-        move = Move(F, Q)
-        if self.anchor is not None:
-            p, v = fields["p_m"][self.anchor].copy(), fields["v_mps"][self.anchor].copy()
-            move = Move(F, Q, self.anchor, p, v)
-            fields["p_m"] -= p
-            fields["v_mps"] -= v
-        return replace(state, **fields), move, rates, without, drawn
-
-    def step(self, t_s: float) -> None:
-        """Bring the network to t_s, by ticks where that is long, and take what sensors say there."""
-        while t_s - self.t_s > 1.5 * TICK_S:
-            self.step(self.t_s + TICK_S)
-        if t_s - self.t_s < TOGETHER_S:
-            return
-        self.state, move, self.rates_radps, without, drawn = self._moved(t_s)
-        self.shaking = self.shaking.moved(move.F[:, :MOVING, :MOVING], drawn)
-        for member, now in zip(self.members, without, strict=True):
-            member.without = now
-        self.covariance = move.covariance(self.covariance)
-        self.t_s = t_s
-        for index, member in enumerate(self.members):
-            self._take_depth(index, member)
-            if member.node not in self.places:
-                self._take_attitude(index, member)
-                self._take_turning(index, member)
-
-    # Sensors
-
-    def _apply(self, H: Floats, y: Floats, noise: Floats, *, teaches: bool = False) -> float:
-        assert self.state is not None
-        before = self.covariance
-        error, self.covariance, chi2, S_inverse = anchors.kalman(before, H, y, noise)
-        if teaches:
-            self.shaking = self.shaking.taught(y, S_inverse, H, before)
-        self.state = self.state.plus(error)
-        return chi2
-
-    def _take_depth(self, index: int, member: Member) -> None:
-        """Update by a depth gauge: h = p_z + (R port)_z - v_z age + offset + datum."""
-        assert self.state is not None
-        found = newest_before(self.intake.depths[member.node], self.t_s)
-        if found is None or found[0] <= member.depth_s or self.t_s - found[0] > 0.3:
-            return
-        time_s, seen = found
-        member.depth_s = time_s
-        age_s = self.t_s - time_s
-        state = self.state
-        port = state.R[index] @ self.nodes[member.node].rig.depth_port_m
-        place = state.p_m[index] - age_s * state.v_mps[index] + port
-        y = np.array((seen.depth_m - place[2] - state.gauge_m[index] - state.datum_m,))
-        H = np.zeros((1, len(self.covariance)))
-        own = H[:, block(index)]
-        own[0, P_.stop - 1], own[0, V_.stop - 1] = 1.0, -age_s
-        own[0, PHI] = place[1], -place[0], 0.0
-        own[0, GAUGE] = 1.0
-        H[0, 0] = 1.0
-        # A frame that moves with a node may have risen or sunk since, by some 0.3 m/s.
-        drift_m = 0.0 if self.anchor is None else 0.3 * age_s
-        noise = np.array(((seen.sigma_m**2 + drift_m**2 + 1e-6,),))
-        if y[0] ** 2 < 16.0 * float((H @ self.covariance @ H.T + noise)[0, 0]):
-            self._apply(H, y, noise)
-
-    def _take_attitude(self, index: int, member: Member) -> None:
-        found = newest_before(self.intake.attitudes[member.node], self.t_s)
-        since = self.t_s - member.attitude_s
-        if found is None or since < ATTITUDE_EVERY_S or self.t_s - found[0] > 0.1:
-            return
-        assert self.state is not None
-        time_s, seen = found
-        first, member.attitude_s = member.attitude_s == -np.inf, self.t_s
-        turn = rotation_exp(self.rates_radps[index] * (self.t_s - time_s))
-        y, H = self._attitude_residual(index, self.intake.level_camera(member.node, seen) @ turn)
-        factors = (1.0, 1.0) if first else (2.0 * anchors.TILT_TIME_S / since, 2.0 * anchors.HEADING_TIME_S / since)
-        noise = self._attitude_noise(seen, *factors)
-        chi2 = float(y @ np.linalg.solve(noise + H @ self.covariance @ H.T, y))
-        if chi2 > 16.0:
-            noise = noise * (chi2 / 4.0)
-        self._apply(H, y, noise)
-
-    def _attitude_residual(self, index: int, R_level_camera: Floats) -> tuple[Floats, Floats]:
-        assert self.state is not None
-        H = np.zeros((3, len(self.covariance)))
-        H[:, block(index)][:, PHI] = np.eye(3)
-        return rotation_log(R_level_camera @ self.state.R[index].T), H
-
-    def _attitude_noise(self, seen: AttitudeSeen, tilt_factor: float, heading_factor: float) -> Floats:
-        """Give an attitude's covariance; where fixed nodes say where north is, its heading does not count."""
-        if self.places:
-            heading_factor = FREE_HEADING
-        return anchors.attitude_covariance(seen.R_ned_body, seen.sigma_rad, tilt_factor, heading_factor)
-
-    def _take_turning(self, index: int, member: Member) -> None:
-        """Update a node without an inertial unit by its attitude, which may be off by a slow error."""
-        near = self.intake.turning[member.node].at(self.t_s, self.t_s + HOLD_S) if member.without else None
-        if near is None:
-            return
-        assert self.state is not None
-        R_level_camera, variances = near
-        y, H = self._attitude_residual(index, R_level_camera)
-        y = y - self.state.mount_rad[index]
-        H[:, block(index)][:, MOUNT] = np.eye(3)
-        noise = (R_level_camera * variances) @ R_level_camera.T
-        if float(y @ np.linalg.solve(noise + H @ self.covariance @ H.T, y)) < 30.0:
-            self._apply(H, y, noise)
+        """Let a member go, and what was learned of its lights and of those in its pictures."""
+        gone = self.members[index].node
+        super().remove(index)
+        self.detection = {pair: of for pair, of in self.detection.items() if gone not in pair}
 
     # Lights
 
@@ -452,8 +160,7 @@ class NetEstimate:
             for member in (self.members[compared[bar][0]], self.members[observer]):
                 member.light_s = max(member.light_s, sight.t_s)
         noise = np.diag(np.repeat([variance for *_, variance in chosen], 2))
-        self.surprise += self._apply(H, rows_y, noise, teaches=True)
-        self.told += len(rows_y)
+        self._apply(H, rows_y, noise, teaches=True)
 
     def _judge(self) -> None:
         """Confirm members, and remove those of which no light tells any more."""
@@ -470,20 +177,6 @@ class NetEstimate:
                 self.remove(index)
         if self.members and not self.places and len(self.members) == 1:
             self.remove(0)
-
-    def sigma_m(self, index: int) -> float:
-        """Give how well a member's place is known, 1 sd of its distance."""
-        assert self.state is not None
-        J = self.plain(self.state, index)
-        own = self.covariance[block(index), block(index)][:9, :9]
-        return math.sqrt(max(float(np.trace((J @ own @ J.T)[:3, :3])), 0.0))
-
-    @staticmethod
-    def plain(state: NetState, index: int) -> Floats:
-        """Give (9, 9): plain errors of place, velocity and attitude by a member's own."""
-        J = np.eye(9)
-        J[P_, PHI], J[V_, PHI] = -skew(np.stack((state.p_m[index], state.v_mps[index])))
-        return J
 
     # Poses
 

@@ -14,7 +14,8 @@ from typing import Final
 
 import numpy as np
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
-from buddyline.solver_service.network.estimate import CONTRADICTS, KnownPlace, NetEstimate, NetRow, PairFix
+from buddyline.solver_service.network.belief import KnownPlace
+from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -28,7 +27,7 @@ from buddyline.solver_service.network.state import (
     plain_of_own,
 )
 from buddyline.solver_service.track import state as pair_state
-from buddyline.solver_service.track.shaking import SHAKEN_S
+from buddyline.solver_service.track.shaking import SHAKEN_S, kept_share
 from buddyline.solver_service.track.strapdown import Increment, Noise
 
 GRAVITY_MPS2: Final = np.array((0.0, 0.0, 9.80665))
@@ -129,7 +128,7 @@ def moved_member(
 
     shaking (2,): variances of the unit's angle in its mount, and of the velocity that shaking adds.
     """
-    kept = math.exp(-span_s / SHAKEN_S)
+    kept = kept_share(span_s)
     felt = 0.0 if part.without else 1.0
     gone, back_s = felt * (1.0 - kept), felt * (span_s - SHAKEN_S * (1.0 - kept))
     p, v, R0 = state.p_m[member], state.v_mps[member], state.R[member]

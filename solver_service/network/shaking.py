@@ -22,6 +22,7 @@ from buddyline.solver_service.track.shaking import (
     SHAKE_RAD,
     SHAKEN_S,
     SHOVE_MPS,
+    kept_share,
 )
 
 # A picture's weight is halved after so many more of each member.
@@ -93,7 +94,7 @@ def shaking_parts(R: Floats, span_s: float) -> Floats:
 
     R (3, 3): its attitude at the end. As track/shaking.shaking_noise, for one node.
     """
-    a, t = math.exp(-span_s / SHAKEN_S), SHAKEN_S
+    a, t = kept_share(span_s), SHAKEN_S
     fresh, both = 1.0 - a * a, t * (1.0 - a) ** 2
     out = np.zeros((2, MOVING, MOVING))
     angle, velocity = out

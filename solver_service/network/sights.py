@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, skew
+from buddyline.solver_service.geometry.rotation import Floats, skew
 from buddyline.solver_service.network.state import BLOCK, CLOCK, P_, PHI, V_, NetState
+from buddyline.solver_service.track.lights import turns_over
 
 # The errors of the observer, then of the other node, that move a light: of each place, velocity, attitude and clock.
 OF_NODE: Final = np.r_[P_, V_, PHI, CLOCK]
@@ -33,8 +34,8 @@ def light_positions(
     times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
     late_s = float(state.clock_s[other] - state.clock_s[observer])
     ahead = times + late_s
-    toward = np.swapaxes(state.R[observer] @ _turns(rates_radps[observer], times), 1, 2)[:, None]  # (T, 1, 3, 3)
-    R_other = state.R[other] @ _turns(rates_radps[other], ahead)
+    toward = np.swapaxes(state.R[observer] @ turns_over(rates_radps[observer], times), 1, 2)[:, None]  # (T, 1, 3, 3)
+    R_other = state.R[other] @ turns_over(rates_radps[other], ahead)
     arms = np.swapaxes(R_other @ lights_m.T, 1, 2)  # (T, L, 3)
     swept = np.swapaxes(R_other @ (skew(rates_radps[other]) @ lights_m.T), 1, 2)
     a = (state.p_m[other] + ahead[:, None] * state.v_mps[other])[:, None] + arms
@@ -52,9 +53,3 @@ def light_positions(
         K = len(dt_s)
         X, D = np.broadcast_to(X, (K, *X.shape[1:])), np.broadcast_to(D, (K, *D.shape[1:]))
     return X, D
-
-
-def _turns(rate_radps: Floats, times_s: Floats) -> Floats:
-    if len(times_s) == 1:
-        return rotation_exp(rate_radps * float(times_s[0]))[None]
-    return rotation_exp(rate_radps * times_s[:, None])

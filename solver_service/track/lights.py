@@ -38,8 +38,8 @@ def light_positions(
     times = dt_s if not alike else dt_s[:1] if len(dt_s) else np.zeros(1)
     # What the other node has turned on, or has yet to turn, by its own clock.
     late_s = state.clock_s if observer == 0 else -state.clock_s
-    R_observer = state.R[observer] @ _turns(rates_radps[observer], times)
-    R_other = state.R[other] @ _turns(rates_radps[other], times + late_s)
+    R_observer = state.R[observer] @ turns_over(rates_radps[observer], times)
+    R_other = state.R[other] @ turns_over(rates_radps[other], times + late_s)
     arms = R_other @ lights_m.T  # (T, 3, L)
     arms = np.swapaxes(arms, 1, 2)  # (T, L, 3)
     swept = np.swapaxes(R_other @ (skew(rates_radps[other]) @ lights_m.T), 1, 2)
@@ -63,7 +63,7 @@ def light_positions(
     return X, D
 
 
-def _turns(rate_radps: Floats, times_s: Floats) -> Floats:
+def turns_over(rate_radps: Floats, times_s: Floats) -> Floats:
     """Give the turns (T, 3, 3) at a rate (3,) over times (T,)."""
     if len(times_s) == 1:
         return rotation_exp(rate_radps * float(times_s[0]))[None]

@@ -8,7 +8,8 @@ import pytest
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
-from buddyline.solver_service.network.estimate import Member, NetEstimate, PairFix
+from buddyline.solver_service.network.belief import Member
+from buddyline.solver_service.network.estimate import NetEstimate, PairFix
 from buddyline.solver_service.network.filter import inverted
 from buddyline.solver_service.network.motion import Move, as_first_of_pair, moved_member
 from buddyline.solver_service.network.sights import columns, light_positions
