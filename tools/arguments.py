@@ -15,8 +15,8 @@ from buddyline.protocol.security import PLAYER, ROS
 from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
 from buddyline.tools.export_formats import FORMATS
+from buddyline.tools.option_values import above_zero
 from buddyline.tools.pairs import add_pair_argument
-from buddyline.tools.quantity import above_zero
 
 DIVE: Final = "one dive: its log, or each node's own"
 

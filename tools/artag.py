@@ -20,7 +20,8 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats, multiply, normalized, rotate
 from buddyline.tools.evaluation.truth import PoseHistory
 from buddyline.tools.newfile import new_dive_log
-from buddyline.tools.solve import COPIED, node_files, pair_of
+from buddyline.tools.option_values import node_files
+from buddyline.tools.solve import COPIED, pair_of
 from buddyline.tools.tags.detection import TagFinder
 from buddyline.tools.tags.layout import Layout, layout_of, load_layout
 from buddyline.tools.tags.pose import TagPose, readings_of, tag_pose

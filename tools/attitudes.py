@@ -16,7 +16,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Attitude, Imu
 from buddyline.protocol.topics import IMU
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import node_files
+from buddyline.tools.option_values import node_files
 
 log = logging.getLogger(__name__)
 

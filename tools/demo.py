@@ -20,7 +20,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.service import Service
 from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
-from buddyline.tools.quantity import above_zero
+from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.messages import Message

@@ -14,7 +14,7 @@ from buddyline.protocol.messages import NodeId
 from buddyline.protocol.security import HUB, Tls, check_identity
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.tools.quantity import above_zero
+from buddyline.tools.option_values import above_zero
 from msgspec import field
 from msgspec.structs import replace
 

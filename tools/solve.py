@@ -19,13 +19,14 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, Message, NodeInfo, NodePose, Track
-from buddyline.protocol.topics import TRACK, check_node_id
+from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairCore
 from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
+from buddyline.tools.option_values import node_files
 
 log = logging.getLogger(__name__)
 
@@ -108,15 +109,6 @@ def replacements(given: list[str]) -> dict[str, NodeInfo]:
             raise ConfigError(f"--info {node}={path}: the file describes node {info.node}")
         replaced[node] = info
     return replaced
-
-
-def node_files(option: str, given: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield the node and the file's name of each NODE=FILE of an option; raise ConfigError where one is not that."""
-    for text in given:
-        node, equals, path = text.partition("=")
-        if not equals:
-            raise ConfigError(f"{option} {text}: give NODE=FILE")
-        yield check_node_id(node), path
 
 
 def nodes_of(dive: Dive, given: list[str] | None) -> list[str]:

@@ -14,7 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
-from buddyline.tools.quantity import above_zero
+from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus

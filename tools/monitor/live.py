@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 from buddyline.protocol import topics
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.option_values import above_zero
 from buddyline.tools.pairs import add_pair_argument
-from buddyline.tools.quantity import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus

@@ -14,7 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import SURVEYOR
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments
-from buddyline.tools.quantity import above_zero
+from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.tools.survey.network import Adjusted

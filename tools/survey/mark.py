@@ -12,7 +12,7 @@ from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
-from buddyline.tools.quantity import above_zero
+from buddyline.tools.option_values import above_zero
 from buddyline.tools.survey.marks import KINDS, stamp_ns_of, time_of
 from buddyline.tools.survey.project import STATION_NAME
 
