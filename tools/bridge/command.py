@@ -58,9 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "needed), GPS_INPUT (with --place or --boat); default: odometry",
     )
     out.add_argument("--system", type=int, default=1, metavar="ID", help="the vehicle's MAVLink system; default: 1")
-    out.add_argument(
-        "--rate", type=above_zero, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s"
-    )
+    out.add_argument("--rate", type=float, default=DEFAULT_RATE_HZ, metavar="HZ", help="at most; default: %(default)s")
     out.add_argument(
         "--set-origin", action="store_true", help="give the autopilot the reference's place as its origin, once"
     )
