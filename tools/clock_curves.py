@@ -34,15 +34,11 @@ OUTSIDE_NS: Final = 120 * S_NS
 
 @dataclass(frozen=True)
 class BeaconCurve:
-    """A node's clock minus the first node's. covers: whether there were beacons at both ends of the dive.
-
-    sigma_s: of the worst of the estimates, 1 sd.
-    """
+    """A node's clock minus the first node's. covers: whether there were beacons at both ends of the dive."""
 
     node: str
     curve: ClockCurve
     covers: bool
-    sigma_s: float
 
 
 class Ties:
@@ -122,7 +118,6 @@ def beacon_curve(
         node_b,
         ClockCurve(stamps_ns, offsets_ns),
         covers=first_ns - span_ns[0] < OUTSIDE_NS and span_ns[1] - last_ns < OUTSIDE_NS,
-        sigma_s=max(one.sigma_s for one in found),
     )
 
 

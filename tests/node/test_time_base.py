@@ -74,7 +74,7 @@ def test_one_interrupted_comparison_is_no_step(clocks, clock):
     assert clock.steps == 0
 
 
-def test_waiting_ends_when_the_time_clears_the_stop():
+def test_waiting_ends_at_the_instant_or_at_the_stop():
     stop = threading.Event()
     clock = NodeClock()
     assert not clock.wait_until_ns(clock.now_ns() - 1, stop)

@@ -213,7 +213,7 @@ def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
         share = "" if len(recent) == 1 else f" ({count} of {recent.total()})"
         tracked = picture.track_is_fresh(now_ns)
         text = f"No pose: {reason_words(reason)}{share}.{' The track goes on without.' if tracked else ''}"
-        # Where they last were tells more than what helps as a rule.
+        # Turns from where the nodes last were help more than the reason's general advice.
         advice = ", ".join(turns(picture, now_ns)) or REASONS.get(reason, ("", ""))[1]
         return [Finding("pair", "warning" if tracked else "problem", text, advice, picture.pose_ns)]
     if live or picture.pose is not None or picture.first_ns is None or now_ns - picture.first_ns <= NO_POSE_S * S_NS:
