@@ -23,7 +23,8 @@ def test_loops_close_within_their_sigmas():
     figures = run(CAMPAIGNS["loops"], 42)
     print(*table(figures), sep="\n")
     assert len(figures["V: auto, readings"]) >= 40
-    # Half a centimetre is what Survex rounds away.
+    # Survex rounds half a centimetre away; the rest is of second order (test_survey_exports has it leg by leg).
+    # With `readings`, normal style cannot say that an error of a depth shortens the run.
     assert max(figures["cavern off, m: auto, absolute"]) <= 0.01
     assert max(figures["cavern off, m: auto, readings"]) <= 0.02
     assert not any(value for name, values in figures.items() if "warnings" in name for value in values)
