@@ -1,8 +1,10 @@
 """What all packages share: messages, topics, bus, dive log, clock. Imports no other package of the project."""
 
+from importlib import import_module
+
 try:
-    # Written when the package is built or installed; says which commit this is.
-    from buddyline.protocol._version import __version__
+    # Says which commit this is. Building or installing writes it: linters must not need it, so it is imported by name.
+    __version__: str = import_module("buddyline.protocol._version").__version__
 except ImportError:
     __version__ = "0.0.0"
 
