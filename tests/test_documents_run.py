@@ -40,6 +40,7 @@ LEFT_OUT = {
     r"^\. \.venv": "the programs are on the path",
     r"^buddyline (view|monitor)": "a page until Ctrl-C; tests/tools/test_monitor.py",
     r"^buddyline survey watch": "runs until Ctrl-C; tests/tools/test_survey_legs.py",
+    r"^buddyline setup": "a Raspberry Pi; tests/tools/test_setup_pi.py, tests/chroots.py",
     r"^buddyline node --config": "a real camera and sensors; tests/node/test_service.py",
     r"^buddyline (hub|solver)( --config \S+)?$": "run until Ctrl-C; the fixture runs them",
     r"^buddyline experiments": "takes minutes; tests/tools/test_experiments.py",

@@ -89,6 +89,12 @@ COMMANDS: Final = (
         ("install-service node --config pi.toml", "install-service hub --print"),
     ),
     Command(
+        "setup",
+        "make this Raspberry Pi a node: packages, devices, clock, address, service; says what it would do",
+        ("setup pi --config a.toml", "setup pi --config a.toml --apply"),
+        "tools.setup_pi",
+    ),
+    Command(
         "image",
         "make a fresh card with Raspberry Pi OS into a node",
         ("image /media/me/bootfs --config a.toml --source URL --ssh-key ~/.ssh/id_ed25519.pub --gateway 192.168.2.1",),

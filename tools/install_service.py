@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     """Write one unit, or show it."""
     if args.user and (args.root or args.run_as):
         raise BuddylineError("--user writes a unit of your own: it goes with neither --root nor --run-as")
-    source = _source(args)
+    source = source_of(args)
     text = user_unit(source) if args.user else system_unit(source)
     if args.print:
         sys.stdout.write(text)
@@ -150,14 +150,10 @@ WantedBy={target}
 """
 
 
-def _source(args: argparse.Namespace) -> UnitSource:
+def source_of(args: argparse.Namespace) -> UnitSource:
     """Check the service's configuration; return what the unit needs of it."""
     config = Path(args.config).resolve() if args.config else None
-    user: str = args.run_as or os.environ.get("SUDO_USER") or getpass.getuser()
-    if user == "root" and not args.run_as and not args.user:
-        raise BuddylineError("--run-as USER: name the user who runs it; without one it would be root")
-    if not all(letter.isalnum() or letter in "_-." for letter in user):
-        raise BuddylineError(f"--run-as {user}: not a user's name")
+    user = runner(args.run_as, own=args.user)
     if args.service == "node":
         if config is None:
             raise BuddylineError("a node needs its configuration: --config FILE.toml")
@@ -179,6 +175,16 @@ def _source(args: argparse.Namespace) -> UnitSource:
 
         load_solver_config(config)
     return UnitSource(args.service, config, user)
+
+
+def runner(run_as: str | None, *, own: bool = False) -> str:
+    """Return the user who runs a service: as named, else who called sudo. own: a user's own unit, even root's."""
+    user: str = run_as or os.environ.get("SUDO_USER") or getpass.getuser()
+    if user == "root" and not run_as and not own:
+        raise BuddylineError("--run-as USER: name the user who runs it; without one it would be root")
+    if not all(letter.isalnum() or letter in "_-." for letter in user):
+        raise BuddylineError(f"--run-as {user}: not a user's name")
+    return user
 
 
 def _program() -> Path:

@@ -1,0 +1,205 @@
+"""From nothing, on another Debian or processor: the time to the first pose, the tests, and `setup pi`.
+
+    .venv/bin/python -m tests.chroots trixie                 # packages, clone, `make demo` to its first pose
+    .venv/bin/python -m tests.chroots trixie --tests         # and `make test`
+    .venv/bin/python -m tests.chroots trixie --setup-pi      # and `setup pi`, twice, with a stand-in for picamera2
+    .venv/bin/python -m tests.chroots trixie --arch arm64    # emulated by qemu-user, under proot
+
+Each system is made by debootstrap in a folder for temporary files and kept; the clone in it is made anew, of what is
+committed. Each line says the seconds since the beginning, and the processor's seconds, which do not count what else the
+machine does. Needs root, debootstrap and Debian's packages; for arm64 also qemu-user-static and proot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.processes import REPOSITORY
+
+CHROOTS = Path(tempfile.gettempdir()) / "buddyline-chroots"
+CERTIFICATES = "etc/ssl/certs/ca-certificates.crt"
+# README.md's line, and node/README.md's.
+PACKAGES = ("git", "make", "python3", "python3-venv")
+MOUNTED = """
+mount -t proc proc "$1/proc"; mount --rbind /dev "$1/dev"; mount --rbind /sys "$1/sys"; exec chroot "$@"
+"""
+# As Raspberry Pi OS has it: a package of the system, which pip sees as one.
+CAMERA = "usr/lib/python3/dist-packages/picamera2"
+CAMERA_VERSION = "0.3.31"
+
+
+class FailedError(Exception):
+    """A command in the system ended badly; its last lines."""
+
+
+class System:
+    """A Debian in a folder."""
+
+    def __init__(self, suite: str, arch: str) -> None:
+        self.root, self._emulated = CHROOTS / f"{suite}-{arch}", arch == "arm64"
+        self._began_s = time.monotonic()
+        if not (self.root / "made").exists():
+            shutil.rmtree(self.root, ignore_errors=True)
+            self._make(suite, arch)
+        shutil.copy("/etc/resolv.conf", self.root / "etc" / "resolv.conf")
+        self._began_s, self._cpu_s = time.monotonic(), _cpu_s()
+
+    def _make(self, suite: str, arch: str) -> None:
+        print(f"debootstrap {suite} {arch} in {self.root}", flush=True)
+        self.root.mkdir(parents=True)
+        foreign = ["--foreign"] if self._emulated else []
+        words = ["debootstrap", *foreign, f"--arch={arch}", "--variant=minbase", "--include=ca-certificates"]
+        subprocess.run([*words, suite, str(self.root)], check=True, stdout=subprocess.DEVNULL)
+        if self._emulated:
+            self.run("DEBOOTSTRAP_DIR=/debootstrap /debootstrap/debootstrap --second-stage")
+        (self.root / "made").touch()
+
+    def run(self, script: str, user: str = "root", wanted: tuple[int, ...] = (0,), awaited: str = "") -> str:
+        """Run a shell's script; return what it printed. awaited: say when this comes first."""
+        home = "/root" if user == "root" else f"/home/{user}"
+        variables = {
+            "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": home, "LANG": "C.UTF-8",
+            "DEBIAN_FRONTEND": "noninteractive", "PIP_CERT": f"/{CERTIFICATES}", "CI": "true",
+        }  # fmt: skip
+        as_user = [] if user == "root" else ["runuser", "-u", user, "--"]
+        words = ["/usr/bin/env", "-i", *(f"{name}={value}" for name, value in variables.items()), *as_user]
+        words += ["/bin/sh", "-ec", script]
+        if self._emulated:
+            binds = [word for folder in ("/proc", "/dev", "/sys") for word in ("-b", folder)]
+            entered = ["proot", "-q", "qemu-aarch64-static", "-0", "-r", str(self.root), *binds, "-w", "/", *words]
+        else:
+            entered = ["unshare", "--mount", "sh", "-ec", MOUNTED, "sh", str(self.root), *words]
+        child = subprocess.Popen(entered, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        assert child.stdout is not None
+        lines = []
+        for line in child.stdout:
+            lines.append(line.decode(errors="replace"))
+            if awaited and awaited in lines[-1]:
+                print(
+                    f"{time.monotonic() - self._began_s:6.0f} s{'':13} the first pose: {lines[-1].strip()}", flush=True
+                )
+                awaited = ""
+        if child.wait() not in wanted:
+            raise FailedError(f"{script}\nended with {child.returncode}:\n{''.join(lines[-30:])}")
+        return "".join(lines)
+
+    def say(self, what: str) -> None:
+        """Print a line with both times."""
+        passed_s, cpu_s = time.monotonic() - self._began_s, _cpu_s() - self._cpu_s
+        print(f"{passed_s:6.0f} s {cpu_s:6.0f} s CPU  {what}", flush=True)
+
+
+def _cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def first_pose(system: System) -> None:
+    """Do what README.md's first lines say."""
+    system.run(f"apt-get update; apt-get install -y {' '.join(PACKAGES)}")
+    # Those of this machine: it may reach the package index through a proxy of its own.
+    shutil.copy(f"/{CERTIFICATES}", system.root / CERTIFICATES)
+    system.say(f"packages on Debian {system.run('cat /etc/debian_version; uname -m').split()}")
+    shutil.rmtree(system.root / "src.git", ignore_errors=True)
+    subprocess.run(["git", "clone", "--quiet", "--bare", str(REPOSITORY), str(system.root / "src.git")], check=True)
+    system.run(
+        "rm -rf /root/buddyline; git config --global --add safe.directory /src.git; git clone /src.git /root/buddyline"
+    )
+    system.run('cd /root/buddyline; make demo ARGS="--seconds 30" 2>&1', awaited=" range ")
+    system.say("`make demo` of 30 s has ended")
+
+
+def tests(system: System) -> None:
+    """Run the default suite."""
+    said = system.run("cd /root/buddyline; make test 2>&1", wanted=(0, 2))
+    print("".join(f"{'':22}{line}\n" for line in said.splitlines()[-12:]), end="")
+    system.say("`make test` has ended")
+
+
+def setup_pi(system: System) -> None:
+    """Do what node/README.md says, on a system that has what Raspberry Pi OS has beside Debian."""
+    _stand_in(system.root / "stand-ins")
+    config = "sed -i s,tls/192.168.2.1,tls/127.0.0.1, ~/a.toml"
+    system.run(
+        "echo 'deb [trusted=yes] file:/stand-ins ./' > /etc/apt/sources.list.d/stand-ins.list; apt-get update;"
+        "apt-get install -y --no-install-recommends systemd polkitd; id diver || useradd --create-home diver;"
+        "mkdir -p /boot/firmware; echo dtparam=audio=on > /boot/firmware/config.txt;"
+        "rm -rf /home/diver/*; git config --system --add safe.directory /src.git"
+    )
+    system.say("a system with systemd and a user")
+    system.run("git clone /src.git ~/buddyline; cd ~/buddyline; make install 2>&1", user="diver")
+    told = "cd ~/buddyline; .venv/bin/buddyline setup pi --config ~/a.toml"
+    system.run(f"cd ~/buddyline; .venv/bin/buddyline init node --node a -o ~/a.toml; {config}", user="diver")
+    said = system.run(told, user="diver")
+    assert "nothing was changed" in said, said
+    assert "picamera2" in said, said
+    system.say("setup pi, to say what is to do")
+    done = "cd /home/diver/buddyline; .venv/bin/buddyline setup pi --config /home/diver/a.toml --run-as diver --apply"
+    said = system.run(done)
+    print(said[-600:])
+    system.say("setup pi --apply")
+    for script, user in ((told, "diver"), (done, "root")):
+        said = system.run(script, user=user, wanted=(0, 1))
+        assert "nothing is left to do; doctor says:" in said, said
+        assert "Traceback" not in said, said
+    print(said)
+    verified = system.run("systemd-analyze verify /etc/systemd/system/buddyline-node.service 2>&1", wanted=(0, 1))
+    system.say(f"setup pi again, which runs doctor; systemd-analyze verify: {verified.strip() or 'nothing to say'}")
+
+
+def _stand_in(folder: Path) -> None:
+    """Make an apt archive of one package: picamera2, with no camera."""
+    shutil.rmtree(folder, ignore_errors=True)
+    tree = folder / "tree"
+    (tree / "DEBIAN").mkdir(parents=True)
+    control = (
+        f"Package: python3-picamera2\nVersion: {CAMERA_VERSION}\nArchitecture: all\nMaintainer: none <none@none>\n"
+    )
+    (tree / "DEBIAN" / "control").write_text(f"{control}Description: stand-in\n")
+    (tree / CAMERA).mkdir(parents=True)
+    (tree / CAMERA / "__init__.py").write_text("class Picamera2:\n    global_camera_info = staticmethod(list)\n")
+    about = tree / f"{CAMERA}-{CAMERA_VERSION}.dist-info" / "METADATA"
+    about.parent.mkdir()
+    about.write_text(f"Metadata-Version: 2.1\nName: picamera2\nVersion: {CAMERA_VERSION}\n")
+    made = folder / "picamera2.deb"
+    subprocess.run(["dpkg-deb", "--build", "-Zxz", tree, made], check=True, stdout=subprocess.DEVNULL)
+    shutil.rmtree(tree)
+    content = made.read_bytes()
+    listed = f"Filename: ./{made.name}\nSize: {len(content)}\nSHA256: {hashlib.sha256(content).hexdigest()}\n"
+    (folder / "Packages").write_text(f"{control}{listed}Description: stand-in\n")
+
+
+def main() -> int:
+    """Make the system, and do in it what is asked for."""
+    parser = argparse.ArgumentParser(prog="python -m tests.chroots", description=__doc__.split("\n")[0])
+    parser.add_argument("suite", help="Debian's name, such as bookworm or trixie")
+    parser.add_argument("--arch", choices=("amd64", "arm64"), default="amd64")
+    parser.add_argument("--tests", action="store_true")
+    parser.add_argument("--setup-pi", action="store_true")
+    args = parser.parse_args()
+    if os.geteuid() != 0:
+        parser.error("needs root")
+    system = System(args.suite, args.arch)
+    try:
+        first_pose(system)
+        if args.tests:
+            tests(system)
+        if args.setup_pi:
+            setup_pi(system)
+    except (FailedError, AssertionError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
