@@ -75,6 +75,8 @@ def run(args: argparse.Namespace) -> int:
     for node in (args.vehicle, args.reference, args.net):
         if node is not None:
             check_node_id(node)
+    if args.reference and args.net:
+        raise BuddylineError("--reference and --net: give one of them; a net has its own origin")
     if args.reference == args.vehicle:
         raise BuddylineError(f"--reference {args.reference}: is the vehicle itself")
     if not (args.mavlink or args.nmea or args.http):
