@@ -7,23 +7,27 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.clock import Clock
-from buddyline.protocol.codec import encode
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.digest import DigestBook, sealed
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import Topic, key_of, topic_of
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher
     from buddyline.protocol.recorder import Recorder
+    from buddyline.protocol.signing import Signer
 
 
 class Outlet:
     """Records and publishes; safe to use from several threads.
 
     Messages sent while there is no bus are in the log only. When the bus connects, the last message of each
-    latest-only topic (info, status) is published again.
+    latest-only topic (info, status) is sent again. boot: of this run; signer: signs the digests of what was sent.
     """
 
-    def __init__(self, node: str, recorder: Recorder, clock: Clock) -> None:
+    def __init__(
+        self, node: str, recorder: Recorder, clock: Clock, boot: str = "", signer: Signer | None = None
+    ) -> None:
         self.node = node
         self.sent: Counter[str] = Counter()
         self._recorder = recorder
@@ -32,19 +36,37 @@ class Outlet:
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
         self._latest: dict[str, Message] = {}
+        self._book = DigestBook(node, boot, clock.now_ns())
+        self._sign = None if signer is None else signer.sign
 
     def send(self, message: Message, *, record: bool = True, publish: bool = True) -> None:
         """Record and publish one message."""
-        topic = topic_of(message)
         payload = encode(message)
+        with self._lock:
+            self._send(message, payload, record=record, publish=publish)
+            if self._book.is_full:
+                self._send_digest()
+
+    def send_digest(self, *, last: bool = False) -> None:
+        """Send the digest of all that was sent since the last one. last: the node ends in order."""
+        with self._lock:
+            self._send_digest(last=last)
+
+    def _send_digest(self, *, last: bool = False) -> None:
+        digest = self._book.digest(self._clock.now_ns(), last=last)
+        self._send(digest, sealed(digest, self._sign))
+
+    def _send(self, message: Message, payload: bytes, *, record: bool = True, publish: bool = True) -> None:
+        """Send; the lock is held: of each topic, digest, log and bus have the same order."""
+        topic = topic_of(message)
+        self._book.add(topic, payload_stamp_ns(payload) or 0, payload)
         if record:
             self._recorder.write(key_of(message), payload, self._clock.now_ns())
-        with self._lock:
-            self.sent[topic.name] += 1
-            if topic.latest_only:
-                self._latest[topic.name] = message
-            if publish and self._bus is not None:
-                self._publisher(topic).put_bytes(payload)
+        self.sent[topic.name] += 1
+        if topic.latest_only:
+            self._latest[topic.name] = message
+        if publish and self._bus is not None:
+            self._publisher(topic).put_bytes(payload)
 
     @property
     def connected(self) -> bool:
@@ -55,8 +77,8 @@ class Outlet:
         """Publish on this bus from now on, beginning with the last message of each latest-only topic."""
         with self._lock:
             self._bus = bus
-            for message in self._latest.values():
-                self._publisher(topic_of(message)).put_bytes(encode(message))
+            for message in list(self._latest.values()):
+                self._send(message, encode(message))
 
     def disconnect(self) -> None:
         """Stop publishing; the bus closes the publishers when it is closed."""

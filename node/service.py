@@ -11,7 +11,7 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import msgspec
@@ -38,10 +38,14 @@ from buddyline.protocol.health import stale_after_s
 from buddyline.protocol.messages import Candidates, NodeInfo, NodeStatus
 from buddyline.protocol.pictures import PictureLog
 from buddyline.protocol.recorder import Recorder, RecordError
+from buddyline.protocol.security import SecurityError
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
 from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS
 from msgspec import UNSET
+
+if TYPE_CHECKING:
+    from buddyline.protocol.signing import Signer
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +74,7 @@ class NodeService(Service):
         self.boot = uuid.uuid4().hex[:12]
         self.drops: Counter[str] = Counter()
         self._sha256 = config_sha256(config)
+        self._signer = _signer(config)
         self._software = f"buddyline {__version__}"
         self._started_s = time.monotonic()
         self._last_s: dict[str, float] = {}
@@ -114,7 +119,7 @@ class NodeService(Service):
         min_free_bytes = self.config.record.min_free_mb * 1_000_000
         self.pictures = PictureLog(path, f"{self.config.node}-*", min_free_bytes, metadata=metadata)
         self.recorder = Recorder(path, metadata=metadata, pictures=self.pictures)
-        self.outlet = Outlet(self.config.node, self.recorder, self.clock)
+        self.outlet = Outlet(self.config.node, self.recorder, self.clock, self.boot, self._signer)
         self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
@@ -140,7 +145,8 @@ class NodeService(Service):
             own = self.config.node_info(self.clock.now_ns(), self._software, self._sha256, row_time_ns)
         if own.node != self.config.node:
             raise ConfigError(f"node {self.config.node}: the camera's pictures are those of node {own.node}")
-        return self.config.in_net(own)
+        certificate = UNSET if self._signer is None else self._signer.certificate
+        return msgspec.structs.replace(self.config.in_net(own), certificate=certificate)
 
     def _log_metadata(self) -> dict[str, str]:
         """Return what is needed to understand a log later, with the whole configuration."""
@@ -177,6 +183,7 @@ class NodeService(Service):
     def close(self) -> int:
         """Stop all threads, write the log's end; return the exit status."""
         status = self.join()
+        self.outlet.send_digest(last=True)
         # Before the devices, whose end may take its time.
         try:
             self.recorder.close()
@@ -289,6 +296,7 @@ class NodeService(Service):
                 report_s += REPORT_S
                 self.status_message = status = self.status()
                 self.outlet.send(status)
+                self.outlet.send_digest()
                 self._panel.show(status, self.problems)
 
     def status(self) -> NodeStatus:
@@ -382,3 +390,19 @@ class NodeService(Service):
         elif free_bytes < self.config.record.min_free_mb * 1e6:
             problems.append(f"disk: {free_bytes / 1e6:.0f} MB free")
         return problems
+
+
+def _signer(config: NodeConfig) -> Signer | None:
+    """Return what signs with the key of the node's certificate; None, with a warning, where that cannot be."""
+    if config.tls is None:
+        return None
+    try:
+        from buddyline.protocol.signing import Signer
+
+        return Signer.of(config.tls)
+    except ImportError:
+        why = "the package cryptography is missing (`make install EXTRAS=keys`)"
+    except SecurityError as error:
+        why = str(error)
+    log.warning("node %s: what it records is not signed: %s", config.node, why)
+    return None

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import IO, Final, cast
 
@@ -283,6 +284,16 @@ class DiveLogReader:
                     order += 1
         while heap:
             yield heapq.heappop(heap)[2]
+
+    def stored(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Record]:
+        """Yield the records in the order in which they were written. wanted: returns whether to read a key."""
+        wanted = cache(wanted) if wanted else None
+        chunks = sorted(self._contents.chunks, key=lambda chunk: chunk[2])
+        messages = (one for start, end, at, _ in chunks for one in self._chunk_messages(at, start, end))
+        for message in chain(self._contents.loose, messages):
+            record = self._record(message, wanted, None)
+            if record is not None:
+                yield record
 
     def _holds_any(self, channels: frozenset[int] | None, wanted: Callable[[str], bool] | None) -> bool:
         if channels is None or wanted is None:

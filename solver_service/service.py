@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -31,6 +32,7 @@ SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
 TICK_S: Final = 0.25
 TICKS_A_STATUS: Final = 4
 MAX_ALIVE_NAME: Final = 64
+WAIT_S: Final = 1.0
 
 
 class SolverService(Service):
@@ -49,6 +51,7 @@ class SolverService(Service):
         self._declared: set[PairId] = set()
         self._refused = ""
         self._news = False
+        self._handled = 0
         self._answered = Answered()
         self._journal = (
             Journal(Path(config.journal)) if config.journal else Journal.of(config.connect, config.namespace)
@@ -89,12 +92,28 @@ class SolverService(Service):
 
     def tick(self, status_due: bool) -> None:
         """Resolve triggers whose time has come; report where a status is due, or a node has started or ended."""
-        with self._lock:
+        with self._turn():
             results = self.core.advance(self.clock.now_ns())
             self._declare()
             self._publish(results)
         if self._news or status_due:
             self.report()
+
+    @contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Hold the lock; a wait for it counts as a heartbeat while the bus's thread gets on with a backlog.
+
+        That thread may take the lock again before this one has it, for as long as there is a backlog.
+        """
+        handled = -1
+        while not self._lock.acquire(timeout=WAIT_S):
+            if self._handled != handled:
+                handled = self._handled
+                self.heartbeat()
+        try:
+            yield
+        finally:
+            self._lock.release()
 
     def attach(self, bus: Bus) -> None:
         """Subscribe to the nodes on this bus, and publish on it from now on."""
@@ -121,6 +140,7 @@ class SolverService(Service):
                 self._take_frame(message, received.receive_ns)
             else:
                 self._handle(message)
+            self._handled += 1
 
     def watch(self, name: str, alive: bool) -> None:
         """Note that a node has started or ended; the next tick reports all of them at once."""
@@ -129,7 +149,7 @@ class SolverService(Service):
 
     def report(self) -> None:
         """Publish each pair's status."""
-        with self._lock:
+        with self._turn():
             now_ns = self.clock.now_ns()
             refused, self._refused = self._refused, ""
             self._news = False

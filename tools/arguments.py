@@ -39,6 +39,14 @@ def _new_log(parser: argparse.ArgumentParser, text: str = "must not exist yet", 
     parser.add_argument("-o", "--output", required=True, metavar=name, help=text)
 
 
+def _authority(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--authority",
+        metavar="CA.crt",
+        help="the logs must be signed by nodes of this authority (`buddyline keys init`); default: any",
+    )
+
+
 def _json(parser: argparse.ArgumentParser, text: str) -> None:
     parser.add_argument("--json", action="store_true", help=text)
 
@@ -86,6 +94,7 @@ def backfill(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("topside", metavar="TOPSIDE.mcap", help="what `buddyline record` wrote")
     parser.add_argument("nodes", nargs="+", metavar="NODE.mcap", help="the nodes' own logs, all of the dive")
     _new_log(parser)
+    _authority(parser)
 
 
 def detect(parser: argparse.ArgumentParser) -> None:
@@ -143,6 +152,7 @@ def solve(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `solve`."""
     _dives(parser)
     _new_log(parser, "poses, rejections, and their inputs; must not exist yet")
+    _authority(parser)
     parser.add_argument("--method", choices=METHODS, default=METHODS[0], help="default: %(default)s")
     parser.add_argument("--checks", default=",".join(CHECKS), help=f"which of {','.join(CHECKS)}; default: all")
     parser.add_argument(
@@ -208,6 +218,7 @@ def report(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `report`."""
     _dives(parser, "one dive: a solved log, or each node's own")
     add_pair_argument(parser, "the first in the logs")
+    _authority(parser)
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="REPORT.html", help="the page to write; must not exist yet"
     )

@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from buddyline.protocol.divelog import DiveLogReader, Record
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.dives import Dive
 from buddyline.tools.newfile import new_dive_log
 
@@ -51,6 +52,7 @@ class Union:
 def run(args: argparse.Namespace) -> int:
     """Write the union of the logs; report what the topside recording had missed."""
     with Dive([args.topside, *args.nodes]) as dive:
+        told = check_logs(dive.readers, args.authority)
         union = Union()
         # Nodes' own logs come first: their log times are the node's, and their pictures are not previews.
         topside = Path(args.topside)
@@ -62,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         metadata = {
             **ordered[-1].metadata(),
             "backfilled_from": ", ".join(reader.path.name for reader in ordered),
+            **({AUTHENTICITY: "; ".join(told)} if told else {}),
         }
         with new_dive_log(args.output, metadata) as writer:
             for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):

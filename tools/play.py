@@ -16,7 +16,18 @@ from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message, NodeInfo
 from buddyline.protocol.security import PLAYER
-from buddyline.protocol.topics import CANDIDATES, CLOCK, CLOCK_SET, IMAGE, INFO, POSE, REJECTED, TOPICS, parse_key
+from buddyline.protocol.topics import (
+    CANDIDATES,
+    CLOCK,
+    CLOCK_SET,
+    DIGEST,
+    IMAGE,
+    INFO,
+    POSE,
+    REJECTED,
+    TOPICS,
+    parse_key,
+)
 from buddyline.tools.client import client_config
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import LiveClient
@@ -30,8 +41,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 # Results are not sent, because a solver on the bus computes them again. Clock beacons are not sent, because they say
-# nothing about the clocks of the nodes that are on the bus now.
-SENT: Final = tuple(topic.name for topic in TOPICS if not topic.solved and topic not in (CLOCK, CLOCK_SET))
+# nothing about the clocks of the nodes that are on the bus now. Digests are not sent, because not all is sent.
+SENT: Final = tuple(topic.name for topic in TOPICS if not topic.solved and topic not in (CLOCK, CLOCK_SET, DIGEST))
 # Pictures are sent as previews only, to leave the bus to the solver's data.
 IMAGES_HZ: Final = 2.0
 # At --speed 0, the dive may run ahead of the solver's outcomes by this much of the dive's time. It is less than the

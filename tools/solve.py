@@ -23,6 +23,7 @@ from buddyline.protocol.topics import TRACK
 from buddyline.solver_service.config import SolveConfig, node_ids, track_settings
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairCore
+from buddyline.tools.authenticity import AUTHENTICITY, check_logs
 from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
@@ -59,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
         attitudes = _attitudes(dive, args, nodes)
         began_s, tracks = time.monotonic(), defaultdict[tuple[str, ...], Tracked](Tracked)
         metadata = dive.metadata() | {"command": "solve", "method": args.method, "checks": args.checks}
+        told = check_logs(dive.readers, args.authority)
+        metadata |= {AUTHENTICITY: "; ".join(told)} if told else {}
         with new_dive_log(args.output, metadata) as writer:
             for info in replaced.values():
                 core.handle(info)

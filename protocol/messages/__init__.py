@@ -3,6 +3,7 @@
 `codec.decode` checks types, lengths, finite numbers, unit quaternions, and that blobs are inside their picture.
 """
 
+from buddyline.protocol.messages.digest import MAX_SAID, Digest, Said
 from buddyline.protocol.messages.fields import (
     NODE_ID_PATTERN,
     Count,
@@ -47,6 +48,7 @@ from buddyline.protocol.messages.pair import Reason, Rejected, RelativePose, Sol
 __all__ = [
     "MAX_BLOBS",
     "MAX_HEARD",
+    "MAX_SAID",
     "NODE_ID_PATTERN",
     "ArTag",
     "Attitude",
@@ -58,6 +60,7 @@ __all__ = [
     "CompressedImage",
     "Count",
     "Depth",
+    "Digest",
     "Expect",
     "ExpectedLight",
     "FixedPlace",
@@ -78,6 +81,7 @@ __all__ = [
     "Rejected",
     "RelativePose",
     "Role",
+    "Said",
     "SolverStatus",
     "StampNs",
     "Track",

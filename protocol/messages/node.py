@@ -84,7 +84,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     are magnetic. tags: AR tags on the node, for comparison only. imu_m: place of the inertial unit in the camera
     frame. imu_delay_ns: stamp of an inertial sample minus its true time. role: "lights" has two lamps and no camera,
     "camera" a camera and no lamps (its light_left_m and light_right_m, or its camera, are then not used). fixed: for a
-    node that stands still.
+    node that stands still. certificate: in PEM; its key signs the node's digests.
     """
 
     node: NodeId
@@ -107,6 +107,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     imu_delay_ns: int | UnsetType = UNSET
     role: Role | UnsetType = UNSET
     fixed: FixedPlace | UnsetType = UNSET
+    certificate: Annotated[str, Meta(max_length=8192)] | UnsetType = UNSET
 
     @property
     def has_camera(self) -> bool:

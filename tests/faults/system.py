@@ -37,7 +37,7 @@ READY |= {"monitor": "look at"}
 
 
 class System:
-    """Processes by name: hub, a, b, solver, recorder (of everything, into recorder.mcap), monitor.
+    """Processes by name: hub, a, b, solver, recorder (of everything, into recorder.mcap, recorder-2.mcap ...), monitor.
 
     devices: the nodes' camera and sensors; node_module: what runs them.
     """
@@ -59,6 +59,7 @@ class System:
         self.observer: Observer | None = None
         self._node = {"rate_hz": rate_hz, "devices": devices, "width_px": width_px, "preview_hz": preview_hz}
         self._node_module = node_module
+        self._recordings = 0
 
     def spawn(self, name: str, namespace: str | None = None) -> Process:
         """Start a process and do not wait for it; namespace: the network namespace it lives in."""
@@ -70,7 +71,9 @@ class System:
             config.write_text(f'connect = "{self.endpoint}"\njournal = "{self.directory / "solver.answered"}"\n')
             words = ["solver", "--config", str(config)]
         elif name == "recorder":
-            words = ["record", str(self.directory / "recorder.mcap"), *connect]
+            self._recordings += 1
+            again = f"-{self._recordings}" if self._recordings > 1 else ""
+            words = ["record", str(self.directory / f"recorder{again}.mcap"), *connect]
         elif name == "monitor":
             words = ["monitor", *connect, "--port", str(free_port())]
         else:

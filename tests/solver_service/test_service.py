@@ -5,6 +5,7 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Candidates, SolverStatus
 from buddyline.protocol.topics import key_of
+from buddyline.solver_service import service as service_module
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.service import SolverService
 from msgspec.structs import replace
@@ -14,6 +15,24 @@ from tests.fuzz.targets import Capture
 
 def take(service, message):
     service.receive(Received(key_of(message), encode(message), service.clock.now_ns(), ""))
+
+
+def test_a_backlog_is_no_standstill(monkeypatch):
+    """The thread that ticks waits for the lock for longer than a stuck thread may: it beats while the other goes on."""
+    monkeypatch.setattr(service_module, "WAIT_S", 0.001)
+    service = SolverService(SolverConfig(), clock=ManualClock(0))
+    beats = []
+
+    def beat():
+        beats.append(service._handled)
+        service._handled += len(beats) < 3
+        if len(beats) == 3:
+            service._lock.release()
+
+    monkeypatch.setattr(service, "heartbeat", beat)
+    service._lock.acquire()
+    service.tick(status_due=False)
+    assert beats == [0, 1, 2]
 
 
 def test_a_backlog_waits_for_the_other_node(dive):

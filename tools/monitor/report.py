@@ -7,6 +7,7 @@ import logging
 import math
 import time
 from collections import Counter
+from collections.abc import Sequence
 from html import escape
 from typing import Final
 
@@ -15,6 +16,7 @@ from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import NodeInfo
+from buddyline.tools.authenticity import check_logs
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw import dive as dive_figures
 from buddyline.tools.draw import figures
@@ -55,18 +57,21 @@ def run(args: argparse.Namespace) -> int:
     figures.check()
     check_new(args.output)
     with Dive(args.dives) as dive:
-        text = report_html(dive, solved_pair(dive, args.pair))
+        text = report_html(dive, solved_pair(dive, args.pair), check_logs(dive.readers, args.authority))
     write_new(args.output, text)
     log.info("%s: %.1f MB", args.output, len(text) / 1e6)
     return 0
 
 
-def report_html(dive: Dive, pair: Pair | None) -> str:
-    """Return the report of a dive as one HTML page; pair: whose poses are reported."""
+def report_html(dive: Dive, pair: Pair | None, authenticity: Sequence[str] = ()) -> str:
+    """Return the report of a dive as one HTML page; pair: whose poses are reported.
+
+    authenticity: lines that say whether the logs are what their nodes wrote.
+    """
     summary = summarize(dive, pair)
     begun = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(dive.start_ns / S_NS))
     nodes = " and ".join(sorted(summary.picture.nodes)) or "none"
-    warnings = dive.losses
+    warnings = [*dive.losses, *authenticity]
     if not summary.poses:
         warnings.append("this log holds no pose; solve it first: buddyline solve DIVE.mcap -o OUT.mcap")
     if summary.picture.other_pairs:

@@ -1,0 +1,297 @@
+"""Tell whether a log is what its node wrote: the node sums up each second, and a reader compares.
+
+No bus, no clock, no files, no keys: signing and checking signatures are functions that are passed in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final, Literal, NamedTuple
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.envelope import open_envelope
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import MAX_SAID, Digest, NodeInfo, Said
+from buddyline.protocol.topics import DIGEST, IMAGE, INFO, MARK, Topic, parse_key
+from msgspec import UNSET
+
+# A digest is judged when the log is this far ahead of it: messages of other keys may arrive after it.
+LATE_NS: Final = 10 * S_NS
+# Messages that wait for their digest, of one topic of one node: minutes.
+MAX_WAITING: Final = 20_000
+MAX_NODES: Final = 256
+_SIGNATURE: Final = b',"signature":"'
+
+# A node's certificate, the signature and what is signed -> why it is not valid; "" if it is.
+Refuses = Callable[[str, str, str, bytes], str]
+Kind = Literal["altered", "missing", "unsigned"]
+
+
+def is_covered(topic: Topic) -> bool:
+    """Return whether digests cover a topic: what only the node itself says. Surveyors set marks for a node, too."""
+    return topic.id_fields == ("node",) and not topic.solved and topic not in (DIGEST, MARK)
+
+
+class DigestBook:
+    """Sums up what a node says, for its digests. Not safe in several threads."""
+
+    def __init__(self, node: str, boot: str, began_ns: int) -> None:
+        self._node = node
+        self._boot = boot
+        self._seq = 0
+        self._since_ns = began_ns
+        self._open: dict[str, tuple[int, int, int, hashlib._Hash]] = {}
+        self._said: list[Said] = []
+
+    def add(self, topic: Topic, stamp_ns: int, payload: bytes) -> None:
+        """Take a message that the node says."""
+        if not is_covered(topic):
+            return
+        count, first_ns, last_ns, hashed = self._open.get(topic.name, (0, stamp_ns, -1, hashlib.sha256()))
+        # Pictures are recorded and shown each at its own rate: each is a stretch of its own.
+        if count and (stamp_ns <= last_ns or topic is IMAGE):
+            self._end(topic.name)
+            count, first_ns, hashed = 0, stamp_ns, hashlib.sha256()
+        hashed.update(hashlib.sha256(payload).digest())
+        self._open[topic.name] = count + 1, first_ns, stamp_ns, hashed
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a digest is due before its second is over."""
+        return len(self._said) + len(self._open) >= MAX_SAID - 1
+
+    def digest(self, stamp_ns: int, *, last: bool = False) -> Digest:
+        """Return the digest of all since the last one."""
+        for topic in list(self._open):
+            self._end(topic)
+        said, self._said = self._said, []
+        made = Digest(
+            node=self._node,
+            stamp_ns=stamp_ns,
+            boot=self._boot,
+            seq=self._seq,
+            since_ns=self._since_ns,
+            said=said,
+            last=last or UNSET,
+        )
+        self._seq += 1
+        self._since_ns = stamp_ns
+        return made
+
+    def _end(self, topic: str) -> None:
+        count, first_ns, last_ns, hashed = self._open.pop(topic)
+        short = hashed.hexdigest()[:32]
+        self._said.append(Said(topic=topic, count=count, first_ns=first_ns, last_ns=last_ns, sha256=short))
+
+
+def sealed(digest: Digest, sign: Callable[[bytes], str] | None) -> bytes:
+    """Return the payload of a digest, with its signature."""
+    payload = encode(digest)
+    return payload if sign is None else payload[:-1] + _SIGNATURE + sign(payload).encode() + b'"}'
+
+
+def unsealed(key: str, payload: bytes) -> tuple[Digest, bytes, str]:
+    """Return the digest of a payload, what is signed of it, and the signature ("" without one); raise MessageError."""
+    head, mark, tail = payload.rpartition(_SIGNATURE)
+    # What comes after the signed part counts for nothing.
+    signed, signature = (head + b"}", tail[:-2].decode("ascii", "replace")) if mark else (payload, "")
+    digest = open_envelope(key, signed).message
+    assert isinstance(digest, Digest)
+    return digest, signed, signature
+
+
+class Undigested(NamedTuple):
+    """A message that no digest has named so far. time_ns: its log time."""
+
+    stamp_ns: int
+    time_ns: int
+    sha256: bytes
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """What is wrong with a log, from a second on.
+
+    kind: altered: it is not what the node wrote. missing: not all of it is there, so the rest is not verified.
+    unsigned: nobody vouches for it. since_ns, until_ns: the digest's second, by the node's clock; of messages without
+    one, the second of their log times.
+    stretch: the one that is wrong; None: a digest is. have: the checksums of what is there of it.
+    """
+
+    node: str
+    kind: Kind
+    since_ns: int
+    until_ns: int
+    words: str
+    boot: str = ""
+    stretch: Said | None = None
+    have: frozenset[bytes] = frozenset()
+
+
+@dataclass
+class Checked:
+    """What is known of a node. seconds: how many digests were right, signed: those of them with a sound signature."""
+
+    seconds: int = 0
+    signed: int = 0
+    certificates: list[str] = field(default_factory=list)
+    waiting: dict[str, list[Undigested]] = field(default_factory=lambda: defaultdict(list))
+    # By boot: the newest judged digest.
+    newest: dict[str, Digest] = field(default_factory=dict)
+    due: list[tuple[int, bytes]] = field(default_factory=list)
+    # Where the first digest begins, if the log begins amid the node's run; else 0.
+    begins_ns: int = 0
+
+
+class DigestCheck:
+    """Compares messages, in the order in which they were written, with their nodes' digests.
+
+    refuses: checks signatures; None: they are not looked at. must_sign: digests without a signature are named, too.
+    """
+
+    def __init__(self, refuses: Refuses | None = None, *, must_sign: bool = False) -> None:
+        self.nodes: dict[str, Checked] = {}
+        self._refuses = refuses
+        self._must_sign = must_sign
+
+    def add(self, key: str, payload: bytes, time_ns: int) -> Iterator[Discrepancy]:
+        """Take a message; yield what is wrong with those of some seconds ago. time_ns: log time."""
+        parsed = parse_key(key)
+        if parsed is None or not (is_covered(parsed[0]) or parsed[0] is DIGEST):
+            return
+        topic, (node,) = parsed
+        if node not in self.nodes and len(self.nodes) >= MAX_NODES:
+            return
+        of = self.nodes.setdefault(node, Checked())
+        if topic is DIGEST:
+            of.due.append((time_ns, payload))
+        else:
+            if topic is INFO:
+                _take_certificate(of, key, payload)
+            one = Undigested(payload_stamp_ns(payload) or 0, time_ns, hashlib.sha256(payload).digest())
+            waiting = of.waiting[topic.name]
+            waiting.append(one)
+            if len(waiting) > MAX_WAITING:
+                yield from _leftover(node, of, topic.name, [waiting.pop(0)])
+        while of.due and (of.due[0][0] + LATE_NS < time_ns or len(of.due) > MAX_WAITING):
+            yield from self._judge(node, of, *of.due.pop(0))
+
+    def finish(self) -> Iterator[Discrepancy]:
+        """Yield what is wrong with the rest, at the log's end."""
+        for node, of in self.nodes.items():
+            for due in of.due:
+                yield from self._judge(node, of, *due)
+            of.due.clear()
+            for topic, waiting in of.waiting.items():
+                yield from _leftover(node, of, topic, waiting)
+            of.waiting.clear()
+            for boot, digest in of.newest.items():
+                if digest.last is UNSET:
+                    words = "the log ends without the node's last digest: what came after is not known"
+                    yield Discrepancy(node, "unsigned", digest.stamp_ns, digest.stamp_ns, words, boot)
+
+    def _judge(self, node: str, of: Checked, time_ns: int, payload: bytes) -> Iterator[Discrepancy]:
+        # What is not the node's says nothing of time.
+        second = time_ns - S_NS, time_ns
+        try:
+            digest, signed, signature = unsealed(DIGEST.key(node), payload)
+        except MessageError as error:
+            yield Discrepancy(node, "altered", *second, f"a digest cannot be read: {error}")
+            return
+        why = self._why_refused(node, of, signature, signed)
+        if why:
+            yield Discrepancy(node, "altered", *second, f"a digest is not the node's: {why}")
+            return
+        if not signature and self._must_sign:
+            yield Discrepancy(node, "unsigned", digest.since_ns, digest.stamp_ns, "is not signed", digest.boot)
+        newest = of.newest.get(digest.boot)
+        if newest is not None and digest.seq <= newest.seq:
+            yield Discrepancy(node, "altered", *second, "a digest comes again, or late")
+            return
+        if newest is None and digest.seq:
+            of.begins_ns = of.begins_ns if of.newest else digest.since_ns
+            words = f"the log has nothing of the node's first {digest.seq} s"
+            yield Discrepancy(node, "unsigned", digest.since_ns, digest.since_ns, words, digest.boot)
+        elif newest is not None and digest.seq > newest.seq + 1:
+            words = f"{digest.seq - newest.seq - 1} digests are missing"
+            yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
+        of.newest[digest.boot] = digest
+        found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
+        yield from found
+        if not found:
+            of.seconds += 1
+            of.signed += bool(signature and self._refuses is not None)
+
+    def _why_refused(self, node: str, of: Checked, signature: str, signed: bytes) -> str:
+        if not signature or self._refuses is None:
+            return ""
+        if not of.certificates:
+            return "no calibration of the node has its certificate"
+        whys = [self._refuses(node, certificate, signature, signed) for certificate in of.certificates]
+        return "" if "" in whys else whys[-1]
+
+
+def _take_certificate(of: Checked, key: str, payload: bytes) -> None:
+    try:
+        info = open_envelope(key, payload).message
+    except MessageError:
+        return
+    certificate = info.certificate if isinstance(info, NodeInfo) else UNSET
+    if certificate is not UNSET and certificate not in of.certificates:
+        # Those of a node's last starts; an invented one takes the place of none that is in use.
+        of.certificates = [*of.certificates, certificate][:8]
+
+
+def sum_of(leaves: list[bytes]) -> str:
+    """Return a stretch's checksum of its messages' checksums."""
+    return hashlib.sha256(b"".join(leaves)).hexdigest()[:32]
+
+
+def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[Discrepancy]:
+    """Compare the messages of a stretch, which then no longer wait."""
+    waiting = of.waiting[stretch.topic]
+    inside = [one for one in waiting if stretch.first_ns <= one.stamp_ns <= stretch.last_ns]
+    # Where a clock was set back, or a message was said again, there are others among them.
+    for begin in range(len(inside) - stretch.count + 1):
+        found = inside[begin : begin + stretch.count]
+        if sum_of([one.sha256 for one in found]) == stretch.sha256:
+            _remove(of, stretch.topic, found)
+            return
+    if stretch.topic == IMAGE.name:
+        return  # pictures are not all recorded, and not all kept; what is there without a digest is named
+    distinct = list({one.sha256: one for one in inside}.values())
+    _remove(of, stretch.topic, inside)
+    by_stamp = sorted(distinct, key=lambda one: one.stamp_ns)
+    kind: Kind = "altered"
+    if sum_of([one.sha256 for one in by_stamp]) == stretch.sha256:
+        words = f"{stretch.topic}: {'in another order' if len(inside) == len(distinct) else 'some stand twice'}"
+    elif len(distinct) < stretch.count:
+        kind, words = "missing", f"{stretch.topic}: {stretch.count - len(distinct)} of {stretch.count} are missing"
+    else:
+        words = f"{stretch.topic}: other messages than the node's"
+    have = frozenset(one.sha256 for one in distinct)
+    yield Discrepancy(node, kind, digest.since_ns, digest.stamp_ns, words, digest.boot, stretch, have)
+
+
+def _remove(of: Checked, topic: str, gone: list[Undigested]) -> None:
+    known = set(map(id, gone))
+    of.waiting[topic] = [one for one in of.waiting[topic] if id(one) not in known]
+
+
+def _leftover(node: str, of: Checked, topic: str, left: list[Undigested]) -> Iterator[Discrepancy]:
+    """Name the messages that no digest has named, by second."""
+    if not of.newest:
+        return  # the whole node is not signed
+    ended = all(digest.last is not UNSET for digest in of.newest.values())
+    ends_ns = max(digest.stamp_ns for digest in of.newest.values())
+    seconds: dict[tuple[int, Kind], int] = defaultdict(int)
+    for one in left:
+        outside = one.stamp_ns < of.begins_ns or (one.stamp_ns >= ends_ns and not ended)
+        seconds[one.time_ns // S_NS, "unsigned" if outside else "altered"] += 1
+    for (second, kind), count in sorted(seconds.items()):
+        at_ns = second * S_NS
+        yield Discrepancy(node, kind, at_ns, at_ns + S_NS, f"{topic}: {count} that are in no digest")

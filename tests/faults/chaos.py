@@ -1,0 +1,139 @@
+"""Random kills, stops and cuts of up to five processes at once, for a time: what is lost, and what comes twice.
+
+python -m tests.faults.chaos --seconds 3600 --seed 1. Needs root.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from buddyline.protocol.clock import S_NS
+
+from tests.faults.observer import Tally
+from tests.faults.scenarios import BACK_S, RATE_HZ, ip, namespace
+from tests.faults.system import System
+
+NAMES = ("hub", "solver", "a", "b", "recorder")
+LONGEST_S = 8.0
+PAUSE_S = 6.0
+
+Undo = Callable[[], object]
+
+
+class Chaos:
+    """Does things to the processes of a system; each returns what undoes it. b lives behind a cable that can be cut."""
+
+    def __init__(self, system: System, namespace: str) -> None:
+        self._system = system
+        self._namespace = namespace
+
+    def spawn(self, name: str) -> None:
+        """Start a process, and wait for nothing: there may be no hub."""
+        self._system.spawn(name, namespace=self._namespace if name == "b" else None)
+
+    def kill(self, name: str) -> Undo:
+        """Kill with SIGKILL."""
+        self._system.kill(name)
+        return lambda: self.spawn(name)
+
+    def stop(self, name: str) -> Undo:
+        """Stop it where it stands, for longer or shorter than the leases."""
+        self._system.freeze(name)
+        return lambda: self._system.thaw(name)
+
+    def end(self, name: str) -> Undo:
+        """End it in order."""
+        self._system.processes.pop(name).end()
+        return lambda: self.spawn(name)
+
+    def cut(self, name: str) -> Undo:
+        """Pull its cable; where it has none, stop it."""
+        if name != "b":
+            return self.stop(name)
+        ip("link", "set", f"{self._namespace}h", "down")
+        return lambda: ip("link", "set", f"{self._namespace}h", "up")
+
+    def explain(self) -> None:
+        """Say what the processes said last, and start those again that have ended."""
+        for name, process in list(self._system.processes.items()):
+            print(
+                name, "ended" if process.ended else "", *process.lines[-6:], sep="\n    ", file=sys.stderr, flush=True
+            )
+            if process.ended:
+                self._system.processes.pop(name).end()
+                self.spawn(name)
+
+    def do(self, seconds: float, rng: random.Random) -> tuple[Counter[str], list[float]]:
+        """Let faults happen; return how often each did, and how long a match took after each round."""
+        assert self._system.observer is not None
+        faults: Counter[str] = Counter()
+        recovered_s: list[float] = []
+        ends_s = time.monotonic() + seconds
+        while time.monotonic() < ends_s:
+            undone: list[tuple[float, Undo]] = []
+            struck = rng.sample(NAMES, rng.randint(1, len(NAMES)))
+            for name in struck:
+                action = rng.choice((self.kill, self.kill, self.stop, self.end, self.cut))
+                faults[f"{action.__name__} {name}"] += 1
+                undone.append((time.monotonic() + rng.uniform(0.0, LONGEST_S), action(name)))
+                time.sleep(rng.choice((0.0, rng.uniform(0.0, 1.0))))
+            faults[f"{len(struck)} at once"] += 1
+            for at_s, undo in sorted(undone, key=lambda one: one[0]):
+                time.sleep(max(at_s - time.monotonic(), 0.0))
+                undo()
+            since_ns = time.time_ns()
+            try:
+                self._system.observer.wait_for_match(since_ns, 3 * BACK_S)
+            except TimeoutError:
+                faults["not recovered"] += 1
+                self.explain()
+                continue
+            recovered_s.append((time.time_ns() - since_ns) / S_NS)
+            time.sleep(rng.uniform(0.0, PAUSE_S))
+        return faults, recovered_s
+
+
+def main() -> int:
+    """Run; print the counts as JSON."""
+    parser = argparse.ArgumentParser(prog="python -m tests.faults.chaos", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=1200.0)
+    parser.add_argument("--seed", type=int, default=1)
+    args = parser.parse_args()
+    # A SIGTERM also ends the processes that were started.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    rng = random.Random(args.seed)
+    with (
+        namespace() as (name, host),
+        tempfile.TemporaryDirectory() as directory,
+        System(Path(directory), RATE_HZ, f"tcp/{host}:17449") as system,
+    ):
+        chaos = Chaos(system, name)
+        system.start("hub")
+        observer = system.observe()
+        for one in NAMES[1:]:
+            chaos.spawn(one)
+        observer.wait_for_match(0, 2 * BACK_S)
+        faults, recovered_s = chaos.do(args.seconds, rng)
+        tally: Tally = system.finish()
+    recovered_s.sort()
+    found = {
+        "rounds": len(recovered_s),
+        "faults": dict(sorted(faults.items())),
+        "recovery_s": {"median": recovered_s[len(recovered_s) // 2], "worst": recovered_s[-1]},
+        **vars(tally),
+    }
+    print(json.dumps(found, indent=2))
+    return 1 if faults["not recovered"] or tally.outcomes_doubled or tally.duplicated or tally.disordered else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

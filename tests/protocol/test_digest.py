@@ -1,0 +1,212 @@
+"""What a node says is summed up and signed; whatever is done to its log afterwards is named, with its second."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.digest import DigestBook, DigestCheck, Discrepancy, sealed, unsealed
+from buddyline.protocol.messages import Attitude, Depth, Message
+from buddyline.protocol.signing import Signer, Trust
+from buddyline.protocol.topics import key_of, topic_of
+from msgspec import UNSET
+
+from tests.tools.evaluated import info
+from tests.tools.identities import make_keys, tls
+
+BEGAN_NS = 1_700_000_000_000_000_000
+SECONDS = 6
+
+Line = tuple[str, bytes, int]  # key, payload, log time
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_keys(tmp_path_factory.mktemp("keys"), "a", "b")
+
+
+def said(node: str, at_ns: int, value: float) -> list[Message]:
+    rest = (0.0, 0.0, 0.0, 1.0)
+    return [
+        Depth(node=node, stamp_ns=at_ns, depth_m=value, sigma_m=0.1),
+        Attitude(node=node, stamp_ns=at_ns + 1, q_ned_body_xyzw=rest, sigma_rad=(0.1, 0.1, value + 1.0)),
+    ]
+
+
+def written(
+    node: str, keys: Path | None, boot: str = "x", began_ns: int = BEGAN_NS, *, ended: bool = True
+) -> list[Line]:
+    """Return a node's log of some seconds: four depths and attitudes a second."""
+
+    signer = None if keys is None else Signer.of(tls(keys, f"node-{node}"))
+    book, lines = DigestBook(node, boot, began_ns), []
+
+    def say(message: Message, at_ns: int) -> None:
+        payload = encode(message)
+        book.add(topic_of(message), payload_stamp_ns(payload) or 0, payload)
+        lines.append((key_of(message), payload, at_ns))
+
+    certificate = UNSET if signer is None else signer.certificate
+    say(info(node=node, stamp_ns=began_ns, certificate=certificate), began_ns)
+    for k in range(SECONDS * 4):
+        at_ns = began_ns + k * S_NS // 4
+        for message in said(node, at_ns, float(k)):
+            say(message, at_ns + 2)
+        if k % 4 == 3:
+            digest = book.digest(at_ns + S_NS // 8, last=ended and k == SECONDS * 4 - 1)
+            lines.append((key_of(digest), sealed(digest, signer and signer.sign), at_ns + S_NS // 8))
+    return lines
+
+
+def findings(lines: list[Line], keys: Path | None) -> list[Discrepancy]:
+    trust = Trust(keys / "ca.crt") if keys is not None else None
+    check = DigestCheck(None if trust is None else trust.refuses, must_sign=trust is not None)
+    return [*(one for line in lines for one in check.add(*line)), *check.finish()]
+
+
+def altered(payload: bytes, rng: random.Random) -> bytes:
+    """Change a digit: of a value, a stamp, a checksum, a signature or the certificate."""
+    digits = [i for i, byte in enumerate(payload) if 48 <= byte <= 57]
+    at = rng.choice(digits)
+    return payload[:at] + (b"9" if payload[at] != 57 else b"8") + payload[at + 1 :]
+
+
+def change_one(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    at = rng.randrange(len(lines))
+    key, payload, time_ns = lines[at]
+    lines[at] = key, altered(payload, rng), time_ns
+    return time_ns
+
+
+def take_from_elsewhere(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    """A message of another run of the same node, in the place of its own or beside it."""
+    at = rng.randrange(1, len(lines))
+    key, _, time_ns = lines[at]
+    payload = rng.choice([one for one in other if one[0] == key])[1]
+    lines[at : at + rng.randint(0, 1)] = [(key, payload, time_ns)]
+    # A digest of another run tells of that one's seconds.
+    return (payload_stamp_ns(payload) or 0) if key.endswith("/digest") and len(lines) > len(other) else time_ns
+
+
+def take_a_second_from_elsewhere(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    """A whole second of another run, with its own signed digest."""
+    second = rng.randrange(SECONDS)
+    lines[1 + 9 * second : 10 + 9 * second] = other[1 + 9 * second : 10 + 9 * second]
+    return lines[9 + 9 * second][2]
+
+
+def repeat_one(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    at = rng.randrange(1, len(lines))
+    to = rng.randrange(at, len(lines))
+    lines.insert(to, (*lines[at][:2], lines[to][2]))
+    return lines[to][2]
+
+
+def drop_some(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    at = rng.randrange(1, len(lines))
+    time_ns = lines[at][2]
+    del lines[at : at + rng.randint(1, 20)]
+    return time_ns
+
+
+def swap_two(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    """Two neighbours of one key change places; the places keep their log times."""
+    at = rng.randrange(1, len(lines))
+    alike = [i for i, one in enumerate(lines) if one[0] == lines[at][0] and i != at]
+    to = min(alike, key=lambda i: (abs(i - at), i))
+    (key, first, at_ns), (_, second, to_ns) = lines[at], lines[to]
+    lines[at], lines[to] = (key, second, at_ns), (key, first, to_ns)
+    return min(at_ns, to_ns)
+
+
+def strip_a_signature(lines: list[Line], other: list[Line], rng: random.Random) -> int:
+    at = rng.choice([i for i, one in enumerate(lines) if one[0].endswith("/digest")])
+    key, payload, time_ns = lines[at]
+    lines[at] = key, unsealed(key, payload)[1], time_ns
+    return time_ns
+
+
+ATTACKS: tuple[Callable[[list[Line], list[Line], random.Random], int], ...] = (
+    *(change_one, take_from_elsewhere, take_a_second_from_elsewhere),
+    *(repeat_one, drop_some, swap_two, strip_a_signature),
+)
+
+
+def named(found: list[Discrepancy], at_ns: int) -> bool:
+    """Whether a finding names the second in which something was done, or the end of what is known."""
+    return any(one.since_ns - S_NS <= at_ns <= one.until_ns + S_NS for one in found)
+
+
+def attacked(times: int, keys: Path, seed: int) -> Iterator[tuple[str, list[Discrepancy], int]]:
+    rng = random.Random(seed)
+    own, other = written("a", keys), written("a", keys, boot="y", began_ns=BEGAN_NS + 1000 * S_NS)
+    assert not findings(own, keys)
+    for _ in range(times):
+        attack = rng.choice(ATTACKS)
+        lines = list(own)
+        at_ns = attack(lines, other, rng)
+        if lines == own:  # a message was put in its own place
+            continue
+        yield attack.__name__, findings(lines, keys), at_ns
+
+
+def test_attacks_are_named(keys: Path) -> None:
+    for attack, found, at_ns in attacked(150, keys, seed=1):
+        assert named(found, at_ns), (attack, at_ns - BEGAN_NS, found)
+
+
+def test_a_log_without_keys_is_summed_up_all_the_same(keys: Path) -> None:
+    lines = written("a", None)
+    assert not findings(lines, None)
+    assert {one.kind for one in findings(lines, keys)} == {"unsigned"}
+    at_ns = change_one(lines, lines, random.Random(1))
+    assert named(findings(lines, None), at_ns)
+
+
+def test_another_nodes_key_and_another_authority_count_for_nothing(keys: Path, tmp_path: Path) -> None:
+    others = make_keys(tmp_path / "others", "a")
+    assert {one.kind for one in findings(written("a", others), keys)} == {"altered"}
+    lines = written("a", keys)
+    forged = [
+        (key.replace("/a/", "/b/"), payload.replace(b'"node":"a"', b'"node":"b"'), t) for key, payload, t in lines
+    ]
+    assert {one.kind for one in findings(forged, keys)} == {"altered"}
+
+
+def test_what_follows_a_signature_counts_for_nothing(keys: Path) -> None:
+    key, digest, _ = written("a", keys)[9]
+    assert unsealed(key, digest[:-1] + b',"seq":7}')[0].seq == 0
+    assert not Trust(keys / "ca.crt").refuses(
+        "a", Signer.of(tls(keys, "node-a")).certificate, *reversed(unsealed(key, digest)[1:])
+    )
+
+
+def test_a_clock_that_was_set_back_is_no_fraud(keys: Path) -> None:
+    """Stamps come twice then; each second has its own messages, in the order in which they were written."""
+    book, lines = DigestBook("a", "x", BEGAN_NS), []
+    for k in range(400):
+        at_ns = BEGAN_NS + k * S_NS // 10 - (30 * S_NS if k > 200 else 0)
+        message = Depth(node="a", stamp_ns=at_ns, depth_m=float(k), sigma_m=0.1)
+        book.add(topic_of(message), at_ns, encode(message))
+        lines.append((key_of(message), encode(message), at_ns))
+        if k % 10 == 9:
+            digest = book.digest(at_ns + 1, last=k == 399)
+            lines.append((key_of(digest), sealed(digest, None), at_ns + 1))
+    assert not findings(lines, None)
+
+
+def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:
+    lines = written("a", keys)
+    assert [one.kind for one in findings(lines[:-1], keys)].count("altered") == 0
+    assert {one.kind for one in findings(lines[:-12], keys)} == {"unsigned"}
+    late = [lines[0], *lines[19:]]
+    assert {one.kind for one in findings(late, keys)} == {"unsigned"}
+
+
+@pytest.mark.slow
+def test_ten_thousand_attacks_are_named(keys: Path) -> None:
+    assert not [one for one in attacked(10_000, keys, seed=2) if not named(*one[1:])]
