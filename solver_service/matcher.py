@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -45,7 +46,8 @@ class _Waiting:
     """The frames of one trigger, of a and b, and the arrival of the first one.
 
     receive_ns: receive time; None when read from a log. elapsed_ns: both streams' elapsed_ns at that time, which
-    measures the waiting where receive time does not. live: the dive is live, so it waits in receive time.
+    measures the waiting where receive time does not. live: the dive is live, so it waits in receive time. due: whether
+    an outcome is due; if not, the trigger has one, and waits for a frame that repeats it.
     """
 
     trigger: int
@@ -53,6 +55,7 @@ class _Waiting:
     receive_ns: int | None
     elapsed_ns: tuple[int, int]
     live: bool
+    due: bool
     conflict: bool = False
 
 
@@ -99,34 +102,35 @@ class PairMatcher:
         """
         if receive_ns is not None:
             self._now_ns = receive_ns
-        trigger, side = frame.trigger, self._side(frame)
-        resolved = self._is_resolved(trigger, side)
         if arrival is Arrival.DUPLICATE:
             self.duplicates += 1
             return []
+        trigger, side = frame.trigger, self._side(frame)
+        due, may_repeat = self._is_due(trigger, side)
+        waiting = self._waiting.get(trigger)
+        if waiting is not None:
+            waiting.due |= due
         if arrival is Arrival.FAR:
             self.late += 1
-            if resolved:
-                return []
             seconds = (frame.stamp_ns - (self.streams[side].newest_ns or 0)) / S_NS
             detail = f"frame of {frame.node} is {seconds:+.1f} s from the node's others"
             # It may be the first frame of a new time line: its outcome is stored for that one.
-            return [self._give_up(frame, "late", detail, ahead=1)]
-        if resolved:
+            return self._give_up(frame, "late", detail, ahead=1) if due else []
+        if not (due or may_repeat):
             self.late += 1
             return []
-        waiting = self._waiting.get(trigger)
         if arrival is Arrival.CONFLICT:
             if waiting is None:
-                return [self._give_up(frame, "duplicate", TWO_FRAMES)]
+                return self._give_up(frame, "duplicate", TWO_FRAMES) if due else []
             waiting.conflict = True
             return []
         if trigger < self._newest_resolved:
             self.late += 1
-            return [self._give_up(frame, "late", f"frame of {frame.node} came after later triggers were solved")]
+            detail = f"frame of {frame.node} came after later triggers were solved"
+            return self._give_up(frame, "late", detail) if due else []
         if waiting is None:
             elapsed_ns = self.streams[0].elapsed_ns, self.streams[1].elapsed_ns
-            waiting = _Waiting(trigger, [None, None], receive_ns, elapsed_ns, live)
+            waiting = _Waiting(trigger, [None, None], receive_ns, elapsed_ns, live, due)
             if len(self._arrivals) > 2 * MAX_PENDING:
                 self._arrivals = deque(one for one in self._arrivals if self._waiting.get(one.trigger) is one)
             self._arrivals.append(waiting)
@@ -143,12 +147,10 @@ class PairMatcher:
         new time may not: they have their outcome.
         """
         side = 0 if self.streams[0].node == node else 1
-        results = [
-            result
-            for trigger in list(self._order)
-            if self._waiting[trigger].frames[side] is not None
-            and (result := self._resolve_one(self._waiting[trigger], at_once=True)) is not None
-        ]
+        results: list[Matched | Unmatched] = []
+        for trigger in list(self._order):
+            if self._waiting[trigger].frames[side] is not None:
+                results += self._resolve_one(self._waiting[trigger], at_once=True) or ()
         self._time_lines[side] += 1
         self._newest_resolved = -1
         return results
@@ -168,7 +170,7 @@ class PairMatcher:
             result = self._resolve_one(self._waiting[trigger], at_once=at_once)
             if result is None:
                 break
-            results.append(result)
+            results += result
         return results
 
     def _side(self, frame: Candidates) -> int:
@@ -195,8 +197,8 @@ class PairMatcher:
         since = zip(self.streams, waiting.elapsed_ns, strict=True)
         return any(stream.elapsed_ns - began_ns > LONGEST_WAIT_NS for stream, began_ns in since)
 
-    def _resolve_one(self, waiting: _Waiting, *, at_once: bool) -> Matched | Unmatched | None:
-        """Resolve one trigger; None if it still waits."""
+    def _resolve_one(self, waiting: _Waiting, *, at_once: bool) -> Sequence[Matched | Unmatched] | None:
+        """Resolve one trigger, with no result if none is due; None if it still waits."""
         frame_a, frame_b = waiting.frames
         frame = frame_a or frame_b
         if frame is None:
@@ -229,7 +231,7 @@ class PairMatcher:
                 return self._give_up(one, "no_info", f"frame of {one.node} is {sizes}")
         self._finish(waiting.trigger, 0)
         self._newest_resolved = max(self._newest_resolved, waiting.trigger)
-        return Matched(
+        matched = Matched(
             trigger=waiting.trigger,
             stamp_ns=(frame_a.stamp_ns + frame_b.stamp_ns) // 2,
             frame_a=frame_a,
@@ -241,6 +243,7 @@ class PairMatcher:
             sensed_a=sensed_of(stream_a.attitude, stream_a.depth, frame_a.stamp_ns),
             sensed_b=sensed_of(stream_b.attitude, stream_b.depth, frame_b.stamp_ns),
         )
+        return [matched]
 
     def _expired(self, waiting: _Waiting, frame: Candidates, other: NodeStream) -> bool:
         """Return whether to stop waiting for the other node's frame of this frame's trigger."""
@@ -252,30 +255,43 @@ class PairMatcher:
         own_ns = self.streams[self._side(frame)].newest_ns or 0
         return own_ns - frame.stamp_ns > SILENCE_WINDOW_NS
 
-    def _is_resolved(self, trigger: int, side: int) -> bool:
-        """Return whether a trigger has its outcome; not if a node has reached it again on a new time line."""
+    def _is_due(self, trigger: int, side: int) -> tuple[bool, bool]:
+        """Return whether a frame calls for an outcome of its trigger, and whether the other node's frame still may.
+
+        A trigger that has its outcome gets another one if a node that had a frame in it reaches the trigger again on a
+        new time line. The frame of a node that had none, and is on a new time line too, waits for that one.
+        """
         resolved = self._resolved.get(trigger)
         if resolved is None:
-            return False
+            return True, True
         anew = [now > then for now, then in zip(self._time_lines, resolved.time_lines, strict=True)]
-        return not (anew[side] and (resolved.had_frame[side] or anew[1 - side]))
+        return anew[side] and resolved.had_frame[side], all(anew)
 
-    def _give_up(self, frame: Candidates, reason: Reason, detail: str, *, ahead: int = 0) -> Unmatched:
+    def _give_up(self, frame: Candidates, reason: Reason, detail: str, *, ahead: int = 0) -> list[Matched | Unmatched]:
         """End a trigger without a match; ahead: 1 if the frame may be the first of a new time line."""
+        waiting = self._waiting.get(frame.trigger)
+        if waiting is not None and not waiting.due:
+            self._drop(waiting)
+            return []
         self._finish(frame.trigger, self._side(frame), ahead)
         if reason != "late":
             self._newest_resolved = max(self._newest_resolved, frame.trigger)
-        return Unmatched(frame.trigger, frame.stamp_ns, reason, detail)
+        return [Unmatched(frame.trigger, frame.stamp_ns, reason, detail)]
+
+    def _drop(self, waiting: _Waiting) -> None:
+        """Drop a trigger's frames."""
+        del self._waiting[waiting.trigger]
+        del self._order[bisect.bisect_left(self._order, waiting.trigger)]
+        self.pending_bytes -= sum(size_bytes(frame) for frame in waiting.frames if frame is not None)
+        waiting.frames = [None, None]
 
     def _finish(self, trigger: int, side: int, ahead: int = 0) -> None:
         """Drop a trigger's frames, and store that it has its outcome. side: 0 or 1, the node that had a frame."""
-        waiting = self._waiting.pop(trigger, None)
+        waiting = self._waiting.get(trigger)
         had_frame = [False, False]
         if waiting is not None:
-            del self._order[bisect.bisect_left(self._order, trigger)]
-            self.pending_bytes -= sum(size_bytes(frame) for frame in waiting.frames if frame is not None)
             had_frame = [frame is not None for frame in waiting.frames]
-            waiting.frames = [None, None]
+            self._drop(waiting)
         had_frame[side] = True
         time_lines = list(self._time_lines)
         time_lines[side] += ahead

@@ -194,7 +194,9 @@ class NodeStream:
             return Arrival.FRESH
         if self._far and abs(stamp_ns - self._far[-1]) > FAR_NS:
             self._far.clear()
-        self._far.append(stamp_ns)
+        # An old frame that comes again and again shows no new time.
+        if not self._far or stamp_ns > self._far[-1]:
+            self._far.append(stamp_ns)
         if len(self._far) < FRAMES_TO_BELIEVE:
             return Arrival.FAR
         self._far.clear()

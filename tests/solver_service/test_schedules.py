@@ -8,6 +8,7 @@ from collections import Counter, defaultdict
 from itertools import combinations
 
 import hypothesis.strategies as st
+import pytest
 from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
 from buddyline.protocol.messages import Attitude, Blob, Candidates, Depth, Imu
 from buddyline.solver_service.core import SolverCore
@@ -16,7 +17,7 @@ from buddyline.solver_service.matcher import MAX_PENDING, MAX_PENDING_BYTES, MAX
 from buddyline.solver_service.sensors import MAX_SAMPLES
 from buddyline.solver_service.streams import MAX_FRAME_BYTES, MAX_SEQUENCE_MEMORY, size_bytes
 from hypothesis import HealthCheck, settings
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 from msgspec.structs import replace
 
 from tests.solver_service.conftest import START_NS, dive_messages
@@ -246,11 +247,44 @@ class Schedules(RuleBasedStateMachine):
             assert self.core.pending == 0
 
 
+def limits(examples, *, derandomize):
+    return settings(
+        max_examples=examples,
+        stateful_step_count=40,
+        deadline=None,
+        derandomize=derandomize,
+        suppress_health_check=list(HealthCheck),
+    )
+
+
 TestSchedules = Schedules.TestCase
-TestSchedules.settings = settings(
-    max_examples=EXAMPLES,
-    stateful_step_count=40,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=list(HealthCheck),
-)
+TestSchedules.settings = limits(EXAMPLES, derandomize=True)
+
+
+@pytest.mark.slow
+def test_schedules_that_no_run_has_seen_before():
+    run_state_machine_as_test(Schedules, settings=limits(20 * EXAMPLES, derandomize=False))
+
+
+def play(period_ms, *steps):
+    schedule = Schedules()
+    schedule.begin(period_ms=period_ms, chosen=True)
+    for rule_name, *arguments in steps:
+        getattr(schedule, rule_name)(*arguments)
+        schedule.each_trigger_ends_once()
+        schedule.what_is_matched_came_together()
+    schedule.teardown()
+    schedule.each_trigger_ends_once()
+    return schedule
+
+
+def test_a_node_that_reaches_what_the_other_had_alone_gives_no_second_outcome():
+    """B's clock goes back by half a minute, then a's by a day: b reaches triggers that a had without it."""
+    away = [("set_the_clock_of_a_node", "a", -86_400), ("go_on", 16.0), ("set_the_clock_of_a_node", "b", 4)]
+    play(2500, ("go_on", 0.5), ("set_the_clock_of_a_node", "b", -30), ("go_on", 7.2), *away, ("go_on", 3.75))
+
+
+def test_an_old_frame_that_comes_again_and_again_is_no_new_time():
+    again = [("deliver_again", 10)] * 6
+    played = play(2500, ("go_on", 20.0), *again, ("go_on", 8.0))
+    assert all(stream.newest_ns > START_NS + 25 * S_NS for stream in played.core.streams.values())
