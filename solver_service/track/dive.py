@@ -23,7 +23,8 @@ from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV
 from buddyline.solver_service.track.stepping import PassGuide
 from buddyline.solver_service.track.trail import Trail
-from buddyline.solver_service.track.vibration import Shares, fast_part
+from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
+from buddyline.solver_service.track.walking import joint
 
 # The clocks' offset in the last pass, 1 sd: what the first pass has left beside its own sigma; and where a node has no
 # inertial unit, so that no pass estimates it.
@@ -59,7 +60,8 @@ Records: TypeAlias = tuple["NodeRecord", "NodeRecord"]
 class NodeRecord:
     """What one node recorded, in order of stamps.
 
-    Inertial columns: stamps (N,), accel and gyro (N, 3), body frame; fast (N, 6): the fast part of both, where known.
+    Inertial columns: stamps (N,), accel and gyro (N, 3), body frame; fast (N, 7): the fast part of both and the
+    camera's sudden turn, where known.
     """
 
     node: TrackNode
@@ -156,7 +158,7 @@ def pass_over(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) ->
 
 def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int], clock_ns: int = 0) -> Smoothed:
     """Give the whole dive's track at outputs_ns."""
-    records, fixes = (_parted(in_order(records[0])), _parted(in_order(records[1]))), sorted(fixes, key=_stamp_of)
+    records, fixes = (parted(in_order(records[0])), parted(in_order(records[1]))), sorted(fixes, key=_stamp_of)
     told_ns = clock_ns
     if fixes and fixes[-1].stamp_ns - fixes[0].stamp_ns > 2 * HEAD_NS:
         # The dive's beginning gives the clocks' offset, so that the whole dive needs no other round.
@@ -187,6 +189,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     second.restarts = False
     shares = reduce(Shares.plus, [part.shares for part in parts]).best()
     second.take_off(shares)
+    walking = joint([part.walking for part in parts])
     told = sum(part.told for part in parts)
     if told > 100:
         second.unrest = min(max(math.sqrt(sum(part.surprise for part in parts) / told), 0.3), 2.0)
@@ -201,7 +204,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         state = replace(path.state(0), clock_s=0.0)
         shaking = part.shaking.less(shares)
         begun = broad_start(second.nodes, state, clock_sigma_s, path.oldest, shaking)
-        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, shaking)
+        second.begin(float(path.t_s[0]) - 0.01, part.end_s, *begun, shaking, walking)
         since_s = part.end_s
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
     del first, parts, part, learned, path, earlier
@@ -286,10 +289,11 @@ def in_order(record: NodeRecord) -> NodeRecord:
     )
 
 
-def _parted(record: NodeRecord) -> NodeRecord:
-    """Give a record with the fast part of its inertial samples."""
-    of_each = [fast_part(record.imu_stamps_ns, values) for values in (record.accel_mps2, record.gyro_radps)]
-    return replace(record, fast=np.hstack(of_each))
+def parted(record: NodeRecord) -> NodeRecord:
+    """Give a record with the fast part of its inertial samples, and its camera's sudden turns."""
+    stamps_ns = record.imu_stamps_ns
+    of_each = [fast_part(stamps_ns, values) for values in (record.accel_mps2, record.gyro_radps)]
+    return replace(record, fast=np.column_stack((*of_each, sudden_turn(stamps_ns, record.gyro_radps))))
 
 
 def last_ns(records: Records) -> int:

@@ -12,6 +12,7 @@ from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.state import MOVING, SIZE, State
 from buddyline.solver_service.track.trail import Chosen, Trail
 from buddyline.solver_service.track.vibration import SHARES, Shares
+from buddyline.solver_service.track.walking import Walking
 
 # A challenger that has not replaced the track after so long is dropped.
 CHALLENGE_S: Final = 4.0
@@ -23,10 +24,10 @@ class Estimate:
 
     The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
     learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
-    without: which nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what its attitudes
-    are off their prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1 of the
-    samples' fast parts; shares: what the lights tell of them (vibration.py). attitude_s, depth_s: when attitudes and
-    depths were last used.
+    walking: how much the units' biases walk, learned while learns_walk. without: which nodes have no inertial unit
+    now. turning_off: of each, the lasting part (3,) of what its attitudes are off their prediction, in sigmas.
+    by_shares (SIZE, 4): how the state would be moved by a share of 1 of the samples' fast parts; shares: what the
+    lights tell of them (vibration.py). attitude_s, depth_s: when attitudes and depths were last used.
 
     The lights: detection (2, 2): by observer and light, how likely a light in the picture is found. last_seen (2,):
     the probability that each light is among the last picture's candidates, None where not both should be in it.
@@ -61,6 +62,8 @@ class Estimate:
     confirmed: bool = False
     shaking: Shaking = field(default_factory=Shaking)
     shaken: Floats = field(default_factory=lambda: np.zeros((3, MOVING, MOVING)))
+    walking: Walking = field(default_factory=Walking)
+    learns_walk: bool = True
     surprise: float = 0.0
     fit: float = 0.0
     told: int = 0

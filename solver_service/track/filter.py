@@ -20,6 +20,7 @@ from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
 from buddyline.solver_service.track.state import CLOCK, State
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TOGETHER_S
+from buddyline.solver_service.track.walking import Walking
 
 # Log odds by which an estimate must explain its pictures better than clutter to be confirmed, and a challenger better
 # than the track to replace it. Each node's pictures alone must give at least MUTUAL.
@@ -212,8 +213,11 @@ class TrackFilter(TrackPool):
         noise = anchors.attitude_covariance(seen.R_ned_body, np.hypot(seen.sigma_rad, IRON_RAD), 1.0, 1.0)
         return float(y @ np.linalg.solve(noise + H @ P @ H.T, y)) < CONTRADICTS
 
-    def begin(self, t_s: float, end_s: float, state: State, P: Floats, shaking: Shaking) -> None:
-        """Start from a state that is known beforehand, confirmed; a later one takes over at its time."""
+    def begin(self, t_s: float, end_s: float, state: State, P: Floats, shaking: Shaking, walking: Walking) -> None:
+        """Start from a state that is known beforehand, confirmed; a later one takes over at its time.
+
+        walking: as it was learned; it is not learned further.
+        """
         estimate = Estimate(
             t_s,
             state,
@@ -225,6 +229,8 @@ class TrackFilter(TrackPool):
             evidence=CONFIRMED,
             light_s=t_s,
             shaking=shaking,
+            walking=walking,
+            learns_walk=False,
         )
         self._open(estimate)
         self._waiting.append(estimate)

@@ -66,7 +66,8 @@ class TrackIntake:
     def add_imu(
         self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats, fast: Floats | None = None
     ) -> None:
-        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame; fast (N, 6): the fast part of both."""
+        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame; fast (N, 7): the fast part of
+        both, and the camera's sudden turn."""
         if not len(stamps_ns):
             return
         self.seconds(node, int(stamps_ns[0]))
@@ -77,7 +78,7 @@ class TrackIntake:
             values = np.hstack((accel_mps2 @ R_body_camera, gyro_radps @ R_body_camera))
             values[clipped(gyro_radps), 3:] = np.nan
         if fast is not None:
-            fast = np.hstack((fast[:, :3] @ R_body_camera, fast[:, 3:] @ R_body_camera))
+            fast = np.hstack((fast[:, :3] @ R_body_camera, fast[:, 3:6] @ R_body_camera, fast[:, 6:]))
         self.samples[node].add(times_s, values, fast)
 
     def take_off(self, shares: Floats) -> None:

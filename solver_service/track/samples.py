@@ -27,8 +27,8 @@ class Samples:
 
     def __init__(self) -> None:
         self._t = np.empty(1024)
-        # Force, rate, and the fast part of both.
-        self._values = np.zeros((1024, 12))
+        # Force, rate, the fast part of both, and the camera's sudden turn.
+        self._values = np.zeros((1024, 13))
         self._parted = False
         self.shares = np.zeros(2)
         self._count = 0
@@ -53,12 +53,12 @@ class Samples:
     def add(self, times_s: Floats, values: Floats, fast: Floats | None = None) -> None:
         """Take samples (N,), (N, 6), in any order; a stamp that is there already is refused.
 
-        fast (N, 6): their fast part, where it is known.
+        fast (N, 7): their fast part and the camera's sudden turn, where they are known.
         """
         sound = np.isfinite(times_s) & np.isfinite(values).all(1) & (np.abs(values) < 1e4).all(1)
         self.rejected += int(len(sound) - sound.sum())
         self._parted |= fast is not None
-        values = np.hstack((values, np.zeros_like(values) if fast is None else fast))
+        values = np.hstack((values, np.zeros((len(values), 7)) if fast is None else fast))
         times_s, values = times_s[sound], values[sound]
         if not len(times_s):
             return
@@ -73,7 +73,7 @@ class Samples:
         if need > len(self._t):
             room = max(2 * len(self._t), need)
             self._t = np.concatenate((self.times_s, np.empty(room - self._count)))
-            self._values = np.concatenate((self._values[: self._count], np.empty((room - self._count, 12))))
+            self._values = np.concatenate((self._values[: self._count], np.empty((room - self._count, 13))))
         self._t[self._count : need] = times_s
         self._values[self._count : need] = values
         self._count = need
@@ -89,7 +89,8 @@ class Samples:
     def between(self, start_s: float, end_s: float, known_s: float) -> tuple[Floats, Floats, Bools, Floats | None]:
         """Give the grid (M,) from start_s to end_s, the values (M, 6) there, and which intervals are told (M - 1,).
 
-        The values are without `shares` of their fast part, which comes last (M, 6), None where it is not known.
+        The values are without `shares` of their fast part, which comes last with the camera's sudden turn (M, 7), None
+        where they are not known.
         known_s: nothing later than this is looked at, so that more samples do not change the answer.
         """
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
@@ -115,7 +116,7 @@ class Samples:
         if not self._parted:
             return grid, at[:, :6], told, None
         fast = at[:, 6:]
-        return grid, at[:, :6] - np.repeat(self.shares, 3) * fast, told, fast
+        return grid, at[:, :6] - np.repeat(self.shares, 3) * fast[:, :6], told, fast
 
     def slow_rate(self, time_s: float, known_s: float) -> Floats | None:
         """Give the mean turn rate (3,) of SLOW_S until known_s or shortly after time_s, None where there is none.

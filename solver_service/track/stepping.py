@@ -107,8 +107,15 @@ class TrackSteps(TrackIntake):
             parts.append(replace(part, without=True) if without else part)
         return parts[0], parts[1]
 
-    def _noises(self, t_s: float) -> tuple[Noise, Noise]:
-        a, b = (self._noise(node, t_s) for node in (0, 1))
+    def _with_sudden(self, variances: Floats, parts: tuple[Increment, Increment]) -> Floats:
+        """Give the variances (3,) of shaking with what is taken off of a camera's own sudden turns."""
+        lost = [samples.shares[1] * part.sudden_rad for samples, part in zip(self.samples, parts, strict=True)]
+        widened: Floats = variances + np.square((*lost, 0.0))
+        return widened
+
+    def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
+        gyro, accel = estimate.walking.densities
+        a, b = (replace(self._noise(node, t_s), gyro_bias_radps=gyro, accel_bias_mps2=accel) for node in (0, 1))
         return a, b
 
     def _noise(self, node: int, t_s: float) -> Noise:
@@ -123,15 +130,19 @@ class TrackSteps(TrackIntake):
         span_s = t_s - estimate.t_s
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)
-        a, b = self._noises(t_s)
+        a, b = self._noises(estimate, t_s)
         noises = self._startled(estimate, after, F, 0, a, t_s), self._startled(estimate, after, F, 1, b, t_s)
-        Q, walk, shaken = process_noise(after, parts, noises, estimate.shaking.variances, span_s)
+        learned = estimate.shaking.variances
+        shaking = self._with_sudden(learned, parts)
+        Q, walk, shaken = process_noise(after, parts, noises, shaking, span_s)
         onward = F[:, :MOVING]
-        estimate.shaken = onward @ estimate.shaken @ onward.T + shaken
+        estimate.shaken = onward @ estimate.shaken @ onward.T + (learned / shaking)[:, None, None] * shaken
         if parts[0].by_fast is not None or parts[1].by_fast is not None:
             by_shares = estimate.by_shares.copy()
             by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts)
             estimate.by_shares = by_shares
+        if estimate.confirmed and estimate.learns_walk:
+            estimate.walking = estimate.walking.stepped(F, walk, (not parts[0].without, not parts[1].without))
         for node, part in enumerate(parts):
             if part.without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
@@ -322,6 +333,8 @@ class TrackSteps(TrackIntake):
             if teaches:
                 estimate.shares = estimate.shares.taught(y, S_inverse, moved)
             estimate.by_shares = estimate.by_shares - before @ H.T @ (S_inverse @ moved)
+        if estimate.confirmed and estimate.learns_walk:
+            estimate.walking = estimate.walking.taught(y, S_inverse, H, before @ H.T @ S_inverse)
         # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:
             moving = H[:, :MOVING]
@@ -394,7 +407,8 @@ class TrackSteps(TrackIntake):
             return estimate.state, estimate.covariance
         parts = self.increments(estimate, t_s)
         after, F = propagate(estimate.state, parts, span_s)
-        Q, walk, _ = process_noise(after, parts, self._noises(t_s), estimate.shaking.variances, span_s)
+        shaking = self._with_sudden(estimate.shaking.variances, parts)
+        Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)
 
 

@@ -43,8 +43,7 @@ class Noise:
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
     gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
     gyro's bias, and of the attitude filter's own error, which stands in place of the mount (by its stated sigmas,
-    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk. Good units walk by a fifth of it, units
-    that fins shake and water cools by twice as much: too steady a bias is worse than too loose a one (docs/track.md).
+    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk, as learned (walking.py).
     """
 
     gyro_rad: float
@@ -78,6 +77,7 @@ class Increment:
     attitude at the start and constants. gap_s: how much of the time no sample covers. rate_radps (3,): the turn rate
     at the end. without: whether there is no unit at all: the gyro's bias is then minus the turn rate. by_fast (9, 2):
     what a share of the fast part of force and of rate does to the same as the jacobian's rows; None where not known.
+    sudden_rad: how far the camera itself may have turned as fast.
     """
 
     R: Floats
@@ -88,6 +88,7 @@ class Increment:
     rate_radps: Floats
     without: bool = False
     by_fast: Floats | None = None
+    sudden_rad: float = 0.0
 
 
 def integrate(
@@ -104,8 +105,8 @@ def integrate(
 
     told (M - 1,): whether the accelerometer covers each interval; where not, the node moves on unaccelerated.
     slow_radps (2, 3): the turn rates at both ends without shaking, uncorrected. Delay and lever arm are told by them:
-    by rates that are themselves shaken both would be fitted to the shaking. fast (M, 6): the fast part of force and
-    rate.
+    by rates that are themselves shaken both would be fitted to the shaking. fast (M, 7): the fast part of force and
+    rate, and the camera's sudden turn.
     """
     R0 = state.R[node]
     # Where no sample tells at all, bias and mount stand for other things (process_noise).
@@ -182,7 +183,7 @@ def integrate(
     if fast is not None and whole_told:
         fast_mid = 0.5 * (fast[1:] + fast[:-1])
         by_force, by_rate = (
-            -(turned[:, :, :3] @ part[:, :, None])[:, :, 0] for part in (fast_mid[:, :3], fast_mid[:, 3:])
+            -(turned[:, :, :3] @ part[:, :, None])[:, :, 0] for part in (fast_mid[:, :3], fast_mid[:, 3:6])
         )
         turns = by_rate * h[:, None]
         swung = np.add.accumulate(turns, axis=0)
@@ -191,7 +192,8 @@ def integrate(
         by_fast[0:3, 1] = swung[-1]
         by_fast[3:9, 0] = (weights @ by_force).ravel()
         by_fast[3:9, 1] = (weights @ tipped).ravel()
-    return Increment(R, dv, dp, J, gap, w[-1], by_fast=by_fast)
+    sudden_rad = 0.0 if fast is None else float(fast[:, 6].max())
+    return Increment(R, dv, dp, J, gap, w[-1], by_fast=by_fast, sudden_rad=sudden_rad)
 
 
 def propagate(state: State, parts: tuple[Increment, Increment], span_s: float) -> tuple[State, Floats]:

@@ -16,7 +16,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.inputs import Stamps
 
-# The fast part begins here, and is made by a window of so long on either side.
+# The fast part begins here, and is made by a window of so long on either side, longer for what is slower.
 FAST_HZ: Final = 1.5
 HALF_WINDOW_S: Final = 1.5
 # A fast part of less than so many times the variance of the samples' white noise is taken to be that noise: taken off,
@@ -24,6 +24,9 @@ HALF_WINDOW_S: Final = 1.5
 LEAST_SHAKING: Final = 4.0
 # Samples further apart than this many periods are of two runs; a run of less than a window has no fast part.
 BROKEN: Final = 1.5
+# Of a camera's sudden turn: over so long its variance is averaged, and which share of an octave's is above the octave.
+SUDDEN_S: Final = 0.4
+ABOVE: Final = 1.0 / 7.0
 # The shares of both units' forces and turn rates: A's force, A's rate, B's.
 SHARES: Final = 4
 
@@ -33,16 +36,41 @@ def fast_part(stamps_ns: Stamps, values: Floats) -> Floats:
 
     0 where samples are too few to tell, and throughout where it is hardly more than white noise (LEAST_SHAKING).
     """
+    fast = _faster_than(FAST_HZ, stamps_ns, values)
+    if fast.any() and (fast * fast).mean() < LEAST_SHAKING * _white_variance(values):
+        fast[:] = 0.0
+    return fast
+
+
+def sudden_turn(stamps_ns: Stamps, rates_radps: Floats) -> Floats:
+    """Give how far (N,) the camera itself may turn faster than FAST_HZ, 1 sd of each axis, rad.
+
+    A diver who looks away turns faster than he swims. Shaking of the unit alone has little in the octave below FAST_HZ,
+    such a turn has most there: its rate, whose changes begin and end at once, has a spectrum that falls by 12 dB an
+    octave, and so 1 / 7 of that octave's variance above it.
+    """
+    octave = _faster_than(0.5 * FAST_HZ, stamps_ns, rates_radps) - _faster_than(FAST_HZ, stamps_ns, rates_radps)
+    if len(octave) < 2:
+        return np.zeros(len(octave))
+    period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+    near = np.ones(max(round(SUDDEN_S / max(period_s, 1e-9)), 1) if len(octave) * period_s > SUDDEN_S else 1)
+    variance = np.convolve((octave * octave).mean(axis=1), near / len(near), "same")
+    turn: Floats = np.sqrt(ABOVE * variance) / (2.0 * np.pi * FAST_HZ)
+    return turn
+
+
+def _faster_than(hz: float, stamps_ns: Stamps, values: Floats) -> Floats:
+    """Give what is faster than hz in samples (N, C); 0 where they are too few to tell."""
     fast = np.zeros_like(values)
     if len(stamps_ns) < 3:
         return fast
     steps_s = np.diff(stamps_ns) * 1e-9
     period_s = float(np.median(steps_s))
-    half = round(HALF_WINDOW_S / period_s) if period_s > 0.0 else 0
+    half = round(HALF_WINDOW_S * FAST_HZ / hz / period_s) if period_s > 0.0 else 0
     if half < 2:
         return fast
     t_s = np.arange(-half, half + 1) * period_s
-    window = np.sinc(2.0 * FAST_HZ * t_s) * np.hanning(2 * half + 3)[1:-1]
+    window = np.sinc(2.0 * hz * t_s) * np.hanning(2 * half + 3)[1:-1]
     breaks = np.flatnonzero(np.abs(steps_s / period_s - 1.0) > BROKEN - 1.0) + 1
     for first, stop in zip((0, *breaks.tolist()), (*breaks.tolist(), len(values)), strict=True):
         run = values[first:stop]
@@ -54,8 +82,6 @@ def fast_part(stamps_ns: Stamps, values: Floats) -> Floats:
             middle = run[:, column].mean()
             slow = np.convolve(run[:, column] - middle, window, "same") / weight
             fast[first:stop, column] = run[:, column] - middle - slow
-    if (fast * fast).mean() < LEAST_SHAKING * _white_variance(values):
-        fast[:] = 0.0
     return fast
 
 

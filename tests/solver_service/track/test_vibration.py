@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats
-from buddyline.solver_service.track.dive import in_order, pass_over, smooth
+from buddyline.solver_service.track.dive import in_order, parted, pass_over, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.strapdown import integrate, moved_by_shares, propagate
-from buddyline.solver_service.track.vibration import Shares, fast_part
+from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 
 from tests.solver_service.track.dives import Dive, Setting, make, score
 from tests.solver_service.track.test_track_jacobians import a_state, samples
@@ -47,6 +47,21 @@ def test_runs_on_both_sides_of_a_gap_are_parted_by_themselves() -> None:
     assert not fast_part(np.zeros(5, np.int64), np.ones((5, 6))).any()
 
 
+def test_a_sudden_turn_is_told_from_shaking_by_the_octave_below() -> None:
+    """A head turned by 0.5 rad within 0.6 s, beside shaking of the unit alone."""
+    t = STAMPS_NS * 1e-9
+    turning = np.abs(t - 10.0) < 0.3
+    turn = np.where(turning, 0.5 * np.pi / 1.2 * np.cos(np.pi * (t - 10.0) / 0.6), 0.0)[:, None] * np.ones(3)
+    shaken = 0.02 * np.sqrt(2.0) * np.hstack((wave(2.5), wave(4.0), wave(7.0)))
+    said = sudden_turn(STAMPS_NS, turn + shaken)
+    lost = np.cumsum(fast_part(STAMPS_NS, turn), axis=0) * 0.01
+    near = np.abs(t - 10.0) < 0.5
+    assert 0.7 < np.sqrt((lost[near] ** 2).mean()) / np.sqrt((said[near] ** 2).mean()) < 1.5
+    assert said[np.abs(t - 10.0) > 3.0][200:-200].max() < 0.02 * said.max()
+    assert not sudden_turn(STAMPS_NS[:1], turn[:1]).any()
+    assert not sudden_turn(np.zeros(5, np.int64), np.ones((5, 3))).any()
+
+
 def test_shares_are_least_squares() -> None:
     rng = np.random.default_rng(5)
     truth = np.array((0.2, 0.9, 0.5, 0.7))
@@ -62,7 +77,7 @@ def test_shares_are_least_squares() -> None:
 def test_what_a_share_moves(column: int) -> None:
     state = a_state(3)
     rng = np.random.default_rng(8)
-    fast = rng.normal(0.0, 0.1, (2, 41, 6))
+    fast = rng.normal(0.0, 0.1, (2, 41, 7))
 
     def after(share: float) -> tuple[object, Floats]:
         parts = []
@@ -75,7 +90,7 @@ def test_what_a_share_moves(column: int) -> None:
             taken = np.zeros(6)
             if column // 2 == node:
                 taken[3 * (column % 2) : 3 * (column % 2) + 3] = share
-            values = values - taken * fast[node]
+            values = values - taken * fast[node, :, :6]
             ends = values[[0, -1], 3:]
             told = np.ones(40, dtype=bool)
             still = replace(state, lever_m=np.zeros((2, 3)))
@@ -104,9 +119,8 @@ def test_a_unit_that_shakes_alone_costs_little_once_the_lights_have_told_so() ->
     good, bad = (score(each, smooth(each.records, each.fixes, each.stamps_ns).rows) for each in (still, dive))
     assert np.median(bad.errors_m) < 1.35 * np.median(good.errors_m)
     assert bad.nees < 1.6
-    a, b = map(in_order, dive.records)
-    parts = [fast_part(b.imu_stamps_ns, values) for values in (b.accel_mps2, b.gyro_radps)]
-    records = a, replace(b, fast=np.hstack(parts))
+    a, b = dive.records
+    records = in_order(a), parted(in_order(b))
     track = TrackFilter(a.node, b.node, keep_s=np.inf)
     pass_over(track, records, dive.fixes)
     assert track.main is not None
