@@ -163,6 +163,15 @@ class Bus(ABC):
     def is_alive(self, name: str) -> bool:
         """Return whether another process on this bus has declared name."""
 
+    @abstractmethod
+    def withdraw_alive(self, name: str) -> None:
+        """Take a declared name back."""
+
+    @property
+    @abstractmethod
+    def hub(self) -> str | None:
+        """An id of the hub's process, to which this one is connected; None while it is cut off."""
+
     @property
     def shed(self) -> dict[str, int]:
         """How many messages of each topic a slow link has left out."""

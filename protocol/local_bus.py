@@ -203,6 +203,18 @@ class LocalBus(Bus):
             if not known:
                 self._network.notify(name, True)
 
+    def withdraw_alive(self, name: str) -> None:
+        """Take a declared name back."""
+        with self._network.lock:
+            self._network.alive.remove((name, self))
+            if not any(name == other for other, _ in self._network.alive):
+                self._network.notify(name, False)
+
+    @property
+    def hub(self) -> str | None:
+        """An id of the hub's process; None while this one is cut off."""
+        return "local"
+
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
         """Call handle(name, alive) for every name that is alive now, and at every change."""
         delivery = Delivery[tuple[str, bool]]("bus alive", lambda item: handle(*item), 1024, self._failures)

@@ -14,6 +14,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="FILE.toml", help="the solver's configuration (every key has a default)")
     parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, as tcp/host:7447; replaces the configured one")
     parser.add_argument("--nodes", metavar="A,B,...", help="solve only the pairs of these, not the configured ones")
+    parser.add_argument(
+        "--share", action="store_true", help="divide the pairs among all solvers of this hub that are started so"
+    )
     parser.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
 
 
@@ -28,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
         config = msgspec.structs.replace(config, connect=args.connect)
     if args.nodes:
         config = msgspec.structs.replace(config, nodes=node_ids([args.nodes]), pairs=[])
+    if args.share:
+        config = msgspec.structs.replace(config, share=True)
     service = SolverService(config, args.config or "defaults")
     service.handle_signals()
     service.start()

@@ -14,6 +14,8 @@ Outcome = RelativePose | Rejected
 MAX_WITHHELD: Final = 8192
 # Longer than a prediction is valid, and longer than the solver waits for a sensor.
 WARM_UP_NS: Final = 10 * S_NS
+# A pair that another solver takes over is solved again from this long before its last answer. It must not take long.
+HANDED_OVER_NS: Final = 2 * S_NS
 # An answer this near to the present is of the live dive, of which there is one. A stored dive may come again.
 THIS_DIVE_NS: Final = 600 * S_NS
 
@@ -29,6 +31,10 @@ class Answered:
     def __init__(self, said: Iterable[Outcome] = ()) -> None:
         self._said: dict[tuple[str, str], list[Outcome]] = {}
         self._pairs: dict[tuple[str, str], AnsweredPair] = {}
+        self.know(said)
+
+    def know(self, said: Iterable[Outcome]) -> None:
+        """Take the last outcomes that were published before."""
         for outcome in said:
             self._said.setdefault((outcome.node_a, outcome.node_b), []).append(outcome)
 
@@ -48,9 +54,14 @@ class Answered:
         known = [self.pair(nodes).is_over(stamp_ns, now_ns) for nodes in pairs]
         return bool(known) and all(known)
 
-    def saw_new_frame(self, pairs: Iterable[tuple[str, str]], trigger: int) -> list[Message]:
+    def saw_new_frame(self, pairs: Iterable[tuple[str, str]], trigger: int, stamp_ns: int) -> list[Message]:
         """Note a frame that was sent after this solver joined; return withheld outcomes to publish now."""
-        return [outcome for nodes in pairs for outcome in self.pair(nodes).saw_new_frame(trigger)]
+        return [outcome for nodes in pairs for outcome in self.pair(nodes).saw_new_frame(trigger, stamp_ns)]
+
+    def take_over(self, nodes: tuple[str, str], said: Iterable[Outcome]) -> int:
+        """Go on with a pair that another solver had; return the time of that one's last answer, 0 for none."""
+        pair = self._pairs[nodes] = AnsweredPair(said, taken_over=True)
+        return pair.up_to_ns
 
     def pair(self, nodes: tuple[str, str]) -> AnsweredPair:
         """Return the published outcomes of a pair."""
@@ -64,13 +75,15 @@ class AnsweredPair:
 
     The last seconds are solved again, because the prior needs the earlier poses, but the outcomes are withheld. A new
     frame cannot have been answered before. If its trigger number was, the frame is of another dive, or a clock was set
-    back: then the withheld outcomes are published.
+    back: then the withheld outcomes are published. taken_over: from a solver that runs no longer, or lets it go; then
+    frames of the last seconds that it has answered may still come. up_to_ns: the time of the last answer, 0 for none.
     """
 
-    def __init__(self, said: Iterable[Outcome] = ()) -> None:
+    def __init__(self, said: Iterable[Outcome] = (), *, taken_over: bool = False) -> None:
+        self._taken_over = taken_over
         in_order = [one for one in said if is_in_order(one)]
         self._up_to: int | None = max((one.trigger for one in in_order), default=None)
-        self._up_to_ns = max((one.stamp_ns for one in in_order), default=0)
+        self.up_to_ns = max((one.stamp_ns for one in in_order), default=0)
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
 
     def is_due(self, outcome: Outcome) -> bool:
@@ -83,12 +96,14 @@ class AnsweredPair:
 
     def is_over(self, stamp_ns: int, now_ns: int) -> bool:
         """Return whether the dive is live, and was answered to WARM_UP_NS after stamp_ns or later."""
-        live = self._up_to is not None and abs(now_ns - self._up_to_ns) < THIS_DIVE_NS
-        return live and stamp_ns < self._up_to_ns - WARM_UP_NS
+        live = self._up_to is not None and abs(now_ns - self.up_to_ns) < THIS_DIVE_NS
+        return live and stamp_ns < self.up_to_ns - WARM_UP_NS
 
-    def saw_new_frame(self, trigger: int) -> list[Outcome]:
+    def saw_new_frame(self, trigger: int, stamp_ns: int) -> list[Outcome]:
         """Note a new frame; return the withheld outcomes if its trigger number was answered before, else nothing."""
         if self._up_to is None or trigger > self._up_to:
+            return []
+        if self._taken_over and stamp_ns > self.up_to_ns - WARM_UP_NS:
             return []
         due = list(self._withheld)
         self._withheld.clear()

@@ -75,7 +75,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
 
     nodes: solve every pair of these nodes. pairs: solve these pairs, A first. Neither: solve every pair that appears.
     status_file: its path; "" for the runtime directory (protocol/statusfile.py). journal: where it keeps what it has
-    answered, so that it answers nothing twice; "" likewise.
+    answered, so that it answers nothing twice; "" likewise. share: several solvers on one hub divide the pairs.
     """
 
     nodes: list[NodeId] = field(default_factory=list)
@@ -85,6 +85,7 @@ class SolverConfig(Config, frozen=True, kw_only=True):
     tls: Tls | None = None
     status_file: str = ""
     journal: str = ""
+    share: bool = False
     solve: SolveConfig = field(default_factory=SolveConfig)
     track: TrackConfig = field(default_factory=TrackConfig)
 

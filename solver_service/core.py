@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
 from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS, trigger_index
@@ -27,7 +28,7 @@ from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
-from buddyline.solver_service.pair_core import PairCore, PairId
+from buddyline.solver_service.pair_core import PairCore, PairId, newer
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.tracking import TrackSettings
@@ -50,7 +51,8 @@ class SolverCore:
     node's clock minus the common clock, where known; the node's stamps are moved to the common clock. align:
     estimate the clock offset of each pair. track: the tracks to make; None for no track, and no network. lone: nodes of
     the network beside those of the chosen pairs. network: follows all nodes in one frame; None without `track`. unused:
-    number of messages of each node that is not used.
+    number of messages of each node that is not used. shared: other cores have some of the pairs, and perhaps the
+    network: this one begins with none, and gets its own by `adopt` and `adopt_network`.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class SolverCore:
         align: bool = False,
         track: TrackSettings | None = None,
         lone: Iterable[str] = (),
+        shared: bool = False,
     ) -> None:
         self.settings = settings
         self.streams: dict[str, NodeStream] = {}
@@ -72,11 +75,12 @@ class SolverCore:
         self._clocks = clocks or {}
         self._align = align
         self._track = track
+        self._shared = shared
         self._pairs_of: dict[str, list[PairCore]] = {}
         self._single: set[str] = set()
         self._now_ns = 0
         self._set_back_ns = 0
-        self.network = NetTracker(self.streams, track) if track is not None else None
+        self.network = NetTracker(self.streams, track) if track is not None and not shared else None
         for node in lone:
             self.streams.setdefault(node, NodeStream(node))
         for pair in chosen or ():
@@ -86,7 +90,10 @@ class SolverCore:
                 raise ValueError(f"the pair {pair[0]}, {pair[1]} is named twice")
             for node in pair:
                 self.streams.setdefault(node, NodeStream(node))
-            self._add_pair(pair)
+            if shared:
+                self._pairs_of |= {node: [] for node in pair}
+            else:
+                self._add_pair(pair)
 
     @property
     def counts(self) -> Counter[str]:
@@ -161,15 +168,59 @@ class SolverCore:
         """Return the pairs that a node is in."""
         return [pair.nodes for pair in self._pairs_of.get(node, ())]
 
+    # Work that is shared with other cores
+
+    def possible_pairs(self) -> list[PairId]:
+        """Return the chosen pairs, or all that the nodes so far can form."""
+        if self._chosen is not None:
+            return list(self._chosen)
+        return list(combinations(sorted(self._pairs_of.keys() - self._single), 2))
+
+    def adopt(self, nodes: PairId, since_ns: int, told_ns: int, receive_ns: int) -> list[Message]:
+        """Take up a pair with the frames since then that are still in its nodes' windows; return what they give.
+
+        told_ns: up to there another core has told of it; track and network begin after that.
+        """
+        now_ns = self._steady(receive_ns)
+        pair = self._add_pair(nodes)
+        frames = [
+            (frame, at_ns or receive_ns) for node in nodes for frame, at_ns in self.streams[node].frames.since(since_ns)
+        ]
+        for frame, at_ns in sorted(frames, key=lambda one: one[0].stamp_ns):
+            pair.take(frame, Arrival.FRESH, at_ns, live=abs(at_ns - frame.stamp_ns) < LIVE_WITHIN_NS)
+        pair.resolve(now_ns)
+        return self._settled([pair], told_ns)
+
+    def release(self, nodes: PairId) -> None:
+        """Let a pair go; what it has not answered another core will."""
+        pair = self.pairs.pop(nodes)
+        for node in nodes:
+            self._pairs_of[node].remove(pair)
+
+    def adopt_network(self) -> None:
+        """Take up the network; it begins anew."""
+        if self._track is not None:
+            self.network = NetTracker(self.streams, self._track)
+
+    def release_network(self) -> None:
+        """Let the network go."""
+        self.network = None
+
+    def hear(self, outcome: RelativePose | Rejected) -> list[Message]:
+        """Take an outcome of a pair that another core has; return what it gives for the network."""
+        return self.network.take([outcome]) if self.network is not None else []
+
     def saw_published(self, messages: Iterable[Message], now_ns: int) -> None:
         """Note the latency of published poses; now_ns: wall clock."""
         for message in messages:
             if isinstance(message, RelativePose) and 0 <= now_ns - message.stamp_ns < LIVE_WITHIN_NS:
                 self.pairs[message.node_a, message.node_b].latencies_s.append((now_ns - message.stamp_ns) / S_NS)
 
-    def _settled(self, pairs: Iterable[PairCore]) -> list[Message]:
-        messages = [message for pair in pairs for message in pair.settle()]
-        return messages + (self.network.take(messages) if self.network is not None else [])
+    def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
+        messages = [message for pair in pairs for message in pair.settle(told_ns)]
+        if self.network is None:
+            return messages
+        return messages + self.network.take(newer(messages, told_ns))
 
     def _steady(self, receive_ns: int | None) -> int | None:
         """Return the receive time on a clock that never goes back, so that a clock set back prolongs no waiting."""
@@ -231,6 +282,8 @@ class SolverCore:
         """Pair a new node with all known ones. The frames in their windows count as received now."""
         others = sorted(self._pairs_of)
         self._pairs_of[stream.node] = []
+        if self._shared:
+            return
         for node in others:
             first, second = sorted((node, stream.node))
             pair = self._add_pair((first, second))

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
-from buddyline.protocol.messages import Candidates, Message, Rejected, SolverStatus
+from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.topics import EXPECT, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
@@ -31,6 +31,13 @@ PUBLISHED_FOR_NODES: Final = (EXPECT,)
 # The clock offset is reported when its sigma is below this.
 REPORTED_OFFSET_SIGMA_S: Final = 0.003
 ALIGN_EVERY_NS: Final = 10 * S_NS
+
+
+def newer(messages: list[Message], told_ns: int) -> list[Message]:
+    """Return the outcomes among messages that are later than told_ns; all if that is -1."""
+    if told_ns < 0:
+        return messages
+    return [one for one in messages if isinstance(one, RelativePose | Rejected) and one.stamp_ns > told_ns]
 
 
 class PairCore:
@@ -76,11 +83,14 @@ class PairCore:
         """Match or reject the triggers whose waiting is over; everything: all of them."""
         self._unsettled += self.matcher.resolve(receive_ns, everything=everything)
 
-    def settle(self) -> list[Message]:
-        """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track."""
+    def settle(self, told_ns: int = -1) -> list[Message]:
+        """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track.
+
+        told_ns: outcomes up to there are nothing to the track.
+        """
         self._solve()
         settled, self._settled = self._settled, []
-        return settled + (self.tracker.take(settled) if self.tracker is not None else [])
+        return settled + (self.tracker.take(newer(settled, told_ns)) if self.tracker is not None else [])
 
     def finish(self) -> Iterator[Message]:
         """Yield the last outcomes and the rest of the track, at the end of the dive."""

@@ -21,6 +21,7 @@ from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.journal import Journal
 from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
+from buddyline.solver_service.shared_work import SharedWork
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher, Received
@@ -44,7 +45,13 @@ class SolverService(Service):
         self.config = config
         self.clock = clock or SystemClock()
         self.refusals = Refusals("solver")
-        self.core = SolverCore(config.solve.settings(source), config.chosen, align=True, track=config.track.settings)
+        self.core = SolverCore(
+            config.solve.settings(source),
+            config.chosen,
+            align=True,
+            track=config.track.settings,
+            shared=config.share,
+        )
         self._lock = threading.Lock()
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
@@ -53,14 +60,22 @@ class SolverService(Service):
         self._news = False
         self._handled = 0
         self._answered = Answered()
+        self._work = SharedWork(self.core, self._answered) if config.share else None
+        self._shown: set[str] = set()
+        instance = self._work.sharing.instance if self._work is not None else ""
         self._journal = (
-            Journal(Path(config.journal)) if config.journal else Journal.of(config.connect, config.namespace)
+            Journal(Path(config.journal), instance)
+            if config.journal
+            else Journal.of(config.connect, config.namespace, instance)
         )
         self._joined_ns: int | None = None
 
     def start(self) -> None:
         """Start all threads."""
         self.spawn("bus", self._connect)
+        if self._work is not None:
+            work = self._work
+            self.spawn("pulse", lambda: _pulse(work, self.stop))
 
     def _connect(self) -> None:
         from buddyline.protocol.zenoh_bus import connect
@@ -78,8 +93,9 @@ class SolverService(Service):
             bus.on_failure(lambda error: self.fail("bus", error))
             self.attach(bus)
             bus.watch_alive(self.watch)
-            nodes = [node for pair in self.config.chosen or () for node in pair]
-            bus.declare_alive(f"solver/{'_'.join(dict.fromkeys(nodes))[:MAX_ALIVE_NAME] or 'any'}")
+            if self._work is None:
+                nodes = [node for pair in self.config.chosen or () for node in pair]
+                bus.declare_alive(f"solver/{'_'.join(dict.fromkeys(nodes))[:MAX_ALIVE_NAME] or 'any'}")
             log.info("solver: connected to %s", self.config.connect)
             ticks = 0
             while not self.stop.wait(TICK_S):
@@ -87,11 +103,14 @@ class SolverService(Service):
                 self.tick(ticks % TICKS_A_STATUS == 0)
                 if ticks % TICKS_A_STATUS == 0:
                     self.heartbeat()
-            with self._lock:
-                self._publish(self.core.flush())
+            if self._work is None or self._work.sharing.alone:
+                with self._lock:
+                    self._publish(self.core.flush())
 
     def tick(self, status_due: bool) -> None:
         """Resolve triggers whose time has come; report where a status is due, or a node has started or ended."""
+        if self._work is not None and self._bus is not None:
+            self._share(self._work, self._bus)
         with self._turn():
             results = self.core.advance(self.clock.now_ns())
             self._declare()
@@ -115,12 +134,47 @@ class SolverService(Service):
         finally:
             self._lock.release()
 
+    def _share(self, work: SharedWork, bus: Bus) -> None:
+        """Go on with the tasks that are this solver's now."""
+        hub = bus.hub
+        with self._turn():
+            begin = work.tick(hub)
+            self._shown = work.declare(bus, self._shown)
+        if not begin:
+            return
+        said = self._said_before(bus)
+        for task in begin:
+            with self._turn():
+                found = work.begin(task, said, self.clock.now_ns())
+                self._declare()
+                self._publish(found)
+        log.info("solver: takes up %s", ", ".join("/".join(task) or "the network" for task in begin))
+
+    def _hear(self, received: Received) -> None:
+        """Take an outcome that some solver has published."""
+        work = self._work
+        if work is None:
+            return
+        with self._lock:
+            try:
+                if work.hear(received.payload):
+                    message = received.open().message
+                    if isinstance(message, Outcome):
+                        results = self.core.hear(message)
+                        self._declare()
+                        self._publish(results)
+            except MessageError as error:
+                self.refusals.note(received.key, error)
+
     def attach(self, bus: Bus) -> None:
         """Subscribe to the nodes on this bus, and publish on it from now on."""
         self._bus = bus
-        kept = self._journal.read() if self._journal is not None else []
-        self._answered = Answered(_newest_of(_said_before(bus), kept))
         self.problems = ["no two nodes yet"]
+        if self._work is None:
+            self._answered.know(self._said_before(bus))
+        else:
+            bus.subscribe((POSE.key_any(), REJECTED.key_any()), self._hear, history=False)
+            log.info("solver: shares the work of this hub as %s", self._work.sharing.instance)
         self._declare()
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
@@ -146,6 +200,8 @@ class SolverService(Service):
         """Note that a node has started or ended; the next tick reports all of them at once."""
         with self._lock:
             self._news |= self.core.health.saw_process(name, alive)
+            if self._work is not None:
+                self._work.sharing.saw(name, alive)
 
     def report(self) -> None:
         """Publish each pair's status."""
@@ -153,8 +209,11 @@ class SolverService(Service):
             now_ns = self.clock.now_ns()
             refused, self._refused = self._refused, ""
             self._news = False
-            statuses = self.core.report(now_ns, now_ns, self.refusals.count, [refused] if refused else [])
+            problems = ([refused] if refused else []) + (self._work.problems if self._work is not None else [])
+            statuses = self.core.report(now_ns, now_ns, self.refusals.count, problems)
             if not statuses:
+                if self._work is not None:
+                    self.problems = problems
                 return
             named = [(f"{one.node_a}/{one.node_b}: ", one) for one in statuses if one.problem]
             self.problems = [f"{pair if len(statuses) > 1 else ''}{one.problem}" for pair, one in named]
@@ -171,7 +230,8 @@ class SolverService(Service):
             return
         self._handle(frame)
         if new:
-            self._publish(self._answered.saw_new_frame(self.core.pairs_of(frame.node), frame.trigger))
+            pairs = self.core.pairs_of(frame.node)
+            self._publish(self._answered.saw_new_frame(pairs, frame.trigger, frame.stamp_ns))
 
     def _handle(self, message: Message) -> None:
         # The time is now, not the receive time: a message that waited in the queue has not yet waited for other nodes.
@@ -196,12 +256,23 @@ class SolverService(Service):
                     self._publishers[topic.key(*ids)] = self._bus.publisher(topic, *ids)
 
     def _publish(self, messages: Iterable[Message]) -> None:
+        if self._work is not None and not self._work.may_speak:
+            return
         unsaid = self._answered.unsaid(messages)
         for message in unsaid:
             self._publishers[key_of(message)].put(message)
         if self._journal is not None:
             self._journal.add(unsaid)
         self.core.saw_published(unsaid, self.clock.now_ns())
+
+    def _said_before(self, bus: Bus) -> list[Outcome]:
+        """Return the last outcomes of each pair, of all solvers so far: as the hub holds them, else the journals."""
+        return _newest_of(_held_by(bus), self._journal.read() if self._journal is not None else [])
+
+
+def _pulse(work: SharedWork, stop: threading.Event) -> None:
+    while not stop.wait(TICK_S):
+        work.pulse()
 
 
 def _newest_of(held: Iterable[Outcome], kept: Iterable[Outcome]) -> list[Outcome]:
@@ -211,7 +282,7 @@ def _newest_of(held: Iterable[Outcome], kept: Iterable[Outcome]) -> list[Outcome
     return known + [one for one in kept if (one.node_a, one.node_b) not in pairs]
 
 
-def _said_before(bus: Bus) -> list[Outcome]:
+def _held_by(bus: Bus) -> list[Outcome]:
     """Return the last outcome of each pair that earlier solvers have published, as kept by the hub."""
     refusals = Refusals("solver, of what the hub holds")
     held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]

@@ -76,6 +76,10 @@ class FrameWindow:
         """Return the frames received at receive_ns or later, and those whose receive time is unknown; None: all."""
         return [frame for frame, at_ns in self._frames if receive_ns is None or (at_ns or receive_ns) >= receive_ns]
 
+    def since(self, start_ns: int) -> list[tuple[Candidates, int | None]]:
+        """Return the frames from start_ns on, with their receive times."""
+        return self._frames[bisect.bisect_left(self._stamps, start_ns) :]
+
     def clear(self) -> None:
         """Drop all frames."""
         self._stamps.clear()

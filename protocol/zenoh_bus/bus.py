@@ -140,7 +140,7 @@ class ZenohBus(Bus):
         self._bulk = SecondLink(config)
         self._datagrams = SecondLink(datagrams)
         self._cache_s = cache_s
-        self._tokens: list[zenoh.LivelinessToken] = []
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._budget = LinkBudget()
         self._link = Link(session, self._budget)
         self._watchdog = Watchdog(session, self._link)
@@ -216,7 +216,18 @@ class ZenohBus(Bus):
         key = f"{ALIVE}/{check_alive_name(name)}/{self._session.zid()}"
         token = self._session.liveliness().declare_token(key)
         with self._lock:
-            self._tokens.append(token)
+            self._tokens[name] = token
+
+    def withdraw_alive(self, name: str) -> None:
+        """Take a declared name back."""
+        with self._lock:
+            token = self._tokens.pop(name)
+        token.undeclare()  # type: ignore[no-untyped-call]
+
+    @property
+    def hub(self) -> str | None:
+        """An id of the hub's process, to which this one is connected; None while it is cut off."""
+        return next((str(router) for router in self._session.info.routers_zid()), None)
 
     def watch_alive(self, handle: Callable[[str, bool], None]) -> Subscription:
         """Call handle(name, alive) for every name that is alive now, and at every change."""

@@ -17,7 +17,7 @@ from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import hub_settings
 
 # A client that invents keys or sends huge payloads must not fill the hub's memory.
-MAX_RETAINED: Final = 256
+MAX_RETAINED: Final = 512
 MAX_RETAINED_BYTES: Final = 65536
 REOPEN_ATTEMPTS: Final = 20
 REOPEN_S: Final = 0.1

@@ -34,13 +34,13 @@ def unsaid(answered, ks):
 def test_the_first_solver_says_everything():
     answered = AnsweredPair()
     assert unsaid(answered, range(5)) == list(range(5))
-    assert answered.saw_new_frame(0) == []
+    assert answered.saw_new_frame(0, 0) == []
 
 
 def test_what_was_said_is_not_said_again_and_what_was_not_is():
     answered = AnsweredPair([outcome(3), outcome(7)])
     assert unsaid(answered, range(12)) == [8, 9, 10, 11]
-    assert answered.saw_new_frame(12) == []
+    assert answered.saw_new_frame(12, 12) == []
     assert unsaid(answered, [5, 12]) == [12]
 
 
@@ -53,14 +53,14 @@ def test_another_dive_is_no_answered_one():
     """Its frames came before the solver did, and those that come now have triggers that were answered."""
     answered = AnsweredPair([outcome(100)])
     assert unsaid(answered, [1, 2]) == []
-    assert triggers(answered.saw_new_frame(3)) == [1, 2]
+    assert triggers(answered.saw_new_frame(3, 3)) == [1, 2]
     assert unsaid(answered, [3]) == [3]
 
 
 def test_what_was_said_for_certain_stays_so_when_another_dive_begins():
     answered = AnsweredPair([outcome(7)])
     assert unsaid(answered, [6, 8]) == [8]
-    assert answered.saw_new_frame(2) == []
+    assert answered.saw_new_frame(2, 2) == []
     assert unsaid(answered, [2]) == [2]
 
 

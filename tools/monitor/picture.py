@@ -219,6 +219,7 @@ class PairPicture:
         self.solver_heard_ns: int | None = None
         self.solver_problem_since_ns = 0
         self.solver_left_ns: int | None = None
+        self.solvers: set[str] = set()
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self.other_pairs: set[Pair] = set()
@@ -256,7 +257,8 @@ class PairPicture:
         kind, _, node = name.partition("/")
         left_ns = None if alive else at_ns
         if kind == "solver":
-            self.solver_left_ns = left_ns
+            (self.solvers.add if alive else self.solvers.discard)(name)
+            self.solver_left_ns = None if self.solvers else left_ns
         elif kind == "node" and (alive or node in self.nodes):
             self.nodes.setdefault(node, NodePicture(node)).left_ns = left_ns
 

@@ -1,0 +1,229 @@
+"""Several solvers that share the work, and are killed again and again: `python -m tests.soak.shared --kills 20`.
+
+Prints how many outcomes were missing or doubled, and for how long pairs had none. Exit status 1 where any was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import random
+import signal
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.scenario import DivePlan, Scenario, more_nodes
+from buddyline.node.sim.world import World
+from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Candidates, Message, NodePose, Rejected, RelativePose
+from buddyline.protocol.topics import NET_POSE, POSE, REJECTED, topic_of
+from buddyline.protocol.zenoh_bus import connect
+from msgspec.structs import replace
+
+from tests.processes import PATIENCE_S, Process, free_endpoint, until
+
+START_NS = 1_764_000_000_000_000_000
+# From the last frame on; longer than a solver waits for anything.
+REST_S = 6.0
+
+
+def simulated(nodes: int, rate_hz: float, seconds: float, *, imu: bool) -> list[Message]:
+    """Return what nodes tell in a dive, in order of time."""
+    world = World(Scenario(seed=3, start_ns=START_NS, more_nodes=more_nodes(nodes), fixed_nodes=("a",)))
+    told = (one for _, _, one in simulation.messages(world, DivePlan(seconds=seconds, rate_hz=rate_hz, imu=imu)))
+    return [one for one in told if hasattr(one, "node") and not isinstance(one, NodePose)]
+
+
+def moved(message: Message, by_triggers: int, period_ns: int) -> Message:
+    """Return a message as it would be so many triggers later."""
+    later = replace(message, stamp_ns=message.stamp_ns + by_triggers * period_ns)
+    return replace(later, trigger=later.trigger + by_triggers) if isinstance(later, Candidates) else later
+
+
+@dataclass
+class Told:
+    """What the solvers have told: by pair and trigger, when each outcome came; when each node of the net was told."""
+
+    outcomes: dict[tuple[str, str, int], list[float]] = field(default_factory=lambda: defaultdict(list))
+    poses: int = 0
+    net: list[float] = field(default_factory=list)
+
+    def take(self, received: Received) -> None:
+        """Take one message from the bus."""
+        message = received.open().message
+        if isinstance(message, RelativePose | Rejected):
+            self.poses += isinstance(message, RelativePose)
+            self.outcomes[message.node_a, message.node_b, message.trigger].append(time.monotonic())
+        else:
+            self.net.append(time.monotonic())
+
+    def longest_gap_s(self, start_s: float, end_s: float) -> float:
+        """Return the longest time without an outcome of some pair, and without the network, in a span."""
+        of_pair = defaultdict(list)
+        for (a, b, _), came in list(self.outcomes.items()):
+            of_pair[a, b] += came
+        return max(_longest(sorted(came), start_s, end_s) for came in of_pair.values())
+
+
+def _longest(came: list[float], start_s: float, end_s: float) -> float:
+    within = [start_s, *(at_s for at_s in came if start_s <= at_s <= end_s), end_s]
+    return max(after - before for before, after in itertools.pairwise(within))
+
+
+class LiveDive:
+    """Sends a dive as if it happened now, again and again, and takes what solvers tell.
+
+    expected: by pair, all triggers so far.
+    """
+
+    def __init__(self, bus: Bus, messages: list[Message], rate_hz: float) -> None:
+        self.told = Told()
+        self.expected: set[tuple[str, str, int]] = set()
+        self._messages, self._period_ns = messages, round(S_NS / rate_hz)
+        self._nodes = sorted({one.node for one in messages})
+        self._publishers = {(topic_of(one), one.node): bus.publisher(topic_of(one), one.node) for one in messages}
+        bus.subscribe((POSE.key_any(), REJECTED.key_any(), NET_POSE.key_any()), self.told.take, capacity=100_000)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> LiveDive:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """Send no more."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        first_ns = self._messages[0].stamp_ns
+        span = -(-(self._messages[-1].stamp_ns - first_ns) // self._period_ns) + 1
+        later = (time.time_ns() - first_ns) // self._period_ns + 2
+        seq: dict[str, int] = defaultdict(int)
+        while True:
+            for message in self._messages:
+                one = moved(message, later, self._period_ns)
+                if self._stop.wait(max(one.stamp_ns - time.time_ns(), 0) / S_NS):
+                    return
+                if isinstance(one, Candidates):
+                    seq[one.node] += 1
+                    one = replace(one, seq=seq[one.node])
+                    others = (node for node in self._nodes if node != one.node)
+                    self.expected |= {(*sorted((one.node, other)), one.trigger) for other in others}
+                self._publishers[topic_of(one), one.node].put(one)
+            later += span
+
+
+@dataclass
+class Result:
+    """How it went."""
+
+    triggers: int
+    missing: int
+    doubled: int
+    poses: int
+    gaps_s: list[float]
+    net_rows: int
+
+
+def soak(
+    work: Path, kills: int, *, solvers: int, nodes: int, rate_hz: float, track_hz: float, again_s: float, seed: int = 1
+) -> Result:
+    """Run the solvers, kill one after another with -9, and start it again. track_hz: 0 for neither tracks nor net."""
+    messages = simulated(nodes, rate_hz, 20.0, imu=track_hz > 0)
+    config = work / "solver.toml"
+    config.write_text(f'share = true\njournal = "{work / "answered"}"\n[track]\nrate_hz = {track_hz}\n')
+    pick = random.Random(seed)
+    endpoint = free_endpoint()
+    words = ("solver", "--config", config, "--connect", endpoint)
+    running: list[Process] = []
+    stop = threading.Event()
+    with Process("hub", "--listen", endpoint) as hub:
+        hub.wait_for("listens")
+        bus = connect(endpoint, stop=stop, on_wait=lambda _: None)
+        assert bus is not None
+        try:
+            with bus, LiveDive(bus, messages, rate_hz) as dive:
+                running += [Process(*words) for _ in range(solvers)]
+                for one in running:
+                    one.wait_for("shares the work")
+                pairs = nodes * (nodes - 1) // 2
+                until(lambda: len({key[:2] for key in dive.told.outcomes}) == pairs, 0.05)
+                until(lambda: dive.told.net or not track_hz, 0.05)
+                time.sleep(again_s)
+                gaps_s = []
+                for _ in range(kills):
+                    killed = running.pop(pick.randrange(len(running)))
+                    time.sleep(pick.random())
+                    killed_s = time.monotonic()
+                    killed.end(signal.SIGKILL)
+                    running.append(Process(*words))
+                    running[-1].wait_for("shares the work")
+                    time.sleep(again_s)
+                    gaps_s.append(dive.told.longest_gap_s(killed_s, time.monotonic()))
+                dive.end()
+                due = set(dive.expected)
+                deadline_s = time.monotonic() + PATIENCE_S
+                while not due <= dive.told.outcomes.keys() and time.monotonic() < deadline_s:
+                    time.sleep(0.1)
+                    if time.monotonic() > deadline_s - PATIENCE_S + REST_S:
+                        break
+                came = {key: len(at_s) for key, at_s in dive.told.outcomes.items()}
+        finally:
+            for one in running:
+                one.end()
+    return Result(
+        triggers=len(due),
+        missing=len(due - came.keys()),
+        doubled=sum(count > 1 for count in came.values()),
+        poses=dive.told.poses,
+        gaps_s=gaps_s,
+        net_rows=len(dive.told.net),
+    )
+
+
+def main() -> int:
+    """Run as a program."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--solvers", type=int, default=3)
+    parser.add_argument("--nodes", type=int, default=4)
+    parser.add_argument("--rate", type=float, default=10.0)
+    parser.add_argument("--again", type=float, default=3.0, help="s from a new solver's first task to the next kill")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--track", type=float, default=20.0, help="Hz; 0: neither tracks nor the network")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = soak(
+            Path(folder),
+            args.kills,
+            solvers=args.solvers,
+            nodes=args.nodes,
+            rate_hz=args.rate,
+            track_hz=args.track,
+            again_s=args.again,
+            seed=args.seed,
+        )
+    print(msgspec.json.encode(found).decode())
+    print(
+        f"{len(found.gaps_s)} kills among {args.solvers}: of {found.triggers} outcomes {found.missing} missing, "
+        f"{found.doubled} doubled; longest time without one, of each kill: "
+        f"median {statistics.median(found.gaps_s):.2f} s, worst {max(found.gaps_s):.2f} s"
+    )
+    return 1 if found.missing or found.doubled else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
