@@ -8,16 +8,20 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from typing import Final, TypeAlias
 
+import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD
-from buddyline.protocol.messages import Candidates, Message, Rejected, RelativePose, SolverStatus
+from buddyline.protocol.health import CLOCKS_APART_S, HEADINGS_APART_RAD, NO_POSE_S
+from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, SolverStatus, Track
 from buddyline.protocol.topics import EXPECT, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
+from buddyline.solver_service.coach import LastPlace, advise
+from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
 from buddyline.solver_service.matcher import PairMatcher, Unmatched
 from buddyline.solver_service.pair import Matched, PairSolver
 from buddyline.solver_service.results import relative_pose
+from buddyline.solver_service.sensors import attitude_at
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.clocks import Clocks
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
@@ -64,6 +68,9 @@ class PairCore:
         self.tracker = PairTracker(stream_a, stream_b, track) if track is not None else None
         self.counts: Counter[str] = Counter()
         self.latencies_s: deque[float] = deque(maxlen=2000)
+        self._posed_ns: int | None = None
+        self._why: Counter[str] = Counter()
+        self._last: RelativePose | Track | None = None
         self._offset: ClockOffset | None = None
         self._aligned_ns: int | None = None
         self._unsettled: list[Matched | Unmatched] = []
@@ -75,6 +82,8 @@ class PairCore:
             self._unsettled += self.matcher.restart(frame.node)
             self._solve()
             self.solver.forget()
+            self._posed_ns = self._last = None
+            self._why.clear()
             if self.tracker is not None:
                 self.tracker.forget()
         self._unsettled += self.matcher.take(frame, arrival, receive_ns, live=live)
@@ -90,7 +99,18 @@ class PairCore:
         """
         self._solve()
         settled, self._settled = self._settled, []
-        return settled + (self.tracker.take(newer(settled, told_ns)) if self.tracker is not None else [])
+        told = settled + (self.tracker.take(newer(settled, told_ns)) if self.tracker is not None else [])
+        for message in told:
+            if isinstance(message, RelativePose):
+                self._posed_ns = message.stamp_ns
+                self._why.clear()
+            elif isinstance(message, Rejected):
+                self._why[message.reason] += 1
+            if isinstance(message, RelativePose | Track) and (
+                self._last is None or message.stamp_ns >= self._last.stamp_ns
+            ):
+                self._last = message
+        return told
 
     def finish(self) -> Iterator[Message]:
         """Yield the last outcomes and the rest of the track, at the end of the dive."""
@@ -157,7 +177,37 @@ class PairCore:
             clock_skew_s=UNSET if offset is None else offset.offset_s,
             problem="; ".join(problems + self._disagreements(offset) + (self.tracker.problems if self.tracker else [])),
             unused=unused or UNSET,
+            advice=self.advice() or UNSET,
         )
+
+    def advice(self) -> list[str]:
+        """Return what the divers should do for a fix or a better one, by the newest data of both nodes."""
+        now_ns = max((stream.newest_ns or 0 for stream in self.streams), default=0)
+        known = [stream.calibration(now_ns) for stream in self.streams]
+        infos = [each[0] for each in known if each is not None]
+        if len(infos) < 2:
+            return []
+        last, place = self._last, None
+        if last is not None:
+            turned = [
+                self._turned(stream, info, last.stamp_ns) for stream, info in zip(self.streams, infos, strict=True)
+            ]
+            both = (turned[0], turned[1]) if turned[0] is not None and turned[1] is not None else None
+            has_fix = self._posed_ns is not None and now_ns - self._posed_ns < NO_POSE_S * S_NS
+            why = "" if has_fix else next((reason for reason, _ in self._why.most_common(1)), "unmatched")
+            place = LastPlace.of(last, max(now_ns - last.stamp_ns, 0) / S_NS, why, both)
+        return advise(infos, place, self.tracker.dark_lamps() if self.tracker is not None else ())
+
+    def _turned(self, stream: NodeStream, info: NodeInfo, since_ns: int) -> Floats | None:
+        """Return R_then_now of a node's camera by its attitude sensor, whose slow error cancels; None without one."""
+        now_ns = stream.attitude.newest_ns
+        then = attitude_at(stream.attitude, since_ns)
+        now = attitude_at(stream.attitude, now_ns) if now_ns is not None else None
+        if then is None or now is None:
+            return None
+        R_body_camera = quat_to_matrix(np.array(info.q_body_camera_xyzw))
+        R_camera: Floats = R_body_camera.T @ quat_to_matrix(then[0]).T @ quat_to_matrix(now[0]) @ R_body_camera
+        return R_camera
 
     def clocks(self) -> Clocks | ClockOffset | None:
         """Return what the dive, which is over, tells of the clocks: by the track, or else by the fixes' gaps."""

@@ -91,6 +91,10 @@ class PairTracker:
         found = [problem for problem in self._filter.problems if problem not in self._past]
         return self._past + found + self._dark_lamps(self._filter.lamps.dark())
 
+    def dark_lamps(self) -> list[tuple[int, int]]:
+        """Return the lamps that are dark now, as node (0: A) and light (0: left)."""
+        return [] if self._filter is None else [(node, light) for node, light, _ in self._filter.lamps.dark()]
+
     def _dark_lamps(self, dark: Iterable[tuple[int, int, float]]) -> list[str]:
         sides = ("left", "right")
         return [

@@ -104,11 +104,15 @@ class SceneView:
 
 
 class Scene:
-    """All rigs, other divers, the surface, and passing things. Times in seconds since the start."""
+    """All rigs, other divers, the surface, and passing things. Times in seconds since the start.
 
-    def __init__(self, scenario: Scenario) -> None:
+    motion: of the nodes; None for the scenario's own.
+    """
+
+    def __init__(self, scenario: Scenario, motion: NodesMotion | None = None) -> None:
         self.scenario = scenario
-        self.motion: NodesMotion = TeamMotion(scenario) if scenario.is_team else PairMotion(scenario)
+        own = TeamMotion if scenario.is_team else PairMotion
+        self.motion: NodesMotion = own(scenario) if motion is None else motion
         nodes = scenario.nodes
         self._dead = {
             (i, s) for i, node in enumerate(nodes) for s in (LEFT, RIGHT) if _named(node, s) in scenario.dead_lamps

@@ -21,6 +21,7 @@ from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.scene import Lamp, Scene
 from buddyline.node.sim.sensors import SensorModel
 from buddyline.node.sim.tags import Tag
+from buddyline.node.sim.trajectory import NodesMotion
 from buddyline.protocol.messages import (
     ArTag,
     Attitude,
@@ -43,11 +44,11 @@ SOFTWARE = "buddyline simulator"
 
 
 class World:
-    """Nodes in water, as their cameras and sensors see each other."""
+    """Nodes in water, as their cameras and sensors see each other. motion: None for the scenario's own."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, motion: NodesMotion | None = None) -> None:
         self.scenario = scenario
-        self._scene = Scene(scenario)
+        self._scene = Scene(scenario, motion)
         self._sensors = [SensorModel(scenario, self._scene, i) for i in range(len(scenario.nodes))]
         self._painters: dict[int, Painter] = {}
 

@@ -141,6 +141,7 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     latency: from the middle of exposure to the pose, over the poses of the last second (live dives only).
     clock_skew_s: B's clock minus A's, estimated from the dive's own messages; absent until there is an estimate.
     unused: nodes that the solver receives but is configured not to use; absent if there are none.
+    advice: what the divers should do for a fix or a better one, a phrase each; absent if there is nothing to do.
     """
 
     node_a: NodeId
@@ -161,3 +162,4 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     clock_skew_s: float | UnsetType = UNSET
     problem: str = ""
     unused: list[NodeId] | UnsetType = UNSET
+    advice: list[str] | UnsetType = UNSET

@@ -15,6 +15,9 @@ from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Message, RelativePose, SolverStatus
 from buddyline.protocol.topics import ATTITUDE, INFO, POSE, TRACK
+from buddyline.solver_service.coach import UNSEEN
+from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
+from buddyline.tools.health.finding import Finding
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import REASONS, sentence
 from buddyline.tools.monitor import panel
@@ -23,6 +26,7 @@ from buddyline.tools.monitor.live import subscribe
 from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.picture import KEPT_NS, PairPicture, columns
 from buddyline.tools.monitor.scene import R_LEVEL, ellipsoid, frame_of
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 
 from tests.tools.evaluated import FACING, INFOS, frame, pose, rejection, track
@@ -210,7 +214,8 @@ class TestHealth:
             take(picture, solver_status(at(k)), at(k))
         said = next(finding for finding in findings(picture, at(60)) if finding.name == "pair")
         assert said.text == f"No pose: {REASONS[reason][0]}."
-        assert said.advice == REASONS[reason][1]
+        # The nodes are 3 m apart and look at each other: where lights are not found there is more to say.
+        assert said.advice == ("come 1.0 m closer" if reason in UNSEEN else REASONS[reason][1])
 
     def test_a_log_without_poses_says_how_to_get_them(self) -> None:
         picture = PairPicture()
@@ -428,3 +433,37 @@ class TestCoverage:
 
     def test_times_are_shown_in_minutes_and_hours(self) -> None:
         assert [clock_words(s) for s in (0.0, 59.96, 61.5, 3661.0)] == ["0:00.0", "1:00.0", "1:01.5", "1:01:01.0"]
+
+
+class TestCoach:
+    """What to do: in the solver's words, else by the newest estimate."""
+
+    @staticmethod
+    def lost(advice: list[str] | UnsetType) -> Finding:
+        """A pair that lost its fix four seconds ago, when a had turned 40 degrees to the right."""
+        picture, R_a = PairPicture(), rotation_exp(np.array((0.0, math.radians(40.0), 0.0)))
+        for node in "ab":
+            take(picture, INFOS[node], at(0))
+        qx, qy, qz, qw = matrix_to_quat(R_a.T @ quat_to_matrix(np.array(FACING))).tolist()
+        x, y, z = (R_a.T @ (0.0, 0.0, 4.0)).tolist()
+        take(picture, track(0, (x, y, z), 0.01, q_a_b_xyzw=(qx, qy, qz, qw)), at(0))
+        for k in range(1, 41):
+            for message in (frame("a", k, ()), frame("b", k), rejection(k, "too_few_candidates")):
+                take(picture, message, at(k))
+            if k % 10 == 0:
+                take(picture, solver_status(at(k), advice=advice), at(k))
+        (said,) = [finding for finding in findings(picture, at(40)) if finding.name == "pair"]
+        return said
+
+    def test_the_solver_s_words_are_the_advice(self) -> None:
+        words = ["left lamp of b is dark", "come 1.5 m closer"]
+        assert self.lost(words).advice == "left lamp of b is dark, come 1.5 m closer"
+
+    def test_of_a_solver_that_says_nothing_the_newest_estimate_tells(self) -> None:
+        assert self.lost(UNSET).advice == "turn a 40 deg left"
+
+    def test_what_would_make_a_fix_better_is_said_where_all_is_well(self) -> None:
+        picture = watched()
+        take(picture, solver_status(at(29), advice=["come 1.5 m closer"]), at(29))
+        (said,) = findings(picture, at(29))
+        assert (said.level, said.advice) == ("ok", "come 1.5 m closer")

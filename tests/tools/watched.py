@@ -16,6 +16,7 @@ from buddyline.protocol.messages import (
 )
 from buddyline.protocol.topics import key_of
 from buddyline.tools.monitor.picture import PairPicture
+from msgspec import UNSET, UnsetType
 
 from tests.tools.evaluated import FIRST, INFOS, PERIOD_NS, frame, pose
 
@@ -49,7 +50,7 @@ def status(node: str, stamp_ns: int, problem: str = "") -> NodeStatus:
     )
 
 
-def solver_status(stamp_ns: int, problem: str = "") -> SolverStatus:
+def solver_status(stamp_ns: int, problem: str = "", advice: list[str] | UnsetType = UNSET) -> SolverStatus:
     return SolverStatus(
         node_a="a",
         node_b="b",
@@ -65,6 +66,7 @@ def solver_status(stamp_ns: int, problem: str = "") -> SolverStatus:
         bad_messages=0,
         pending=0,
         problem=problem,
+        advice=advice,
     )
 
 

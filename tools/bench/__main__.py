@@ -20,6 +20,7 @@ BENCHMARKS: Final = {
     "detect": "the detector: time per picture beside other finders, memory",
     "lights": "the detector: lights found in rendered pictures, and the truth of sigma and score",
     "monitor": "the monitor: processor and memory with viewers, latency beside it, weight of the page",
+    "coach": "the coach: fixes within 5 s, where its words are followed",
     "node": "a whole node: capture to candidates published, processor, memory",
 }
 

@@ -20,9 +20,9 @@ from buddyline.protocol.health import (
 )
 from buddyline.protocol.messages import NodeStatus
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, SOLVER_STATUS
+from buddyline.solver_service.coach import LastPlace, advise
 from buddyline.tools.estimate import sigma_m
 from buddyline.tools.health import machine
-from buddyline.tools.health.coach import turns
 from buddyline.tools.health.finding import Finding, worst_first
 from buddyline.tools.health.words import REASONS, reason_words
 from msgspec import UNSET
@@ -57,8 +57,29 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
                 Finding("pair", "warning", text, "wait a moment; if it stays, see the figures of nodes and solver")
             )
         else:
-            said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose."))
+            better = ", ".join(coached(picture, now_ns))
+            said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose.", better))
     return worst_first(said)
+
+
+def coached(picture: PairPicture, now_ns: int, why: str = "") -> list[str]:
+    """Return what the divers should do: in the solver's words if it says some now, else by the newest estimate.
+
+    why: the rejection reason for which there is no pose; "" where there are poses.
+    """
+    told, told_ns = picture.solver, picture.solver_ns or 0
+    if told is not None and told.advice is not UNSET and now_ns - told_ns <= stale_after_s(SOLVER_STATUS) * S_NS:
+        return told.advice
+    kept = [
+        (at_ns, estimate)
+        for at_ns, estimate in ((picture.track_ns, picture.track), (picture.pose_ns, picture.pose))
+        if at_ns is not None and estimate is not None
+    ]
+    infos = [node.info for node in picture.end_nodes() if node is not None and node.info is not None]
+    if not kept or len(infos) < 2:
+        return []
+    at_ns, estimate = max(kept, key=lambda one: one[0])
+    return advise(infos, LastPlace.of(estimate, (now_ns - at_ns) / S_NS, why))
 
 
 def _unproven(picture: PairPicture, now_ns: int, live: bool) -> list[str]:
@@ -199,7 +220,8 @@ def _track(picture: PairPicture, now_ns: int) -> list[Finding]:
     if off_m <= TRACK_SIGMA_SHARE * track.range_m:
         return []
     text = f"The track is uncertain: by {off_m:.2f} m (1 sd) at {track.range_m:.2f} m."
-    return [Finding("track", "warning", text, "turn the nodes toward each other: each light that is seen helps")]
+    general = "turn the nodes toward each other: each light that is seen helps"
+    return [Finding("track", "warning", text, ", ".join(coached(picture, now_ns)) or general)]
 
 
 def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
@@ -213,8 +235,8 @@ def _pair(picture: PairPicture, now_ns: int, live: bool) -> list[Finding]:
         share = "" if len(recent) == 1 else f" ({count} of {recent.total()})"
         tracked = picture.track_is_fresh(now_ns)
         text = f"No pose: {reason_words(reason)}{share}.{' The track goes on without.' if tracked else ''}"
-        # Turns from where the nodes last were help more than the reason's general advice.
-        advice = ", ".join(turns(picture, now_ns)) or REASONS.get(reason, ("", ""))[1]
+        # What to do from where the nodes last were helps more than the reason's general advice.
+        advice = ", ".join(coached(picture, now_ns, reason)) or REASONS.get(reason, ("", ""))[1]
         return [Finding("pair", "warning" if tracked else "problem", text, advice, picture.pose_ns)]
     if live or picture.pose is not None or picture.first_ns is None or now_ns - picture.first_ns <= NO_POSE_S * S_NS:
         return []
