@@ -91,7 +91,7 @@ class Steering(NodesMotion):
         return Placement(R, position_m)
 
 
-class Followed:
+class SteeredDive:
     """A simulated dive that goes on tick by tick, with the solver that sees it."""
 
     def __init__(self, environment: Environment, seed: int, *, imu: bool) -> None:
@@ -168,7 +168,7 @@ def losing(case: str, rng: np.random.Generator) -> Callable[[float], Vector]:
 
 def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> float | None:
     """Return the time from the first words to a fix, s; inf if there were none in time, None if no fix was lost."""
-    dive, rng = Followed(environment, seed, imu=imu), np.random.default_rng(seed)
+    dive, rng = SteeredDive(environment, seed, imu=imu), np.random.default_rng(seed)
     still = np.zeros(5)
     while dive.t_s < SETTLE_S or dive.without_s() > 0.3:
         dive.tick(still)
