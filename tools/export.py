@@ -11,12 +11,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
 from typing import Final
 
+import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
 from buddyline.tools.columns import in_order, of_mode
 from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.recorded import Recorded
+from buddyline.tools.evaluation.rotation import Floats
+from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.export_formats import ExportFormat, format_of
 from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
@@ -30,6 +33,11 @@ _PLACE_FIELDS: Final = (
     *("range_m", "azimuth_rad", "inclination_rad", "t_ned_north_m", "t_ned_east_m", "t_ned_down_m"),
 )
 _NED_SD_FIELDS: Final = (*("sd_azimuth_rad", "sd_inclination_rad", "sd_ned_north_m", "sd_ned_east_m", "sd_ned_down_m"),)
+# The true pose at the row's time, where the logs have the truth.
+_TRUTH_FIELDS: Final = (
+    *("truth_t_a_b_x_m", "truth_t_a_b_y_m", "truth_t_a_b_z_m"),
+    *("truth_q_a_b_x", "truth_q_a_b_y", "truth_q_a_b_z", "truth_q_a_b_w"),
+)
 _CSV_FIELDS: Final = (
     *("stamp_ns", "trigger", "node_a", "node_b"),
     *_PLACE_FIELDS,
@@ -38,6 +46,7 @@ _CSV_FIELDS: Final = (
     "heading_gap_rad",
     # The row-major upper triangle, in m and rad.
     *(f"cov_{_AXES[row]}_{_AXES[column]}" for row, column in _UPPER),
+    *_TRUTH_FIELDS,
 )
 NO_POSES: Final = "no poses in it; solve it first: buddyline solve DIVE.mcap -o OUT.mcap"
 _REASON_FIELDS: Final = ("reason", "detail")
@@ -49,6 +58,7 @@ _TRACK_FIELDS: Final = (
     # Row-major upper triangles, in m, rad and m/s.
     *(f"cov_{_AXES[row]}_{_AXES[column]}" for row, column in _UPPER),
     *(f"cov_v{_AXES[row]}_v{_AXES[column]}" for row, column in _UPPER if column < 3),
+    *_TRUTH_FIELDS,
 )
 
 
@@ -86,17 +96,11 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
         if not recorded.truths:
             raise BuddylineError(f"{name}: no truth in it")
         return f"the truth, {len(recorded.truths)} rows", tum_lines(recorded.truths)
-    if args.rejected:
-        if not recorded.poses and not recorded.rejected:
-            raise BuddylineError(f"{name}: {NO_POSES}")
-        rows = csv_lines(recorded.poses, recorded.rejected, reasons=True)
-        return f"the poses, {len(recorded.poses)} rows", rows
-    said, estimates = chosen(recorded, args.what, name)
     if args.format == "tum":
+        said, estimates = chosen(recorded, args.what, name)
         return said, tum_lines(estimates)
-    tracks = [one for one in estimates if isinstance(one, Track)]
-    poses = [one for one in estimates if isinstance(one, RelativePose)]
-    return said, track_csv_lines(tracks) if tracks else csv_lines(poses, [], reasons=False)
+    said, names, rows = rows_of(recorded, args.what, name, rejected=args.rejected)
+    return said, _csv(names, rows)
 
 
 def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[RelativePose] | list[Track]]:
@@ -112,13 +116,26 @@ def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[R
     return f"the poses, {len(recorded.poses)} rows", recorded.poses
 
 
-def rows_of(recorded: Recorded, what: str | None, name: str) -> tuple[str, tuple[str, ...], list[dict[str, object]]]:
-    """Return what is exported, in words, its columns, and its rows; an unknown value is absent or ""."""
+def rows_of(
+    recorded: Recorded, what: str | None, name: str, *, rejected: bool = False
+) -> tuple[str, tuple[str, ...], list[dict[str, object]]]:
+    """Return what is exported, in words, its columns, and its rows by time; an unknown value is absent or "".
+
+    rejected: the poses, with two more columns, and rows for rejections.
+    """
+    truth = TruthTrack(recorded.truths)
+    if rejected:
+        results: list[RelativePose | Rejected] = [*recorded.poses, *recorded.rejected]
+        if not results:
+            raise BuddylineError(f"{name}: {NO_POSES}")
+        rows = [_csv_row(one, truth) for one in sorted(results, key=lambda result: result.stamp_ns)]
+        return f"the poses, {len(recorded.poses)} rows", _CSV_FIELDS + _REASON_FIELDS, rows
     said, estimates = chosen(recorded, what, name)
-    if isinstance(estimates[0], Track):
-        return said, _TRACK_FIELDS, [_track_csv_row(one) for one in estimates if isinstance(one, Track)]
+    tracks = [one for one in estimates if isinstance(one, Track)]
+    if tracks:
+        return said, _TRACK_FIELDS, [_track_csv_row(one, truth) for one in tracks]
     poses = sorted((one for one in estimates if isinstance(one, RelativePose)), key=lambda pose: pose.stamp_ns)
-    return said, _CSV_FIELDS, [_csv_row(pose) for pose in poses]
+    return said, _CSV_FIELDS, [_csv_row(pose, truth) for pose in poses]
 
 
 def _export_network(args: argparse.Namespace) -> int:
@@ -157,12 +174,6 @@ def tum_lines(poses: Iterable[RelativePose | Track | Truth]) -> Iterator[str]:
         yield f"{seconds}.{rest_ns:09d} {numbers}\n"
 
 
-def csv_lines(poses: Iterable[RelativePose], rejected: Iterable[Rejected], *, reasons: bool) -> Iterator[str]:
-    """Yield a header and a row a pose by time; reasons: with two more columns, and rows for rejections."""
-    results: list[RelativePose | Rejected] = sorted([*poses, *rejected], key=lambda result: result.stamp_ns)
-    yield from _csv(_CSV_FIELDS + (_REASON_FIELDS if reasons else ()), map(_csv_row, results))
-
-
 def _csv(names: Sequence[str], rows: Iterable[dict[str, object]]) -> Iterator[str]:
     text = io.StringIO()
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
@@ -175,7 +186,7 @@ def _csv(names: Sequence[str], rows: Iterable[dict[str, object]]) -> Iterator[st
     yield text.getvalue()
 
 
-def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
+def _csv_row(result: RelativePose | Rejected, truth: TruthTrack) -> dict[str, object]:
     row: dict[str, object] = {
         name: getattr(result, name)
         for name in ("stamp_ns", "trigger", "node_a", "node_b", *_REASON_FIELDS)
@@ -183,7 +194,7 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
     }
     if isinstance(result, Rejected):
         return row
-    row |= _place(result)
+    row |= _place(result) | _true(truth.at(result.stamp_ns, result.trigger))
     row |= {
         name: getattr(result, name)
         for name in ("range_gap_m", "twist_gap_rad", "chi2", "hypotheses", "method", "skew_ns")
@@ -193,14 +204,14 @@ def _csv_row(result: RelativePose | Rejected) -> dict[str, object]:
     return row | {f"cov_{_AXES[i]}_{_AXES[k]}": result.covariance[6 * i + k] for i, k in _UPPER}
 
 
-def track_csv_lines(track: Iterable[Track]) -> Iterator[str]:
-    """Yield a header and a row for each sample of a track, in the order given."""
-    yield from _csv(_TRACK_FIELDS, map(_track_csv_row, track))
+def _true(truth: tuple[Floats, Floats] | None) -> dict[str, object]:
+    """Return the columns of the true t_a_b_m (3,) and q_a_b_xyzw (4,), if they are known."""
+    return {} if truth is None else dict(zip(_TRUTH_FIELDS, np.concatenate(truth).tolist(), strict=True))
 
 
-def _track_csv_row(one: Track) -> dict[str, object]:
+def _track_csv_row(one: Track, truth: TruthTrack) -> dict[str, object]:
     row: dict[str, object] = {name: getattr(one, name) for name in ("stamp_ns", "node_a", "node_b", "mode")}
-    row |= _place(one) | {"lights": one.lights, "age_s": one.age_s}
+    row |= _place(one) | {"lights": one.lights, "age_s": one.age_s} | _true(truth.interpolated(one.stamp_ns))
     row |= dict(zip(("v_a_b_x_mps", "v_a_b_y_mps", "v_a_b_z_mps"), one.v_a_b_mps, strict=True))
     for i, k in _UPPER:
         row[f"cov_{_AXES[i]}_{_AXES[k]}"] = one.covariance[6 * i + k]

@@ -25,8 +25,11 @@ FORMATS: Final = (
     ExportFormat("parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet"),
     ExportFormat(
         "foxglove",
-        "a log with pictures, marks, transforms and the track's path for Foxglove, Lichtblick and rerun",
+        "a log with scene, pictures, marks, path, series and log for Foxglove and Lichtblick, and a layout beside it",
         "export_foxglove",
+    ),
+    ExportFormat(
+        "rerun", "a recording for rerun: nodes in space, pictures, series, log (extra `rerun`)", "export_rerun"
     ),
     ExportFormat(
         "mcap-ros2",

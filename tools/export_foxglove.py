@@ -2,7 +2,9 @@
 
 World is east, north, up with its origin on the surface above A, or at A where no depth is known. A stands in it by
 its attitude and depth, and B in A's camera frame by the track, or by the poses where there is no track. B's path is a
-line: of the track's places in north-east-down, as seen from A.
+line: of the track's places in north-east-down, as seen from A. Both rigs are a scene; what nodes and solver report, and
+why a trigger gave no pose, is a log. For plots the log's own messages follow, byte for byte (JSON with schema), under
+their own keys. Beside OUTPUT lies OUTPUT.layout.json: import it as a layout, and all of it is in place.
 """
 
 from __future__ import annotations
@@ -23,25 +25,37 @@ from buddyline.protocol.messages import (
     Candidates,
     CompressedImage,
     Depth,
+    Message,
     NodeInfo,
+    NodeStatus,
+    Rejected,
     RelativePose,
+    SolverStatus,
     Track,
 )
+from buddyline.protocol.schemas import json_schema
 from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
 from buddyline.tools.enu import R_ENU_NED, BaseCamera
-from buddyline.tools.newfile import new_file
+from buddyline.tools.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
+from buddyline.tools.health.words import reason_words
+from buddyline.tools.monitor.frames import rig_outline
+from buddyline.tools.newfile import check_new, new_file, write_new
 from msgspec import UNSET
 
-WORLD: Final = "world"
-TRANSFORMS: Final = "/tf"
 KEPT_FRAMES: Final = 256
 DISTORTION_MODELS: Final = {"pinhole": "plumb_bob", "fisheye": "kannala_brandt"}
 # A's attitude until it is known: level, looking north.
 R_ENU_LEVEL: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 # The path is written in pieces of this length, so that it can be watched as it grows.
 PATH_NS: Final = S_NS
+LAMP_M: Final = 0.07
+# What is passed on as it is, for plots. Candidates and inertial samples are many, and no viewer plots them.
+SERIES: Final = (
+    *("pose", "track", "track_lag", "rejected", "truth", "attitude", "depth", "node_status", "solver_status"),
+    *("info", "net_pose", "net_truth"),
+)
 LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
 
 
@@ -54,6 +68,7 @@ class FoxgloveTranslation:
         self._paths: dict[tuple[str, str], list[Track]] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._camera = BaseCamera()
+        self._said: dict[str, str] = {}
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
         """Yield the messages before the dive's first: A level at the origin. base: A's id."""
@@ -65,7 +80,10 @@ class FoxgloveTranslation:
     def messages(self, envelope: Envelope) -> Iterator[tuple[str, int, Any]]:
         """Yield (topic, stamp_ns, Foxglove message) for one of ours."""
         message = envelope.message
-        if isinstance(message, NodeInfo | Depth):
+        if isinstance(message, NodeInfo):
+            self._camera.take(message)
+            yield f"/{message.node}/rig", message.stamp_ns, self._rig(message)
+        elif isinstance(message, Depth):
             self._camera.take(message)
         elif isinstance(message, Attitude):
             yield from self._attitude(message)
@@ -78,6 +96,61 @@ class FoxgloveTranslation:
             yield from self._pose(message)
         elif isinstance(message, Track):
             yield from self._track(message)
+        elif isinstance(message, Rejected):
+            yield from self._log(message.stamp_ns, f"pose {message.node_a}/{message.node_b}", "Info", _why(message))
+        elif isinstance(message, NodeStatus):
+            yield from self._log(message.stamp_ns, f"node {message.node}", "Warning", message.problem)
+        elif isinstance(message, SolverStatus):
+            name = f"solver {message.node_a}/{message.node_b}"
+            advice = [] if message.advice is UNSET else message.advice
+            yield from self._log(message.stamp_ns, name, "Warning", message.problem)
+            yield from self._log(
+                message.stamp_ns, f"coach {message.node_a}/{message.node_b}", "Info", ", ".join(advice)
+            )
+
+    def _log(self, stamp_ns: int, name: str, level: str, text: str) -> Iterator[tuple[str, int, Any]]:
+        """Yield a line of the log, unless the name said the same before."""
+        before, self._said[name] = self._said.get(name, ""), text
+        if text and text != before:
+            fox = self._fox
+            line = fox.Log(timestamp=self._time(stamp_ns), level=getattr(fox.LogLevel, level), name=name, message=text)
+            yield LOG, stamp_ns, line
+
+    def _rig(self, info: NodeInfo) -> Any:
+        """Return a node as a scene that moves with its camera: the bar, both lamps, and the edges of its view."""
+        fox, outline = self._fox, rig_outline(info)
+        width_m, height_m, depth_m = outline["corners"]
+        rim = [(x * width_m, y * height_m, depth_m) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]
+        view = [point for corner in rim for point in ((0.0, 0.0, 0.0), corner)]
+        at_rest = self._quaternion(np.eye(3))
+        lines = [
+            fox.LinePrimitive(
+                type=fox.LinePrimitiveLineType.LineStrip,
+                pose=fox.Pose(position=self._vector(np.zeros(3)), orientation=at_rest),
+                thickness=2.0,
+                scale_invariant=True,
+                points=[fox.Point3(x=x, y=y, z=z) for x, y, z in points],
+                color=fox.Color(r=0.8, g=0.8, b=0.8, a=1.0),
+            )
+            for points in (view, rim, outline["lights"])
+        ]
+        spheres = [
+            fox.SpherePrimitive(
+                pose=fox.Pose(position=self._vector(np.array(light)), orientation=at_rest),
+                size=fox.Vector3(x=LAMP_M, y=LAMP_M, z=LAMP_M),
+                color=fox.Color(r=colour[0], g=colour[1], b=colour[2], a=1.0),
+            )
+            for light, colour in zip(outline["lights"], (LEFT, RIGHT), strict=True)
+        ]
+        entity = fox.SceneEntity(
+            timestamp=self._time(info.stamp_ns),
+            frame_id=f"{info.node}_camera",
+            id=f"rig {info.node}",
+            frame_locked=True,
+            lines=lines,
+            spheres=spheres,
+        )
+        return fox.SceneUpdate(entities=[entity])
 
     def _attitude(self, attitude: Attitude) -> Iterator[tuple[str, int, Any]]:
         node, stamp_ns = attitude.node, attitude.stamp_ns
@@ -239,46 +312,98 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
         ) from error
     from mcap.writer import CompressionType, Writer
 
-    track = _track_topic(dive)
-    if what == "track" and track is None:
-        raise BuddylineError(f"{dive.name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
-    track = None if what == "poses" else track
+    layout_path = output.with_name(f"{output.name}.layout.json")
+    check_new(layout_path)
+    track = track_of(dive, what)
     translation = FoxgloveTranslation(fox, dive.ids(track) if track else ())
-    count = cut_ns = 0
-    schemas: dict[str, int] = {}
-    channels: dict[str, int] = {}
+    cut_ns = 0
     with new_file(output) as part, open(part, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="", library="buddyline")
+        channels = _Channels(writer)
         for topic, stamp_ns, message in _translated(dive, translation, track):
-            if topic not in channels:
-                schema = message.get_schema()
-                if schema.name not in schemas:
-                    schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[topic] = writer.register_channel(topic, "protobuf", schemas[schema.name])
             if stamp_ns - cut_ns >= CHUNK_NS:
                 writer.flush()
                 cut_ns = stamp_ns
-            writer.add_message(channels[topic], stamp_ns, message.encode(), stamp_ns, count & 0xFFFFFFFF)
-            count += 1
+            if isinstance(message, Envelope):
+                channels.add_ours(message, stamp_ns)
+            else:
+                channels.add(topic, stamp_ns, message)
         writer.finish()
-    return count
+    pair = next((ids for ids in dive.ids("pose", "track", "track_lag")), None)
+    write_new(layout_path, layout(channels.topics, None if pair is None else (pair[0], pair[1]), base_of(dive)))
+    return channels.count
 
 
-def _track_topic(dive: Dive) -> str | None:
-    """Return the topic of the best track in a dive: for a live dive, the one that is a second late."""
-    return next((topic.name for topic in (TRACK_LAG, TRACK) if dive.ids(topic.name)), None)
+class _Channels:
+    """The channels of the file that is written. topics: by name, with the number of messages."""
+
+    def __init__(self, writer: Any) -> None:
+        self.topics: dict[str, int] = {}
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._ids: dict[str, int] = {}
+
+    @property
+    def count(self) -> int:
+        """Number of messages."""
+        return sum(self.topics.values())
+
+    def add(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Write one of Foxglove's messages."""
+        if topic not in self._ids:
+            schema = message.get_schema()
+            self._open(topic, "protobuf", schema.name, schema.encoding, schema.data)
+        self._write(topic, stamp_ns, message.encode())
+
+    def add_ours(self, envelope: Envelope, stamp_ns: int) -> None:
+        """Write one of our messages as it is in the log."""
+        if envelope.key not in self._ids:
+            kind: type[Message] = type(envelope.message)
+            self._open(envelope.key, "json", envelope.topic.schema_name, "jsonschema", json_schema(kind))
+        self._write(envelope.key, stamp_ns, envelope.payload)
+
+    def _open(self, topic: str, encoding: str, name: str, schema_encoding: str, schema: bytes) -> None:
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, schema_encoding, schema)
+        self._ids[topic] = self._writer.register_channel(topic, encoding, self._schemas[name])
+
+    def _write(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        self._writer.add_message(self._ids[topic], stamp_ns, data, stamp_ns, self.count & 0xFFFFFFFF)
+        self.topics[topic] = self.topics.get(topic, 0) + 1
+
+
+def _why(rejection: Rejected) -> str:
+    return f"no pose: {reason_words(rejection.reason)}"
+
+
+def track_of(dive: Dive, what: str | None) -> str | None:
+    """Return the topic of the best track in a dive: for a live dive, the one that is a second late.
+
+    None without a track, or if what is "poses"; a BuddylineError if what is "track" and there is none.
+    """
+    track = next((topic.name for topic in (TRACK_LAG, TRACK) if dive.ids(topic.name)), None)
+    if what == "track" and track is None:
+        raise BuddylineError(f"{dive.name}: no track in it; solve it: buddyline solve DIVE.mcap -o OUT.mcap")
+    return None if what == "poses" else track
 
 
 def _translated(dive: Dive, translation: FoxgloveTranslation, track: str | None) -> Iterator[tuple[str, int, Any]]:
-    topics = ["info", "candidates", "attitude", "depth", "image", "pose", *([track] if track else [])]
-    yield from translation.start(dive.infos(), _base(dive), dive.start_ns)
+    """Yield topic, stamp_ns and message: one of Foxglove's, or an Envelope that is passed on as it is."""
+    left_out = () if track else ("track", "track_lag")
+    topics = ["candidates", "image", *(topic for topic in SERIES if topic not in left_out)]
+    yield from translation.start(dive.infos(), base_of(dive), dive.start_ns)
     for envelope in dive.messages(*topics):
-        yield from translation.messages(envelope)
+        name = envelope.topic.name
+        if name in SERIES:
+            yield envelope.key, envelope.stamp_ns, envelope
+        # Of two tracks one places B.
+        if name == track or name not in ("track", "track_lag"):
+            yield from translation.messages(envelope)
     yield from translation.paths()
 
 
-def _base(dive: Dive) -> str | None:
+def base_of(dive: Dive) -> str | None:
     """Return A's id: of the first pair with poses or a track, else the first node."""
     for ids in dive.ids("pose", "track", "track_lag"):
         return ids[0]

@@ -57,6 +57,7 @@ def test_csv_names_units_and_leaves_unknowns_empty(solved, capsys):
     assert [int(row["stamp_ns"]) for row in rows] == [STAMP_NS - 10**15, (FIRST + 1) * PERIOD_NS]
     assert float(rows[0]["t_a_b_z_m"]) == 1 / 3
     assert rows[0]["azimuth_rad"] == rows[0]["t_ned_north_m"] == ""
+    assert [float(rows[1][f"truth_t_a_b_{axis}_m"]) for axis in "xyz"] == [0.0, 0.0, 3.0]
     assert [float(rows[1][name]) for name in ("azimuth_rad", "inclination_rad", "t_ned_down_m")] == [0.5, -0.25, -3.0]
     deviations = [float(rows[0][f"sd_{name}"]) for name in ("x_m", "y_m", "z_m", "wx_rad", "wy_rad", "wz_rad")]
     assert deviations == pytest.approx([math.sqrt(v) for v in np.diag(COVARIANCE)])
@@ -149,6 +150,10 @@ def test_csv_of_a_track_equals_the_log(tracked, capsys):
         assert read(*(f"cov_{axes[i]}_{axes[k]}" for i, k in upper)) == [one.covariance[6 * i + k] for i, k in upper]
         assert read("cov_vx_vx", "cov_vx_vy", "cov_vz_vz") == [1e-4, 0.0, 9e-4]
         assert read("range_m") == [one.range_m]
+        # The log has one truth, at the first sample's time.
+        of_truth = [row[f"truth_t_a_b_{axis}_m"] for axis in "xyz"] + [row[f"truth_q_a_b_{axis}"] for axis in "xyzw"]
+        known = [0.0, 0.0, 3.0, 0.0, 1.0, 0.0, 0.0] if one.stamp_ns == FIRST * PERIOD_NS else [""] * 7
+        assert [text and float(text) for text in of_truth] == known
 
 
 def test_tum_has_the_track_unless_poses_are_asked_for(tracked, capsys):

@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.cli import main
+from mcap.decoder import DecoderFactory
+from mcap.records import Schema
 
-from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, track, write_log
-from tests.tools.watched import PNG, at, attitude, depth, image
+from tests.tools.evaluated import INFOS, LEFT, RIGHT, frame, pose, rejection, track, write_log
+from tests.tools.watched import PNG, at, attitude, depth, image, solver_status, status
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed")
 decoding = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support is not installed")
+
+
+class JsonDecoder(DecoderFactory):
+    """Decodes our own messages, by nothing but what the file says."""
+
+    def decoder_for(self, message_encoding: str, schema: Schema | None) -> Callable[[bytes], Any] | None:
+        if message_encoding != "json":
+            return None
+        assert schema is not None
+        assert json.loads(schema.data)["type"] == "object"
+        return json.loads
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +46,15 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         for node in "ab":
             messages += [attitude(node, at(k)), depth(node, at(k)), frame(node, k), image(node, at(k))]
         messages.append(pose(k, blobs_a=(0, 1), blobs_b=(-1, 1)))
+    messages += [rejection(5), rejection(6), status("a", at(5), "camera: gone"), status("a", at(6), "camera: gone")]
+    messages.append(solver_status(at(6), advice=["turn b 20 deg left", "come 1.5 m closer"]))
     dive = write_log(directory / "dive.mcap", *messages)
     output = directory / "foxglove.mcap"
     assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 0
     found: dict[str, list[Any]] = defaultdict(list)
     with open(output, "rb") as file:
-        reader = make_reader(file, decoder_factories=[decoding.DecoderFactory()])
+        factories = [decoding.DecoderFactory(), JsonDecoder()]
+        reader = make_reader(file, decoder_factories=factories)
         for schema, channel, _, message in reader.iter_decoded_messages():
             assert schema is not None
             found[channel.topic].append((schema.name, message))
@@ -51,8 +70,10 @@ def matrix(rotation: Any) -> np.ndarray[Any, Any]:
 
 
 def test_every_topic_has_foxglove_s_own_schema(exported: dict[str, list[Any]]) -> None:
-    schemas = {topic: {name for name, _ in messages} for topic, messages in exported.items()}
+    schemas = {topic: {name for name, _ in messages} for topic, messages in exported.items() if topic[0] == "/"}
     assert schemas == {
+        "/log": {"foxglove.Log"},
+        **{f"/{node}/rig": {"foxglove.SceneUpdate"} for node in "ab"},
         "/tf": {"foxglove.FrameTransforms"},
         "/pair/a/b/pose": {"foxglove.PoseInFrame"},
         **{f"/{node}/camera/image": {"foxglove.CompressedImage"} for node in "ab"},
@@ -60,6 +81,70 @@ def test_every_topic_has_foxglove_s_own_schema(exported: dict[str, list[Any]]) -
         **{f"/{node}/camera/candidates": {"foxglove.ImageAnnotations"} for node in "ab"},
         **{f"/{node}/camera/chosen": {"foxglove.ImageAnnotations"} for node in "ab"},
     }
+
+
+def test_every_value_of_the_log_can_be_plotted_as_it_is(exported: dict[str, list[Any]]) -> None:
+    told = [message for name, message in exported["buddyline/pair/a/b/pose"] if name == "buddyline.RelativePose"]
+    assert told == [json.loads(encode(pose(k, blobs_a=(0, 1), blobs_b=(-1, 1)))) for k in range(5)]
+    depths = [message for _, message in exported["buddyline/node/b/depth"]]
+    assert depths == [json.loads(encode(depth("b", at(k)))) for k in range(5)]
+
+
+def test_a_problem_a_reason_and_the_coach_are_a_log_and_said_once(exported: dict[str, list[Any]]) -> None:
+    said = [(message.name, message.message) for _, message in exported["/log"]]
+    assert said == [
+        ("pose a/b", "no pose: more than one arrangement fits"),
+        ("node a", "camera: gone"),
+        ("coach a/b", "turn b 20 deg left, come 1.5 m closer"),
+    ]
+
+
+def test_both_rigs_are_scenes_that_move_with_their_cameras(exported: dict[str, list[Any]]) -> None:
+    for node, info in INFOS.items():
+        (entity,) = last(exported, f"/{node}/rig").entities
+        assert (entity.frame_id, entity.frame_locked) == (f"{node}_camera", True)
+        lamps = [(s.pose.position.x, s.pose.position.y, s.pose.position.z) for s in entity.spheres]
+        assert lamps == [info.light_left_m, info.light_right_m]
+        view = entity.lines[0].points
+        # Edges of the view at the camera's own slopes.
+        assert {round(abs(p.x / p.z), 2) for p in view if p.z} == {round(410 / 904, 2)}
+
+
+def test_the_layout_s_panels_show_topics_that_are_in_the_file(tmp_path: Path) -> None:
+    messages: list[Message] = [*INFOS.values(), image("a", at(0)), frame("a", 0), frame("b", 0)]
+    messages += [message for k in range(25) for message in (track(k, (0.0, 0.0, 3.0)), pose(k))]
+    dive, output = write_log(tmp_path / "dive.mcap", *messages, rejection(30)), tmp_path / "dive.foxglove.mcap"
+    assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 0
+    from mcap.reader import make_reader
+
+    with open(output, "rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    told = json.loads((tmp_path / "dive.foxglove.mcap.layout.json").read_text())
+    panels = told["configById"]
+    assert set(panels) == {
+        *("3D!scene", "Image!a", "Plot!range", "Plot!north", "Plot!azimuth", "RosOut!log"),
+    }
+    shown = {*panels["3D!scene"]["topics"], panels["RosOut!log"]["topicToRender"]}
+    shown |= {panels["Image!a"]["imageMode"]["imageTopic"], *panels["Image!a"]["imageMode"]["annotations"]}
+    for name in ("Plot!range", "Plot!north", "Plot!azimuth"):
+        paths = [path["value"] for path in panels[name]["paths"]]
+        assert paths
+        shown |= {path.split('"')[1] for path in paths}
+    assert shown <= topics
+    placed: list[str] = []
+
+    def walk(part: Any) -> None:
+        if isinstance(part, str):
+            placed.append(part)
+        else:
+            walk(part["first"])
+            walk(part["second"])
+
+    walk(told["layout"])
+    assert sorted(placed) == sorted(panels)
+    # Neither of the two files is ever replaced.
+    output.unlink()
+    assert main(["export", dive, "--format", "foxglove", "-o", str(output)]) == 2
 
 
 def test_transforms_chain_from_the_surface_to_b(exported: dict[str, list[Any]]) -> None:
@@ -126,7 +211,7 @@ def test_a_track_moves_b_and_draws_its_path(tmp_path: Path) -> None:
     found: dict[str, list[Any]] = defaultdict(list)
     with open(output, "rb") as file:
         for _, channel, _, message in make_reader(
-            file, decoder_factories=[decoding.DecoderFactory()]
+            file, decoder_factories=[decoding.DecoderFactory(), JsonDecoder()]
         ).iter_decoded_messages():
             found[channel.topic].append(message)
     assert len(found["/pair/a/b/pose"]) == 25

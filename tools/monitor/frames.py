@@ -233,7 +233,7 @@ def rig_outline(info: NodeInfo | None) -> dict[str, Any]:
     if info is None:
         return {"lights": [[-0.5, 0, 0], [0.5, 0, 0]], "corners": [0.25, 0.2, FRUSTUM_M]}
     fov_rad, aspect = fields_of_view(info)
-    half_m = FRUSTUM_M * min(max(fov_rad / 2, 0.1), 1.2)
+    half_m = FRUSTUM_M * math.tan(min(max(fov_rad / 2, 0.1), 1.2))
     return {
         "lights": [list(info.light_left_m), list(info.light_right_m)],
         "corners": [round(half_m * aspect, 4), round(half_m, 4), FRUSTUM_M],
