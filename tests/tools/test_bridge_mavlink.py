@@ -17,7 +17,7 @@ from buddyline.solver_service.geometry.rotation import (
 from buddyline.tools.bridge.command import Datagrams
 from buddyline.tools.bridge.mavlink import MavlinkTranslation
 from buddyline.tools.bridge.place import on_earth
-from buddyline.tools.bridge.placed import Placed, Placing, euler_covariance
+from buddyline.tools.bridge.placed import Placed, Placing, euler_covariance, euler_rad
 
 from tests.tools.bridged import P_NED, PLACE, R_NED_B, V_NED, estimate, oriented, placed_of, rotation_of, take
 from tests.tools.evaluated import INFOS
@@ -111,3 +111,71 @@ class TestMavlink:
         gps_time_s = gps.time_week * 604_800 + gps.time_week_ms / 1e3
         epoch = datetime(1980, 1, 6, tzinfo=UTC).timestamp()
         assert gps_time_s == pytest.approx(at(5) / S_NS - epoch + 18, abs=1e-3)
+
+    def test_every_number_is_in_the_unit_that_the_definitions_state(self, mavlink: Any) -> None:
+        """Turned into SI by the units of MAVLink's own definitions, each field is the place that was sent."""
+        si = {"us": 1e-6, "ms": 1e-3, "m": 1.0, "m/s": 1.0, "rad": 1.0, "degE7": 1e-7, "cdeg": 0.01, "%": 0.01}
+        placing = Placing("b", declination_rad=0.0)
+        take(placing, *INFOS.values())
+        first, placed = (
+            take(placing, oriented(k), estimate(k, P_NED + np.array((0.0, 0.1 * k, 0.0)))) for k in range(2)
+        )
+        assert first is not None
+        assert placed is not None
+        read = self.received(mavlink, [first, placed], ("odometry", "estimate", "delta", "gps"))
+        told = {
+            f"{message.get_type()}.{name}": np.array(getattr(message, name)) * si[unit]
+            for message in read
+            if message.get_type() not in ("HEARTBEAT", "SET_GPS_GLOBAL_ORIGIN")
+            for name, unit in message.fieldunits_by_name.items()
+            if unit in si
+        }
+        roll, pitch, yaw = euler_rad(placed.R_ned_body)
+        earth, (north, east, down) = on_earth(placed, PLACE), placed.p_ned_m
+        moved = placed.R_ned_body.T @ (placed.p_ned_m - first.p_ned_m)
+        assert placed.v_covariance is not None
+        expected = {
+            **{f"{kind}.{name}": value for kind in ("ODOMETRY", "VISION_POSITION_ESTIMATE")
+               for name, value in zip("xyz", (north, east, down), strict=True)},
+            **dict(zip(("ODOMETRY.vx", "ODOMETRY.vy", "ODOMETRY.vz"), placed.R_ned_body.T @ V_NED, strict=True)),
+            "ODOMETRY.quality": placed.confidence,
+            "VISION_POSITION_ESTIMATE.roll": roll,
+            "VISION_POSITION_ESTIMATE.pitch": pitch,
+            "VISION_POSITION_ESTIMATE.yaw": yaw,
+            "VISION_POSITION_DELTA.time_delta_usec": 0.1,
+            "VISION_POSITION_DELTA.position_delta": moved,
+            "VISION_POSITION_DELTA.angle_delta": np.zeros(3),
+            "VISION_POSITION_DELTA.confidence": placed.confidence,
+            "GPS_INPUT.lat": earth.latitude_deg,
+            "GPS_INPUT.lon": earth.longitude_deg,
+            "GPS_INPUT.alt": earth.altitude_m,
+            **dict(zip(("GPS_INPUT.vn", "GPS_INPUT.ve", "GPS_INPUT.vd"), V_NED, strict=True)),
+            "GPS_INPUT.speed_accuracy": math.sqrt(np.trace(placed.v_covariance)),
+            "GPS_INPUT.horiz_accuracy": earth.horizontal_m,
+            "GPS_INPUT.vert_accuracy": earth.sigma_down_m,
+            "GPS_INPUT.yaw": math.degrees(placed.yaw_rad),
+        }  # fmt: skip
+        # Whole percents, and hundredths of a degree.
+        rounded = {"ODOMETRY.quality": 0.006, "GPS_INPUT.yaw": 0.006}
+        for name, value in expected.items():
+            np.testing.assert_allclose(told.pop(name), value, rtol=1e-5, atol=rounded.get(name, 2e-6))
+        stamps = {name: told.pop(name) for name in list(told) if name.endswith((".time_usec", ".usec"))}
+        assert (len(stamps), set(stamps.values())) == (4, {at(1) // 1000 * 1e-6})
+        # What is left: GPS time, which is tested above.
+        assert set(told) == {"GPS_INPUT.time_week_ms"}
+
+    def test_covariances_are_upper_triangles_row_by_row(self, mavlink: Any) -> None:
+        placed = placed_of()
+        assert placed.v_covariance is not None
+        odometry, estimated, *_ = self.received(mavlink, [placed], ("odometry", "estimate"))
+        whole = euler_covariance(placed)
+        rows = [whole[i, k] for i in range(6) for k in range(i, 6)]
+        assert np.abs(whole - np.diag(np.diag(whole))).max() > 0
+        np.testing.assert_allclose(odometry.pose_covariance, rows, rtol=1e-5, atol=1e-12)
+        np.testing.assert_allclose(estimated.covariance, rows, rtol=1e-5, atol=1e-12)
+        of_velocity = R_NED_B.T @ placed.v_covariance @ R_NED_B
+        told = np.array(odometry.velocity_covariance)
+        for i in range(3):
+            for k in range(i, 3):
+                # Row i of the triangle begins after those of 6, 5, ... numbers.
+                assert told[6 * i - i * (i - 1) // 2 + k - i] == pytest.approx(of_velocity[i, k], rel=1e-5, abs=1e-12)
