@@ -67,10 +67,13 @@ def leapfrog(path: Path) -> None:
     """Three legs of a survey, without what the solver said of them."""
     rng = np.random.default_rng(5)
     messages = survey_world.dive(survey_world.line(rng, 3), rng, rest_s=8.0, swim_s=2.0)
-    with DiveLogWriter(path) as writer:
+    by_second = path.with_name("by_second.mcap")
+    with DiveLogWriter(by_second) as writer:
         for message in messages:
             if not isinstance(message, RelativePose | Rejected):
                 writer.write_message(message)
+    write_log(path, read_log(by_second))
+    by_second.unlink()
 
 
 def sample(path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey import normal, report
+from buddyline.tools.survey.blunders import critical_chi2
 from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import AdjustSettings, FixedPoint, Known, Place
@@ -15,6 +16,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
+from tests.tools.test_survey_turns import turned
 
 
 def two_loops(seed):
@@ -75,6 +77,40 @@ def test_nearly_all_misnamed_stations_are_named_first():
     found = [named_first(seed) for seed in range(200)]
     assert np.mean([right for right, _ in found]) >= 0.95
     assert np.mean([known for _, known in found]) >= 0.9
+
+
+def false_blunder(seed):
+    """Whether something is said to be wrong in a sound survey of 3 to 40 legs: a line, a loop, or a network."""
+    rng = np.random.default_rng([seed, 77])
+    legs = int(rng.integers(3, 41))
+    course = (world.line(rng, legs), world.loop(rng, max(legs, 4)), two_loops(seed)[0])[seed % 3]
+    read = world.readings_of(course, rng, compass_deg=float(rng.choice([1.0, 1.5, 4.0])))
+    turns = turned(course, read, rng) if seed % 4 < 2 else []
+    return bool(adjust(world.project_of(read, "absolute" if seed % 5 else "readings", turn=turns)).blunders)
+
+
+@pytest.mark.parametrize("seed", range(1000, 1006))
+def test_few_legs_whose_instruments_nothing_else_checks_have_no_blunder(seed):
+    rng = np.random.default_rng(seed)
+    course = world.line(rng, 3)
+    legs = world.readings_of(course, rng, compass_deg=1.5)
+    # Both compasses err by more than is stated: nothing tells whether it is one's iron or the other's.
+    legs = [replace(leg, azimuth_deg=leg.azimuth_deg + 4.0) for leg in legs]
+    assert not adjust(world.project_of(legs, turn=turned(course, legs, rng))).blunders
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_sound_surveys_have_no_blunder():
+    assert sum(false_blunder(seed) for seed in range(200)) <= 4
+
+
+def test_the_fewer_observations_too_many_the_more_a_suspicion_needs():
+    needed = [critical_chi2(100, variance_freedom) for variance_freedom in (20, 50, 1000)]
+    assert needed == sorted(needed, reverse=True)
+    # Of one in 10,000, both ways, of Student's and of the normal distribution.
+    assert needed[0] == pytest.approx(4.84**2, rel=0.02)
+    assert needed[2] == pytest.approx(3.90**2, rel=0.02)
 
 
 @pytest.mark.parametrize("seed", range(100, 106))

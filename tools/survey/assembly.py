@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from statistics import median
 from typing import Final, TypeAlias
 
@@ -67,35 +68,79 @@ class Assembly:
     turns_rad: Sequence[float]
 
 
-class _GaugeReadings:
-    """Terms of depth readings."""
+@dataclass(frozen=True, slots=True)
+class DepthReading:
+    """A gauge's depth at a leg's end (0, 1), m: its noise, and its slow error (1 sd)."""
 
-    def __init__(self, of: Observations, legs: Sequence[Leg], tides: Sequence[int]) -> None:
-        self._of, self._tides = of, tides
+    leg: int
+    end: int
+    depth_m: float
+    noise_m: float
+    slow_m: float
+
+    @property
+    def key(self) -> tuple[int, str]:
+        """Its key in Observations.rows."""
+        return self.leg, "depth_to" if self.end else "depth_from"
+
+
+def readings_of(legs: Sequence[Leg]) -> list[DepthReading]:
+    """Return all depths that were read."""
+    both = ((number, end, depth) for number, leg in enumerate(legs) for end, depth in enumerate(depths_of(leg)))
+    return [DepthReading(number, end, *depth) for number, end, depth in both if depth is not None]
+
+
+class _GaugeTerms:
+    """Unknowns of all gauges."""
+
+    def __init__(
+        self, of: Observations, legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]
+    ) -> None:
+        self._of, self._legs, self._tides = of, legs, tides
+        self._at_s = [(leg.start_ns + leg.end_ns) / 2 / S_NS for leg in legs]
         self._start_s: dict[int, float] = {}
+        for leg, at_s in zip(legs, self._at_s, strict=True):
+            self._start_s[leg.dive] = min(self._start_s.get(leg.dive, math.inf), at_s)
         slow: dict[tuple[int, str], list[float]] = defaultdict(list)
-        for leg in legs:
-            start_s = (leg.start_ns + leg.end_ns) / 2 / S_NS
-            self._start_s[leg.dive] = min(self._start_s.get(leg.dive, math.inf), start_s)
-            for node, depth in ((leg.from_node, from_depth(leg)), (leg.to_node, to_depth(leg))):
-                if depth is not None:
-                    slow[leg.dive, node].append(depth[2])
+        for one in readings:
+            slow[self._gauge(one)].append(one.slow_m)
         self._slow_m = {key: max(median(values), LEAST_NOISE_M) for key, values in slow.items()}
         self._first = min((dive for dive, _ in slow), default=1)
+        # By dive and node: zero and drift, and the dive's level and tide, None where they are no unknowns.
+        self._columns: dict[tuple[int, str], tuple[int, int, int | None, int | None]] = {}
 
-    def terms(self, leg: Leg, node: str, sign: float) -> list[tuple[int, float]]:
+    def _gauge(self, one: DepthReading) -> tuple[int, str]:
+        leg = self._legs[one.leg]
+        return leg.dive, leg.to_node if one.end else leg.from_node
+
+    def what(self, one: DepthReading) -> str:
+        """Return the reading's name in words."""
+        return f"gauge of {self._gauge(one)[1]}"
+
+    def terms(self, one: DepthReading, sign: float) -> list[tuple[int, float]]:
         """Return zero, drift, level and tide of one reading."""
-        of, dive, name, slow_m = self._of, leg.dive, gauge_name(leg.dive, node), self._slow_m[leg.dive, node]
-        time_s = (leg.start_ns + leg.end_ns) / 2 / S_NS - self._start_s[dive]
-        terms = [
-            (of.unknown(f"{name}: zero", slow_m), sign),
-            (of.unknown(f"{name}: drift", slow_m), sign * time_s / DRIFT_S),
-        ]
-        if dive != self._first:
-            terms.append((of.unknown(f"water level in dive {dive}", LEVEL_M), sign))
-        if dive in self._tides:
-            terms.append((of.unknown(f"tide in dive {dive}", TIDE_M_PER_S), sign * time_s))
-        return terms
+        key = self._gauge(one)
+        zero, drift, level, tide = self._columns.get(key) or self._unknowns(key)
+        time_s = self._at_s[one.leg] - self._start_s[key[0]]
+        terms = [(zero, sign), (drift, sign * time_s / DRIFT_S)]
+        terms += [(level, sign)] if level is not None else []
+        return [*terms, (tide, sign * time_s)] if tide is not None else terms
+
+    def _unknowns(self, key: tuple[int, str]) -> tuple[int, int, int | None, int | None]:
+        of, (dive, node), slow_m = self._of, key, self._slow_m[key]
+        name = gauge_name(dive, node)
+        self._columns[key] = found = (
+            of.unknown(f"{name}: zero", slow_m),
+            of.unknown(f"{name}: drift", slow_m),
+            of.unknown(f"water level in dive {dive}", LEVEL_M) if dive != self._first else None,
+            of.unknown(f"tide in dive {dive}", TIDE_M_PER_S) if dive in self._tides else None,
+        )
+        return found
+
+
+def depths_of(leg: Leg) -> tuple[tuple[float, float, float] | None, tuple[float, float, float] | None]:
+    """Return the depths read at the leg's start and end, each with its noise and its slow error (1 sd), m."""
+    return from_depth(leg), to_depth(leg)
 
 
 def from_depth(leg: Leg) -> tuple[float, float, float] | None:
@@ -115,39 +160,34 @@ def _depth(depth_m: object, sigma_m: object, noise_m: object) -> tuple[float, fl
     return float(depth_m), float(noise), math.sqrt(max(sigma_m**2 - noise**2, 0.0))
 
 
-def depths_alone(legs: Sequence[Leg], tides: Sequence[int]) -> Assembly:
-    """Return the observations of all gauges alone: stations' depths as `up` (negative)."""
-    names = dict.fromkeys(
-        name
-        for leg in legs
-        for name, depth in ((leg.from_, from_depth(leg)), (leg.to, to_depth(leg)))
-        if depth is not None
-    )
-    of = Observations(list(names))
-    found = Assembly(of, legs, [(leg.from_, leg.to) for leg in legs], [0.0] * len(legs))
-    _add_depths(found, tides, 0.0)
-    for number in range(len(names)):
-        # Depths alone say nothing of the map.
-        of.add("east", number, -1, 0.0, 1.0, what="map")
-        of.add("north", number, -1, 0.0, 1.0, what="map")
-    return found
+def depths_alone(legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]) -> Observations:
+    """Return the observations of all gauges alone, a row for each reading: stations' depths are unknowns by name."""
+    of = Observations([])
+    gauges = _GaugeTerms(of, legs, readings, tides)
+    for one in readings:
+        name = legs[one.leg].to if one.end else legs[one.leg].from_
+        terms = [(of.unknown(name, early=True), 1.0), *gauges.terms(one, 1.0)]
+        of.rows[one.key] = of.add("number", -1, -1, one.depth_m, one.noise_m, terms, leg=one.leg, what=gauges.what(one))
+    return of
 
 
 def _add_depths(to: Assembly, tides: Sequence[int], level_m: float, *, free_level: bool = False) -> None:
-    of, gauges = to.observations, _GaugeReadings(to.observations, to.legs, tides)
-    for number, (leg, (start, end)) in enumerate(zip(to.legs, to.ends, strict=True)):
-        for what, name, node, depth in (
-            ("depth_from", start, leg.from_node, from_depth(leg)),
-            ("depth_to", end, leg.to_node, to_depth(leg)),
-        ):
-            if depth is None:
-                continue
-            terms = gauges.terms(leg, node, -1.0)
-            if free_level:
-                terms.append((of.unknown(WATER, WATER_M), -1.0))
-            to.observations.rows[number, what] = of.add(
-                "up", of.at[name], -1, level_m - depth[0], depth[1], terms, leg=number, what=f"gauge of {node}"
-            )
+    of, readings = to.observations, readings_of(to.legs)
+    gauges = _GaugeTerms(of, to.legs, readings, tides)
+    for one in readings:
+        terms = gauges.terms(one, -1.0)
+        if free_level:
+            terms.append((of.unknown(WATER, WATER_M), -1.0))
+        of.rows[one.key] = of.add(
+            "up",
+            of.at[to.ends[one.leg][one.end]],
+            -1,
+            level_m - one.depth_m,
+            one.noise_m,
+            terms,
+            leg=one.leg,
+            what=gauges.what(one),
+        )
 
 
 def assemble(
@@ -217,20 +257,19 @@ def assemble(
 
 def _add_rises(to: Assembly, tides: Sequence[int]) -> None:
     """Let each leg keep the difference of its own two readings."""
-    of, gauges = to.observations, _GaugeReadings(to.observations, to.legs, tides)
-    for number, (leg, names) in enumerate(zip(to.legs, to.ends, strict=True)):
-        depths = from_depth(leg), to_depth(leg)
-        if depths[0] is None or depths[1] is None:
+    of, readings = to.observations, readings_of(to.legs)
+    gauges = _GaugeTerms(of, to.legs, readings, tides)
+    for start, end in pairwise(readings):
+        if start.leg != end.leg:
             continue
-        terms = gauges.terms(leg, leg.from_node, 1.0) + gauges.terms(leg, leg.to_node, -1.0)
-        to.observations.rows[number, "rise"] = of.add(
+        of.rows[start.leg, "rise"] = of.add(
             "rise",
-            of.at[names[0]],
-            of.at[names[1]],
-            depths[0][0] - depths[1][0],
-            math.hypot(depths[0][1], depths[1][1]),
-            terms,
-            leg=number,
+            of.at[to.ends[start.leg][0]],
+            of.at[to.ends[start.leg][1]],
+            start.depth_m - end.depth_m,
+            math.hypot(start.noise_m, end.noise_m),
+            gauges.terms(start, 1.0) + gauges.terms(end, -1.0),
+            leg=start.leg,
             what="gauges",
         )
 

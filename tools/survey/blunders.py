@@ -13,15 +13,19 @@ from statistics import NormalDist
 from typing import Final
 
 import numpy as np
-from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.connected import Change, Survey
 from buddyline.tools.survey.observations import ANGLES, CHECKED, DISTANCE, Solution
 
 MOST_BLUNDERS: Final = 10
-# Chance that a sound survey is said to have a blunder, over all of its observations.
+# Chance that a sound survey is said to have a blunder, over all hypotheses that are tried.
 FALSE_ALARM: Final = 0.01
 # A station's name has three unknowns; an explanation by one is taken before it unless this much better.
 NAME_COST: Final = 8.0
+# A median of squares is as certain as a variance of this share of its observations; stated sds, as one of so many.
+MEDIAN_SHARE: Final = 0.37
+STATED_WORTH: Final = 20.0
+# An instrument's error is suspected where the survey tells at least this share of it, not what is known beforehand.
+TOLD_SHARE: Final = 0.1
 # An explanation is listed with the best one if it explains this share as much.
 AS_GOOD: Final = 0.8
 MOST_OTHERS: Final = 4
@@ -77,13 +81,25 @@ class _Suspect:
     visit: tuple[tuple[int, int], ...] = ()
 
 
-def variance_factor(solution: Solution) -> float:
-    """Return how much larger than stated residuals are, squared, by their median, which no blunder moves; least 1."""
-    shown = (solution.redundancies > 0.1) & (solution.model.leg >= 0)
-    if shown.sum() < 20:
-        return 1.0
+def variance_factor(solution: Solution) -> tuple[float, float]:
+    """Return how much larger than stated residuals are, squared, at least 1, and its degrees of freedom.
+
+    It is by their median, which few blunders move, beside what the stated sds are worth.
+    """
+    shown = (solution.redundancies > CHECKED) & (solution.model.leg >= 0)
+    freedom = MEDIAN_SHARE * max(solution.freedom - 1, 0)
     # The median of chi^2 with one degree of freedom.
-    return max(float(np.median(solution.suspicion[shown])) / 0.455, 1.0)
+    factor = float(np.median(solution.suspicion[shown])) / 0.455 if shown.any() else 1.0
+    return max((STATED_WORTH + freedom * factor) / (STATED_WORTH + freedom), 1.0), STATED_WORTH + freedom
+
+
+def critical_chi2(hypotheses: int, freedom: float) -> float:
+    """Return what one unknown must explain to be suspected, over the variance factor, of which `freedom` is known.
+
+    It is FALSE_ALARM's over all hypotheses, by Student's distribution (Wallace 1959).
+    """
+    z = NormalDist().inv_cdf(1 - FALSE_ALARM / (2 * max(hypotheses, 1))) * (8 * freedom + 3) / (8 * freedom + 1)
+    return freedom * math.expm1(z**2 / freedom)
 
 
 def find_blunders(survey: Survey) -> list[Blunder]:
@@ -124,12 +140,15 @@ def find_blunders(survey: Survey) -> list[Blunder]:
 def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Suspect]:
     """Yield what may be wrong by the adjustment as it is, linearly."""
     model, of, r = solution.model, solution.observations, solution.redundancies
-    scale = variance_factor(solution)
+    scale, known = variance_factor(solution)
     w2 = solution.suspicion / scale
-    critical = NormalDist().inv_cdf(1 - FALSE_ALARM / (2 * max(len(w2), 1))) ** 2
-    for row in np.flatnonzero(w2 > critical).tolist():
+    least = np.where(model.leg >= 0, CHECKED, TOLD_SHARE)
+    tried = (r > least) & ~model.robust & ~model.told_by_robust
+    every = list(_visits(survey, taken))
+    critical = critical_chi2(int(tried.sum()) + len(every), known)
+    for row in np.flatnonzero(tried & (w2 > critical)).tolist():
         leg, what = int(model.leg[row]), of.what[row]
-        if (leg, what) in taken.drops or model.robust[row]:
+        if (leg, what) in taken.drops:
             continue
         off = abs(float(solution.misfit[row] / r[row]))
         if model.kind[row] == DISTANCE and leg >= 0 and survey.legs[leg].from_node:
@@ -144,7 +163,7 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
         yield _Suspect(cause, (name,) if name else (), drop, float(w2[row]), row)
     worst = np.zeros(len(survey.legs))
     np.maximum.at(worst, model.leg[model.leg >= 0], w2[model.leg >= 0])
-    visits = sorted(_visits(survey, taken), key=lambda visit: -max(worst[leg] for leg, _ in visit))[:VISITS_TRIED]
+    visits = sorted(every, key=lambda visit: -max(worst[leg] for leg, _ in visit))[:VISITS_TRIED]
     if not visits or worst.max(initial=0.0) <= critical / 2:
         return
     rows_of: dict[int, list[int]] = {}
@@ -159,19 +178,13 @@ def _suspects(survey: Survey, solution: Solution, taken: Change) -> Iterator[_Su
             [(derivatives[rows] * (unknowns[rows] == 3 * at + axis)).sum(axis=1) for axis in range(3)], axis=1
         )
         errors.append((rows, moved))
-    for visit, M, b in zip(visits, *solution.effect(errors), strict=True):
-        chi2 = _chi2(M, b) / scale
+    for visit, effect in zip(visits, solution.effect(errors), strict=True):
+        chi2 = effect / scale
         if chi2 > critical + NAME_COST:
             name = survey.name_at(*visit[0], taken)
             legs = tuple(survey.legs[leg].name for leg, _ in visit)
             change = Change(names=dict.fromkeys(visit, f"{name}'"))
             yield _Suspect(f"station name: {name} of {' and '.join(legs)}", legs, change, chi2 - NAME_COST, visit=visit)
-
-
-def _chi2(M: Floats, b: Floats) -> float:
-    values, axes = np.linalg.eigh(M)
-    seen = values > CHECKED * max(float(values[-1]), 1e-12)
-    return float(((axes.T @ b)[seen] ** 2 / values[seen]).sum())
 
 
 def _visits(survey: Survey, taken: Change) -> Iterator[tuple[tuple[int, int], ...]]:

@@ -13,7 +13,7 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.assembly import Fixed, assemble, from_depth, to_depth
 from buddyline.tools.survey.averages import Floats, wrap
-from buddyline.tools.survey.gauges import adjust_gauges
+from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
 from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, slopes_of
 from buddyline.tools.survey.observations import Observations, Solution
@@ -105,7 +105,7 @@ class Survey:
             raise ConfigError('adjust.compass = "ignore": north needs a [[known]] azimuth_deg or two fixed points')
         self.origin_m = np.nan_to_num(next(iter(self.fixed.values()))[0])
         self.level_m = water_level_m(project)
-        self.tides = [dive for dive in adjust_gauges(project.leg).tides_m_per_h] if _may_have_tides(project) else []
+        self.tides = tides_of(project.leg) if _may_have_tides(project) else []
         self.left_out: list[tuple[Leg, str]] = []
         self.legs: list[Leg] = []
         self.ends: list[tuple[str, str]] = []

@@ -57,10 +57,10 @@ def fit_of(solution: Solution) -> SurveyFit:
     """Return the tests of an adjustment. Unknowns with a prior are observed by it as well."""
     of = solution.observations
     names = [name for name in of.names if not name.startswith("sight ")]
-    columns = np.array([[of.unknown(name)] for name in names], dtype=np.int64).reshape(-1, 1)
-    sigmas = np.sqrt(solution.normal.blocks(columns)[:, 0, 0]) if names else np.empty(0)
+    columns = np.array([of.unknown(name) for name in names], dtype=np.int64)
+    sigmas = np.sqrt(solution.variances(columns)) if names else np.empty(0)
     instruments = {}
-    for name, (column,), sigma in zip(names, columns.tolist(), sigmas.tolist(), strict=True):
+    for name, column, sigma in zip(names, columns.tolist(), sigmas.tolist(), strict=True):
         scale, unit = _unit(name)
         instruments[name] = scale * float(solution.x[column]), scale * sigma, unit
     freedom = solution.freedom

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.tools.survey.assembly import TIDE_M_PER_S, Assembly, depths_alone
+from buddyline.tools.survey.assembly import TIDE_M_PER_S, DepthReading, depths_alone, readings_of
 from buddyline.tools.survey.observations import Solution
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.settings import AlarmSettings
@@ -51,68 +52,93 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
     show them. A tide is taken in only where the readings show it. limits: depth_sigmas and depth_m, both exceeded,
     make an alarm.
     """
-    tides: list[int] = []
-    assembly = depths_alone(legs, tides)
-    if not assembly.observations.stations:
+    readings = readings_of(legs)
+    if not readings:
         return Gauges({}, {}, [])
-    fit = _fit(assembly)
-    visits = _visits(assembly)
-    for dive in sorted({leg.dive for leg in legs}):
-        if _revisited(legs, visits, dive) < LEAST_STATIONS:
-            continue
-        trial = depths_alone(legs, [*tides, dive])
-        with_tide = _fit(trial)
-        rate, _ = with_tide.unknown(f"tide in dive {dive}")
-        if abs(rate) < POSSIBLE_TIDE * TIDE_M_PER_S and fit.chi2 - with_tide.chi2 > SHOWN_CHI2:
-            tides, assembly, fit = [*tides, dive], trial, with_tide
-    ups = 3 * np.arange(len(visits))[:, None] + 2
-    sigmas_m = np.sqrt(fit.normal.blocks(ups)[:, 0, 0])
+    tides, fit = _with_tides(legs, readings)
+    visits = _visits(legs, readings)
+    columns = np.array([fit.observations.unknown(name) for name in visits])
+    sigmas_m = np.sqrt(fit.variances(columns))
     depths = {
-        name: StationDepth(float(-fit.position_m[i, 2]), float(sigmas_m[i]), len(visits[name]))
-        for i, name in enumerate(assembly.observations.stations)
+        name: StationDepth(float(fit.x[column]), float(sigma_m), len(visits[name]))
+        for name, column, sigma_m in zip(visits, columns.tolist(), sigmas_m.tolist(), strict=True)
     }
-    visits = _visits(assembly)
     rates = {dive: 3600.0 * fit.unknown(f"tide in dive {dive}")[0] for dive in tides}
-    return Gauges(depths, rates, _alarms(assembly, fit, visits, limits or AlarmSettings()))
+    return Gauges(depths, rates, _alarms(legs, fit, visits, limits or AlarmSettings()))
 
 
-def _fit(assembly: Assembly) -> Solution:
-    of = assembly.observations
-    return of.adjust(np.zeros((len(of.stations), 3)))
+def tides_of(legs: Sequence[Leg]) -> list[int]:
+    """Return the dives whose gauges' readings show a tide."""
+    readings = readings_of(legs)
+    return _with_tides(legs, readings)[0] if readings else []
 
 
-def _visits(assembly: Assembly) -> dict[str, list[tuple[int, int]]]:
-    """Return, by station, its readings as leg and row."""
-    visits: dict[str, list[tuple[int, int]]] = {name: [] for name in assembly.observations.stations}
-    for (leg, what), row in assembly.observations.rows.items():
-        visits[assembly.ends[leg][what == "depth_to"]].append((leg, row))
+def _with_tides(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> tuple[list[int], Solution]:
+    tides: list[int] = []
+    fit = _fit(legs, readings, tides)
+    for dive in _revisiting(legs, readings):
+        rate, explained = _tide(legs, readings, fit, dive)
+        if abs(rate) < POSSIBLE_TIDE * TIDE_M_PER_S and explained > SHOWN_CHI2:
+            tides = [*tides, dive]
+            fit = _fit(legs, readings, tides)
+    return tides, fit
+
+
+def _tide(legs: Sequence[Leg], readings: Sequence[DepthReading], fit: Solution, dive: int) -> tuple[float, float]:
+    """Return the rate of a tide, m/s, as one more unknown would have it, and by what chi^2 would fall."""
+    of_dive = [one for one in readings if legs[one.leg].dive == dive]
+    rows = np.array([fit.observations.rows[one.key] for one in of_dive])
+    time_s = np.array([(legs[one.leg].start_ns + legs[one.leg].end_ns) / 2 / S_NS for one in of_dive])
+    by = np.zeros(len(fit.misfit))
+    by[rows] = time_s - time_s.min()
+    weighed = fit.weights * by
+    (at, columns), values = fit.at, fit.values
+    push = np.bincount(columns, values * weighed[at], len(fit.x)).astype(float)
+    information = weighed @ by - push @ fit.normal.solve(push) + TIDE_M_PER_S**-2
+    right = float(weighed @ fit.misfit)
+    return right / float(information), right**2 / float(information)
+
+
+def _fit(legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]) -> Solution:
+    return depths_alone(legs, readings, tides).adjust(np.empty((0, 3)), linear=True)
+
+
+def _visits(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> dict[str, list[DepthReading]]:
+    """Return each station's readings."""
+    visits: dict[str, list[DepthReading]] = {}
+    for one in readings:
+        visits.setdefault(legs[one.leg].to if one.end else legs[one.leg].from_, []).append(one)
     return visits
 
 
-def _revisited(legs: Sequence[Leg], visits: dict[str, list[tuple[int, int]]], dive: int) -> int:
-    """Return how many stations were visited in a dive with a long time between."""
-    times_s = [[legs[leg].start_ns / S_NS for leg, _ in of if legs[leg].dive == dive] for of in visits.values()]
-    return sum(len(one) > 1 and max(one) - min(one) > APART_S for one in times_s)
+def _revisiting(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> list[int]:
+    """Return the dives in which enough stations were visited with a long time between."""
+    times_ns: dict[tuple[int, str], list[int]] = {}
+    for one in readings:
+        leg = legs[one.leg]
+        times_ns.setdefault((leg.dive, leg.to if one.end else leg.from_), []).append(leg.start_ns)
+    again = Counter(dive for (dive, _), at in times_ns.items() if max(at) - min(at) > APART_S * S_NS)
+    return sorted(dive for dive, count in again.items() if count >= LEAST_STATIONS)
 
 
 def _alarms(
-    assembly: Assembly, fit: Solution, visits: dict[str, list[tuple[int, int]]], limits: AlarmSettings
+    legs: Sequence[Leg], fit: Solution, visits: dict[str, list[DepthReading]], limits: AlarmSettings
 ) -> list[str]:
     said = []
-    noise_m = fit.model.sigma
+    noise_m, of = fit.model.sigma, fit.observations
     off_sigma_m = noise_m * np.sqrt(fit.redundancies)
     for name, of_station in visits.items():
-        rows = np.array([row for _, row in of_station])
+        rows = np.array([of.rows[one.key] for one in of_station])
         # If nothing checks a reading, its residual and its sigma are both zero.
         checked = off_sigma_m[rows] > 0.1 * noise_m[rows]
-        off_m = np.abs(fit.misfit[rows])
-        away = off_m > limits.depth_sigmas * off_sigma_m[rows]
-        if (checked & away).any() and np.ptp(fit.model.value[rows] - fit.terms[rows]) > limits.depth_m:
+        off_m = fit.misfit[rows]
+        away = np.abs(off_m) > limits.depth_sigmas * off_sigma_m[rows]
+        if (checked & away).any() and np.ptp(off_m) > limits.depth_m:
             texts = []
-            for leg, row in of_station:
-                node = fit.observations.what[row].removeprefix("gauge of ")
-                texts.append(f"{-fit.model.value[row]:.2f} m by {node} in dive {assembly.legs[leg].dive}")
-            sigmas = float((off_m / np.maximum(off_sigma_m[rows], 1e-9))[checked].max())
+            for row in rows.tolist():
+                node = of.what[row].removeprefix("gauge of ")
+                texts.append(f"{fit.model.value[row]:.2f} m by {node} in dive {legs[of.leg[row]].dive}")
+            sigmas = float((np.abs(off_m) / np.maximum(off_sigma_m[rows], 1e-9))[checked].max())
             said.append(
                 f"ALARM: gauges at station {name} differ by {sigmas:.1f} sd: {', '.join(texts)}; is it one station?"
             )

@@ -9,11 +9,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from buddyline.tools.survey.assembly import (
-    EXACT_M,
-    from_depth,
-    to_depth,
-)
+from buddyline.tools.survey.assembly import EXACT_M, depths_of
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.blunders import Blunder, find_blunders
 from buddyline.tools.survey.connected import Survey, held_depths
@@ -26,8 +22,6 @@ from buddyline.tools.survey.proposals import Proposal, proposals
 from msgspec import UNSET
 
 Triple: TypeAlias = tuple[float, float, float]
-# A leg's number, its line, and the sense in which a loop goes along it.
-SignedLine: TypeAlias = tuple[int, Line, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +188,7 @@ def find_loops(survey: Survey, solution: Solution) -> list[Loop]:
     Fixed points count as joined, so that a way between two of them is a loop. V is of the gauges' own readings, with
     zeros, drifts and levels taken off.
     """
-    project, fixed = survey.project, survey.fixed
-    depths_m = held_depths(project)
+    fixed = survey.fixed
     touching: dict[str, list[tuple[str, int, float]]] = {}
     for number, (start, end) in enumerate(survey.ends):
         if " " not in end:
@@ -212,14 +205,7 @@ def find_loops(survey: Survey, solution: Solution) -> list[Loop]:
                 tree[other], level[other] = (name, number, sign), level[name] + 1
                 queue.append(other)
     in_tree = {step[1] for step in tree.values() if step is not None}
-    lines: dict[int, Line | None] = {}
-
-    def line(number: int) -> Line | None:
-        if number not in lines:
-            leg, turn_rad = survey.legs[number], survey.turns_rad[number]
-            lines[number] = line_of(leg, measures_of(leg, project, turn_rad, depths_m), turn_rad)
-        return lines[number]
-
+    read = _AsRead(survey, solution, held_depths(survey.project))
     found = []
     for closing, (start, end) in enumerate(survey.ends):
         if closing in in_tree or start not in tree or end not in tree:
@@ -231,43 +217,60 @@ def find_loops(survey: Survey, solution: Solution) -> list[Loop]:
             back, number, sign = tree[ways[side][-1]]  # type: ignore[misc]
             ways[side].append(back)
             steps.append((number, sign if side == 0 else -sign))
-        signed = [(number, one, sign) for number, sign in steps if (one := line(number)) is not None]
-        if len(signed) == len(steps):
-            found.append(_loop(survey, solution, ways, signed))
+        if (loop := read.loop(ways, *zip(*steps, strict=True))) is not None:
+            found.append(loop)
     return found
 
 
-def _loop(survey: Survey, solution: Solution, ways: tuple[list[str], list[str]], signed: list[SignedLine]) -> Loop:
-    vector = sum((sign * one.vector_m for _, one, sign in signed), np.zeros(3))
-    covariance = sum((one.covariance for _, one, _ in signed), np.zeros((3, 3)))
-    out, back = ways
-    names = [*reversed(out), *(back if out[-1] != back[-1] else back[:-1])]
-    if out[-1] != back[-1]:
-        for name, sign in ((out[-1], 1.0), (back[-1], -1.0)):
-            position_m, sigmas_m = survey.fixed[name]
-            vector = vector + sign * np.nan_to_num(position_m)
-            covariance = covariance + np.diag(sigmas_m**2)
-        if any(math.isnan(survey.fixed[name][0][2]) for name in (out[-1], back[-1])):
-            vector[2] = 0.0
-    # Held depths close by construction, so V is of each leg's own readings.
-    variance = float(covariance[2, 2])
-    for number, one, sign in signed:
-        leg = one.leg
-        depths = from_depth(leg), to_depth(leg)
-        if depths[0] is not None and depths[1] is not None and not one.by_clino:
-            read_m = depths[0][0] - depths[1][0]
-            read_m += solution.correction(number, "depth_from")
-            read_m -= solution.correction(number, "depth_to")
-            read_m -= solution.correction(number, "rise")
-            vector[2] += sign * (read_m - one.rise_m)
+class _AsRead:
+    """Legs' vectors as read, each made at its first use."""
+
+    def __init__(self, survey: Survey, solution: Solution, depths_m: dict[str, float]) -> None:
+        self._survey, self._solution, self._depths_m = survey, solution, depths_m
+        # East, north, up by the gauges' own readings; the variances of these, and the length. NaN: no vector.
+        self._numbers = np.full((len(survey.legs), 7), np.nan)
+
+    def _numbers_of(self, number: int) -> Floats:
+        survey, solution = self._survey, self._solution
+        leg, turn_rad = survey.legs[number], survey.turns_rad[number]
+        line = line_of(leg, measures_of(leg, survey.project, turn_rad, self._depths_m), turn_rad)
+        if line is None:
+            return np.full(7, np.nan)
+        vector_m, variances = line.vector_m.copy(), np.diag(line.covariance).copy()
+        start, end = depths_of(leg)
+        if start is not None and end is not None and not line.by_clino:
+            # Held depths close by construction, so V is of each leg's own readings.
+            vector_m[2] = start[0] - end[0] + solution.correction(number, "depth_from")
+            vector_m[2] -= solution.correction(number, "depth_to") + solution.correction(number, "rise")
             noises = leg.depth_from_noise_m, leg.depth_to_noise_m
             sigmas = (leg.depth_from_sigma_m, leg.depth_to_sigma_m) if UNSET in noises else noises
-            variance += sum(sd**2 for sd in sigmas if sd is not UNSET) - one.rise_sigma_m**2
-    return Loop(
-        tuple(names),
-        sum(one.length_m for _, one, _ in signed),
-        _triple(vector),
-        math.hypot(vector[0], vector[1]) / math.sqrt(covariance[0, 0] + covariance[1, 1]),
-        abs(float(vector[2])) / math.sqrt(max(variance, EXACT_M**2)),
-        tuple(number for number, _, _ in signed),
-    )
+            variances[2] += sum(sd**2 for sd in sigmas if sd is not UNSET) - line.rise_sigma_m**2
+        return np.array([*vector_m, *variances, line.length_m])
+
+    def loop(
+        self, ways: tuple[list[str], list[str]], numbers: tuple[int, ...], signs: tuple[float, ...]
+    ) -> Loop | None:
+        """Return the loop of two ways that meet, or end at two fixed points; None if a leg in it has no vector."""
+        for number in numbers:
+            if math.isnan(self._numbers[number, 0]):
+                self._numbers[number] = self._numbers_of(number)
+        parts = self._numbers[list(numbers)]
+        if np.isnan(parts).any():
+            return None
+        vector, variances, length_m = np.array(signs) @ parts[:, :3], parts[:, 3:6].sum(axis=0), parts[:, 6].sum()
+        fixed, (out, back) = self._survey.fixed, ways
+        joined = out[-1] == back[-1]
+        for name, sign in () if joined else ((out[-1], 1.0), (back[-1], -1.0)):
+            position_m, sigmas_m = fixed[name]
+            vector = vector + sign * np.nan_to_num(position_m)
+            variances = variances + sigmas_m**2
+        if not joined and any(math.isnan(fixed[name][0][2]) for name in (out[-1], back[-1])):
+            vector[2] = 0.0
+        return Loop(
+            (*reversed(out), *(back[:-1] if joined else back)),
+            float(length_m),
+            _triple(vector),
+            math.hypot(vector[0], vector[1]) / math.sqrt(variances[0] + variances[1]),
+            abs(float(vector[2])) / math.sqrt(max(float(variances[2]), EXACT_M**2)),
+            numbers,
+        )

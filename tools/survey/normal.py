@@ -6,20 +6,24 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.averages import Bools, Floats, Ints
+from buddyline.tools.survey.averages import Floats, Ints
 
 # Up to this many unknowns a dense inverse is as fast, and needs no scipy.
 DENSE: Final = 1500
+SYMMETRIC: Final[dict[str, Any]] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
 class Normal:
     """N = A^T W A of rows A (m, n) as coordinates (row, column, value) and their weights (m,); positive definite.
 
     blocks: (n,), unknowns of one number are eliminated together; -1: last, for those that stand in very many rows.
+    before: equations of the same pattern, whose order of elimination is taken.
     Raises BuddylineError if an unknown is not determined.
     """
 
-    def __init__(self, at: tuple[Ints, Ints], values: Floats, weights: Floats, blocks: Ints) -> None:
+    def __init__(
+        self, at: tuple[Ints, Ints], values: Floats, weights: Floats, blocks: Ints, before: Normal | None = None
+    ) -> None:
         self.count = count = len(blocks)
         rows, columns = at
         square = np.zeros(count)
@@ -30,6 +34,7 @@ class Normal:
         self._scale = 1 / np.sqrt(square)
         scaled = values * np.sqrt(weights[rows]) * self._scale[columns]
         self._lu: Any = None
+        self._order: Ints = np.empty(0, dtype=np.int64) if before is None else before._order
         try:
             if count <= DENSE:
                 A = np.zeros((len(weights), count))
@@ -46,21 +51,15 @@ class Normal:
             from scipy.sparse.linalg import splu
         except ModuleNotFoundError as error:
             raise BuddylineError("a survey of this size needs scipy: make install EXTRAS=survey") from error
-        symmetric = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
         count = int(rows.max()) + 1
-        # Least fill between blocks (Liu's minimum degree, by a matrix of their neighbourhood).
-        early = blocks[columns] >= 0
-        met = csc_array((np.ones(early.sum()), (blocks[columns[early]], rows[early])), shape=(blocks.max() + 1, count))
-        met.data[:] = 1.0
-        beside = (met @ met.T).tocsc()
-        beside.setdiag(beside.sum(axis=0) + 1)
-        rank = splu(beside, permc_spec="MMD_AT_PLUS_A", **symmetric).perm_c
-        self._order = np.argsort(np.where(blocks >= 0, rank[blocks], len(rank)), kind="stable")
+        if not len(self._order):
+            rank = _elimination(rows, blocks[columns], count)
+            self._order = np.argsort(np.where(blocks >= 0, rank[blocks], len(rank)), kind="stable")
         place = np.empty(self.count, dtype=np.int64)
         place[self._order] = np.arange(self.count)
         A = csc_array((scaled, (rows, place[columns])), shape=(count, self.count))
         self._N, self._place = (A.T @ A).tocsc(), place
-        self._lu = splu(self._N, permc_spec="NATURAL", **symmetric)
+        self._lu = splu(self._N, permc_spec="NATURAL", **SYMMETRIC)
 
     def solve(self, right: Floats) -> Floats:
         """Return N^-1 times right, (n,) or (n, k)."""
@@ -70,19 +69,22 @@ class Normal:
             return np.asarray(scale * np.linalg.solve(self._dense, scaled))
         return np.asarray(scale * self._lu.solve(np.ascontiguousarray(scaled[self._order]))[self._place])
 
-    def blocks(self, groups: Ints) -> Floats:
-        """Return the inverse between the unknowns of each group, (g, k, k). groups: (g, k) of numbers, -1: none (zero).
+    def blocks(self, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
+        """Return the inverse between the unknowns of each group, (g, k, k), and v^T N^-1 v of each row v, (m,).
 
-        The unknowns of a group must occur in one row, or N between them is not kept.
+        groups: (g, k) of unknowns; columns: (m, j), each row's unknowns; -1: none. values: (m, j). The unknowns of a
+        group or row must occur in one observation together, or N between them is not kept.
         """
-        known = groups >= 0
-        at = np.where(known, groups, 0)
+        at = [np.where(one >= 0, one, 0) for one in (groups, columns)]
+        scales = [np.where(one >= 0, self._scale[here], 0.0) for one, here in zip((groups, columns), at, strict=True)]
+        scaled = values * scales[1]
         if self._lu is None:
-            found = np.linalg.inv(self._dense)[at[:, :, None], at[:, None, :]]
+            inverse = np.linalg.inv(self._dense)
+            found = inverse[at[0][:, :, None], at[0][:, None, :]]
+            forms = np.einsum("mi,mij,mj->m", scaled, inverse[at[1][:, :, None], at[1][:, None, :]], scaled)
         else:
-            found = self._selected(at, known)
-        scale = np.where(known, self._scale[at], 0.0)
-        return np.asarray(found * scale[:, :, None] * scale[:, None, :])
+            found, forms = self._selected(groups, columns, scaled)
+        return np.asarray(found * scales[0][:, :, None] * scales[0][:, None, :]), np.asarray(forms)
 
     def _lower(self) -> tuple[Ints, Ints, Floats]:
         """Return L's columns' starts, its rows in order and their values, with the zeros that happen to be exact.
@@ -94,8 +96,7 @@ class Normal:
         pattern = self._N.copy()
         pattern.data[:] = -1.0
         pattern.setdiag(2.0 * np.diff(pattern.indptr))
-        options = {"SymmetricMode": True}
-        whole = splu(pattern, permc_spec="NATURAL", diag_pivot_thresh=0.0, options=options).L.tocsc()
+        whole = splu(pattern, permc_spec="NATURAL", **SYMMETRIC).L.tocsc()
         whole.sort_indices()
         lower = self._lu.L.tocsc()
         lower.sort_indices()
@@ -108,8 +109,8 @@ class Normal:
         values[np.searchsorted(keys(whole), keys(lower))] = lower.data
         return whole.indptr, whole.indices, values
 
-    def _selected(self, at: Ints, known: Bools) -> Floats:
-        """Return the blocks of a sparse inverse (Takahashi, Fagan and Chin 1973), front by front of the factor.
+    def _selected(self, groups: Ints, columns: Ints, values: Floats) -> tuple[Floats, Floats]:
+        """Return what `blocks` does, scaled, of a sparse inverse (Takahashi, Fagan and Chin 1973), front by front.
 
         For columns J of L with the same rows R below them: with G = L_RJ L_JJ^-1, Z_RJ = -Z_RR G and
         Z_JJ = (L_JJ D_J L_JJ^T)^-1 - G^T Z_RJ. R is part of the front (J and R together) that R's first row is in.
@@ -118,7 +119,7 @@ class Normal:
 
         count, lu = self.count, self._lu
         place = lu.perm_c[self._place]
-        starts, rows, values = self._lower()
+        starts, rows, lower = self._lower()
         pivots = lu.U.diagonal()
         lengths = np.diff(starts)
         following = np.full(count, -1)
@@ -130,19 +131,21 @@ class Normal:
         of_front = np.cumsum(opens[:-1]) - 1
         parents = np.where(following[bounds[1:] - 1] >= 0, of_front[following[bounds[1:] - 1]], -1)
         children = np.bincount(parents[parents >= 0], minlength=len(parents)).tolist()
-        wanted: dict[int, list[int]] = {}
-        first = np.where(known, place[at], count).min(axis=1)
-        for group, front in enumerate(of_front[first].tolist()):
-            wanted.setdefault(front, []).append(group)
-        found = np.zeros((*at.shape, at.shape[1]))
+        # Each group is of the front that its first unknown is in. None is the last place, with nothing.
+        places = [np.where(one >= 0, place[one], count) for one in (groups, columns)]
+        wanted = []
+        for one in places:
+            front = of_front[np.minimum(one.min(axis=1, initial=count), count - 1)]
+            sizes = np.bincount(front, minlength=len(parents))
+            wanted.append(np.split(np.argsort(front, kind="stable"), np.cumsum(sizes)[:-1]))
+        found, forms = np.zeros((*groups.shape, groups.shape[1])), np.zeros(len(columns))
         fronts: dict[int, tuple[Ints, Floats]] = {}
-        positions = place[at]
         for number in range(len(parents) - 1, -1, -1):
             begin, end = int(bounds[number]), int(bounds[number + 1])
             members, width = rows[starts[begin] : starts[begin + 1]], end - begin
             L = np.zeros((len(members), width))
             for k in range(width):
-                L[k:, k] = values[starts[begin + k] : starts[begin + k + 1]]
+                L[k:, k] = lower[starts[begin + k] : starts[begin + k + 1]]
             inverse = dtrtri(L[:width], lower=1, unitdiag=1)[0]
             Z = np.empty((len(members), len(members)))
             Z[:width, :width] = inverse.T @ (inverse / pivots[begin:end, None])
@@ -160,8 +163,24 @@ class Normal:
                     del fronts[parent]
             if children[number]:
                 fronts[number] = members, Z
-            for group in wanted.get(number, ()):
-                here = np.searchsorted(members, positions[group])
-                here[~known[group]] = 0
-                found[group] = Z[here[:, None], here]
-        return found
+            if len(which := wanted[0][number]):
+                here = np.searchsorted(members[:-1], places[0][which])
+                found[which] = Z[here[:, :, None], here[:, None, :]]
+            if len(which := wanted[1][number]):
+                here = np.searchsorted(members[:-1], places[1][which])
+                v = values[which]
+                forms[which] = np.einsum("mi,mij,mj->m", v, Z[here[:, :, None], here[:, None, :]], v)
+        return found, forms
+
+
+def _elimination(rows: Ints, blocks: Ints, count: int) -> Ints:
+    """Return the order of least fill between blocks (Liu's minimum degree, by a matrix of their neighbourhood)."""
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    early = blocks >= 0
+    met = csc_array((np.ones(early.sum()), (blocks[early], rows[early])), shape=(blocks.max() + 1, count))
+    met.data[:] = 1.0
+    beside = (met @ met.T).tocsc()
+    beside.setdiag(beside.sum(axis=0) + 1)
+    return np.asarray(splu(beside, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Literal, TypeAlias
@@ -145,7 +145,7 @@ class Observations:
         misfit, at, values = model.linear(x)
         for number in range(1 if linear else MOST_ITERATIONS):
             weights = model.weights(misfit) if number else model.sigma**-2
-            normal = Normal(at, values, weights, model.blocks)
+            normal = Normal(at, values, weights, model.blocks, normal)
             step = normal.solve(np.bincount(at[1], values * (weights * misfit)[at[0]], len(x)).astype(float))
             chi2 = float(weights @ misfit**2)
             for _ in range(MOST_HALVINGS):
@@ -169,7 +169,7 @@ class Observations:
         weights = model.sigma**-2 if linear else model.weights(misfit)
         # The last step was too short to turn the rows, but robust weights may have changed.
         if normal is None or (model.robust.any() and not linear):
-            normal = Normal(at, values, weights, model.blocks)
+            normal = Normal(at, values, weights, model.blocks, normal)
         return Solution(self, model, x, misfit, at, values, weights, normal)
 
 
@@ -196,6 +196,12 @@ class Model:
             self.base_m[known] = of.vectors_m[self.leg[self.lines][known]]
         self.by_reading = ~np.isnan(self.base_m[:, 0])
         self.heights = np.flatnonzero((self.kind >= _EAST) & (self.kind <= _UP))
+        # What is known beforehand of an unknown of robust observations: their long tails speak against it as well.
+        tailed = np.zeros(self.count, dtype=bool)
+        tailed[self.term_column[self.robust[self.term_row]]] = True
+        self.told_by_robust = np.zeros(len(self.value), dtype=bool)
+        alone = self.kind[self.term_row] == _NUMBER
+        self.told_by_robust[self.term_row[alone]] = tailed[self.term_column[alone]]
 
     def turn_to(self, x: Floats) -> None:
         """Take derivatives from now on at the places x, but at the readings where a leg is far from what it reads.
@@ -329,36 +335,25 @@ class Solution:
         return unknowns, derivatives
 
     @cached_property
-    def _inverses(self) -> Floats:
-        """The inverse between each row's unknowns, (m, k, k), and at last between each station's, in the same shape.
+    def _inverses(self) -> tuple[Floats, Floats]:
+        """Each station's covariance, (s, 3, 3), and each row's variance as the solution predicts it, (m,)."""
+        stations = np.arange(3 * self.model.stations).reshape(-1, 3)
+        return self.normal.blocks(stations, *self.design)
 
-        The last only where lines were observed: nothing else ties a station's east, north and up together.
-        """
-        unknowns, _ = self.design
-        if not (self.model.kind == DISTANCE).any():
-            return self.normal.blocks(unknowns)
-        stations = np.full((self.model.stations, max(unknowns.shape[1], 3)), -1)
-        stations[:, :3] = np.arange(3 * self.model.stations).reshape(-1, 3)
-        wide = np.pad(unknowns, ((0, 0), (0, stations.shape[1] - unknowns.shape[1])), constant_values=-1)
-        keys, back = np.unique(np.vstack([wide, stations]), axis=0, return_inverse=True)
-        return np.asarray(self.normal.blocks(keys)[back.ravel()])
-
-    @cached_property
+    @property
     def station_covariances(self) -> Floats:
         """Covariance of each station, (s, 3, 3)."""
-        found = self._inverses[len(self.misfit) :, :3, :3]
-        return np.asarray(
-            found if len(found) else self.normal.blocks(np.arange(3 * self.model.stations).reshape(-1, 3))
-        )
+        return self._inverses[0]
 
     @cached_property
     def redundancies(self) -> Floats:
         """Each observation's redundancy number, (m,): the share of its error that shows in its residual."""
-        _, derivatives = self.design
-        width = derivatives.shape[1]
-        blocks = self._inverses[: len(derivatives), :width, :width]
-        spread = np.einsum("mi,mij,mj->m", derivatives, blocks, derivatives)
-        return np.asarray(np.clip(1 - self.weights * spread, 0.0, 1.0))
+        return np.asarray(np.clip(1 - self.weights * self._inverses[1], 0.0, 1.0))
+
+    def variances(self, columns: Ints) -> Floats:
+        """Return the variances of unknowns, (c,)."""
+        nothing = np.empty((0, 1), dtype=np.int64)
+        return self.normal.blocks(columns[:, None], nothing, np.empty((0, 1)))[0][:, 0, 0]
 
     @cached_property
     def suspicion(self) -> Floats:
@@ -366,13 +361,12 @@ class Solution:
         r = self.redundancies
         return np.asarray(np.where(r > CHECKED, self.weights * self.misfit**2 / np.where(r > CHECKED, r, 1.0), 0.0))
 
-    def effect(self, columns: Iterable[tuple[Ints, Floats]]) -> tuple[Floats, Floats]:
-        """Return what errors would be worth: their estimates' information (h, q, q) and right sides (h, q).
+    def effect(self, errors: Sequence[tuple[Ints, Floats]]) -> list[float]:
+        """Return what errors explain, each a chi^2 of at most q degrees of freedom where it is not there.
 
-        columns: an error is a list of rows and the (r, q) changes of their readings by its q unknowns. Errors of one
-        call have the same q. T = b^T M^-1 b of an error is chi^2 with q degrees of freedom where it is not there.
+        An error: a list of rows, and the (r, q) changes of their readings by its q unknowns; all have the same q.
+        What no residual would show of it explains nothing.
         """
-        errors = list(columns)
         q = errors[0][1].shape[1]
         unknowns, derivatives = self.design
         push = np.zeros((len(self.x), q * len(errors)))
@@ -386,7 +380,14 @@ class Solution:
             part = np.einsum("rk,rq->rkq", derivatives[rows], weighed)[known]
             np.add.at(push, (where[known][:, None], np.arange(q) + q * number), part)
         moved = self.normal.solve(push)
+        explained = []
         for number in range(len(errors)):
             part = slice(q * number, q * number + q)
-            information[number] -= push[:, part].T @ moved[:, part]
-        return information, right
+            # Along axes of unit information, what is left of it is a redundancy number.
+            known_by, axes = np.linalg.eigh(information[number])
+            seen = known_by > CHECKED**2 * known_by[-1]
+            unit = axes[:, seen] / np.sqrt(known_by[seen])
+            shares, turned = np.linalg.eigh(np.eye(seen.sum()) - unit.T @ push[:, part].T @ moved[:, part] @ unit)
+            off = turned.T @ unit.T @ right[number]
+            explained.append(float((off[shares > CHECKED] ** 2 / shares[shares > CHECKED]).sum()))
+        return explained
