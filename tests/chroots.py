@@ -157,25 +157,30 @@ def setup_pi(system: System) -> None:
 
 
 def _stand_in(folder: Path) -> None:
-    """Make an apt archive of one package: picamera2, with no camera."""
+    """Make an apt archive of picamera2, with no camera, and of an empty lgpio, which Debian 12 has not."""
     shutil.rmtree(folder, ignore_errors=True)
-    tree = folder / "tree"
-    (tree / "DEBIAN").mkdir(parents=True)
-    control = (
-        f"Package: python3-picamera2\nVersion: {CAMERA_VERSION}\nArchitecture: all\nMaintainer: none <none@none>\n"
-    )
-    (tree / "DEBIAN" / "control").write_text(f"{control}Description: stand-in\n")
-    (tree / CAMERA).mkdir(parents=True)
-    (tree / CAMERA / "__init__.py").write_text("class Picamera2:\n    global_camera_info = staticmethod(list)\n")
-    about = tree / f"{CAMERA}-{CAMERA_VERSION}.dist-info" / "METADATA"
+    folder.mkdir()
+    camera, lgpio = folder / "python3-picamera2", folder / "python3-lgpio"
+    (camera / CAMERA).mkdir(parents=True)
+    (camera / CAMERA / "__init__.py").write_text("class Picamera2:\n    global_camera_info = staticmethod(list)\n")
+    about = camera / f"{CAMERA}-{CAMERA_VERSION}.dist-info" / "METADATA"
     about.parent.mkdir()
     about.write_text(f"Metadata-Version: 2.1\nName: picamera2\nVersion: {CAMERA_VERSION}\n")
-    made = folder / "picamera2.deb"
+    # "~": older than any version that Debian has.
+    listed = [_package(camera, CAMERA_VERSION), _package(lgpio, "0~stand-in")]
+    (folder / "Packages").write_text("\n".join(listed))
+
+
+def _package(tree: Path, version: str) -> str:
+    """Make a package of a folder; return its entry in the archive's list."""
+    control = f"Package: {tree.name}\nVersion: {version}\nArchitecture: all\nMaintainer: none <none@none>\n"
+    (tree / "DEBIAN").mkdir(parents=True)
+    (tree / "DEBIAN" / "control").write_text(f"{control}Description: stand-in\n")
+    made = tree.with_suffix(".deb")
     subprocess.run(["dpkg-deb", "--build", "-Zxz", tree, made], check=True, stdout=subprocess.DEVNULL)
-    shutil.rmtree(tree)
     content = made.read_bytes()
     listed = f"Filename: ./{made.name}\nSize: {len(content)}\nSHA256: {hashlib.sha256(content).hexdigest()}\n"
-    (folder / "Packages").write_text(f"{control}{listed}Description: stand-in\n")
+    return f"{control}{listed}Description: stand-in\n"
 
 
 def main() -> int:
