@@ -12,7 +12,7 @@ PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off 
 # picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
 VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
-.PHONY: demo test coverage docs release install names clean
+.PHONY: demo test matrix coverage docs release install names clean
 
 demo: .venv/.run
 	$(BIN)/buddyline demo $(ARGS)
@@ -23,6 +23,10 @@ test: .venv/.test names
 	$(BIN)/mypy
 	cd build/names && ../../$(BIN)/lint-imports --config ../../pyproject.toml
 	$(BIN)/pytest
+
+# The same tests on each Python, and with the lowest and the newest packages: five times as long.
+matrix: .venv/.test
+	$(BIN)/python -m tests.matrix $(ARGS)
 
 # Traced, everything takes half as long again: too slow for the viewer of the soak on a slow machine.
 coverage: .venv/.test

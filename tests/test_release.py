@@ -7,12 +7,13 @@ import os
 import re
 import shutil
 import subprocess
+import tarfile
 from pathlib import Path
 
 import pytest
 
 from tests.processes import PATIENCE_S
-from tests.wheels import copy_sources
+from tests.wheels import PIP, copy_sources, run
 
 pytestmark = [
     pytest.mark.slow,
@@ -68,12 +69,21 @@ def test_a_tag_becomes_a_release(checkout: Checkout) -> None:
         pytest.skip("the tools of a release cannot be fetched from here")
     assert done.returncode == 0, done.stdout + done.stderr
     dist = checkout.folder / "dist"
-    assert {path.suffix for path in dist.glob("buddyline-7.8.9*")} == {".whl", ".gz", ".json", ".md", ".txt"}
+    suffixes = {".whl", ".gz", ".json", ".md", ".txt", ".bash", ".zsh"}
+    assert {path.suffix for path in dist.glob("buddyline-7.8.9*")} == suffixes
+    names = {name.partition("/")[2] for name in tarfile.open(dist / "buddyline-7.8.9.tar.gz").getnames()}
+    for name in ("docs/tutorial.md", "examples/01_solve_a_dive.py", "node/examples/pi.toml", "tools/sample.mcap"):
+        assert name in names
+    assert "solve" in (dist / "buddyline-7.8.9.bash").read_text()
     parts = json.loads((dist / "buddyline-7.8.9.cdx.json").read_text())["components"]
     assert {"buddyline", "numpy", "eclipse-zenoh", "mcap"} <= {part["name"] for part in parts}
     pinned = (dist / "buddyline-7.8.9.requirements.txt").read_text()
     assert re.search(r"^numpy==\S+( \\\n    --hash=sha256:[0-9a-f]{64}){6}$", pinned, re.MULTILINE)
     assert "://" not in pinned
+    assert re.search(r"^cryptography==\S+ \\$", pinned, re.MULTILINE), "the extras are missing"
+    fleet = ("install", "--dry-run", "--ignore-installed", "--require-hashes", "--only-binary", ":all:")
+    done = run(*PIP, *fleet, "-r", dist / "buddyline-7.8.9.requirements.txt", cwd=dist)
+    assert done.returncode == 0, done.stderr
     assert "### Poses" in (dist / "buddyline-7.8.9.notes.md").read_text()
     subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=dist, check=True)
     assert "dist exists" in checkout.release().stderr

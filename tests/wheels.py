@@ -1,14 +1,16 @@
-"""Our wheel, built from the files that git knows."""
+"""Our wheel, built from the files that git knows, and the Pythons of this machine."""
 
 import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.processes import REPOSITORY
 
+PYTHONS = ("3.11", "3.12", "3.13")
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 
 
@@ -16,6 +18,19 @@ def run(*words, cwd):
     """Run a program without this repository on its path; return the finished process."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     return subprocess.run(words, capture_output=True, text=True, timeout=600, check=False, cwd=cwd, env=environment)
+
+
+def interpreter(version):
+    """Return a Python of a version such as 3.12, from the path or pyenv; None where there is none."""
+    if version == f"{sys.version_info.major}.{sys.version_info.minor}":
+        return Path(sys.executable)
+    found = shutil.which(f"python{version}")
+    others = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python{version}"))
+    # One on the path may be pyenv's own, which runs no Python that is not chosen.
+    works = (
+        Path(one) for one in (found, *others) if one and run(one, "-c", "import ensurepip", cwd=".").returncode == 0
+    )
+    return next(works, None)
 
 
 def copy_sources(folder):

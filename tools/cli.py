@@ -38,17 +38,21 @@ class Command:
 
     def parser(self) -> argparse.ArgumentParser:
         """Return the command's parser."""
-        from buddyline.tools import arguments
-
         parser = argparse.ArgumentParser(
             prog=f"buddyline {self.name}",
             description=f"{self.does[0].upper()}{self.does[1:]}.",
             epilog="\n  ".join(["examples:", *(f"buddyline {example}" for example in self.examples)]),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        self.declare(parser)
+        return parser
+
+    def declare(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the command's arguments."""
+        from buddyline.tools import arguments
+
         declare = getattr(arguments, self.name, None) or import_module(self.path).add_arguments
         declare(parser)
-        return parser
 
     def run(self, words: Sequence[str]) -> int:
         """Run it with the words that follow its name; return the exit status."""
@@ -222,6 +226,11 @@ COMMANDS: Final = (
         "repeat the paper's figures and numbers, with ours beside them, in one report",
         ("experiments -o report/ --quick", "experiments -o report/ --tag-video test_vid.mp4"),
         "tools.experiments.command",
+    ),
+    Command(
+        "completion",
+        "print what a shell needs to complete commands and options at the tab key",
+        ("completion bash > ~/.local/share/bash-completion/completions/buddyline",),
     ),
 )
 
