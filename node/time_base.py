@@ -117,7 +117,7 @@ def wait_for_time(
             why = "" if tracking is None or tracking.synchronised else "chrony has no source"
         except ChronyError as error:
             why = str(error)
-        if not why or _is_set(rtc):
+        if not why or is_kept(rtc):
             return True
         if boottime() > TIME_WITHIN_NS:
             log.warning("clock: %s and there is no clock chip: stamps count from the last time this machine knew", why)
@@ -129,7 +129,7 @@ def wait_for_time(
     return False
 
 
-def _is_set(rtc: Path) -> bool:
+def is_kept(rtc: Path = RTC) -> bool:
     """Return whether the kernel has set the clock from this chip, and the chip has kept the time."""
     try:
         hctosys, since_epoch = ((rtc / name).read_text().strip() for name in ("hctosys", "since_epoch"))

@@ -6,25 +6,26 @@ For two nodes that never heard each other during the dive: everything that is do
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import logging
 from collections.abc import Iterable
-from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from buddyline.node.choices import DETECTORS
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import parse_key
+from buddyline.solver_service.track.clocks import Clocks
+from buddyline.tools.align import clocks_json, clocks_of
 from buddyline.tools.clock_curves import LEAST_OFFSET_S, beacon_curves
 from buddyline.tools.clock_sets import ClockSets
 from buddyline.tools.dives import Dive
 from buddyline.tools.losses import collected
 from buddyline.tools.losses import report as report_losses
+from buddyline.tools.solve import pair_of
 
 log = logging.getLogger(__name__)
 
@@ -141,26 +142,27 @@ def _clock_words(logs: list[str], file: Path) -> list[str]:
     """
     with Dive(logs) as dive:
         beacons = beacon_curves(dive, dive.nodes("candidates", "image"))
-    if beacons and beacons[0].covers:
+        if beacons and beacons[0].covers:
+            return []
+        try:
+            pair = pair_of(dive, None)
+            found = clocks_of(dive, pair, DETECTORS[0], "auto")
+        except BuddylineError as error:
+            log.info("clocks: `align` does not tell: %s", error)
+            found = None
+    if found is None:
+        if not beacons:
+            log.warning(
+                "clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set"
+            )
         return []
-    said = io.StringIO()
-    try:
-        with redirect_stdout(said):
-            status = run_command(["align", *logs, "--json"])
-    except BuddylineError as error:
-        log.info("clocks: `align` does not tell: %s", error)
-        status = 2
-    if status == 0:
-        told = json.loads(said.getvalue())
-        drift = "" if told.get("drift") is None else f", gaining {1e6 * told['drift']:+.1f} us a second"
-        log.info("clocks: %s's is %+.2f ms from %s's%s, by `align`", told["node_b"], 1e3 * told["offset_s"],
-                 told["node_a"], drift)  # fmt: skip
-        if abs(told["offset_s"]) > LEAST_OFFSET_S or drift:
-            file.write_text(said.getvalue())
-            return ["--clocks", str(file)]
-    elif not beacons:
-        log.warning("clocks: neither beacons nor the dive tell their offset; poses are as good as the clocks were set")
-    return []
+    drift = found.drift if isinstance(found, Clocks) else None
+    log.info("clocks: %s's is %+.2f ms from %s's%s, by `align`", pair[1], 1e3 * found.offset_s, pair[0],
+             "" if drift is None else f", gaining {1e6 * drift:+.1f} us a second")  # fmt: skip
+    if abs(found.offset_s) <= LEAST_OFFSET_S and drift is None:
+        return []
+    file.write_text(clocks_json(pair, found))
+    return ["--clocks", str(file)]
 
 
 def run_command(words: list[str]) -> int:

@@ -27,29 +27,40 @@ PASSES: Final = 4
 def run(args: argparse.Namespace) -> int:
     """Estimate offset and drift; return 1 where the dive does not tell the offset."""
     with Dive(args.dives) as dive:
-        pair = node_a, node_b = pair_of(dive, args.nodes)
-        found = _pass(dive, args, pair, 0.0, 1)
-        # By gaps alone, each pass corrects B's times by the offset found so far, until what is left is below its sigma.
-        number, left = 1, found
-        while isinstance(found, ClockOffset) and left is not None and number < PASSES:
-            if abs(left.offset_s) < 0.1 * left.sigma_s:
-                break
-            number += 1
-            left = _pass(dive, args, pair, found.offset_s, number)
-            found = left and ClockOffset(found.offset_s + left.offset_s, left.sigma_s, left.fixes)
+        pair = pair_of(dive, args.nodes)
+        found = clocks_of(dive, pair, args.detector, args.environment)
     if found is None:
         log.error("align: the fixes do not tell the offset: they are too few, or the pair did not move")
         return 1
     if args.json:
-        print(json.dumps({"node_a": node_a, "node_b": node_b, **asdict(found)}))
+        print(clocks_json(pair, found))
     else:
         print(
-            f"the clock of {node_b} is {found.offset_s * 1e3:+.2f} ms from that of {node_a} "
+            f"the clock of {pair[1]} is {found.offset_s * 1e3:+.2f} ms from that of {pair[0]} "
             f"(1 sd {found.sigma_s * 1e3:.2f} ms, {found.fixes} fixes)\n"
             f"{_drift_text(found)}\n"
             f"{_solve_text(found)}"
         )
     return 0
+
+
+def clocks_of(dive: Dive, pair: tuple[str, str], detector: str, environment: str) -> Clocks | ClockOffset | None:
+    """Return what the dive tells of the clocks of a pair, None for nothing; raise BuddylineError for no fix."""
+    left = found = _pass(dive, pair, detector, environment, 0.0, 1)
+    # By gaps alone, each pass corrects B's times by the offset found so far, until what is left is below its sigma.
+    number = 1
+    while isinstance(found, ClockOffset) and left is not None and number < PASSES:
+        if abs(left.offset_s) < 0.1 * left.sigma_s:
+            break
+        number += 1
+        left = _pass(dive, pair, detector, environment, found.offset_s, number)
+        found = left and ClockOffset(found.offset_s + left.offset_s, left.sigma_s, left.fixes)
+    return found
+
+
+def clocks_json(pair: tuple[str, str], found: Clocks | ClockOffset) -> str:
+    """Return it as `solve --clocks` reads it."""
+    return json.dumps({"node_a": pair[0], "node_b": pair[1], **asdict(found)})
 
 
 def _drift_text(found: Clocks | ClockOffset) -> str:
@@ -69,14 +80,15 @@ def _solve_text(found: Clocks | ClockOffset) -> str:
 
 
 def _pass(
-    dive: Dive, args: argparse.Namespace, pair: tuple[str, str], offset_s: float, number: int
+    dive: Dive, pair: tuple[str, str], detector: str, environment: str, offset_s: float, number: int
 ) -> Clocks | ClockOffset | None:
     settings = SolveConfig(skew_sigma_s=SKEW_SIGMA_S).settings("align")
     clocks = {pair[1]: ClockCurve.constant(offset_s)}
     # The track finds any offset in one pass; later ones are by gaps.
     track = track_settings("smooth", 1.0) if number == 1 else None
     core = SolverCore(settings, [pair], clocks, align=True, track=track)
-    for envelope in messages_of(dive, args, dive.infos(), *pair, doing=f"align, pass {number}"):
+    doing = f"align, pass {number}"
+    for envelope in messages_of(dive, dive.infos(), *pair, detector=detector, environment=environment, doing=doing):
         core.handle(envelope.message)
     found = core.pairs[pair].clocks()
     if not core.counts["solved"]:

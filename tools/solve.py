@@ -66,7 +66,10 @@ def run(args: argparse.Namespace) -> int:
             for info in replaced.values():
                 core.handle(info)
                 writer.write_message(info, dive.start_ns)
-            envelopes = messages_of(dive, args, infos, *dict.fromkeys([*nodes, *lone]), doing="solve")
+            wanted = dict.fromkeys([*nodes, *lone])
+            envelopes = messages_of(
+                dive, infos, *wanted, detector=args.detector, environment=args.environment, doing="solve"
+            )
             if attitudes:
                 from buddyline.tools.attitudes import in_place_of
 
@@ -151,23 +154,23 @@ def _with_info(dive: Dive, nodes: list[str], infos: Mapping[str, NodeInfo], *, g
 
 
 def messages_of(
-    dive: Dive, args: argparse.Namespace, infos: dict[str, NodeInfo], *nodes: str, doing: str
+    dive: Dive, infos: dict[str, NodeInfo], *nodes: str, detector: str, environment: str, doing: str
 ) -> Iterator[Envelope]:
     """Yield the messages for solver and output; pictures of a node without candidates are detected."""
     raw = [node for node in nodes if node in dive.nodes("image") and node not in dive.nodes("candidates")]
-    detector = None
+    finder = None
     if raw:
         from buddyline.tools.detect import DiveDetector, recorded_masks
 
-        detector = DiveDetector(args.detector, args.environment, infos, recorded_masks(dive))
+        finder = DiveDetector(detector, environment, infos, recorded_masks(dive))
     topics = (*COPIED, "image") if raw else COPIED
     for envelope in dive.messages(*topics, doing=doing):
         if len(envelope.ids) == 1 and envelope.node not in nodes:
             continue
         if not isinstance(envelope.message, CompressedImage):
             yield envelope
-        elif detector is not None and envelope.node in raw:
-            found = detector.candidates(envelope)
+        elif finder is not None and envelope.node in raw:
+            found = finder.candidates(envelope)
             if found is not None:
                 yield found
 

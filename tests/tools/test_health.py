@@ -48,6 +48,13 @@ def test_clock(line, error, timesyncd, stamps, level):
     assert bool(found.advice) == (level != "ok")
 
 
+@pytest.mark.parametrize(
+    ("kept", "stamps", "level"), [(True, True, "ok"), (False, True, "warning"), (False, False, "skipped")]
+)
+def test_clock_chip(kept, stamps, level):
+    assert judge_machine.clock_chip(kept=kept, stamps=stamps).level == level
+
+
 @pytest.mark.parametrize(("degc", "level"), [(None, "skipped"), (45.0, "ok"), (72.0, "warning"), (80.0, "problem")])
 def test_temperature(degc, level):
     assert judge_machine.temperature(degc).level == level

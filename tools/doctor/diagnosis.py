@@ -13,6 +13,7 @@ from typing import Final
 from buddyline.node.chrony import ChronyError, read_tracking
 from buddyline.node.config import NodeConfig, load_node_config
 from buddyline.node.power.board import Throttled, temperature_degc
+from buddyline.node.time_base import is_kept
 from buddyline.protocol.config import load_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.client import ClientConfig
@@ -69,7 +70,7 @@ def diagnose(node: NodeConfig | None, client: ClientConfig) -> list[Finding]:
 
 
 def check_machine(node: NodeConfig | None) -> list[Finding]:
-    """Check clock, disk, temperature and power."""
+    """Check clock, clock chip, disk, temperature and power."""
     tracking, error = None, ""
     try:
         tracking = read_tracking()
@@ -82,6 +83,7 @@ def check_machine(node: NodeConfig | None) -> list[Finding]:
     min_free_bytes = node.record.min_free_mb * 1_000_000 if node else 0
     return [
         judge.clock(tracking, error, machine.timesyncd(), stamps=stamps),
+        judge.clock_chip(kept=is_kept(), stamps=stamps),
         judge.disk(str(directory.absolute()), free_bytes, min_free_bytes, rate_px, unwritable),
         judge.temperature(temperature_degc()),
         judge.power(Throttled().read()),

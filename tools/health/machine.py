@@ -64,6 +64,20 @@ def clock(tracking: Tracking | None, error: str, timesyncd: bool, *, stamps: boo
     return Finding("clock", "ok", text)
 
 
+def clock_chip(*, kept: bool, stamps: bool) -> Finding:
+    """Judge whether the time outlives a night without power. kept: a chip has given it; stamps: as for `clock`."""
+    if not stamps:
+        return Finding("clock chip", "skipped", "this machine stamps no pictures")
+    if kept:
+        return Finding("clock chip", "ok", "the time of the start is a clock chip's")
+    return Finding(
+        "clock chip",
+        "warning",
+        "none: after the start the time is that of the last shutdown, until chrony has a source",
+        "start with the tether connected, or add one: node/README.md, Synchronise the clocks",
+    )
+
+
 def temperature(degc: float | None) -> Finding:
     """Judge the processor's temperature."""
     if degc is None:
