@@ -5,16 +5,18 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.config import NodeConfig
 from buddyline.node.guide import Guide
+from buddyline.node.log_desk import LogDesk
 from buddyline.node.outlet import Outlet
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
-from buddyline.protocol.topics import EXPECT
+from buddyline.protocol.topics import EXPECT, LOG
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -40,6 +42,7 @@ class HubConnection:
         self._outlet = outlet
         self._clock_sync = clock_sync
         self._guide = guide
+        self._desk = LogDesk(Path(config.record.directory), config.node)
 
     @property
     def problem(self) -> str:
@@ -76,6 +79,7 @@ class HubConnection:
                 bus.subscribe(EXPECT.key(config.node), self._guide.hear, history=False)
                 bus.watch_alive(self._guide.saw_process)
             self._clock_sync.listen(bus)
+            bus.answer(LOG.format(node=config.node), self._desk.answer)
             stop.wait()
             self._outlet.disconnect()
 

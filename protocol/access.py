@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from buddyline.protocol.security import PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
-from buddyline.protocol.topics import EXPECT, TOPICS, Topic
+from buddyline.protocol.topics import EXPECT, LOG, TOPICS, Topic
 
 _ASK: Final = ["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"]
 # The keys that `ros2` publishes: domain, topic, type, and the type's hash. They have more chunks than any Buddyline
@@ -42,7 +42,7 @@ def access_rules(nodes: Iterable[str], namespace: str = "", shut_out: Iterable[s
     ]
     policies: list[dict[str, object]] = [{"rules": ["ask", "hear"], "subjects": clients}]
     for name, keys, alive in [
-        *((node_name(node), [_short(topic, node) for topic in _OF_NODES], f"node/{node}") for node in nodes),
+        *((node_name(node), _said_by(node), f"node/{node}") for node in nodes),
         (SOLVER, ["pair/*/*/*", "net/*/*", _short(EXPECT, "*")], "solver"),
         (VIEWER, [], "viewer"),
         (SURVEYOR, ["node/*/mark"], "surveyor"),
@@ -67,6 +67,11 @@ def access_rules(nodes: Iterable[str], namespace: str = "", shut_out: Iterable[s
         "subjects": [{"id": name, "cert_common_names": [name]} for name in clients],
         "policies": policies,
     }
+
+
+def _said_by(node: str) -> list[str]:
+    """Return the keys of a node below the root: its topics, and the one on which it answers from its log."""
+    return [*(_short(topic, node) for topic in _OF_NODES), LOG.removeprefix("buddyline/").format(node=node)]
 
 
 def _short(topic: Topic, node: str) -> str:

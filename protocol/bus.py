@@ -10,7 +10,7 @@ import math
 import re
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Final, Protocol, Self, TypeAlias
@@ -171,6 +171,18 @@ class Bus(ABC):
     @abstractmethod
     def hub(self) -> str | None:
         """An id of the hub's process, to which this one is connected; None while it is cut off."""
+
+    @abstractmethod
+    def answer(self, key: str, reply: Callable[[str], Iterable[bytes]]) -> None:
+        """Answer questions on key until the bus closes: reply returns the payloads of an answer to a question's text.
+
+        In a thread of its own, one question at a time, and with what the link has to spare: a payload may wait, and the
+        rest of an answer that waits too long is left out. An exception in reply becomes the bus's failure.
+        """
+
+    @abstractmethod
+    def ask(self, key: str, text: str, timeout_s: float) -> list[bytes]:
+        """Ask a question on key; return what has come of the answer within this time, in its order."""
 
     @property
     def shed(self) -> dict[str, int]:

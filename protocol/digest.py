@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
 
@@ -24,6 +24,8 @@ LATE_NS: Final = 10 * S_NS
 # Messages that wait for their digest, of one topic of one node: minutes.
 MAX_WAITING: Final = 20_000
 MAX_NODES: Final = 256
+# Digests of a boot that may come late: a day's.
+MAX_ABSENT: Final = 86_400
 _SIGNATURE: Final = b',"signature":"'
 
 # A node's certificate, the signature and what is signed -> why it is not valid; "" if it is.
@@ -34,6 +36,11 @@ Kind = Literal["altered", "missing", "unsigned"]
 def is_covered(topic: Topic) -> bool:
     """Return whether digests cover a topic: what only the node itself says. Surveyors set marks for a node, too."""
     return topic.id_fields == ("node",) and not topic.solved and topic not in (DIGEST, MARK)
+
+
+def end_of(topic: Topic) -> str:
+    """Return the last chunk of a topic's keys."""
+    return topic.template.rpartition("/")[2]
 
 
 class DigestBook:
@@ -51,13 +58,14 @@ class DigestBook:
         """Take a message that the node says."""
         if not is_covered(topic):
             return
-        count, first_ns, last_ns, hashed = self._open.get(topic.name, (0, stamp_ns, -1, hashlib.sha256()))
+        name = end_of(topic)
+        count, first_ns, last_ns, hashed = self._open.get(name, (0, stamp_ns, -1, hashlib.sha256()))
         # Pictures are recorded and shown each at its own rate: each is a stretch of its own.
         if count and (stamp_ns <= last_ns or topic is IMAGE):
-            self._end(topic.name)
+            self._end(name)
             count, first_ns, hashed = 0, stamp_ns, hashlib.sha256()
         hashed.update(hashlib.sha256(payload).digest())
-        self._open[topic.name] = count + 1, first_ns, stamp_ns, hashed
+        self._open[name] = count + 1, first_ns, stamp_ns, hashed
 
     @property
     def is_full(self) -> bool:
@@ -119,7 +127,7 @@ class Discrepancy:
     kind: altered: it is not what the node wrote. missing: not all of it is there, so the rest is not verified.
     unsigned: nobody vouches for it. since_ns, until_ns: the digest's second, by the node's clock; of messages without
     one, the second of their log times.
-    stretch: the one that is wrong; None: a digest is. have: the checksums of what is there of it.
+    stretch: the one that is wrong; None: a digest is. have: the log times of what is there of it, by checksum.
     """
 
     node: str
@@ -129,7 +137,16 @@ class Discrepancy:
     words: str
     boot: str = ""
     stretch: Said | None = None
-    have: frozenset[bytes] = frozenset()
+    have: Mapping[bytes, int] = field(default_factory=dict)
+
+
+class _Due(NamedTuple):
+    """A digest that is to be judged. time_ns: its log time."""
+
+    time_ns: int
+    digest: Digest
+    signed: bytes
+    signature: str
 
 
 @dataclass
@@ -142,7 +159,11 @@ class Checked:
     waiting: dict[str, list[Undigested]] = field(default_factory=lambda: defaultdict(list))
     # By boot: the newest judged digest.
     newest: dict[str, Digest] = field(default_factory=dict)
-    due: list[tuple[int, bytes]] = field(default_factory=list)
+    # By boot: the numbers of the digests that are missing before that.
+    absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
+    due: list[_Due] = field(default_factory=list)
+    # By topic: the checksum of the newest stretch that was right.
+    right: dict[str, str] = field(default_factory=dict)
     # Where the first digest begins, if the log begins amid the node's run; else 0.
     begins_ns: int = 0
 
@@ -168,23 +189,27 @@ class DigestCheck:
             return
         of = self.nodes.setdefault(node, Checked())
         if topic is DIGEST:
-            of.due.append((time_ns, payload))
+            try:
+                _insert(of.due, _Due(time_ns, *unsealed(key, payload)))
+            except MessageError as error:
+                words = f"a digest cannot be read: {error}"
+                yield Discrepancy(node, "altered", time_ns - S_NS, time_ns, words)
         else:
             if topic is INFO:
                 _take_certificate(of, key, payload)
             one = Undigested(payload_stamp_ns(payload) or 0, time_ns, hashlib.sha256(payload).digest())
-            waiting = of.waiting[topic.name]
+            waiting = of.waiting[end_of(topic)]
             waiting.append(one)
             if len(waiting) > MAX_WAITING:
-                yield from _leftover(node, of, topic.name, [waiting.pop(0)])
-        while of.due and (of.due[0][0] + LATE_NS < time_ns or len(of.due) > MAX_WAITING):
-            yield from self._judge(node, of, *of.due.pop(0))
+                yield from _leftover(node, of, end_of(topic), [waiting.pop(0)])
+        while of.due and (of.due[0].time_ns + LATE_NS < time_ns or len(of.due) > MAX_WAITING):
+            yield from self._judge(node, of, of.due.pop(0))
 
     def finish(self) -> Iterator[Discrepancy]:
         """Yield what is wrong with the rest, at the log's end."""
         for node, of in self.nodes.items():
             for due in of.due:
-                yield from self._judge(node, of, *due)
+                yield from self._judge(node, of, due)
             of.due.clear()
             for topic, waiting in of.waiting.items():
                 yield from _leftover(node, of, topic, waiting)
@@ -194,14 +219,10 @@ class DigestCheck:
                     words = "the log ends without the node's last digest: what came after is not known"
                     yield Discrepancy(node, "unsigned", digest.stamp_ns, digest.stamp_ns, words, boot)
 
-    def _judge(self, node: str, of: Checked, time_ns: int, payload: bytes) -> Iterator[Discrepancy]:
+    def _judge(self, node: str, of: Checked, due: _Due) -> Iterator[Discrepancy]:
+        time_ns, digest, signed, signature = due
         # What is not the node's says nothing of time.
         second = time_ns - S_NS, time_ns
-        try:
-            digest, signed, signature = unsealed(DIGEST.key(node), payload)
-        except MessageError as error:
-            yield Discrepancy(node, "altered", *second, f"a digest cannot be read: {error}")
-            return
         why = self._why_refused(node, of, signature, signed)
         if why:
             yield Discrepancy(node, "altered", *second, f"a digest is not the node's: {why}")
@@ -209,9 +230,16 @@ class DigestCheck:
         if not signature and self._must_sign:
             yield Discrepancy(node, "unsigned", digest.since_ns, digest.stamp_ns, "is not signed", digest.boot)
         newest = of.newest.get(digest.boot)
-        if newest is not None and digest.seq <= newest.seq:
+        absent = of.absent[digest.boot]
+        if newest is not None and digest.seq <= newest.seq and digest.seq not in absent:
             yield Discrepancy(node, "altered", *second, "a digest comes again, or late")
             return
+        if newest is None and of.newest:
+            # The end of its run before may be in its log alone.
+            before = max(of.newest.values(), key=lambda one: one.stamp_ns)
+            if before.last is UNSET and before.stamp_ns < digest.since_ns:
+                words = "the end of the node's run before is missing"
+                yield Discrepancy(node, "missing", before.stamp_ns, digest.since_ns, words, before.boot)
         if newest is None and digest.seq:
             of.begins_ns = of.begins_ns if of.newest else digest.since_ns
             words = f"the log has nothing of the node's first {digest.seq} s"
@@ -219,7 +247,10 @@ class DigestCheck:
         elif newest is not None and digest.seq > newest.seq + 1:
             words = f"{digest.seq - newest.seq - 1} digests are missing"
             yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
-        of.newest[digest.boot] = digest
+            absent.update(range(newest.seq + 1, min(digest.seq, newest.seq + MAX_ABSENT)))
+        absent.discard(digest.seq)
+        if newest is None or digest.seq > newest.seq:
+            of.newest[digest.boot] = digest
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
         yield from found
         if not found:
@@ -233,6 +264,14 @@ class DigestCheck:
             return "no calibration of the node has its certificate"
         whys = [self._refuses(node, certificate, signature, signed) for certificate in of.certificates]
         return "" if "" in whys else whys[-1]
+
+
+def _insert(due: list[_Due], new: _Due) -> None:
+    """Put a digest in its place: one that came late goes before the later ones of its boot that wait."""
+    at = len(due)
+    while at and due[at - 1].digest.boot == new.digest.boot and due[at - 1].digest.seq > new.digest.seq:
+        at -= 1
+    due.insert(at, new)
 
 
 def _take_certificate(of: Checked, key: str, payload: bytes) -> None:
@@ -260,7 +299,10 @@ def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[
         found = inside[begin : begin + stretch.count]
         if sum_of([one.sha256 for one in found]) == stretch.sha256:
             _remove(of, stretch.topic, found)
+            of.right[stretch.topic] = stretch.sha256
             return
+    if not inside and of.right.get(stretch.topic) == stretch.sha256:
+        return  # the same message said again, which logs that were put together have once
     if stretch.topic == IMAGE.name:
         return  # pictures are not all recorded, and not all kept; what is there without a digest is named
     distinct = list({one.sha256: one for one in inside}.values())
@@ -273,7 +315,7 @@ def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[
         kind, words = "missing", f"{stretch.topic}: {stretch.count - len(distinct)} of {stretch.count} are missing"
     else:
         words = f"{stretch.topic}: other messages than the node's"
-    have = frozenset(one.sha256 for one in distinct)
+    have = {one.sha256: one.time_ns for one in distinct}
     yield Discrepancy(node, kind, digest.since_ns, digest.stamp_ns, words, digest.boot, stretch, have)
 
 
@@ -287,7 +329,8 @@ def _leftover(node: str, of: Checked, topic: str, left: list[Undigested]) -> Ite
     if not of.newest:
         return  # the whole node is not signed
     ended = all(digest.last is not UNSET for digest in of.newest.values())
-    ends_ns = max(digest.stamp_ns for digest in of.newest.values())
+    # What is sent after the last digest was measured at most a second before.
+    ends_ns = max(digest.stamp_ns for digest in of.newest.values()) - S_NS
     seconds: dict[tuple[int, Kind], int] = defaultdict(int)
     for one in left:
         outside = one.stamp_ns < of.begins_ns or (one.stamp_ns >= ends_ns and not ended)

@@ -30,6 +30,8 @@ OVERHEAD_BYTES: Final = 100
 # By Topic.shed: a message is left out where the budget of a second is used up to this share of it.
 _RESERVES: Final = (-1.0, 0.9, 0.6, 0.3, 0.1)
 WORDS_S: Final = 10.0
+# What can wait for hours goes only where so much of a second's budget is left.
+SPARE_SHARE: Final = 0.8
 
 
 class LinkBudget:
@@ -86,6 +88,18 @@ class LinkBudget:
             self._refill(now_s, self._limit)
             self._tokens = max(self._tokens - size_bytes - OVERHEAD_BYTES, -self._limit)
             self._offered += size_bytes + OVERHEAD_BYTES
+            return True
+
+    def admits_spare(self, size_bytes: int, now_s: float) -> bool:
+        """Return whether the link has room for what can wait; if so, count it as sent."""
+        cost = float(size_bytes + OVERHEAD_BYTES)
+        with self._lock:
+            if self._limit is not None:
+                self._refill(now_s, self._limit)
+                if self._tokens < SPARE_SHARE * self._limit:
+                    return False
+                self._tokens = max(self._tokens - cost, -self._limit)
+            self._offered += cost
             return True
 
     def observe(self, state: TcpState, now_s: float) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from buddyline.protocol.bus import (
     CACHE_S,
@@ -58,6 +58,7 @@ class LocalNetwork:
         self.watches: list[LocalWatch] = []
         self.alive: list[tuple[str, LocalBus]] = []
         self.newest: dict[str, tuple[Topic, bytes]] = {}
+        self.answers: dict[str, tuple[LocalBus, Callable[[str], Iterable[bytes]]]] = {}
 
     def connect(self) -> LocalBus:
         """Return a new client."""
@@ -194,6 +195,17 @@ class LocalBus(Bus):
         now_ns = self.clock.now_ns()
         return [Received(key, payload, now_ns, of.encoding) for key, (of, payload) in held if of is topic]
 
+    def answer(self, key: str, reply: Callable[[str], Iterable[bytes]]) -> None:
+        """Answer questions on key until the bus closes."""
+        with self._network.lock:
+            self._network.answers[key] = self, reply
+
+    def ask(self, key: str, text: str, timeout_s: float) -> list[bytes]:
+        """Ask a question on key; return the answer."""
+        with self._network.lock:
+            found = self._network.answers.get(key)
+        return [] if found is None else list(found[1](text))
+
     def declare_alive(self, name: str) -> None:
         """Show others that this process is alive, until it closes the bus."""
         check_alive_name(name)
@@ -234,6 +246,7 @@ class LocalBus(Bus):
 
     def _leave(self) -> None:
         with self._network.lock:
+            self._network.answers = {key: one for key, one in self._network.answers.items() if one[0] is not self}
             own = {name for name, bus in self._network.alive if bus is self}
             self._network.alive = [entry for entry in self._network.alive if entry[1] is not self]
             for name in own - {name for name, _ in self._network.alive}:

@@ -70,7 +70,7 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
     offset = suspect = len(MAGIC)
     while offset < size:
         try:
-            end, found, last = _record_at(file, offset, size)
+            end, found, last = record_at(file, offset, size)
         except MalformedError as error:
             resumed = _resume(file, suspect, offset, size)
             if resumed is None:
@@ -93,7 +93,7 @@ def walk(file: IO[bytes], size: int, note: Callable[[str], None]) -> Iterator[Fo
     note(f"ends at byte {size} without having been closed")
 
 
-def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
+def record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | None, bool]:
     """Return the record's end, its content (None for kinds that no reader uses), and whether it is the last one."""
     file.seek(offset)
     head = file.read(_HEAD_BYTES)
@@ -128,7 +128,7 @@ def _record_at(file: IO[bytes], offset: int, size: int) -> tuple[int, Found | No
 
 def read_chunk(file: IO[bytes], offset: int, size: int) -> list[McapMessage | Schema | Channel]:
     """Return the records of the chunk at offset; raise MalformedError, or its compression's or checksum's error."""
-    end, found, _ = _record_at(file, offset, size)
+    end, found, _ = record_at(file, offset, size)
     if not isinstance(found, ChunkAt):
         raise MalformedError("no chunk where the index says")
     file.seek(offset + _HEAD_BYTES)
@@ -193,7 +193,7 @@ def _resume(file: IO[bytes], begin: int, damaged: int, size: int) -> int | None:
             offset = match.start()
             del match
             try:
-                _, found, _ = _record_at(file, offset, size)
+                _, found, _ = record_at(file, offset, size)
             except MalformedError:
                 pass
             else:

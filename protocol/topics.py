@@ -254,6 +254,8 @@ TOPICS: Final = (
 )
 
 EVERYTHING: Final = "buddyline/**"
+# On this key a node answers questions about its own log (protocol/log_pages.py); no message is published on it.
+LOG: Final = "buddyline/node/{node}/log"
 
 _NODE_ID = re.compile(NODE_ID_PATTERN)
 _PATTERNS: Final = [

@@ -13,10 +13,11 @@ from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message
+from buddyline.protocol.security import PLAYER
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, NET_POSE, POSE, REJECTED, Topic, key_of
-from buddyline.solver_service.answered import Answered, Outcome
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answered, Outcome
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.journal import Journal
@@ -69,6 +70,8 @@ class SolverService(Service):
             else Journal.of(config.connect, config.namespace, instance)
         )
         self._joined_ns: int | None = None
+        self._attached_ns = 0
+        self._player = False
 
     def start(self) -> None:
         """Start all threads."""
@@ -179,7 +182,7 @@ class SolverService(Service):
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
         bus.subscribe(tuple(topic.key_any() for topic in SOLVED_FROM), self.receive, capacity=32768)
-        self._joined_ns = self.clock.now_ns()
+        self._joined_ns = self._attached_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:
         """Take one message from the bus; a bad one is counted and reported."""
@@ -199,6 +202,8 @@ class SolverService(Service):
     def watch(self, name: str, alive: bool) -> None:
         """Note that a node has started or ended; the next tick reports all of them at once."""
         with self._lock:
+            if name == PLAYER:
+                self._player = alive
             self._news |= self.core.health.saw_process(name, alive)
             if self._work is not None:
                 self._work.sharing.saw(name, alive)
@@ -229,9 +234,17 @@ class SolverService(Service):
         elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
             return
         self._handle(frame)
-        if new:
+        if new and self._is_of_now(frame):
             pairs = self.core.pairs_of(frame.node)
             self._publish(self._answered.saw_new_frame(pairs, frame.trigger, frame.stamp_ns))
+
+    def _is_of_now(self, frame: Candidates) -> bool:
+        """Return whether a new frame may be of another dive than what was answered before.
+
+        A frame of this dive that was exposed before this solver came was held up by its link.
+        """
+        in_this_dive = abs(self.clock.now_ns() - frame.stamp_ns) < THIS_DIVE_NS
+        return self._player or not in_this_dive or frame.stamp_ns >= self._attached_ns
 
     def _handle(self, message: Message) -> None:
         # The time is now, not the receive time: a message that waited in the queue has not yet waited for other nodes.

@@ -6,13 +6,17 @@ import argparse
 import logging
 import shutil
 import sys
+import threading
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from buddyline.protocol.digest import Discrepancy, end_of
 from buddyline.protocol.recorder import Recorder
-from buddyline.protocol.topics import EVERYTHING
+from buddyline.protocol.topics import DIGEST, EVERYTHING, parse_key
+from buddyline.tools.authenticity import digest_check, report
 from buddyline.tools.client import client_config
+from buddyline.tools.filling import Filler
 from buddyline.tools.live import LiveClient, follow
 
 if TYPE_CHECKING:
@@ -21,6 +25,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# What is said at the end; a flood of it must not fill the memory.
+MAX_FOUND: Final = 10_000
 # How often what is recorded is said, on a terminal.
 LOOK_S: Final = 0.5
 
@@ -33,37 +39,91 @@ def progress_words(total: int, new: int, output: Path) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Record until stopped."""
-    client = LiveClient("record", client_config(args), args.seconds)
-    counts: Counter[str] = Counter()
-    dropped = 0
+    config = client_config(args)
+    client = LiveClient("record", config, args.seconds)
     with Recorder(args.output, metadata={"command": "record"}) as recorder:
-
-        def write(envelope: Envelope) -> None:
-            counts[envelope.topic.name] += 1
-            recorder.write(envelope.key, envelope.payload, envelope.time_ns)
+        recording = Recording(recorder, None if config.tls is None else config.tls.ca)
 
         def record(bus: Bus) -> None:
-            nonlocal dropped
-            subscription = follow(bus, EVERYTHING, client.refusals, write, capacity=65536)
+            filler = Filler(bus, recording.fill, bus.clock.now_ns(), client.stop)
+            recording.filler = filler
+            subscription = follow(bus, EVERYTHING, client.refusals, recording.take, capacity=65536)
+            client.spawn("fill", filler.run)
             log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
             before = 0
             while not client.stop.wait(LOOK_S):
                 if recorder.error is not None:
                     client.fail("recorder", recorder.error)
                 if sys.stderr.isatty():
-                    total = counts.total()
+                    total = recording.counts.total()
                     words = progress_words(total, total - before, Path(args.output))
                     print(f"\r{words}", end="\x1b[K", file=sys.stderr, flush=True)
                     before = total
             bus.close()
-            dropped = subscription.dropped
+            recording.dropped = subscription.dropped
 
         status = client.run(record)
-    dropped += recorder.dropped
+    recording.report(args.output)
+    dropped = recording.dropped + recorder.dropped
     print(
-        f"{args.output}: {sum(counts.values())} messages, {dropped} dropped, {client.refusals.count} bad",
+        f"{args.output}: {recording.counts.total()} messages, {dropped} dropped, {client.refusals.count} bad",
         file=sys.stderr,
     )
-    for name, count in sorted(counts.items()):
+    for name, count in sorted(recording.counts.items()):
         print(f"  {count:8d} {name}", file=sys.stderr)
     return status
+
+
+class Recording:
+    """Writes messages, and compares them with the nodes' digests. Safe in the bus's thread and the filler's.
+
+    authority: PEM file, whose nodes' signatures count; None: any. filler: asks for what is missing.
+    """
+
+    def __init__(self, recorder: Recorder, authority: str | None) -> None:
+        self.counts: Counter[str] = Counter()
+        self.dropped = 0
+        self.filler: Filler | None = None
+        self._recorder = recorder
+        self._check = digest_check(authority)
+        self._found: list[Discrepancy] = []
+        self._lock = threading.Lock()
+
+    def take(self, envelope: Envelope) -> None:
+        """Record a message from the bus."""
+        self.write(envelope.key, envelope.payload, envelope.time_ns)
+
+    def fill(self, key: str, payload: bytes, time_ns: int) -> None:
+        """Record what has come later: a digest, to be compared, or messages, of which the filler has done that."""
+        if key.rpartition("/")[2] == end_of(DIGEST):
+            self.write(key, payload, time_ns)
+        else:
+            self._record(key, payload, time_ns)
+
+    def write(self, key: str, payload: bytes, time_ns: int) -> None:
+        """Record a message, and compare it."""
+        self._record(key, payload, time_ns)
+        with self._lock:
+            for one in self._check.add(key, payload, time_ns):
+                if one.kind == "missing" and self.filler is not None:
+                    self.filler.want(one)
+                elif len(self._found) < MAX_FOUND:
+                    self._found.append(one)
+                    if one.kind == "altered":
+                        log.warning("node %s: %s", one.node, one.words)
+
+    def _record(self, key: str, payload: bytes, time_ns: int) -> None:
+        parsed = parse_key(key)
+        with self._lock:
+            self.counts["" if parsed is None else parsed[0].name] += 1
+        self._recorder.write(key, payload, time_ns)
+
+    def report(self, name: str) -> None:
+        """Say whether the recording is what the nodes wrote, and what was filled."""
+        with self._lock:
+            self._found += self._check.finish()
+        if self.filler is not None:
+            self._found += self.filler.open
+            for node, count in sorted(self.filler.filled.items()):
+                log.info("%s: node %s: %d messages came later, from its own log", name, node, count)
+        report(name, self._check, self._found)

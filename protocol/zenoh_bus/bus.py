@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import zenoh
@@ -28,6 +28,7 @@ from buddyline.protocol.link_budget import LinkBudget
 from buddyline.protocol.security import Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
+from buddyline.protocol.zenoh_bus.answers import AnswerDesk, ask
 from buddyline.protocol.zenoh_bus.link import Link
 from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
@@ -141,6 +142,7 @@ class ZenohBus(Bus):
         self._datagrams = SecondLink(datagrams)
         self._cache_s = cache_s
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._answers: list[AnswerDesk] = []
         self._budget = LinkBudget()
         self._link = Link(session, self._budget)
         self._watchdog = Watchdog(session, self._link)
@@ -211,6 +213,16 @@ class ZenohBus(Bus):
         now_ns = self.clock.now_ns()
         return [Received(str(s.key_expr), bytes(s.payload), now_ns, str(s.encoding)) for s in samples]
 
+    def answer(self, key: str, reply: Callable[[str], Iterable[bytes]]) -> None:
+        """Answer questions on key until the bus closes, with what the link has to spare."""
+        answers = AnswerDesk(self._bulk, key, reply, self._budget, self._failures)
+        with self._lock:
+            self._answers.append(answers)
+
+    def ask(self, key: str, text: str, timeout_s: float) -> list[bytes]:
+        """Ask a question on key; return what has come of the answer within this time, in its order."""
+        return ask(self._session, key, text, timeout_s)
+
     def declare_alive(self, name: str) -> None:
         """Show others that this process is alive, until it closes the bus or dies."""
         key = f"{ALIVE}/{check_alive_name(name)}/{self._session.zid()}"
@@ -255,6 +267,8 @@ class ZenohBus(Bus):
 
     def _leave(self) -> None:
         atexit.unregister(self.close)
+        for answers in self._answers:
+            answers.close()
         self._link.stop()
         self._watchdog.stop()
         self._session.close()  # type: ignore[no-untyped-call]

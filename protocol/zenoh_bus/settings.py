@@ -7,8 +7,9 @@ from typing import Final
 from buddyline.protocol.codec import MAX_MESSAGE_BYTES
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.log_pages import MOST_PAGE_BYTES
 from buddyline.protocol.security import Tls
-from buddyline.protocol.topics import TOPICS
+from buddyline.protocol.topics import LOG, TOPICS
 
 # lease, ms: a link that is silent for this time counts as dead. open_timeout, ms: how long a client waits for a hub
 # that accepts the connection but does not answer; a slow link needs seconds for its five round trips. compression: for
@@ -47,6 +48,7 @@ def size_limits() -> list[dict[str, object]]:
     for topic in TOPICS:
         # Clients may have a namespace, which comes before the key; the hub itself has none.
         keys.setdefault(topic.max_bytes, []).append(f"**/{topic.key_any()}")
+    keys.setdefault(MOST_PAGE_BYTES, []).append(f"**/{LOG.format(node='*')}")
     return [
         {
             "id": f"at most {max_bytes} bytes",

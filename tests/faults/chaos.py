@@ -12,13 +12,14 @@ import signal
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
 
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Rejected
 
-from tests.faults.observer import Tally
+from tests.faults.observer import Observer, Tally
 from tests.faults.scenarios import BACK_S, RATE_HZ, ip, namespace
 from tests.faults.system import System
 
@@ -84,12 +85,14 @@ class Chaos:
             for name in struck:
                 action = rng.choice((self.kill, self.kill, self.stop, self.end, self.cut))
                 faults[f"{action.__name__} {name}"] += 1
+                print(f"{time.time() % 10_000:.3f} {action.__name__} {name}", file=sys.stderr, flush=True)
                 undone.append((time.monotonic() + rng.uniform(0.0, LONGEST_S), action(name)))
                 time.sleep(rng.choice((0.0, rng.uniform(0.0, 1.0))))
             faults[f"{len(struck)} at once"] += 1
             for at_s, undo in sorted(undone, key=lambda one: one[0]):
                 time.sleep(max(at_s - time.monotonic(), 0.0))
                 undo()
+            print(f"{time.time() % 10_000:.3f} all are back", file=sys.stderr, flush=True)
             since_ns = time.time_ns()
             try:
                 self._system.observer.wait_for_match(since_ns, 3 * BACK_S)
@@ -100,6 +103,16 @@ class Chaos:
             recovered_s.append((time.time_ns() - since_ns) / S_NS)
             time.sleep(rng.uniform(0.0, PAUSE_S))
         return faults, recovered_s
+
+
+def doubled(observer: Observer) -> list[str]:
+    """Return a line for each trigger with two outcomes: what they were, when they were received, and how old."""
+    by_trigger: dict[int, list[str]] = defaultdict(list)
+    for outcome, receive_ns in observer.outcomes:
+        word = outcome.reason if isinstance(outcome, Rejected) else "pose"
+        at_s, age_s = receive_ns / S_NS % 10_000, (receive_ns - outcome.stamp_ns) / S_NS
+        by_trigger[outcome.trigger].append(f"{word} at {at_s:.3f} s, {age_s:.2f} s old")
+    return [f"{trigger}: {'; '.join(words)}" for trigger, words in sorted(by_trigger.items()) if len(words) > 1]
 
 
 def main() -> int:
@@ -124,6 +137,8 @@ def main() -> int:
         observer.wait_for_match(0, 2 * BACK_S)
         faults, recovered_s = chaos.do(args.seconds, rng)
         tally: Tally = system.finish()
+        for line in doubled(observer):
+            print(line, file=sys.stderr)
     recovered_s.sort()
     found = {
         "rounds": len(recovered_s),

@@ -446,3 +446,13 @@ def test_a_payload_above_its_topics_limit_is_not_sent_and_said_once(
     assert publisher.put_bytes(bytes(topics.DEPTH.max_bytes))
     assert [len(received.payload) for received in inbox.wait_for(1)] == [topics.DEPTH.max_bytes]
     assert len([record for record in caplog.records if "not sent" in record.message]) == 1
+
+
+def test_questions_are_answered_in_order(client: Connect) -> None:
+    desk, asker = client(), client()
+    desk.answer("buddyline/node/a/log", lambda text: [text.encode(), b"second", b"third" * 1000])
+    until(lambda: asker.ask("buddyline/node/a/log", "since=1;until=2", 5.0))
+    assert asker.ask("buddyline/node/a/log", "since=1;until=2", 5.0) == [b"since=1;until=2", b"second", b"third" * 1000]
+    assert asker.ask("buddyline/node/b/log", "since=1;until=2", 5.0) == []
+    desk.close()
+    assert asker.ask("buddyline/node/a/log", "since=1;until=2", 5.0) == []

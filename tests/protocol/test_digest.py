@@ -12,7 +12,7 @@ from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.digest import DigestBook, DigestCheck, Discrepancy, sealed, unsealed
 from buddyline.protocol.messages import Attitude, Depth, Message
 from buddyline.protocol.signing import Signer, Trust
-from buddyline.protocol.topics import key_of, topic_of
+from buddyline.protocol.topics import DIGEST, INFO, key_of, topic_of
 from msgspec import UNSET
 
 from tests.tools.evaluated import info
@@ -197,6 +197,19 @@ def test_a_clock_that_was_set_back_is_no_fraud(keys: Path) -> None:
             digest = book.digest(at_ns + 1, last=k == 399)
             lines.append((key_of(digest), sealed(digest, None), at_ns + 1))
     assert not findings(lines, None)
+
+
+def test_a_calibration_said_again_need_not_stand_twice(keys: Path) -> None:
+    book = DigestBook("a", "x", BEGAN_NS)
+    payload = encode(info(node="a", stamp_ns=BEGAN_NS))
+    for _ in range(2):
+        book.add(INFO, BEGAN_NS, payload)
+    digest = (DIGEST.key("a"), sealed(book.digest(BEGAN_NS + S_NS, last=True), None), BEGAN_NS + S_NS)
+    line = (INFO.key("a"), payload, BEGAN_NS)
+    assert not findings([line, line, digest], None)
+    assert not findings([line, digest], None)
+    assert [one.kind for one in findings([line, line, line, digest], None)] == ["altered"]
+    assert [one.kind for one in findings([digest], None)] == ["missing", "missing"]
 
 
 def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:

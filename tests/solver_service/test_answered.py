@@ -3,8 +3,9 @@
 from collections import Counter
 
 import pytest
+from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS, ManualClock
-from buddyline.protocol.codec import decode
+from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import key_of, parse_key
@@ -129,3 +130,26 @@ def test_two_solvers_one_after_the_other_answer_every_trigger_once(live):
 
 def payload_trigger(received):
     return decode(received.payload, parse_key(received.key)[0].schema).trigger
+
+
+@pytest.mark.parametrize("player", [False, True], ids=["held up", "played"])
+def test_what_a_link_held_up_is_not_answered_again(player):
+    """B's frames come after the solver that was started again: an earlier one has answered their triggers."""
+    messages, _ = dive_messages(seconds=6.0, sensors=False, period_ns=2 * PERIOD_NS)
+    frames = [one for one in messages if isinstance(one, Candidates)]
+    last = max(frames, key=lambda frame: frame.stamp_ns)
+    clock = ManualClock(last.stamp_ns + S_NS)
+    network, outcomes = LocalNetwork(clock), []
+    with network.connect() as bus, network.connect() as viewer:
+        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
+        service = SolverService(SolverConfig(nodes=["a", "b"]), clock=clock)
+        service.attach(bus)
+        service.watch("player", player)
+        said = Rejected(node_a="a", node_b="b", stamp_ns=last.stamp_ns, trigger=last.trigger, reason="unmatched")
+        service._answered = Answered([said])
+        for message in messages:
+            clock.set_ns(clock.now_ns() + 1)
+            service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+        with service._lock:
+            service._publish(service.core.flush())
+    assert bool(outcomes) is player

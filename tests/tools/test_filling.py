@@ -1,0 +1,117 @@
+"""What a recording lacks comes from the node's own log, over the bus, while the node still writes it."""
+
+from __future__ import annotations
+
+import random
+import threading
+from pathlib import Path
+
+import pytest
+from buddyline.node.log_desk import LogDesk
+from buddyline.protocol.codec import encode
+from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.log_pages import PAGE_BYTES, Logged, Question, pages_of, whole
+from buddyline.protocol.messages import Depth
+from buddyline.protocol.recorder import Recorder
+from buddyline.protocol.topics import LOG, key_of
+from buddyline.tools.authenticity import check_logs
+from buddyline.tools.filling import Filler
+from buddyline.tools.record import Recording
+
+from tests.processes import until
+from tests.protocol.test_digest import BEGAN_NS, Line, written
+
+EVERYTHING = Question("x", BEGAN_NS - 1, BEGAN_NS + 60_000_000_000, ("depth", "attitude", "digest", "info"))
+
+
+def own_log(folder: Path, boot: str = "x") -> tuple[DiveLogWriter, list[Line]]:
+    writer = DiveLogWriter(folder / f"a-20260101T000000Z-{boot}.mcap", metadata={"node": "a", "boot": boot})
+    lines = written("a", None, boot, ended=False)
+    for key, payload, time_ns in lines:
+        writer.write(key, payload, time_ns)
+    writer.flush(sync=True)
+    return writer, lines
+
+
+def test_a_log_that_is_being_written_is_handed_out(tmp_path: Path) -> None:
+    writer, lines = own_log(tmp_path)
+    desk = LogDesk(tmp_path, "a")
+    found = whole(list(desk.answer(EVERYTHING.text())))
+    assert found is not None
+    assert [(one.key, one.payload, one.time_ns) for one in found] == lines
+    writer.write(lines[-1][0], lines[-1][1], lines[-1][2] + 1)
+    writer.close()
+    again = whole(list(desk.answer(EVERYTHING.text())))
+    assert again is not None
+    assert len(again) == len(lines) + 1
+    second = Question("x", lines[10][2], lines[20][2], ("depth",))
+    assert {one.key for one in whole(list(desk.answer(second.text()))) or []} == {"buddyline/node/a/depth"}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "boot=../../etc;since=1;until=2;topics=depth", "boot=*;since=1;until=2;topics=depth", "boot=y", "\0"]
+)
+def test_other_questions_have_no_answer(tmp_path: Path, text: str) -> None:
+    own_log(tmp_path)[0].close()
+    assert list(LogDesk(tmp_path, "a").answer(text)) == []
+    assert whole([]) is None
+
+
+def test_an_answer_that_lacks_a_page_is_not_whole() -> None:
+    rng = random.Random(1)
+    messages = [Logged(k, "buddyline/node/a/depth", rng.randbytes(1000)) for k in range(100)]
+    pages = list(pages_of(iter(messages)))
+    assert len(pages) >= 100 * 1000 // PAGE_BYTES
+    assert whole(pages) == messages
+    assert all(whole(pages[:k] + pages[k + 1 :]) is None for k in range(len(pages)))
+    for broken in (b"", b"x" * 100, pages[0][:-1], pages[0].replace(pages[0][8:12], b"abcd")):
+        with pytest.raises(MessageError):
+            whole([broken])
+
+
+@pytest.mark.parametrize("lost", ["some messages", "whole seconds", "all but the ends"])
+def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
+    writer, lines = own_log(tmp_path)
+    rng = random.Random(3)
+    gone = {
+        "some messages": {i for i in range(1, len(lines)) if rng.random() < 0.3 and "digest" not in lines[i][0]},
+        "whole seconds": set(range(10, 28)),
+        "all but the ends": set(range(10, len(lines) - 1)),
+    }[lost]
+    network = LocalNetwork()
+    node, topside = network.connect(), network.connect()
+    node.answer(LOG.format(node="a"), LogDesk(tmp_path, "a").answer)
+    stop = threading.Event()
+    # By the clock topside, which is off.
+    ahead_ns = 123_456_789
+    with Recorder(tmp_path / "top.mcap", metadata={"command": "record"}) as recorder:
+        recording = Recording(recorder, None)
+        recording.filler = filler = Filler(topside, recording.fill, BEGAN_NS, stop)
+        worker = threading.Thread(target=filler.run)
+        worker.start()
+        for i, (key, payload, time_ns) in enumerate(lines):
+            if i not in gone:
+                recording.write(key, payload, time_ns + ahead_ns)
+        went_on = 0
+
+        def is_filled() -> bool:
+            nonlocal went_on
+            went_on += 1  # the node goes on, ten messages a second
+            at_ns = lines[-1][2] + went_on * 10**8
+            more = Depth(node="a", stamp_ns=at_ns, depth_m=1.0, sigma_m=0.1)
+            recording.write(key_of(more), encode(more), at_ns + ahead_ns)
+            return sum(filler.filled.values()) == len(gone)
+
+        until(is_filled)
+        stop.set()
+        worker.join()
+        assert not filler.open
+    writer.close()
+    with DiveLogReader(tmp_path / "top.mcap") as reader:
+        recorded = [(one.key, one.payload) for one in reader.records()]
+        assert set(recorded) >= {(key, payload) for key, payload, _ in lines}
+        assert len(recorded) == len(lines) + went_on
+        told = check_logs([reader], None)
+    assert told[0].startswith(f"{tmp_path}/top.mcap: node a: 6 s are as the node wrote them")

@@ -1,0 +1,152 @@
+"""Complete a recording from the nodes' own logs, over the bus, while it is being made.
+
+What the recording lacks shows by the nodes' digests. It is asked for, a second at a time, and written when its checksum
+is right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from buddyline.protocol.bus import CACHE_S
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.digest import Discrepancy, end_of, sum_of
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.log_pages import MOST_NS, Logged, Question, whole
+from buddyline.protocol.topics import DIGEST, LOG
+
+if TYPE_CHECKING:
+    from buddyline.protocol.bus import Bus
+
+log = logging.getLogger(__name__)
+
+ANSWER_S: Final = 10.0
+PAUSE_S: Final = 0.1
+AGAIN_S: Final = 2.0
+# Each may be a second of a node; the oldest are given up.
+MAX_GAPS: Final = 20_000
+
+# Key, payload, log time.
+Write = Callable[[str, bytes, int], None]
+
+
+class _Second(NamedTuple):
+    """Where messages are missing: (since_ns, until_ns] by the node's clock, of a boot."""
+
+    node: str
+    boot: str
+    since_ns: int
+    until_ns: int
+
+
+class Filler:
+    """Asks for what is missing, in a thread of its own. began_ns: what is older is not asked for.
+
+    write: takes what was missing. open: what has not come so far. filled: how many messages have come, by node.
+    """
+
+    def __init__(self, bus: Bus, write: Write, began_ns: int, stop: threading.Event) -> None:
+        self.filled: Counter[str] = Counter()
+        self._bus = bus
+        self._write = write
+        self._began_ns = began_ns - round(CACHE_S * S_NS)
+        self._stop = stop
+        self._open: OrderedDict[_Second, list[Discrepancy]] = OrderedDict()
+        self._changed = threading.Condition()
+
+    @property
+    def open(self) -> list[Discrepancy]:
+        """What is missing still."""
+        with self._changed:
+            return [one for found in self._open.values() for one in found]
+
+    def want(self, one: Discrepancy) -> None:
+        """Ask for what is missing, when its turn has come."""
+        if one.since_ns < self._began_ns:
+            return
+        # Missing digests may be of hours.
+        since_ns, end_ns = one.since_ns, one.until_ns
+        with self._changed:
+            while since_ns < end_ns:
+                until_ns = min(since_ns + MOST_NS, end_ns)
+                self._open.setdefault(_Second(one.node, one.boot, since_ns, until_ns), []).append(one)
+                since_ns = until_ns
+            while len(self._open) > MAX_GAPS:
+                self._open.popitem(last=False)
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Ask until stopped, the oldest first; what is not answered goes to the end."""
+        failed = 0
+        while not self._stop.is_set():
+            with self._changed:
+                if not self._open:
+                    self._changed.wait(AGAIN_S)
+                    continue
+                second, missing = self._open.popitem(last=False)
+            left = self._fill(second, missing)
+            with self._changed:
+                if left:
+                    self._open.setdefault(second, []).extend(left)
+                failed = failed + 1 if left else 0
+                waiting = len(self._open)
+            # With nothing but failures, all gaps are tried again in turn, slowly.
+            self._stop.wait(AGAIN_S if failed >= max(min(waiting, 10), 1) else PAUSE_S)
+
+    def _fill(self, second: _Second, missing: list[Discrepancy]) -> list[Discrepancy]:
+        """Return what is missing after an attempt."""
+        topics = {end_of(DIGEST) if one.stretch is None else one.stretch.topic for one in missing}
+        question = Question(second.boot, second.since_ns, second.until_ns, tuple(sorted(topics)))
+        try:
+            found = whole(self._bus.ask(LOG.format(node=second.node), question.text(), ANSWER_S))
+        except MessageError as error:
+            log.warning("node %s: %s", second.node, error)
+            return missing
+        if found is None:
+            return missing
+        left = []
+        for one in missing:
+            chosen = _digests(second.node, found) if one.stretch is None else _missing_of(one, found)
+            for logged in chosen or ():
+                self._write(logged.key, logged.payload, logged.time_ns)
+                self.filled[second.node] += 1
+            if chosen is None:
+                left.append(one)
+        return left
+
+
+def _digests(node: str, found: list[Logged]) -> list[Logged]:
+    return [one for one in found if one.key == DIGEST.key(node)]
+
+
+def _missing_of(one: Discrepancy, found: list[Logged]) -> list[Logged] | None:
+    """Return the messages of a stretch that are missing, with log times between their neighbours'; None: not found."""
+    stretch = one.stretch
+    assert stretch is not None
+    key = f"buddyline/node/{one.node}/{stretch.topic}"
+    of_key = [logged for logged in found if logged.key == key]
+    sums = [hashlib.sha256(logged.payload).digest() for logged in of_key]
+    for begin in range(len(of_key) - stretch.count + 1):
+        end = begin + stretch.count
+        if sum_of(sums[begin:end]) == stretch.sha256:
+            return _between(of_key[begin:end], sums[begin:end], one.have)
+    return None
+
+
+def _between(stretch: list[Logged], sums: list[bytes], have: Mapping[bytes, int]) -> list[Logged]:
+    """Return the new ones, with log times that keep the order: before that of the next one that is there."""
+    new: list[Logged] = []
+    before_ns = 0
+    for at, (logged, checksum) in enumerate(zip(stretch, sums, strict=True)):
+        if checksum in have:
+            before_ns = max(before_ns, have[checksum])
+            continue
+        next_ns = min((have[later] for later in sums[at:] if later in have), default=2**63)
+        before_ns = max(min(logged.time_ns, next_ns - 1), before_ns + 1)
+        new.append(logged._replace(time_ns=before_ns))
+    return new
