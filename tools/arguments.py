@@ -218,6 +218,12 @@ def report(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `report`."""
     _dives(parser, "one dive: a solved log, or each node's own")
     add_pair_argument(parser, "the first in the logs")
+    parser.add_argument(
+        "--about",
+        type=Path,
+        metavar="FILE.toml",
+        help="what it says of the dive: title, site, people (a list), instrument, text; each may be left out",
+    )
     _authority(parser)
     parser.add_argument(
         "-o", "--output", required=True, type=Path, metavar="REPORT.html", help="the page to write; must not exist yet"

@@ -28,6 +28,8 @@ from buddyline.tools.clock_curves import chosen_curves
 from buddyline.tools.dives import Dive, load_info
 from buddyline.tools.newfile import new_dive_log
 from buddyline.tools.option_values import node_files
+from msgspec import UNSET
+from msgspec.structs import replace
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +82,11 @@ def run(args: argparse.Namespace) -> int:
                     writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
                 _write(writer, core.handle_many(envelope.message for envelope in sound), tracks)
             _write(writer, core.finish(), tracks)
-        bad = dive.refused
+            bad = dive.refused
+            for pair in core.pairs.values():
+                # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
+                status = pair.report(dive.end_ns, dive.end_ns, [], bad, sorted(core.unused))
+                writer.write_message(replace(status, advice=UNSET), dive.end_ns)
     _summarize(args, core, tracks, bad, time.monotonic() - began_s)
     if not core.counts.total():
         log.error("no trigger was resolved: the dive holds no candidates of %s", " or ".join(nodes))

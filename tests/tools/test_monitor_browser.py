@@ -310,6 +310,9 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         seen.check_clean()
 
 
+GROUND = "() => getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)"
+BEYOND_PAPER = """() => [...document.querySelectorAll("td, th, p, svg, img, canvas")].filter(
+    each => each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 99))"""
 WELL_BGR = [160, 224, 127]
 # How long the page's thread is held: long enough for a loaded machine to film the end of green within it.
 HELD_MS = 20_000
@@ -410,4 +413,15 @@ def test_a_report_is_read_without_a_network(chromium: Any, tmp_path: Path, size:
         assert seen.page.evaluate("document.documentElement.scrollWidth") <= SIZES[size][0]
         SCREENSHOTS.mkdir(parents=True, exist_ok=True)
         seen.page.screenshot(path=str(SCREENSHOTS / f"report-{size}.png"), full_page=True, timeout=PATIENCE_MS)
+        light = seen.page.evaluate(GROUND)
+        seen.page.emulate_media(color_scheme="dark")
+        dark = seen.page.evaluate(GROUND)
+        assert min(light) > 200
+        assert max(dark) < 60
+        seen.page.screenshot(path=str(SCREENSHOTS / f"report-{size}-dark.png"), full_page=True, timeout=PATIENCE_MS)
+        # On paper: light again, and nothing is wider than an A4 page between its margins.
+        seen.page.emulate_media(media="print", color_scheme="dark")
+        seen.page.set_viewport_size({"width": 718, "height": 1000})
+        assert seen.page.evaluate(GROUND) == light
+        assert seen.page.evaluate(BEYOND_PAPER) == []
         seen.check_clean("file:///")

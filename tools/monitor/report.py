@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import logging
 import math
-import time
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.config import load_config
 from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.authenticity import check_logs
@@ -21,15 +20,16 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.draw import dive as dive_figures
 from buddyline.tools.draw import figures
 from buddyline.tools.draw.figures import inline_svg
-from buddyline.tools.draw.page import page, section, table
-from buddyline.tools.estimate import known, sigma_m
-from buddyline.tools.evaluation.statistics import Stats
-from buddyline.tools.evaluation.triggers import trigger_figures
+from buddyline.tools.draw.page import data_block, page, section, table
+from buddyline.tools.estimate import known
 from buddyline.tools.health.words import duration_words, reason_words
 from buddyline.tools.monitor.coverage import CSS as STRIP_CSS
 from buddyline.tools.monitor.coverage import LEGEND, TRACK_LEGEND, clock_words
+from buddyline.tools.monitor.outliers import MAX_LISTED, add_pictures, outliers
 from buddyline.tools.monitor.panel import length_words
 from buddyline.tools.monitor.replay import keyframes, replay_html
+from buddyline.tools.monitor.report_numbers import MIN_STRETCH_S, ReportAbout, numbers_of
+from buddyline.tools.monitor.report_text import budget_html, methods_html, outliers_html
 from buddyline.tools.monitor.summary import Summary, summarize
 from buddyline.tools.newfile import check_new, write_new
 from buddyline.tools.pairs import Pair, solved_pair
@@ -37,18 +37,19 @@ from msgspec import UNSET
 
 log = logging.getLogger(__name__)
 
-MIN_STRETCH_S: Final = 1.0
 MAX_STRETCHES: Final = 40
 # Poses further apart than this are not joined.
 JOINED_NS: Final = 3 * S_NS // 2
 
 CSS: Final = (
-    "@media(min-width:700px){td:first-child{white-space:nowrap}}"
+    "@media screen and (min-width:700px){td:first-child{white-space:nowrap}}"
     ".two{display:grid;grid-template-columns:repeat(auto-fit,minmax(300px,1fr));gap:12px}.wide{min-width:640px}"
     ".cam svg{width:100%;background:#05080c}.replay canvas{width:100%;height:min(62vh,480px);display:block;"
     "touch-action:none;border-radius:4px;cursor:grab}"
     ".bar{display:flex;gap:8px;align-items:center;flex-wrap:wrap;margin:6px 0}.bar input{flex:1;min-width:120px}"
-    ".bar output{min-width:13em;font-variant-numeric:tabular-nums}@media print{.bar{display:none}}" + STRIP_CSS
+    ".bar output{min-width:13em;font-variant-numeric:tabular-nums}"
+    "@media print{.bar{display:none}.wide{min-width:0}.two{grid-template-columns:1fr 1fr}.cam{break-inside:avoid}}"
+    + STRIP_CSS
 )
 
 
@@ -56,20 +57,27 @@ def run(args: argparse.Namespace) -> int:
     """Write the report; return 0."""
     figures.check()
     check_new(args.output)
+    about = ReportAbout() if args.about is None else load_config(args.about, ReportAbout)
     with Dive(args.dives) as dive:
-        text = report_html(dive, solved_pair(dive, args.pair), check_logs(dive.readers, args.authority))
+        checked = check_logs(dive.readers, args.authority)
+        text = report_html(dive, solved_pair(dive, args.pair), checked, about)
     write_new(args.output, text)
     log.info("%s: %.1f MB", args.output, len(text) / 1e6)
     return 0
 
 
-def report_html(dive: Dive, pair: Pair | None, authenticity: Sequence[str] = ()) -> str:
+def report_html(
+    dive: Dive, pair: Pair | None, authenticity: Sequence[str] = (), about: ReportAbout | None = None
+) -> str:
     """Return the report of a dive as one HTML page; pair: whose poses are reported.
 
     authenticity: lines that say whether the logs are what their nodes wrote.
     """
+    about = about or ReportAbout()
     summary = summarize(dive, pair)
-    begun = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(dive.start_ns / S_NS))
+    found = outliers(summary.poses, summary.path) if len(summary.path) else None
+    add_pictures(dive, (found or [])[:MAX_LISTED])
+    numbers = numbers_of(dive, summary, found, about)
     nodes = " and ".join(sorted(summary.picture.nodes)) or "none"
     warnings = [*dive.losses, *authenticity]
     if not summary.poses:
@@ -77,63 +85,70 @@ def report_html(dive: Dive, pair: Pair | None, authenticity: Sequence[str] = ())
     if summary.picture.other_pairs:
         others = ", ".join(f"{a} and {b}" for a, b in sorted(summary.picture.other_pairs))
         warnings.append(f"poses of other pairs are not reported: {others}; choose with --pair A/B")
+    named = about.title or f"Dive report: {', '.join(reader.path.name for reader in dive.readers)}"
+    begun = f"Begun {numbers['dive']['begun']}, {duration_words(dive.seconds)} long, nodes {nodes}."
     return page(
-        f"Dive report: {', '.join(reader.path.name for reader in dive.readers)}",
-        f'<p class="dim">Begun {begun}, {duration_words(dive.seconds)} long, nodes {escape(nodes)}.</p>',
+        named,
+        f'<p class="dim">{escape(begun)}</p>',
+        _about(about),
         *(f'<p class="warn">{escape(warning)}</p>' for warning in warnings),
-        section("Figures", _figures(summary)),
+        section("Figures", _figures(numbers)),
+        section("Methods", methods_html(numbers, summary)),
+        section("Where the error of a place comes from", budget_html(numbers)),
         section("Replay", _replay(summary)),
         section("Plan and profile", _maps(summary)),
         section("Over time", f'<div class="scroll"><div class="wide">{_over_time(summary)}</div></div>'),
         section("Coverage: where there is a pose or a track, and where and why there is no pose", _coverage(summary)),
+        section("Outliers: poses that contradict the track", outliers_html(numbers, found, dive.start_ns)),
         section("Pictures", _pictures(summary)),
         section("Calibration and versions", _calibration(summary), _versions(dive, summary)),
+        data_block("numbers", numbers),
         css=CSS,
     )
 
 
-def _figures(summary: Summary) -> str:
-    triggers = trigger_figures(summary.poses, summary.rejected, [])
-    rows = [("triggers", f"{triggers.total}")]
-    if triggers.total:
-        rows.append(("with a pose", f"{len(summary.poses)} ({len(summary.poses) / triggers.total:.0%})"))
-    covered = summary.covered()
-    if summary.tracks and covered is not None:
-        rows.append((f"covered by the track (1 sd below {TRACK_SIGMA_SHARE:.0%} of the range)", f"{covered:.0%}"))
-        rows.append(("longest time without a light", duration_words(summary.dark_s)))
-    if triggers.gap_s is not None:
-        rows.append(("longest time without a pose", duration_words(triggers.gap_s)))
-    if summary.poses:
-        ranges_m = [pose.range_m for pose in summary.poses]
-        rows.append(("range", f"{min(ranges_m):.2f} to {max(ranges_m):.2f} m"))
-        sigmas_m = [sigma_m(pose) for pose in summary.poses]
-        rows.append(("position's uncertainty (1 sd) of a pose, median", length_words(float(np.median(sigmas_m)))))
-    if summary.tracks:
-        sigmas_m = [sigma_m(point.estimate) for point in summary.tracks]
-        rows.append(("position's uncertainty (1 sd) of the track, median", length_words(float(np.median(sigmas_m)))))
-    if summary.poses:
-        gaps_m = [abs(pose.range_gap_m) for pose in summary.poses]
-        rows.append(("range gap between both nodes, median", length_words(float(np.median(gaps_m)))))
-    for node, line in sorted(summary.depths.items()):
-        depths_m = [depth_m for _, depth_m in line]
-        rows.append((f"depth of {node}", f"{min(depths_m):.2f} to {max(depths_m):.2f} m"))
-    errors = summary.errors()
-    against = [
-        ("position of the poses", Stats.of(errors.translation_m)),
-        ("range of the poses", Stats.of(abs(errors.range_m))),
-    ]
-    for track in summary.track_figures():
-        if track.samples:
-            rows.append(("wrong samples of the track", f"{track.wrong} of {track.samples}"))
-        against += [
-            ("position of the track", track.position_m),
-            (f"position of the track without a light for {NO_LIGHT_S:g} s", track.in_gaps_m),
-        ]
-    for name, stats in against:
-        if stats.median is not None and stats.p95 is not None:
-            rows.append(
-                (f"against truth, {name}", f"{length_words(stats.median)} median, {length_words(stats.p95)} p95")
-            )
+def _about(about: ReportAbout) -> str:
+    rows = [("site", about.site), ("people", ", ".join(about.people)), ("instrument", about.instrument)]
+    told = [row for row in rows if row[1]]
+    text = "".join(f"<p>{escape(line)}</p>" for line in about.text.split("\n\n") if line.strip())
+    return (table(told) if told else "") + text
+
+
+def _figures(numbers: dict[str, Any]) -> str:
+    triggers, poses, track = numbers["triggers"], numbers["poses"], numbers["track"]
+    rows = [("triggers", f"{triggers['total']}")]
+    if triggers["total"]:
+        share = triggers["with_pose"] / triggers["total"]
+        rows.append(("with a pose", f"{triggers['with_pose']} ({share:.0%})"))
+    if track and track["covered"] is not None:
+        name = f"covered by the track (1 sd below {TRACK_SIGMA_SHARE:.0%} of the range)"
+        rows.append((name, f"{track['covered']:.0%}"))
+        rows.append(("longest time without a light", duration_words(track["longest_without_light_s"])))
+    if triggers["longest_without_pose_s"] is not None:
+        rows.append(("longest time without a pose", duration_words(triggers["longest_without_pose_s"])))
+    if poses:
+        rows.append(("range", f"{poses['range_least_m']:.2f} to {poses['range_most_m']:.2f} m"))
+        sigma = length_words(poses["sigma_median_m"])
+        rows.append(("position's uncertainty (1 sd) of a pose, median", sigma))
+    if track:
+        rows.append(("position's uncertainty (1 sd) of the track, median", length_words(track["sigma_median_m"])))
+    if poses:
+        rows.append(("range gap between both nodes, median", length_words(poses["range_gap_median_m"])))
+    for node, depth in numbers["depths"].items():
+        rows.append((f"depth of {node}", f"{depth['least_m']:.2f} to {depth['most_m']:.2f} m"))
+    truth = numbers["against_truth"] or {}
+    if truth.get("track", {}).get("samples"):
+        rows.append(("wrong samples of the track", f"{truth['track']['wrong']} of {truth['track']['samples']}"))
+    for name, of, what in (
+        ("position of the poses", "poses", "position"),
+        ("range of the poses", "poses", "range"),
+        ("position of the track", "track", "position"),
+        (f"position of the track without a light for {NO_LIGHT_S:g} s", "track", "position_without_light"),
+    ):
+        stats = truth.get(of, {}).get(what)
+        if stats and stats["count"]:
+            median, p95 = length_words(stats["median_m"]), length_words(stats["p95_m"])
+            rows.append((f"against truth, {name}", f"{median} median, {p95} p95"))
     return table(rows)
 
 

@@ -15,6 +15,7 @@ from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
 from buddyline.tools.monitor.coverage import BINS, Coverage
+from buddyline.tools.monitor.outliers import TrackPath
 from buddyline.tools.monitor.panel import judged_picture
 from buddyline.tools.monitor.picture import PairPicture, Point
 from buddyline.tools.pairs import Pair
@@ -45,7 +46,8 @@ class Summary:
 
     points: its poses, tracks: its track; of each only some, spacing_ns apart at least. dark_s: the longest time in
     which the track used no light. track_coverage: where the track covers the dive, None without a track.
-    depths: by node, (ns, m). infos: by node, one for each calibration that it had. counts: messages by key.
+    depths: by node, (ns, m). depth_sigma_m: by node, the gauge's stated one. path: all places of the track.
+    infos: by node, one for each calibration that it had. counts: messages by key.
     """
 
     picture: PairPicture
@@ -59,6 +61,8 @@ class Summary:
     rejected: list[Rejected] = field(default_factory=list)
     truths: list[Truth] = field(default_factory=list)
     depths: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    depth_sigma_m: dict[str, float] = field(default_factory=dict)
+    path: TrackPath = field(default_factory=TrackPath)
     counts: Counter[str] = field(default_factory=Counter)
     shots: dict[str, JudgedPicture] = field(default_factory=dict)
     infos: dict[str, list[NodeInfo]] = field(default_factory=dict)
@@ -110,8 +114,10 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
                 uncertain = sigma_m(message) >= TRACK_SIGMA_SHARE * message.range_m
                 summary.track_coverage.add(at_ns, "uncertain" if uncertain else None)
                 _keep(summary, summary.tracks, message, at_ns)
+                summary.path.add(message)
         elif isinstance(message, Depth):
             line = summary.depths.setdefault(message.node, [])
+            summary.depth_sigma_m[message.node] = message.sigma_m
             if not line or at_ns - line[-1][0] >= max(DEPTH_SPACING_NS, spacing_ns):
                 line.append((at_ns, message.depth_m))
         elif isinstance(message, NodeInfo):
