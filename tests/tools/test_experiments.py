@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -37,14 +38,33 @@ def test_near_poses_are_compared_with_the_papers_8_cm():
     assert numbers.near_share(_errors([0.01], range_m=6.0)[0]) is None
 
 
-def test_errors_of_the_bounds_size_have_a_ratio_of_1():
+def test_rms_is_compared_with_rms_and_median_with_median():
     errors, track = _errors([0.0])
-    bound_m = numbers.bounds(errors, track, INFOS, 0.5)
+    bound = numbers.bounds(errors, track, INFOS, 0.5)
     (covariance,) = pose_bounds(np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 1.0, 0.0, 0.0]]), *INFOS.values(), 0.5)
-    assert bound_m[0] == pytest.approx(np.sqrt(np.trace(covariance[:3, :3])))
-    errors, track = _errors([float(bound_m[0]), -float(bound_m[0])])
-    ratio = numbers.over_bound(errors, numbers.bounds(errors, track, INFOS, 0.5))["3-4"]["ratio"]
-    assert ratio == pytest.approx(1.0, rel=1e-6)
+    np.testing.assert_allclose(bound[0], covariance[:3, :3])
+    # Errors along the line of sight alone, as large as the bound of all three axes.
+    size_m = float(np.sqrt(np.trace(bound[0])))
+    errors, track = _errors([size_m, -size_m] * 100)
+    (row,) = numbers.over_bound(errors, numbers.bounds(errors, track, INFOS, 0.5))
+    assert (row["from_m"], row["poses"]) == (3.0, 200)
+    assert row["rms_ratio"] == pytest.approx(1.0, rel=1e-6)
+    assert row["bound_rms_m"] == pytest.approx(size_m)
+    # Gaussian errors have a smaller median than RMS: one axis is by far the largest here.
+    assert 0.6745 * size_m < row["bound_median_m"] < 0.9 * size_m
+    assert row["median_ratio"] == pytest.approx(size_m / row["bound_median_m"])
+
+
+def test_errors_at_the_bound_have_ratios_of_1_within_their_sigma():
+    rng = np.random.default_rng(3)
+    errors, track = _errors([0.0] * 400)
+    bound = numbers.bounds(errors, track, INFOS, 0.5)
+    drawn = rng.standard_normal((400, 3)) @ np.linalg.cholesky(bound[0]).T
+    errors = replace(errors, translation_m=np.linalg.norm(drawn, axis=1))
+    (row,) = numbers.over_bound(errors, bound)
+    assert 0.02 < row["rms_sd"] < 0.04
+    assert abs(row["rms_ratio"] - 1.0) < 3 * row["rms_sd"]
+    assert row["median_ratio"] == pytest.approx(1.0, abs=0.12)
 
 
 def test_a_method_ends_where_half_of_the_triggers_give_no_pose():
@@ -67,7 +87,7 @@ def test_a_quick_run_writes_a_report_that_needs_nothing_else(tmp_path, capsys):
     assert found["right_pairs"]["ours"]["all"]["right_share"] > 0.6
     assert found["right_pairs"]["ours"]["all"]["wrong"] == 0
     assert found["near"]["ours"] == 1.0
-    assert all(0.5 < row["ratio"] < 1.6 for row in found["bound"].values())
+    assert all(0.5 < row["rms_ratio"] < 1.6 for row in found["bound"])
     assert found["time"]["eq1_ms"] < found["time"]["trigger"]["median_ms"]
     html = (folder / "report.html").read_text()
     assert html.count("data:image/png;base64,") >= 7

@@ -16,6 +16,9 @@ from buddyline.tools.evaluation.rotation import Floats
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# On paper between its margins, at its own size: then the letters have theirs.
+PRINTED_IN: Final = 7.2
+MOST_NUMBERS: Final = 13.0
 FILES: Final = ("trajectory.png", "errors_over_time.png", "errors_over_range.png", "normalized_error.png")
 
 
@@ -43,23 +46,27 @@ def by_verdict(errors: PoseErrors) -> list[ErrorCurve]:
 
 
 def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Figure:
-    """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m."""
-    figure, axes = new_figure(max(3.1 * len(dives), 5.0), 6.4, 2, len(dives))
-    for column, (title, (true_m, curves)) in enumerate(dives.items()):
-        # Equal steps in both directions: a metre, or more where that would give over twenty steps.
-        step_m = max(1.0, float(np.ceil(np.abs(true_m).max() / 20)))
-        for row, across, name in ((0, 0, "right"), (1, 1, "down")):
-            axis = axes[row * len(dives) + column]
-            axis.plot(true_m[:, across], true_m[:, 2], ".", color="0.7", markersize=3, label="truth")
+    """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m. Grid: 1 m."""
+    figure, axes = new_figure(PRINTED_IN, 0.5 + 1.9 * len(dives), len(dives), 2)
+    for row, (title, (true_m, curves)) in enumerate(dives.items()):
+        # Each metre has its line; of a long dive not each has its number.
+        step_m = 1.0 if np.abs(true_m).max() < MOST_NUMBERS else 5.0
+        for axis, across, name in ((axes[2 * row], 0, "right"), (axes[2 * row + 1], 1, "down")):
+            axis.plot(true_m[:, 2], true_m[:, across], ".", color="0.7", markersize=3, label="truth")
             for curve in curves:
-                axis.plot(curve.errors.t_m[:, across], curve.errors.t_m[:, 2], **curve.style)
-            axis.plot(0, 0, "k^", markersize=7)
-            axis.set(xlabel=f"{name}, m", aspect="equal", adjustable="datalim")
-            axis.xaxis.set_major_locator(_multiples(step_m))
-            axis.yaxis.set_major_locator(_multiples(step_m))
-        axes[column].set_title(title)
-    axes[0].set_ylabel("from above: forward, m")
-    axes[len(dives)].set_ylabel("from the side: forward, m")
+                axis.plot(curve.errors.t_m[:, 2], curve.errors.t_m[:, across], **curve.style)
+            axis.plot(0, 0, "k>", markersize=6)
+            axis.set(ylabel=f"{name}, m", aspect="equal", adjustable="datalim")
+            for one in (axis.xaxis, axis.yaxis):
+                one.set_major_locator(_multiples(step_m))
+                one.set_minor_locator(_multiples(1.0))
+            axis.grid(visible=True, which="both")
+            # As a surveyor draws it: what is right of A, or below it, is below the line of sight.
+            axis.invert_yaxis()
+        axes[2 * row].set_title(f"{title}: from above", loc="left")
+        axes[2 * row + 1].set_title("from the side", loc="left")
+    for axis in axes[-2:]:
+        axis.set_xlabel("forward, m")
     axes[0].legend()
     return figure
 
@@ -72,7 +79,7 @@ def _multiples(step: float) -> Any:
 
 def over_time(curves: Sequence[ErrorCurve], stamps_ns: Sequence[int], true_m: Floats, title: str) -> Figure:
     """Draw position, its error and the rotation's error over time, with gaps; true_m: (n, 3) at stamps_ns (n,)."""
-    figure, axes = new_figure(9.0, 6.6, 3, 1, sharex=True)
+    figure, axes = new_figure(PRINTED_IN, 6.6, 3, 1, sharex=True)
     start_ns = stamps_ns[0]
     times_s = np.array([stamp_ns - start_ns for stamp_ns in stamps_ns]) / 1e9
     for across, shade, name in ((0, "0.75", "right"), (1, "0.5", "down"), (2, "0.25", "forward")):
@@ -94,7 +101,7 @@ def over_time(curves: Sequence[ErrorCurve], stamps_ns: Sequence[int], true_m: Fl
 
 def over_range(curves: Sequence[ErrorCurve]) -> Figure:
     """Draw the errors of position, range and rotation over the true range."""
-    figure, axes = new_figure(9.0, 9.0, 3, 1, sharex=True)
+    figure, axes = new_figure(PRINTED_IN, 8.0, 3, 1, sharex=True)
     for curve in curves:
         errors = curve.errors
         for axis, values in zip(
@@ -110,11 +117,14 @@ def over_range(curves: Sequence[ErrorCurve]) -> Figure:
     return figure
 
 
-def medians_over_range(methods: Mapping[str, Sequence[Mapping[str, Any]]], range_m: Floats, bound_m: Floats) -> Figure:
-    """Draw the median position error by range, a line a method, beside the Cramér-Rao bound and the paper's 0.08 m."""
-    figure, (axis,) = new_figure(7.5, 4.6)
-    known = np.isfinite(bound_m)
-    axis.plot(range_m[known], bound_m[known], ".", color="0.75", markersize=2, label="Cramér-Rao bound (RMS)")
+def medians_over_range(
+    methods: Mapping[str, Sequence[Mapping[str, Any]]], bound: Sequence[Mapping[str, float]]
+) -> Figure:
+    """Draw the median position error by range, a line a method, beside the bound's median and the paper's 0.08 m."""
+    figure, (axis,) = new_figure(PRINTED_IN, 4.6)
+    middles_m = [(row["from_m"] + row["to_m"]) / 2 for row in bound]
+    medians_m = [row["bound_median_m"] for row in bound]
+    axis.plot(middles_m, medians_m, color="0.6", linewidth=5, alpha=0.6, label="Cramér-Rao bound, median")
     for name, rows in methods.items():
         middles_m = [(row["from_m"] + row["to_m"]) / 2 for row in rows]
         axis.plot(middles_m, [row["position_median_m"] for row in rows], "o-", label=name)
@@ -126,7 +136,7 @@ def medians_over_range(methods: Mapping[str, Sequence[Mapping[str, Any]]], range
 
 def normalized_errors(errors: PoseErrors) -> Figure:
     """Draw the shares of poses below a normalized error (NEES), beside an honest covariance's median and 95 % point."""
-    figure, axes = new_figure(9.0, 4.0, 1, 2)
+    figure, axes = new_figure(PRINTED_IN, 3.6, 1, 2)
     for axis, values, name, median, gate in (
         (axes[0], errors.nees6, "pose", 5.348, 12.592),
         (axes[1], errors.nees3, "position", 2.366, 7.815),

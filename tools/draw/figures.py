@@ -47,7 +47,7 @@ _STYLE: Final[dict[Any, Any]] = {
     "grid.linewidth": 0.4,
     "legend.fontsize": 8.0,
     "lines.markersize": 4.0,
-    "savefig.dpi": 90,
+    "savefig.dpi": 120,
     # Text stays text in SVG, so that it can be searched.
     "svg.fonttype": "none",
     # Fixed, so that the same data give the same file.

@@ -12,8 +12,8 @@ from buddyline.node.detect.detection import Detection, check_image
 from buddyline.protocol.messages import Blob, Candidates, CompressedImage
 from numpy.typing import NDArray
 
-LEFT_COLOUR: Final = "#ff5c5c"
-RIGHT_COLOUR: Final = "#4be37a"
+LEFT_COLOUR: Final = "#ff4040"
+RIGHT_COLOUR: Final = "#8affc1"
 OTHER_COLOUR: Final = "#ffd34d"
 _MIME: Final = {"jpeg": "image/jpeg", "jpg": "image/jpeg", "png": "image/png"}
 _RING_PX: Final = 22
@@ -27,23 +27,25 @@ def mark_candidates(
     image: NDArray[np.uint8],
     detections: Sequence[Detection],
     truth: Sequence[tuple[float, float]] | None = None,
+    letters: float = 1.0,
 ) -> NDArray[np.uint8]:
     """Mark every candidate: outline of its region, axis with the chosen end, centre, 3 sigma circle, rank and score.
 
-    truth: (u, v) px of the true lights, marked with a cross. Likely candidates are green, unlikely ones red. Returns
-    a new (H, W, 3) BGR picture.
+    letters: their size, relative to what can be read on a screen. truth: (u, v) px of the true lights, marked with a
+    cross. Likely candidates are green, unlikely ones red. Returns a new (H, W, 3) BGR picture.
     """
     check_image(image)
     marked = np.array(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
-    size = max(0.4, image.shape[1] / 1800)
+    size = letters * max(0.4, image.shape[1] / 1800)
     for rank, detection in reversed(list(enumerate(detections, start=1))):
-        _mark(marked, rank, detection, size)
+        # Large letters leave no room for the reasons of several.
+        _mark(marked, rank, detection, size, say_why=rank <= 3 and letters <= 1.0)
     for u_px, v_px in truth or ():
         cv2.drawMarker(marked, (round(u_px), round(v_px)), _TRUTH, cv2.MARKER_TILTED_CROSS, round(24 * size), 1)
     return marked
 
 
-def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: float) -> None:
+def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: float, *, say_why: bool) -> None:
     blob = detection.blob
     score = blob.score if isinstance(blob.score, float) else 0.0
     colour = tuple(round(score * a + (1 - score) * b) for a, b in zip(_LIKELY, _UNLIKELY, strict=True))
@@ -60,7 +62,7 @@ def _mark(marked: NDArray[np.uint8], rank: int, detection: Detection, size: floa
     text = f"{rank}: {score:.2f} s{blob.sigma_px:.1f}"
     corner = detection.outline_px.max(axis=0) + 3
     _write(marked, text, (float(corner[0]), float(corner[1])), size, colour)
-    if rank <= 3:
+    if say_why:
         below = float(corner[0]), float(corner[1]) + 26 * size
         _write(marked, detection.why, below, max(0.35, 0.7 * size), colour)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -13,7 +14,9 @@ from buddyline.protocol.messages import Candidates, CompressedImage, RelativePos
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates, mark_lights
 from buddyline.tools.experiments.runs import OURS, Rendered
-from numpy.typing import NDArray
+
+MOST_MARKED: Final = 6
+LETTERS: Final = 2.2
 
 
 def detections(dive: Rendered, path: Path) -> int | None:
@@ -41,14 +44,11 @@ def detections(dive: Rendered, path: Path) -> int | None:
                 chosen = {found.node_a: found.blobs_a, found.node_b: found.blobs_b}
             elif isinstance(found, Candidates) and found.trigger == trigger:
                 frames[found.node] = found
-    rows = []
+    columns = []
     for node, lights in chosen.items():
         raw = pictures[node]
-        candidates = mark_candidates(raw, make_detector().detect(raw))
-        rows.append(np.hstack([_small(one) for one in (raw, candidates, mark_lights(raw, frames[node].blobs, lights))]))
-    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        # Two pictures side by side on paper: their letters must be larger than on a screen.
+        candidates = mark_candidates(raw, make_detector().detect(raw)[:MOST_MARKED], letters=LETTERS)
+        columns.append(np.vstack([raw, candidates, mark_lights(raw, frames[node].blobs, lights)]))
+    cv2.imwrite(str(path), np.hstack(columns), [cv2.IMWRITE_PNG_COMPRESSION, 9])
     return trigger
-
-
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return np.asarray(cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
