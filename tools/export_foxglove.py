@@ -56,7 +56,7 @@ SERIES: Final = (
     *("pose", "track", "track_lag", "rejected", "truth", "attitude", "depth", "node_status", "solver_status"),
     *("info", "net_pose", "net_truth"),
 )
-LEFT, RIGHT, OTHER = (1.0, 0.36, 0.36), (0.29, 0.89, 0.48), (1.0, 0.83, 0.3)
+LEFT, RIGHT, OTHER = (1.0, 0.25, 0.25), (0.54, 1.0, 0.76), (1.0, 0.83, 0.3)
 
 
 class FoxgloveTranslation:

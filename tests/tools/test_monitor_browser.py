@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tarfile
 import threading
 import time
 import urllib.request
@@ -32,7 +33,7 @@ if CHROMIUM is None:
 
 ROOT = Path(__file__).parents[2]
 SCREENSHOTS = ROOT / "build" / "screenshots"
-SIZES = {"desk": (1280, 800), "phone": (390, 844)}
+SIZES = {"desk": (1280, 800), "phone": (390, 844), "tablet": (820, 1180)}
 FLAGS = [
     *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),
@@ -311,6 +312,8 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
 
 
 GROUND = "() => getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)"
+BEYOND_SCREEN = """() => [...document.querySelectorAll(".figure .big, .figure .big *")].filter(
+    each => Math.max(each.scrollWidth, each.getBoundingClientRect().right) > innerWidth).map(each => each.outerHTML)"""
 BEYOND_PAPER = """() => [...document.querySelectorAll("td, th, p, svg, img, canvas")].filter(
     each => each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 99))"""
 WELL_BGR = [160, 224, 127]
@@ -394,6 +397,86 @@ def test_a_stored_dive_is_played_and_scrubbed(chromium: Any, processes: Processe
         seen.page.keyboard.press("ArrowLeft")
         seen.wait_for("0:19.8 of 0:59.9")
         seen.screenshot("end")
+        seen.check_clean()
+
+
+@pytest.fixture(scope="module")
+def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The source of axe-core, which finds what people with other senses or hands cannot use."""
+    npm, folder = shutil.which("npm"), tmp_path_factory.mktemp("axe")
+    if npm is None:
+        pytest.skip("npm is not installed")
+    done = subprocess.run([npm, "pack", "axe-core@4"], cwd=folder, capture_output=True, timeout=300, check=False)
+    packed = list(folder.glob("*.tgz"))
+    if done.returncode or not packed:
+        pytest.skip("axe-core cannot be had from npm here")
+    with tarfile.open(packed[0]) as archive:
+        source = archive.extractfile("package/axe.min.js")
+        assert source is not None
+        return source.read().decode()
+
+
+def test_everyone_can_use_it_in_every_layout(chromium: Any, processes: Processes, tmp_path: Path, axe: str) -> None:
+    port = free_port()
+    processes.start("view", "view", dive_log(tmp_path), "--paused", "--start", "22", "--port", str(port))
+    wait_for_server(f"http://127.0.0.1:{port}")
+    context = chromium.new_context(bypass_csp=True)
+    try:
+        for size, (width, height) in SIZES.items():
+            seen = Browser(context.new_page(), f"layout-{size}")
+            seen.page.set_viewport_size({"width": width, "height": height})
+            seen.page.goto(f"http://127.0.0.1:{port}")
+            seen.wait_for("No pose: more than one arrangement fits")
+            seen.page.evaluate(axe)
+            # Light and dark, with and without large figures alone.
+            for key in ("", "l", "d", "l"):
+                if key:
+                    seen.page.keyboard.press(key)
+                seen.page.wait_for_timeout(1200)
+                pressed = [
+                    name for name in ("deck", "light") if seen.page.locator(f"#{name}[aria-pressed=true]").count()
+                ]
+                found = seen.page.evaluate("axe.run()")["violations"]
+                assert [(one["id"], one["nodes"][0]["html"][:120]) for one in found] == [], pressed
+                assert seen.page.evaluate("document.documentElement.scrollWidth") <= width
+                if "deck" in pressed:
+                    assert min(seen.page.evaluate(FIGURE_PX)) >= 80
+                    assert seen.page.evaluate(BEYOND_SCREEN) == []
+                    assert seen.page.inner_text("#advice") == "What to do: come 1.0 m closer."
+                seen.screenshot("-".join(pressed) or "dark")
+            seen.check_clean()
+            seen.page.close()
+    finally:
+        context.close()
+
+
+def test_fields_of_messages_are_plotted_beside_each_other(chromium: Any, processes: Processes, tmp_path: Path) -> None:
+    port = free_port()
+    processes.start("view", "view", dive_log(tmp_path), "--port", str(port))
+    wait_for_server(f"http://127.0.0.1:{port}")
+    wanted = (
+        "buddyline/node/a/candidates blobs[0].u_px",
+        "buddyline/pair/a/b/pose covariance[14]",
+        "buddyline/node/b/attitude q_ned_body_xyzw[3]",
+    )
+    with looking(chromium, "fields") as seen:
+        seen.page.goto(f"http://127.0.0.1:{port}")
+        seen.wait_for("Pose at ")
+        for k, name in enumerate(wanted):
+            select = seen.page.locator(".plot select").nth(k)
+            select.focus()
+            seen.page.wait_for_function(
+                "([k, name]) => [...document.querySelectorAll('.plot select')[k].options].some(o => o.value === name)",
+                arg=[k, name],
+            )
+            select.select_option(name)
+        seen.page.wait_for_function(
+            "names => names.every(name => (state.probes[name] || []).length > 5)", arg=list(wanted)
+        )
+        seen.page.locator("#still").select_option("a, with its camera")
+        seen.page.wait_for_timeout(1000)
+        assert seen.page.locator(".plot canvas").count() == 3
+        seen.screenshot("three")
         seen.check_clean()
 
 

@@ -29,7 +29,7 @@ from buddyline.tools.monitor.server import FILES, PageServer, open_listener
 from buddyline.tools.monitor.view import DiveSession
 
 from tests.processes import REPOSITORY
-from tests.tools.evaluated import INFOS, info, pose, rejection, track, write_log
+from tests.tools.evaluated import INFOS, RIGHT, info, pose, rejection, track, write_log
 from tests.tools.watched import at, attitude, depth, image, tick
 
 pytest.importorskip("websockets", reason="websockets is not installed")
@@ -166,7 +166,7 @@ class TestFrames:
 
     def test_a_question_is_answered_with_itself_whatever_else_comes(self) -> None:
         with serving(filled()) as (page, _), joined(page) as one:
-            for nonsense in ("", "[]", "{", '{"pair": 3}', '{"field": null}', '{"pair": "x/y/z"}', '{"seek": "far"}'):
+            for nonsense in ("", "[]", "{", '{"pair": 3}', '{"probe": null}', '{"pair": "x/y/z"}', '{"seek": "far"}'):
                 one.send(nonsense)
             one.send('{"ping": 12.5}')
             assert told(one, "pong")["pong"] == 12.5
@@ -203,13 +203,24 @@ class TestFrames:
         names = fields(overview)
         assert {"buddyline/node/a/depth depth_m", "buddyline/pair/a/b/pose t_a_b_m[2]"} <= set(names)
         assert "buddyline/node/a/status rates_hz.candidates" in names
-        viewer.choose_field("buddyline/node/a/depth depth_m")
-        assert viewer.frame(overview, at(29))["probe"] == [at(29) / 1e6, 12.5]
-        assert "probe" not in viewer.frame(overview, at(29))
+        depth_a, sigma, blob = (
+            "buddyline/node/a/depth depth_m",
+            "buddyline/pair/a/b/pose covariance[35]",
+            "buddyline/node/b/candidates blobs[1].u_px",
+        )
+        assert {depth_a, sigma, blob} <= set(fields(overview))
+        viewer.choose_fields([depth_a, sigma, blob])
+        probes = viewer.frame(overview, at(29))["probes"]
+        assert probes == {
+            depth_a: [at(29) / 1e6, 12.5],
+            sigma: [at(29) / 1e6, 4e-6],
+            blob: [at(29) / 1e6, pytest.approx(RIGHT[0])],
+        }
+        assert "probes" not in viewer.frame(overview, at(29))
         take(overview, depth("a", at(30), 13.0), at(30))
-        assert viewer.frame(overview, at(30))["probe"] == [at(30) / 1e6, 13.0]
-        viewer.choose_field("no such field")
-        assert "probe" not in viewer.frame(overview, at(30))
+        assert viewer.frame(overview, at(30))["probes"] == {depth_a: [at(30) / 1e6, 13.0]}
+        viewer.choose_fields(["no such field"])
+        assert "probes" not in viewer.frame(overview, at(30))
 
     def test_memory_is_bounded_whatever_is_said(self) -> None:
         overview = Overview()

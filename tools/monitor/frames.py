@@ -1,7 +1,7 @@
 """What a viewer's page is told at an instant, as JSON: only what has changed since it was last told.
 
 A frame has the page's time (`now`, ms) and, as far as they are new: `scene`, `points` and `misses` (for trail and
-plots), `banner`, `figures`, `health`, `cameras` (HTML whose text is escaped), `rigs`, `pairs`, `probe`, `playback`.
+plots), `banner`, `figures`, `health`, `cameras` (HTML whose text is escaped), `rigs`, `pairs`, `probes`, `playback`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.messages import NodeInfo, RelativePose
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.estimate import Estimate, known, sigma_m
@@ -25,9 +26,12 @@ from buddyline.tools.pairs import Pair
 
 # Texts are made anew in every so many frames, so that they can be read.
 TEXTS_EVERY: Final = 6
-# Fields of messages that can be plotted are numbers, and lists of at most this many of them.
-MAX_ELEMENTS: Final = 4
-MAX_FIELDS: Final = 2000
+# Fields that can be plotted: numbers, of a list the first 36 (a covariance has as many), of objects the first few.
+MAX_ELEMENTS: Final = 36
+MAX_OBJECTS: Final = 4
+MAX_FIELDS: Final = 4000
+# As many as a page has plots.
+MAX_PROBES: Final = 3
 FRUSTUM_M: Final = 0.35
 
 # The columns of a point after its time and whether it is the track's; the page names and plots them.
@@ -35,29 +39,29 @@ Row = list[float | int | None]
 
 
 class Viewer:
-    """What one viewer has been told, and what he has chosen: a pair, and a field to plot."""
+    """What one viewer has been told, and what he has chosen: a pair, and fields to plot."""
 
     def __init__(self, *, live: bool) -> None:
         self.pair: Pair | None = None
-        self.field: tuple[str, str] | None = None
+        # Of each chosen field, `key field`, the time of the value that was told last.
+        self._probed_ns: dict[str, int] = {}
         self._live = live
         self._tick = 0
         self._told: dict[str, Any] = {}
-        self._point_ns = self._miss_ns = self._probe_ns = -1
+        self._point_ns = self._miss_ns = -1
         self._reset = True
 
     def restart(self) -> None:
         """Tell everything again: another pair, or another instant of a dive."""
         self._told.clear()
-        self._point_ns = self._miss_ns = self._probe_ns = -1
+        self._point_ns = self._miss_ns = -1
+        self._probed_ns = dict.fromkeys(self._probed_ns, -1)
         self._tick = 0
         self._reset = True
 
-    def choose_field(self, text: str) -> None:
-        """Choose the field to plot, `key field`; "": none."""
-        key, _, path = text.partition(" ")
-        self.field = (key, path) if path else None
-        self._probe_ns = -1
+    def choose_fields(self, names: list[str]) -> None:
+        """Choose the fields to plot, `key field` each."""
+        self._probed_ns = {name: self._probed_ns.get(name, -1) for name in names[:MAX_PROBES]}
 
     def frame(self, overview: Overview, now_ns: int) -> dict[str, Any]:
         """Return what is new for this viewer."""
@@ -68,7 +72,9 @@ class Viewer:
             self._reset = False
         said |= self._new_points(picture)
         found = findings(picture, now_ns, live=self._live)
-        self._tell(said, "banner", {"level": found[0].level, "text": sentence(found[0], now_ns)})
+        first = found[0]
+        banner = {"level": first.level, "text": sentence(first, now_ns), "advice": first.advice}
+        self._tell(said, "banner", banner)
         if self._tick % TEXTS_EVERY == 0:
             self._tell(said, "figures", panel.figures(picture, now_ns))
             self._tell(said, "health", panel.health(picture, now_ns, live=self._live))
@@ -77,8 +83,9 @@ class Viewer:
             self._tell(said, "rigs", {name: rig_outline(node.info) for name, node in picture.nodes.items()})
             shown = [name or "" for name in picture.ends()]
             self._tell(said, "pairs", {"all": ["/".join(pair) for pair in overview.pairs()], "shown": shown})
-        if self.field is not None:
-            said |= self._probe(overview)
+        probes = self._probes(overview)
+        if probes:
+            said["probes"] = probes
         self._tick += 1
         return said
 
@@ -104,22 +111,31 @@ class Viewer:
         said = {"points": points[::-1], "misses": misses[::-1]}
         return {name: new for name, new in said.items() if new}
 
-    def _probe(self, overview: Overview) -> dict[str, Any]:
-        """Return the chosen field's newest value, if it is new."""
-        assert self.field is not None
-        envelope = overview.last.get(self.field[0])
-        if envelope is None or envelope.time_ns <= self._probe_ns:
-            return {}
-        value = numbers(msgspec.to_builtins(envelope.message)).get(self.field[1])
-        self._probe_ns = envelope.time_ns
-        return {} if value is None else {"probe": [envelope.time_ns / MS_NS, value]}
+    def _probes(self, overview: Overview) -> dict[str, list[float]]:
+        """Return the chosen fields' newest values with their times (ms), as far as they are new."""
+        found = {}
+        for name, told_ns in self._probed_ns.items():
+            key, _, path = name.partition(" ")
+            envelope = overview.last.get(key)
+            if envelope is None or envelope.time_ns <= told_ns:
+                continue
+            self._probed_ns[name] = envelope.time_ns
+            value = numbers(_plain(envelope)).get(path)
+            if value is not None:
+                found[name] = [envelope.time_ns / MS_NS, value]
+        return found
+
+
+def _plain(envelope: Envelope) -> Any:
+    """Return a message as plain values; bytes stay bytes, which is quicker and has no number."""
+    return msgspec.to_builtins(envelope.message, builtin_types=(bytes,))
 
 
 def fields(overview: Overview) -> list[str]:
     """Return all fields that can be plotted, as `key field`."""
     found = []
     for key, envelope in sorted(overview.last.items()):
-        found += [f"{key} {path}" for path in numbers(msgspec.to_builtins(envelope.message, builtin_types=(bytes,)))]
+        found += [f"{key} {path}" for path in numbers(_plain(envelope))]
     return found[:MAX_FIELDS]
 
 
@@ -131,8 +147,9 @@ def numbers(value: Any, path: str = "") -> dict[str, float]:
         return {path: float(value)}
     if isinstance(value, dict):
         parts = [(f"{path}.{name}" if path else str(name), part) for name, part in value.items()]
-    elif isinstance(value, list | tuple) and len(value) <= MAX_ELEMENTS:
-        parts = [(f"{path}[{index}]", part) for index, part in enumerate(value)]
+    elif isinstance(value, list | tuple):
+        most = MAX_OBJECTS if any(isinstance(part, dict) for part in value) else MAX_ELEMENTS
+        parts = [(f"{path}[{index}]", part) for index, part in enumerate(value[:most])]
     else:
         return {}
     return {name: number for each, part in parts for name, number in numbers(part, each).items()}

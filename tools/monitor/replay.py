@@ -64,7 +64,7 @@ _SCRIPT: Final = r"""
 (() => {
 const COLOURS = {back: "#0b1016", text: "#ffffff", dim: "#a9b4c0", grid: "#1d2a35", grid5: "#35495c", a: "#ebebf0",
   b: "#ffaa3c", stale: "#7d848d", track: "#ffbe3c", pose: "#f2a93b", north: "#ff7b74", down: "#6cb0ff",
-  left: "#ff5c5c", right: "#4be37a", surface: "#4696be"};
+  left: "#ff4040", right: "#8affc1", surface: "#4696be"};
 const canvas = document.getElementById("replay"), scene = new Scene(canvas, draw);
 const slider = document.getElementById("at"), said = document.getElementById("said");
 const button = document.getElementById("play"), speed = document.getElementById("speed");

@@ -255,8 +255,8 @@ class _Serving:
                     pair = (ids[0], ids[1]) if len(ids) == 2 else None
                     if pair != viewer.pair:
                         viewer.pair, jumped = pair, True
-                if "field" in command:
-                    viewer.choose_field(str(command["field"]))
+                if isinstance(command.get("probe"), list):
+                    viewer.choose_fields([str(name) for name in command["probe"]])
                 if "fields" in command:
                     said["fields"] = fields(overview)
                 if "ping" in command:

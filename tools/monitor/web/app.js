@@ -7,7 +7,7 @@ const byId = (id) => document.getElementById(id);
 const QUANTITIES = ["Range, m", "Azimuth, deg from north, clockwise", "Inclination, deg, up positive",
   "Uncertainty of the position (1 sd), mm", "Gap between both nodes' ranges, mm", "Latency from exposure to here, ms"];
 const FIRST = 5, NED = ["North, m", "East, m", "Down, m"], MISSES = "Triggers without a pose, a second";
-const state = { scene: { nodes: [], seen: null }, rigs: {}, points: [], misses: [], probes: [], now: 0, playback: null,
+const state = { scene: { nodes: [], seen: null }, rigs: {}, points: [], misses: [], probes: {}, now: 0, playback: null,
   live: true, banner: null };
 let socket = null, heardMs = -1e9, provenMs = -1e9, triedMs = 0, wait = 250, drawn = false, tone = null, soundFor = "";
 
@@ -36,14 +36,16 @@ function ask() { commands({ ping: performance.now() }); }
 function take(said) {
   heardMs = performance.now();
   if (said.title !== undefined) { state.live = said.live; document.title = said.title; return; }
-  if (said.reset) { state.points = []; state.misses = []; state.probes = []; }
+  if (said.reset) { state.points = []; state.misses = []; for (const name in state.probes) state.probes[name] = []; }
   if (said.pong !== undefined) provenMs = said.pong;
   state.now = said.now;
   for (const name of ["scene", "rigs", "banner"]) if (said[name] !== undefined) state[name] = said[name];
   if (said.points) state.points.push(...said.points);
   if (said.misses) state.misses.push(...said.misses);
-  if (said.probe) state.probes.push(said.probe);
-  for (const list of [state.points, state.probes]) while (list.length && list[0][0] < state.now - KEPT_MS) list.shift();
+  for (const [name, value] of Object.entries(said.probes || {})) if (state.probes[name]) state.probes[name].push(value);
+  for (const list of [state.points, ...Object.values(state.probes)]) {
+    while (list.length && list[0][0] < state.now - KEPT_MS) list.shift();
+  }
   while (state.misses.length && state.misses[0] < state.now - KEPT_MS) state.misses.shift();
   for (const name of ["figures", "health"]) if (said[name] !== undefined) byId(name).innerHTML = said[name];
   if (said.cameras) said.cameras.forEach((html, k) => { byId(`cam${k}`).innerHTML = html; });
@@ -69,6 +71,10 @@ function judge() {
   else { words = state.banner ? state.banner.text : "Connecting."; look = level; }
   byId("unproven").classList.toggle("hidden", look !== "ok");
   if (byId("words").textContent !== words) byId("words").textContent = words;
+  // What to do, beside figures that are alone on the page.
+  const advice = state.banner && words === state.banner.text && look !== "ok" && state.banner.advice ?
+    `What to do: ${state.banner.advice}.` : "";
+  if (byId("advice").textContent !== advice) byId("advice").textContent = advice;
   banner.className = look;
   shine(look === "ok", nowMs);
   warn(look === "problem" ? words.replace(/[0-9.]+/g, "") : "");
@@ -119,13 +125,27 @@ function trail() {
   if (!spots.some((spot) => spot.tracked)) spots.forEach((spot, k) => { spot.tracked = spot.joined = k > 0; });
   return spots;
 }
+// A's camera stands still: the scene as A sees it, with A level and its picture's up for up.
+const WITH_CAMERA = ", with its camera", LEVEL = [0, 0, 1, 1, 0, 0, 0, 1, 0];
+const cell = (P, Q, r, c) => P[3 * r] * Q[c] + P[3 * r + 1] * Q[c + 3] + P[3 * r + 2] * Q[c + 6];
+const product = (P, Q) => [0, 1, 2].flatMap((r) => [0, 1, 2].map((c) => cell(P, Q, r, c)));
+const turned = (R) => [0, 1, 2].flatMap((r) => [0, 1, 2].map((c) => R[3 * c + r]));
+function asSeenFrom(told, spots) {
+  const M = product(LEVEL, turned(told.nodes[0].R));
+  for (const spot of spots) spot.t = times(M, spot.t);
+  return { ...told, levelled: false, depth: null, nodes: told.nodes.map((one) => ({ ...one, t: times(M, one.t),
+    R: product(M, one.R), ...(one.axes && { axes: product(M, one.axes) }) })) };
+}
 function drawScene() {
-  const told = state.scene, still = byId("still").value, node = told.nodes.find((one) => one.id === still);
+  let told = state.scene;
+  const still = byId("still").value.replace(WITH_CAMERA, "");
+  const node = told.nodes.find((one) => one.id === still);
   const origin = node ? node.t : [0, 0, 0];
   // Seen from B, the trail is A's: where B was, mirrored, so that B's present place is the origin.
   const isOther = node && told.pair && still !== told.pair[0];
   const spots = trail();
   if (isOther) for (const spot of spots) spot.t = spot.t.map((x) => -x);
+  if (byId("still").value.endsWith(WITH_CAMERA) && told.nodes.length) told = asSeenFrom(told, spots);
   scene.fit(told.nodes.slice(0, 2).map((one) => minus(one.t, origin)));
   scene.draw({ ...told, rigs: state.rigs, trail: spots, origin, follows: isOther ? () => [0, 0, 0] : null }, colours);
 }
@@ -142,7 +162,7 @@ function showPairs(pairs) {
   options(byId("pair"), pairs.all, pairs.shown.join("/"));
   byId("pairbox").classList.toggle("hidden", pairs.all.length < 2);
   const still = byId("still"), ends = pairs.shown.filter((name) => name);
-  options(still, ends, still.dataset.chosen || ends[0]);
+  options(still, [...ends, ...ends.slice(0, 1).map((name) => name + WITH_CAMERA)], still.dataset.chosen || ends[0]);
 }
 
 const plots = [...document.querySelectorAll(".plot")].map((box, k) => {
@@ -164,12 +184,11 @@ function showFields(found) {
     options(plot.select, [...QUANTITIES, ...NED, MISSES, ...found], chosen);
   }
 }
-// One field of a message at a time: that of the first plot which wants one.
 const isField = (name) => name.startsWith("buddyline/");
 function probe() {
-  const wanted = plots.find((plot) => isField(plot.select.value));
-  const name = wanted ? wanted.select.value : "";
-  if (name !== state.probed) { state.probed = name; state.probes = []; commands({ field: name }); }
+  const wanted = [...new Set(plots.map((plot) => plot.select.value).filter(isField))];
+  state.probes = Object.fromEntries(wanted.map((name) => [name, state.probes[name] || []]));
+  commands({ probe: wanted });
 }
 function series(title) {
   const age = (ms) => (ms - state.now) / 1e3;
@@ -183,8 +202,8 @@ function series(title) {
     return [counts.map((_, k) => k - SHOWN_S + 1), counts.map(() => null), counts];
   }
   if (isField(title)) {
-    if (title !== state.probed) return [[], [], []];
-    return [state.probes.map((p) => age(p[0])), state.probes.map(() => null), state.probes.map((p) => p[1])];
+    const found = state.probes[title] || [];
+    return [found.map((p) => age(p[0])), found.map(() => null), found.map((p) => p[1])];
   }
   const column = NED.includes(title) ? 2 + NED.indexOf(title) : FIRST + QUANTITIES.indexOf(title);
   const found = recent.filter((p) => p[column] != null).sort((p, q) => p[0] - q[0]);
@@ -266,7 +285,12 @@ function showPlayback(playback) {
 }
 
 const toggles = {
-  deck: (on) => { document.body.classList.toggle("deck", on); plots.forEach((plot) => plot.remake()); },
+  deck: (on) => {
+    document.body.classList.toggle("deck", on);
+    // Where large figures do not fit, they are scrolled, by keys too.
+    document.querySelector("main").tabIndex = on ? 0 : -1;
+    plots.forEach((plot) => plot.remake());
+  },
   light: (on) => { document.documentElement.classList.toggle("light", on); readColours();
     plots.forEach((plot) => plot.remake()); drawn = false; },
   sound: (on) => { tone = on ? new AudioContext() : null; },
