@@ -81,7 +81,7 @@ class _WithParity:
 class DiveLogWriter:
     """Writes one MCAP file, which must not exist yet, in chunks of at most a second of log time.
 
-    parity: add what `buddyline repair` needs to restore damaged bytes (protocol.parity), an eighth of the file.
+    parity: add what `buddyline repair` needs to restore damaged bytes (protocol.parity), a tenth of the file.
     """
 
     def __init__(self, path: Path | str, *, metadata: dict[str, str] | None = None, parity: bool = True) -> None:

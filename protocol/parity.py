@@ -1,6 +1,6 @@
 """Parity for a file that grows: what is damaged of it can be computed from the rest (Reed-Solomon over its bytes).
 
-The file is covered in groups of up to 180 blocks; after each group goes a record with 12 % of parity blocks and the
+The file is covered in groups of up to 180 blocks; after each group goes a record with 10 % of parity blocks and the
 checksums of all blocks, which say where the damage is. As many damaged blocks of a group, whichever, can be restored as
 there are sound parity blocks. Bytes that were inserted or removed are not found.
 
@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 BLOCK_BYTES: Final = 4096
 MOST_BLOCKS: Final = 180
 GROUP_BYTES: Final = BLOCK_BYTES * MOST_BLOCKS
-PARITY_SHARE: Final = 0.12
+PARITY_SHARE: Final = 0.1
+# A hole of 64 kB touches 17 blocks.
+LEAST: Final = 18
 # A private MCAP record, which other readers skip.
 PARITY_OPCODE: Final = 0x90
 
@@ -114,7 +116,7 @@ def parity_record(data: bytes, end: int) -> bytes:
     """Return the record with the parity of the last bytes of a file, which ends at byte `end`."""
     block_bytes = max(BLOCK_BYTES, -(-len(data) // MOST_BLOCKS))
     blocks = _blocks(data, block_bytes)
-    count = max(round(len(blocks) * PARITY_SHARE), min(len(blocks), 20))
+    count = max(round(len(blocks) * PARITY_SHARE), min(len(blocks), LEAST))
     parity = _combine(_coefficients(count, len(blocks)), blocks)
     sums = tuple(zlib.crc32(block.tobytes()) for block in (*blocks, *parity))
     described_bytes = _HEAD.size + 4 * len(sums) + 4

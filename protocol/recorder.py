@@ -30,7 +30,7 @@ class RecordError(BuddylineError):
 class Recorder:
     """Writes payloads into a dive log and syncs it every second.
 
-    While the disk is slow or refuses to write, messages wait in memory. Beyond 64 MB, besides what is being written,
+    While the disk is slow or refuses to write, messages wait in memory. Beyond 64 MB, with what is being written,
     the oldest pictures are dropped first, then the oldest messages; `dropped` counts them. `error`: why nothing can be
     written; None if it can. After an error the thread tries again until `close`. pictures: receives the pictures, in
     place of the log.
@@ -61,7 +61,7 @@ class Recorder:
             self._ready.notify()
 
     def _bound(self) -> None:
-        while self._queued_bytes > MAX_QUEUED_BYTES:
+        while self._queued_bytes > MAX_QUEUED_BYTES and self._queue:
             self._drop_one()
 
     def _drop_one(self) -> None:
@@ -89,7 +89,6 @@ class Recorder:
                     if not self._queue and not self._closing:
                         self._ready.wait(SYNC_INTERVAL_S / 4)
                     batch, self._queue = self._queue, deque()
-                    self._queued_bytes = 0
                     closing = self._closing
                 self._write(batch)
             self._writer.flush(sync=True)
@@ -114,6 +113,8 @@ class Recorder:
             else:
                 self._writer.write(key, payload, log_time_ns, schema=schema)
             batch.popleft()
+            with self._ready:
+                self._queued_bytes -= len(payload)
             self.written += 1
 
     def _refused(self, error: OSError, unwritten: deque[Item]) -> bool:
@@ -123,7 +124,6 @@ class Recorder:
                 self._writer.abandon()
                 raise error
             self._last_try = self._closing
-            self._queued_bytes += sum(len(item[1]) for item in unwritten)
             self._queue.extendleft(reversed(unwritten))
             self._bound()
         if self.error is None:

@@ -35,6 +35,7 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
         **_COMMON,
         **_tls_settings(tls, "listen"),
         "low_pass_filter": size_limits(),
+        "qos/network": own_urgency(),
     }
     return settings if access is None else {**settings, "access_control": access}
 
@@ -58,6 +59,29 @@ def size_limits() -> list[dict[str, object]]:
             "size_limit": max_bytes,
         }
         for max_bytes, of_size in keys.items()
+    ]
+
+
+def own_urgency() -> list[dict[str, object]]:
+    """Return Zenoh's `qos/network` for a hub: each topic goes on as urgently as its table says, whoever sent it.
+
+    A client could claim the highest priority, and that the hub waits (BLOCK) for a receiver that takes nothing.
+
+    Zenoh's `downsampling` is no limit of rate for us: it passes one message in each interval, and lets none of a burst
+    follow. Of three samples that a link delivers together two would be lost.
+    """
+    keys: dict[tuple[str, bool], list[str]] = {}
+    for topic in TOPICS:
+        keys.setdefault((topic.priority, topic.express), []).append(f"**/{topic.key_any()}")
+    return [
+        {
+            "id": f"{priority}{' express' if express else ''}",
+            "flows": ["ingress"],
+            "messages": ["put", "delete"],
+            "key_exprs": of_kind,
+            "overwrite": {"priority": priority, "congestion_control": "drop", "express": express},
+        }
+        for (priority, express), of_kind in keys.items()
     ]
 
 

@@ -383,3 +383,22 @@ def test_the_hub_passes_on_no_payload_above_its_topics_limit(namespace: str | No
         inbox.wait_for(4)
         assert sorted(len(received.payload) for received in inbox.received) == [1, 2, depth, image]
         sender.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("namespace", [None, "tether/two"])
+def test_no_client_is_more_urgent_than_its_topic(namespace: str | None) -> None:
+    """With BLOCK, the hub would wait for a receiver that takes nothing; all others would wait for the hub."""
+    claims = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.BLOCK}
+    with open_hub(free_endpoint()) as hub:
+        config = config_of(client_settings(hub.endpoint, namespace))
+        with zenoh.open(config) as client, zenoh.open(config) as viewer:
+            found: list[zenoh.Sample] = []
+            viewer.declare_subscriber("buddyline/**", found.append)
+            for topic in (topics.IMU, topics.CANDIDATES, topics.IMAGE):
+                until(lambda: client.declare_publisher(topics.IMU.key("c")).matching_status.matching, 0.05)
+                client.put(topic.key("c"), b"x", express=True, **claims)
+            until(lambda: len(found) == 3)
+    for sample in found:
+        assert sample.congestion_control == zenoh.CongestionControl.DROP
+        assert sample.priority != zenoh.Priority.REAL_TIME
+        assert sample.express is not str(sample.key_expr).endswith(("imu", "image"))

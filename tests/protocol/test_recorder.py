@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import threading
 
 import pytest
 from buddyline.protocol import recorder as module
@@ -14,7 +15,7 @@ from buddyline.protocol.spool import Spool
 from buddyline.tools.dives import Dive
 
 from tests.disks import small_disk
-from tests.processes import until
+from tests.processes import PATIENCE_S, until
 
 MIB = 1024 * 1024
 PICTURE = "buddyline/node/a/image"
@@ -203,6 +204,27 @@ def test_memory_is_bounded_and_pictures_are_dropped_before_messages(tmp_path, mo
     assert [item[2] for item in recorder._queue if item[0] == DEPTH] == sender.depths
     with pytest.raises(RecordError):
         recorder.close()
+
+
+def test_what_is_being_written_counts_among_what_waits(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
+    begun, go_on = threading.Event(), threading.Event()
+
+    def stand(*_args, **_kwargs):
+        begun.set()
+        assert go_on.wait(PATIENCE_S)
+
+    monkeypatch.setattr(PictureLog, "write", stand)
+    with recording(tmp_path / "a-1.mcap") as recorder:
+        sender = Sender(recorder)
+        sender.picture(9000)
+        assert begun.wait(PATIENCE_S)
+        for _ in range(4):
+            sender.picture(9000)
+        held, dropped = recorder._queued_bytes, recorder.dropped
+        go_on.set()
+    assert held <= 20_000
+    assert dropped >= 3
 
 
 def _refuse(*_args, **_kwargs):
