@@ -261,10 +261,11 @@ class SolverCore:
                 pair.take(message, arrival, now_ns, live=live)
         else:
             stream.add_sample(message)
+        if isinstance(message, Imu):
+            return ()  # No trigger waits for inertial samples.
         pairs = self._pairs_of.get(stream.node, ())
-        if not isinstance(message, Imu):  # No trigger waits for inertial samples.
-            for pair in pairs:
-                pair.resolve(now_ns)
+        for pair in pairs:
+            pair.resolve(now_ns)
         return pairs
 
     def _stream(self, node: str) -> NodeStream | None:

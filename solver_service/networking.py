@@ -68,7 +68,9 @@ class NetTracker:
 
     def take(self, outcomes: Iterable[Message]) -> list[Message]:
         """Go on to where these outcomes allow; return the poses of all nodes up to there."""
-        fixes = []
+        outcomes, fixes = list(outcomes), []
+        if not outcomes:
+            return []
         for one in outcomes:
             # A late frame's stamp is old, or far from the dive's time: it does not carry the network on.
             if isinstance(one, RelativePose) or (isinstance(one, Rejected) and one.reason != "late"):

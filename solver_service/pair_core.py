@@ -97,6 +97,8 @@ class PairCore:
 
         told_ns: outcomes up to there are nothing to the track.
         """
+        if not (self._unsettled or self._settled):
+            return []
         self._solve()
         settled, self._settled = self._settled, []
         told = settled + (self.tracker.take(newer(settled, told_ns)) if self.tracker is not None else [])

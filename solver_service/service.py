@@ -185,7 +185,12 @@ class SolverService(Service):
         self._joined_ns = self._attached_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:
-        """Take one message from the bus; a bad one is counted and reported."""
+        """Take one message from the bus; a bad one is counted and reported. At the end a backlog is left to the next.
+
+        The end would else wait for the lock, for as long as the backlog lasts.
+        """
+        if self.stop.is_set():
+            return
         try:
             message = received.open().message
         except MessageError as error:

@@ -241,23 +241,24 @@ class PairTracker:
 
     def _expect(self, track: TrackFilter, to_ns: int) -> list[Message]:
         """Return where each node's next picture should show the other's lights."""
-        messages: list[Message] = []
-        for node, stream in enumerate(self._streams):
-            if self._infos is None or stream.newest_ns is None:
-                continue
-            stamp_ns = stream.newest_ns + self._infos[node].trigger_period_ns
-            lights = foresee(track, node, to_ns, stamp_ns)
-            if lights:
-                messages.append(
-                    Expect(
-                        node=stream.node,
-                        seen=self._streams[1 - node].node,
-                        stamp_ns=stamp_ns,
-                        valid_ns=EXPECT_VALID_NS,
-                        lights=[_expected_light(light) for light in lights],
-                    )
-                )
-        return messages
+        if self._infos is None:
+            return []
+        stamps_ns = {
+            node: stream.newest_ns + self._infos[node].trigger_period_ns
+            for node, stream in enumerate(self._streams)
+            if stream.newest_ns is not None
+        }
+        return [
+            Expect(
+                node=self._streams[node].node,
+                seen=self._streams[1 - node].node,
+                stamp_ns=stamps_ns[node],
+                valid_ns=EXPECT_VALID_NS,
+                lights=[_expected_light(light) for light in lights],
+            )
+            for node, lights in foresee(track, to_ns, stamps_ns).items()
+            if lights
+        ]
 
     def _due(self, start_ns: int, end_ns: int) -> list[int]:
         """Return the instants of the rows from start_ns to end_ns."""

@@ -110,10 +110,11 @@ class TrackFilter(TrackPool):
         main = self.main
         if main is None or not main.confirmed or self.clocks_apart() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
             return None
-        state, P = self._predict(main, t_s)
-        a, b = self.increments(main, t_s) if t_s > main.t_s else (None, None)
-        rates_radps = main.rates_radps if a is None or b is None else np.stack((a.rate_radps, b.rate_radps))
-        return state, P, rates_radps
+        if t_s <= main.t_s:
+            return main.state, main.covariance, main.rates_radps
+        parts = self.increments(main, t_s)
+        state, P = self._predict(main, t_s, parts=parts)
+        return state, P, np.stack((parts[0].rate_radps, parts[1].rate_radps))
 
     def clocks_apart(self) -> bool:
         """Whether the clocks prove further apart than a live track bears, or did lately; `problems` says so then.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,6 +10,7 @@ import numpy as np
 from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import BLOCK, in_picture, light_positions, pixel_of
+from buddyline.solver_service.track.state import State
 from buddyline.solver_service.track.stepping import HOLD_S
 
 # How the nodes may move otherwise than at their last rates, 1 sd: a diver who turns his head, and who swims off.
@@ -35,17 +37,24 @@ class ForeseenLight:
     sigma_rate_pxps: float
 
 
-def foresee(track: TrackFilter, observer: int, known_ns: int, stamp_ns: int) -> list[ForeseenLight]:
-    """Return the other node's lights that should be in the observer's picture at stamp_ns, on the observer's clock.
+def foresee(track: TrackFilter, known_ns: int, stamps_ns: Mapping[int, int]) -> dict[int, list[ForeseenLight]]:
+    """Return, by observer, the other node's lights that should be in its picture at its stamp, on its own clock.
 
     known_ns: up to which the track has been given everything. A light that is dark, outside of the picture, or whose
     place is poorly known is left out.
     """
     now_s = track.seconds(0, known_ns) - HOLD_S
-    ahead_s = track.seconds(observer, stamp_ns) - now_s
-    present = track.present(now_s) if 0.0 < ahead_s <= FURTHEST_S else None
+    ahead_s = {observer: track.seconds(observer, stamp_ns) - now_s for observer, stamp_ns in stamps_ns.items()}
+    near = {observer: ahead for observer, ahead in ahead_s.items() if 0.0 < ahead <= FURTHEST_S}
+    present = track.present(now_s) if near else None
     if present is None:
-        return []
+        return {}
+    return {observer: _foreseen(track, observer, ahead, present) for observer, ahead in near.items()}
+
+
+def _foreseen(
+    track: TrackFilter, observer: int, ahead_s: float, present: tuple[State, Floats, Floats]
+) -> list[ForeseenLight]:
     state, P, rates_radps = present
     rig, other = track.nodes[observer].rig, track.nodes[1 - observer].rig
     dark = {light for node, light, _ in track.lamps.dark() if node == 1 - observer}

@@ -401,11 +401,14 @@ class TrackSteps(TrackIntake):
             first = Step(estimate.t_s, state, state, estimate.covariance, *still, rates, estimate.light_s, 0)
             estimate.steps.append(first)
 
-    def _predict(self, estimate: Estimate, t_s: float, least_s: float = 0.0) -> tuple[State, Floats]:
+    def _predict(
+        self, estimate: Estimate, t_s: float, least_s: float = 0.0, parts: tuple[Increment, Increment] | None = None
+    ) -> tuple[State, Floats]:
+        """Return state and covariance at t_s. parts: `increments` to there, where they are known already."""
         span_s = t_s - estimate.t_s
         if span_s <= least_s:
             return estimate.state, estimate.covariance
-        parts = self.increments(estimate, t_s)
+        parts = self.increments(estimate, t_s) if parts is None else parts
         after, F = propagate(estimate.state, parts, span_s)
         shaking = self._with_sudden(estimate.shaking.variances, parts)
         Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
