@@ -249,6 +249,7 @@ class SolverCore:
         if isinstance(message, NodeInfo):
             stream.add_info(message)
             self.health.saw_period(stream.node, message.trigger_period_ns)
+            self.health.saw_software(stream.node, message.software)
         elif isinstance(message, Candidates):
             live = receive_ns is not None and abs(receive_ns - message.stamp_ns) < LIVE_WITHIN_NS
             others_ns = [s.newest_ns for s in self.streams.values() if s is not stream and s.newest_ns is not None]

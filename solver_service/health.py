@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
+from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import FRAMES_APART_S, stale_after_s
 from buddyline.protocol.topics import CANDIDATES
 
 MAX_PROCESSES: Final = 256
+_RELEASE: Final = re.compile(r"buddyline (\d{1,4}\.\d{1,4})(?!\d)")
 
 
 class Health:
@@ -18,6 +21,7 @@ class Health:
         self._frames: dict[str, tuple[int, int]] = {}
         self._period_s: dict[str, float] = {}
         self._alive: dict[str, bool] = {}
+        self._releases: dict[str, str] = {}
 
     def saw_frame(self, node: str, stamp_ns: int, now_ns: int) -> None:
         """Note a frame of a node."""
@@ -26,6 +30,14 @@ class Health:
     def saw_period(self, node: str, trigger_period_ns: int) -> None:
         """Note a node's trigger period."""
         self._period_s[node] = trigger_period_ns / S_NS
+
+    def saw_software(self, node: str, software: str) -> None:
+        """Note which release of Buddyline a node runs; other programs that send its messages have none."""
+        release = release_of(software)
+        if release is None:
+            self._releases.pop(node, None)
+        else:
+            self._releases[node] = release
 
     def saw_process(self, name: str, alive: bool) -> bool:
         """Note that a process has started or ended; name: as declared alive on the bus. Return whether that is news."""
@@ -40,6 +52,12 @@ class Health:
     def problems(self, nodes: tuple[str, str], now_ns: int) -> list[str]:
         """Return the problems of a pair of nodes, one phrase each."""
         found = [text for node in nodes if (text := self._problem_of(node, now_ns))]
+        own = release_of(f"buddyline {__version__}")
+        others = [
+            f"node {node} runs Buddyline {release}, this solver {own}: update the older"
+            for node in nodes
+            if (release := self._releases.get(node)) is not None and own is not None and release != own
+        ]
         if not found:
             node_a, node_b = nodes
             ahead_ns = self._frames[node_b][1] - self._frames[node_a][1]
@@ -49,7 +67,7 @@ class Health:
                     f"frames of {first} are {abs(ahead_ns) / S_NS:.1f} s ahead of those of {second}: "
                     "do their clocks agree?"
                 )
-        return found
+        return found + others
 
     def _problem_of(self, node: str, now_ns: int) -> str | None:
         if self._alive.get(node) is False:
@@ -61,3 +79,9 @@ class Health:
         if silent_s > stale_after_s(CANDIDATES, self._period_s.get(node, 0.0)):
             return f"no frame of node {node} for {silent_s:.0f} s"
         return None
+
+
+def release_of(software: str) -> str | None:
+    """Return the release, major and minor, that NodeInfo.software names; None if it names none."""
+    found = _RELEASE.match(software)
+    return None if found is None else found[1]

@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
-    if args.format == "trc" or args.what == "net":
+    if args.format == "trc" or (args.what == "net" and args.format != "c3d"):
         return _export_network(args)
     if args.node is not None:
         raise BuddylineError("--node: only with --what net")
@@ -162,7 +162,7 @@ def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
     module = import_module(f"buddyline.tools.{form.module}")
     with Dive(args.logs) as dive:
         count = module.export(dive, args.output, args.what)
-    print(f"{args.output}: {count} {'rows' if form.name == 'parquet' else 'messages'}", file=sys.stderr)
+    print(f"{args.output}: {count} {form.counts}", file=sys.stderr)
     return 0
 
 

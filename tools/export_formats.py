@@ -10,19 +10,23 @@ from typing import Final
 class ExportFormat:
     """A format. module: below buddyline.tools, with export(dive, output, what) -> number of messages or rows.
 
-    "": text, which tools/export.py writes to a file or to standard output.
+    "": text, which tools/export.py writes to a file or to standard output. counts: what its number is of.
     """
 
     name: str
     says: str
     module: str = ""
+    counts: str = "messages"
 
 
 FORMATS: Final = (
     ExportFormat("tum", "t x y z qx qy qz qw, for evo and others"),
     ExportFormat("csv", "a row for each sample, units in the header"),
     ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
-    ExportFormat("parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet"),
+    ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "export_c3d", "frames"),
+    ExportFormat(
+        "parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet", "rows"
+    ),
     ExportFormat(
         "foxglove",
         "a log with scene, pictures, marks, path, series and log for Foxglove and Lichtblick, and a layout beside it",

@@ -7,6 +7,7 @@ import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,7 +24,6 @@ _CSV: Final = (
     *("v_north_mps", "v_east_mps", "v_down_mps", "sd_north_m", "sd_east_m", "sd_down_m"),
     *("sd_w_north_rad", "sd_w_east_rad", "sd_w_down_rad", "age_s"),
 )
-# Motion capture programs take y for up: x north, y up, z east.
 _NORTH_UP_EAST: Final = np.array(((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
 
 
@@ -37,7 +37,7 @@ def network_lines(logs: Sequence[str], form: str, node: str | None, name: str) -
         raise BuddylineError(f"{', '.join(logs)}: nothing of node {node}; nodes: {', '.join(known)}")
     said = f"{'node ' + node if node else 'nodes ' + ', '.join(known)} in the net's frame, {len(poses)} rows"
     if form == "trc":
-        return said, _trc_lines(poses, infos, name)
+        return said, _trc_lines(_markers_of(poses, infos), name)
     if form == "csv":
         return said, _csv_lines(poses)
     if node is None:
@@ -79,30 +79,53 @@ def _csv_lines(poses: Sequence[NodePose]) -> Iterator[str]:
         text.truncate()
 
 
-def _trc_lines(poses: Sequence[NodePose], infos: dict[str, NodeInfo], name: str) -> Iterator[str]:
-    """Yield the lines of a TRC file, mm. Markers: each node's camera and lamps; empty where the node has no pose."""
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """Each node's camera and lamps at all times of a net.
+
+    places_m (T, M, 3): x north, y up, z east, as motion capture programs take y for up; NaN where a node has no pose.
+    """
+
+    names: list[str]
+    stamps_ns: list[int]
+    places_m: Floats
+
+    @property
+    def rate_hz(self) -> float:
+        """Rows a second."""
+        return S_NS / float(np.median(np.diff(self.stamps_ns))) if len(self.stamps_ns) > 1 else 1.0
+
+
+def load_markers(logs: Sequence[str]) -> Markers:
+    """Return the markers of the first log that has a net; raise BuddylineError for none."""
+    return _markers_of(*_load(logs))
+
+
+def _markers_of(poses: Sequence[NodePose], infos: dict[str, NodeInfo]) -> Markers:
     nodes = sorted({pose.node for pose in poses})
     marked = {node: _markers(node, infos.get(node)) for node in nodes}
     names = [marker for node in nodes for marker, _ in marked[node]]
     stamps_ns = sorted({pose.stamp_ns for pose in poses})
-    found = {(pose.stamp_ns, pose.node): pose for pose in poses}
-    rate_hz = S_NS / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 1.0
+    row = {stamp_ns: k for k, stamp_ns in enumerate(stamps_ns)}
+    places_m = np.full((len(stamps_ns), len(names), 3), np.nan)
+    for pose in poses:
+        for marker, place_m in marked[pose.node]:
+            ned_m = np.array(pose.p_m) + rotate(normalized(np.array(pose.q_xyzw)), place_m)
+            places_m[row[pose.stamp_ns], names.index(marker)] = _NORTH_UP_EAST @ ned_m
+    return Markers(names, stamps_ns, places_m)
+
+
+def _trc_lines(markers: Markers, name: str) -> Iterator[str]:
+    """Yield the lines of a TRC file, mm; cells are empty where a node has no pose."""
+    rate_hz, count, names = markers.rate_hz, len(markers.stamps_ns), markers.names
     yield f"PathFileType\t4\t(X/Y/Z)\t{name}\n"
     yield "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
-    count = len(stamps_ns)
     yield f"{rate_hz:g}\t{rate_hz:g}\t{count}\t{len(names)}\tmm\t{rate_hz:g}\t1\t{count}\n"
     yield "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t\n"
     yield "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, len(names) + 1)) + "\n\n"
-    for frame, stamp_ns in enumerate(stamps_ns, start=1):
-        cells = [str(frame), f"{(stamp_ns - stamps_ns[0]) / S_NS:.6f}"]
-        for node in nodes:
-            pose = found.get((stamp_ns, node))
-            for _, place_m in marked[node]:
-                if pose is None:
-                    cells += ["", "", ""]
-                    continue
-                ned_m = np.array(pose.p_m) + rotate(normalized(np.array(pose.q_xyzw)), place_m)
-                cells += [f"{1e3 * value:.3f}" for value in _NORTH_UP_EAST @ ned_m]
+    for frame, (stamp_ns, places_m) in enumerate(zip(markers.stamps_ns, markers.places_m, strict=True), start=1):
+        cells = [str(frame), f"{(stamp_ns - markers.stamps_ns[0]) / S_NS:.6f}"]
+        cells += ["" if math.isnan(value) else f"{1e3 * value:.3f}" for value in places_m.ravel().tolist()]
         yield "\t".join(cells) + "\n"
 
 

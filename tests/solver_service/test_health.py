@@ -112,3 +112,12 @@ def test_a_process_is_news_once_and_only_a_node_is():
     assert health.saw_process("node/a", False)
     many = [health.saw_process(f"node/n{k}", True) for k in range(10_000)]
     assert sum(many) < 300
+
+
+def test_a_node_of_another_release_is_named(health, monkeypatch):
+    monkeypatch.setattr("buddyline.solver_service.health.__version__", "0.2.1.dev14+g3c71112")
+    health.saw_software("a", "buddyline 0.2.0")
+    health.saw_software("b", "another program 0.1")
+    assert health.problems(AB, 50 * S_NS) == []
+    health.saw_software("b", "buddyline 0.1.9")
+    assert health.problems(AB, 50 * S_NS) == ["node b runs Buddyline 0.1, this solver 0.2: update the older"]

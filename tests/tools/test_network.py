@@ -133,6 +133,23 @@ def test_export_trc_has_cameras_and_lamps_as_markers(solved, tmp_path):
     assert {len(line.split("\t")) for line in lines[6:16]} == {2 + 27}
 
 
+def test_export_c3d_has_the_same_markers_as_trc(solved, tmp_path):
+    """Read back by the library: millimetres, y up, and no marker where a node has no pose."""
+    ezc3d = pytest.importorskip("ezc3d")
+    path = tmp_path / "dive.c3d"
+    assert main(["export", solved, "--format", "c3d", "-o", str(path)]) == 0
+    read = ezc3d.c3d(str(path))
+    point = read["parameters"]["POINT"]
+    assert point["LABELS"]["value"] == [node + end for node in "abc" for end in ("", "_left", "_right")]
+    assert (point["RATE"]["value"][0], point["UNITS"]["value"]) == (10.0, ["mm"])
+    points = read["data"]["points"]
+    assert points.shape == (4, 9, 10)
+    assert points[:3, :2, 0].T.ravel() == pytest.approx([0.0, -5000.0, 0.0, 0.0, -5000.0, -400.0], abs=1e-3)
+    assert np.isnan(points[:3, 6:, 8:]).all()
+    assert not np.isnan(points[:3, :6]).any()
+    assert main(["export", solved, "--format", "c3d", "--what", "poses", "-o", str(tmp_path / "x.c3d")]) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -10,17 +10,19 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any, Final
 
+import numpy as np
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import load_config
 from buddyline.protocol.health import NO_LIGHT_S, TRACK_SIGMA_SHARE
-from buddyline.protocol.messages import NodeInfo
+from buddyline.protocol.messages import NodeInfo, NodePose
 from buddyline.tools.authenticity import check_logs
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw import dive as dive_figures
 from buddyline.tools.draw import figures
 from buddyline.tools.draw.figures import inline_svg
 from buddyline.tools.draw.page import data_block, page, section, table
+from buddyline.tools.draw.volume import LEVELS_M, draw_seen_volume, seen_volume
 from buddyline.tools.estimate import known
 from buddyline.tools.health.words import duration_words, reason_words
 from buddyline.tools.monitor.coverage import CSS as STRIP_CSS
@@ -97,6 +99,7 @@ def report_html(
         section("Where the error of a place comes from", budget_html(numbers)),
         section("Replay", _replay(summary)),
         section("Plan and profile", _maps(summary)),
+        *_seen_volume(dive),
         section("Over time", f'<div class="scroll"><div class="wide">{_over_time(summary)}</div></div>'),
         section("Coverage: where there is a pose or a track, and where and why there is no pose", _coverage(summary)),
         section("Outliers: poses that contradict the track", outliers_html(numbers, found, dive.start_ns)),
@@ -176,6 +179,26 @@ def _maps(summary: Summary) -> str:
     by_compass = any(known(point.estimate, "sigma_azimuth_rad") for point in summary.tracks)
     compass = ", which contain the compass's error" if by_compass else ""
     return f'<div class="two">{plan}{profile}</div><p class="dim">{said}{compass}.</p>'
+
+
+def _seen_volume(dive: Dive) -> list[str]:
+    """Return a section that shows where the fixed nodes would see another well; nothing without fixed nodes."""
+    infos = dive.infos()
+    fixed = {node: info for node, info in sorted(infos.items()) if info.fixed is not UNSET}
+    if not fixed:
+        return []
+    poses = [one.message for one in dive.messages("net_pose") if isinstance(one.message, NodePose)]
+    nets = {info.fixed.net for info in fixed.values() if info.fixed is not UNSET}
+    places_m = np.array([pose.p_m for pose in poses if not pose.fixed and pose.net in nets])
+    moving = next((info for node, info in sorted(infos.items()) if node not in fixed), fixed[min(fixed)])
+    volume = seen_volume(fixed, moving, places_m)
+    shares = ", ".join(f"better than {length_words(level)} in {volume.share(level):.0%}" for level in LEVELS_M)
+    said = (
+        f"By the lights that fixed nodes {', '.join(fixed)} and node {moving.node} would see of each other: {shares} "
+        "of this area. Tracks with inertial units do better, turbid water does worse."
+    )
+    drawn = inline_svg(draw_seen_volume(volume, fixed), "where the fixed nodes see well, from above")
+    return [section("Where the network sees well", drawn, f'<p class="dim">{escape(said)}</p>')]
 
 
 def _over_time(summary: Summary) -> str:

@@ -196,3 +196,19 @@ def test_nodes_of_two_nets_are_said() -> None:
     _, core = solved(messages)
     assert core.network is not None
     assert core.network.problems == ["fixed nodes name the nets main and other: all are taken for one frame"]
+
+
+def test_fixed_nodes_whose_places_contradict_each_other_are_named() -> None:
+    """Two frames of one name, say: b is said to stand a metre from where a sees it."""
+    _, messages = dive(5, 2.5, more_nodes=(), fixed_nodes=("a", "b"), imu=False)
+    _, core = solved(messages)
+    assert core.network is not None
+    assert core.network.problems == []
+
+    def aside(info: NodeInfo) -> NodeInfo:
+        x, y, z = info.fixed.p_m
+        return replace(info, fixed=replace(info.fixed, p_m=(x + 0.7, y + 0.7, z)))
+
+    _, core = solved(changed(messages, "b", aside))
+    assert core.network is not None
+    assert core.network.problems == ["fixed nodes a and b: what they see of each other contradicts their places"]

@@ -1,0 +1,51 @@
+"""All nodes of a net as markers in a C3D file, for motion capture and biomechanics programs."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.dives import Dive
+from buddyline.tools.export_network import load_markers
+from buddyline.tools.newfile import new_file
+
+# A C3D file has one rate and no times: rows that are missing are frames without markers. So many frames fit into it.
+MOST_FRAMES: Final = 65535
+
+
+def export(dive: Dive, output: Path, what: str | None = None) -> int:
+    """Write the nodes' cameras and lamps into output, which must not exist, in mm; return the number of frames."""
+    try:
+        import ezc3d
+    except ImportError as error:
+        raise BuddylineError(
+            f"--format c3d needs ezc3d, which is not installed ({error.name}): make install EXTRAS=c3d"
+        ) from error
+    if what not in (None, "net"):
+        raise BuddylineError(f"--format c3d --what {what}: it has all nodes")
+    markers = load_markers([str(reader.path) for reader in dive.readers])
+    period_ns = 1e9 / markers.rate_hz
+    frames = [round((stamp_ns - markers.stamps_ns[0]) / period_ns) for stamp_ns in markers.stamps_ns]
+    if frames[-1] >= MOST_FRAMES:
+        raise BuddylineError(f"{dive.name}: {frames[-1] + 1} frames; a C3D file has at most {MOST_FRAMES}: use trc")
+    # Homogeneous coordinates; of a marker that is not there the residual is -1.
+    points = np.full((4, len(markers.names), frames[-1] + 1), np.nan)
+    points[:3, :, frames] = 1e3 * markers.places_m.transpose(2, 1, 0)
+    points[3] = 1.0
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [markers.rate_hz]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["parameters"]["POINT"]["LABELS"]["value"] = markers.names
+    file.add_parameter("POINT", "X_SCREEN", ["+X"])
+    file.add_parameter("POINT", "Y_SCREEN", ["+Y"])
+    file["data"]["points"] = points
+    file["data"]["meta_points"]["residuals"] = np.where(np.isnan(points[:1]), -1.0, 0.0)
+    with new_file(output) as part, tempfile.TemporaryDirectory(dir=part.parent) as folder:
+        # The library gives every name its own ending.
+        written = Path(folder) / "all.c3d"
+        file.write(str(written))
+        written.rename(part)
+    return len(frames)
