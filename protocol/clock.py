@@ -8,6 +8,8 @@ from typing import Protocol
 
 S_NS = 1_000_000_000
 MS_NS = 1_000_000
+# A message whose stamp is this near to the receive time is of a live dive; any other, of a stored dive that is played.
+LIVE_WITHIN_NS = 60 * S_NS
 
 
 class Clock(Protocol):

@@ -26,9 +26,9 @@ class SolveConfig(Config, frozen=True, kw_only=True):
 
     method: str = "refined"
     checks: list[str] = field(default_factory=lambda: list(CHECKS))
-    range_min_m: Annotated[float, Meta(gt=0)] = 0.5
-    range_max_m: Annotated[float, Meta(gt=0)] = 30.0
-    skew_sigma_s: Annotated[float, Meta(ge=0)] = 0.0
+    range_min_m: Annotated[float, Meta(gt=0)] = Settings.range_min_m
+    range_max_m: Annotated[float, Meta(gt=0)] = Settings.range_max_m
+    skew_sigma_s: Annotated[float, Meta(ge=0)] = Settings.skew_sigma_s
 
     def settings(self, source: str) -> Settings:
         """Return the settings of the geometry; raise ConfigError. source: the file's name in errors."""

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Final, TypeAlias
 
-from buddyline.protocol.clock import S_NS, trigger_index
+from buddyline.protocol.clock import LIVE_WITHIN_NS, S_NS, trigger_index
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -36,8 +36,6 @@ from msgspec.structs import replace
 
 NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu
 
-# A frame whose stamp is this near to the receive time is of a live dive; any other is of a stored dive that is played.
-LIVE_WITHIN_NS: Final = 60 * S_NS
 # If the receive time goes back by more than this, the receiver's clock was set back.
 SET_BACK_NS: Final = 1 * S_NS
 # Limits memory: a sender that invents node ids must not get a stream for each.

@@ -1,10 +1,12 @@
-"""Two compasses that are far apart, or a third party's bar: let the motion tell.
+"""Two compasses that are far apart, or a third party's bar: let the triggers that follow tell.
 
-A pose that both headings contradict is no pose, unless the motion shows that the compasses are off. Of two nodes that
+A pose that both headings contradict is no pose, unless it is shown that the compasses are off. A small contradiction
+that stays is steel's: strangers' lamps that happen to fit do so for a moment, and for a contradiction as small, a third
+whose bar both see would have to stand almost between them. A large one the motion must show. Of two nodes that
 look at each other, both lines of sight turn together, so that the contradiction stays the same wherever they go. Of two
 that look at a third's bar, a line of sight turns with one of them alone. And where the third itself comes nearer to
 both by a share p of the range, the lines of sight, theta apart, turn against each other by 2 p tan(theta / 2): by p and
-more, where they are a quarter turn apart. Nodes that rest tell nothing.
+more, where they are a quarter turn apart. Nodes that rest tell nothing of it.
 """
 
 from __future__ import annotations
@@ -25,6 +27,10 @@ FEWEST: Final = 15
 LEAST_SHARE: Final = 0.3
 # Scatter of the contradiction, at most, as a share of the change that a third's bar would have caused.
 MOST_SCATTER: Final = 0.35
+# Steel and iron put compasses 10 to 25 degrees off, at stations by a wreck or in a mine. What is off by up to this, and
+# scatters by no more than compasses' noise (1 sd), is taken for steel's.
+MOST_STEEL_RAD: Final = math.radians(30.0)
+MOST_NOISE_RAD: Final = math.radians(6.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +70,8 @@ class Witnesses:
         gap_rad, gap_scatter = _about_mean([one.gap.gap_rad for one in shown])
         _, azimuth_scatter = _about_mean([one.gap.azimuth_rad for one in shown])
         by_a_third = float(log_range.var()) + azimuth_scatter
-        if gap_scatter > MOST_SCATTER**2 * by_a_third:
+        by_steel = abs(gap_rad) < MOST_STEEL_RAD and gap_scatter < MOST_NOISE_RAD**2
+        if not by_steel and gap_scatter > MOST_SCATTER**2 * by_a_third:
             return None
         return Witnessed(gap_rad, gap_scatter)
 

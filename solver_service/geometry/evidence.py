@@ -50,6 +50,8 @@ _WRONG: Final = _OVER_CHANCE * _BROKEN / _ANYTHING
 _FALSE_LIGHT: Final = MISSING_ODDS * 2.0 * math.pi * _PREDICTED_VARIANCE
 # Log odds of a false candidate among four lights from which on three are tried.
 POOR_FIT: Final = math.log(2e-3)
+# Four lights whose gaps have a larger chi^2 (two degrees of freedom) do not fit: one true pose in 10^4 has, by noise.
+UNFIT_CHI2: Final = -2.0 * math.log(1e-4)
 # Agreement of a sensor with a pose: chi^2 below this, of one or two degrees of freedom.
 AGREES: Final = 20.0
 

@@ -120,13 +120,14 @@ class Settings:
 
     checks: what may speak for or against a hypothesis. min_probability: of the published pose, against chance and
     every other; min_oriented_probability: the same where both attitudes speak, because a right pose is then mostly
-    certain. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior
-    knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
+    certain. range_min_m: nearer, no picture of 60 degrees holds a bar of 0.57 m. gate_sigma: both gaps, in standard
+    deviations. speed_mps, turn_radps: relative motion where the prior knows none (1 sd); skew_sigma_s: how well the
+    clocks agree (1 sd).
     """
 
     method: Method = "refined"
     checks: frozenset[str] = CHECKS
-    range_min_m: float = 0.8
+    range_min_m: float = 0.5
     range_max_m: float = 30.0
     min_probability: float = 0.9
     min_oriented_probability: float = 0.95

@@ -16,7 +16,7 @@ import numpy as np
 from buddyline.solver_service.geometry.batch import Batch
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
-from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT
+from buddyline.solver_service.geometry.evidence import AGREES, CHANCE_ODDS, POOR_FIT, UNFIT_CHI2
 from buddyline.solver_service.geometry.fix import Fix, NoFix
 from buddyline.solver_service.geometry.four_lights import FourLights, read_four_lights
 from buddyline.solver_service.geometry.observation import (
@@ -59,6 +59,9 @@ _SAME_TRACE: Final = 1.0 + 2.0 * math.cos(0.1)
 # They must be likelier where the motion prior decides for or against them: it knows nothing of how a diver turns aside.
 _THREE_PROBABILITY: Final = 0.98
 _FOLLOWED_PROBABILITY: Final = 0.999
+# Four lights that no earlier pose supports. In dives among strangers' lamps, most wrong poses were less likely than
+# this, and few right ones.
+_ALONE_PROBABILITY: Final = 0.997
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
 _GROSS_CHI2: Final = 11.3
 # Where a position is known better than this share of the range (1 sd), a false light does not make it wrong.
@@ -139,16 +142,22 @@ class _Batched:
                 read = read_three_lights(self.batch, np.arange(self.batch.triggers) == trigger)
             if read.readings.refined.sound[read.places_of(trigger)].any():
                 three = weigh_readings(read, trigger, past, settings, three=True)
-                found = self._choose(trigger, three if four is None else four.joined(three), heading)
+                chosen = self._choose(trigger, three if four is None else four.joined(three), heading)
+                # That four lights do not fit says more than that the other three tell nothing.
+                if isinstance(chosen, Fix) or four is None or four.log_ratio.max() > -np.inf:
+                    found = chosen
         return replace(found, all_four=all_four)
 
     def _choose(self, trigger: int, weighed: Weighed, learned: Heading | None) -> Fix | NoFix:
         """Publish the likeliest reading where it stands alone."""
         settings, others = self.batch.settings, weighed.others
         k = int(weighed.log_ratio.argmax())
-        if weighed.log_ratio[k] == -np.inf:
-            return NoFix("degenerate", "the directions do not determine a pose")
         t = weighed.T_a_b.t_m
+        if weighed.log_ratio[k] == -np.inf:
+            k = int((weighed.chi2 > UNFIT_CHI2).argmax())
+            if weighed.chi2[k] > UNFIT_CHI2:
+                return NoFix(*_why_unfit(weighed, k, "a light of another, or a gross error"))
+            return NoFix("degenerate", "the directions do not determine a pose")
         range_m = math.hypot(*t[k].tolist())
         if not settings.range_min_m <= range_m <= settings.range_max_m:
             return NoFix("out_of_range", f"what agrees, at {range_m:.3g} m, is not {self.batch.range_limits}")
@@ -175,6 +184,8 @@ class _Batched:
         probability = agreeing / (CHANCE_ODDS + agreeing + others + false_light)
         oriented = self.oriented[trigger] and "attitude" in settings.checks
         required = settings.min_oriented_probability if oriented else settings.min_probability
+        if oriented and weighed.log_prior[k] <= 0.0:
+            required = max(required, _ALONE_PROBABILITY)
         if short:
             required = _FOLLOWED_PROBABILITY if weighed.log_prior[k] != 0.0 else _THREE_PROBABILITY
         if probability >= required:
@@ -198,9 +209,7 @@ class _Batched:
             return NoFix("depth", f"{what} is {math.sqrt(depth_chi2):.1f} sigma off the depths")
         why = "one light may be a false candidate" if false_light > CHANCE_ODDS else "chance may give it"
         if widened > 1.0 and false_light > CHANCE_ODDS + others:
-            in_range = abs(math.log(float(readings.range_m[place, 0] / readings.range_m[place, 1])))
-            reason: Reason = "range_gap" if in_range > abs(float(readings.twist_gap_rad[place])) else "twist_gap"
-            return NoFix(reason, f"{what} does not fit its lights (chi2 {chi2:.1f}): {why}")
+            return NoFix(*_why_unfit(weighed, k, why))
         rivals = np.where(same, -np.inf, weighed.log_ratio)
         rival = int(rivals.argmax())
         if rivals[rival] > weighed.log_ratio[k] - _RIVAL:
@@ -280,6 +289,16 @@ def _is_doubtful(found: Fix | NoFix, weighed: Weighed | None) -> bool:
         return True
     k = int(weighed.log_ratio.argmax())
     return bool(weighed.log_prior[k] < 0.0 or weighed.log_false[k] > POOR_FIT)
+
+
+def _why_unfit(weighed: Weighed, k: int, why: str) -> tuple[Reason, str]:
+    """Say which gap of reading k is too large."""
+    readings, place = weighed.sources[k]
+    range_a_m, range_b_m = readings.range_m[place].tolist()
+    in_range = abs(math.log(range_a_m / range_b_m)) > abs(float(readings.twist_gap_rad[place]))
+    range_m, chi2 = math.hypot(*weighed.T_a_b.t_m[k].tolist()), float(weighed.chi2[k])
+    what = f"the best of the hypotheses, at {range_m:.3g} m, does not fit its lights (chi2 {chi2:.1f}): {why}"
+    return "range_gap" if in_range else "twist_gap", what
 
 
 def _all_four(weighed: Weighed) -> float:

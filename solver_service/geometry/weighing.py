@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.evidence import log_false_light, log_gaps
+from buddyline.solver_service.geometry.evidence import UNFIT_CHI2, log_false_light, log_gaps
 from buddyline.solver_service.geometry.observation import Settings
 from buddyline.solver_service.geometry.past import Past
 from buddyline.solver_service.geometry.readings import Read, Readings
@@ -27,10 +27,10 @@ _SKEW_SIGN: Final = np.array((1.0,) * 4 + (-1.0,) * 4 + (0.0,) * 3)
 class Weighed:
     """M readings of one trigger, poses between the cameras' frames.
 
-    covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound. log_prior: (M,)
-    the prediction's part in it, log_past (M,) all that the past says. log_false: (M,) log odds that a false candidate
-    stands in for one of four lights. others: the sum of the likelihood ratios of all that is not here. sources: the
-    readings that each is one of, and its place there.
+    covariance (M, 6, 6), chi2 (M,). log_ratio: (M,) against chance, -inf where the pose is not sound, or its four
+    lights do not fit. log_prior: (M,) the prediction's part in it, log_past (M,) all that the past says. log_false:
+    (M,) log odds that a false candidate stands in for one of four lights. others: the sum of the likelihood ratios of
+    all that is not here. sources: the readings that each is one of, and its place there.
     """
 
     T_a_b: SE3
@@ -100,6 +100,7 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
     readings = read.readings
     solved = _solve(readings, place, past)
     chi2, covariance = solved.chi2, solved.covariance
+    sound = readings.refined.sound[place]
     if three:
         fit = log_fit(solved)
         covariance = UNCHECKED * covariance
@@ -107,8 +108,9 @@ def weigh_readings(read: Read, trigger: int, past: Past, settings: Settings, *, 
         # Without both gaps the picture's chi2 would bring in what the settings leave out.
         chi2 = chi2 if settings.gaps == 2 else readings.gap_chi2[place]
         fit = log_gaps(chi2, settings.gaps)
+        sound = sound & (chi2 < UNFIT_CHI2)
     log_ratio = readings.log_ratio[place] + fit + log_past
-    log_ratio[~(readings.refined.sound[place] & np.isfinite(log_ratio))] = -np.inf
+    log_ratio[~(sound & np.isfinite(log_ratio))] = -np.inf
     return Weighed(
         T_a_b=readings.refined.T_a_b[place].retract(solved.step),
         covariance=covariance,

@@ -2,12 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 from buddyline.protocol.messages import RelativePose
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.geometry.compasses import compare_headings
+from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
 from buddyline.solver_service.geometry.observation import Heading
 from buddyline.solver_service.geometry.trigger import Settings
+from buddyline.solver_service.witness import FEWEST, Witnesses
 
 from tests.solver_service.conftest import dive_messages
 from tests.solver_service.strangers import messages_of, outcome, strangers_dive
@@ -28,15 +30,14 @@ def judged(gap_deg, learned_deg=None, *, follows=False):
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_what_two_compasses_can_explain(sign):
     agrees, neither, contradicts = (True, False), (False, False), (False, True)
-    assert judged(20 * sign) == agrees
-    # Steel beside one of them.
-    assert judged(30 * sign) == agrees
-    # More of it, or a third's bar.
+    assert judged(15 * sign) == agrees
+    # Steel beside one of them, or strangers' lamps: what follows will tell.
+    assert judged(20 * sign) == contradicts
     assert judged(40 * sign) == contradicts
     assert judged(156 * sign) == contradicts
     # Learned: it is believed, and left for what follows from earlier poses alone.
     assert judged(80 * sign, 82 * sign) == agrees
-    assert judged(95 * sign, 82 * sign) == agrees
+    assert judged(92 * sign, 82 * sign) == agrees
     assert judged(80 * sign, 0) == contradicts
     assert judged(80 * sign, 0, follows=True) == neither
     assert judged(175 * sign, 90 * sign, follows=True) == contradicts
@@ -70,6 +71,20 @@ def test_a_third_partys_bar_gives_no_pose_before_headings_are_learned():
         assert found.poses == 0
         asked += found.reasons.get("heading", 0)
     assert asked > 0
+
+
+@pytest.mark.parametrize(
+    ("gap_deg", "scatter_deg", "steel"), [(20, 4, True), (-25, 4, True), (40, 4, False), (0, 12, False)]
+)
+def test_what_stays_at_a_rest_is_taken_for_steel(gap_deg, scatter_deg, steel):
+    witnesses, told = Witnesses(), []
+    for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, FEWEST)):
+        gap = HeadingGap(math.radians(off_deg), 1e-4, 0.5, agrees=False, contradicts=True)
+        told.append(witnesses.take(k * 200_000_000, Contradiction(gap, 4.0)))
+    assert not any(told[:-1])
+    assert (told[-1] is not None) == steel
+    if told[-1]:
+        assert math.degrees(told[-1].offset_rad) == pytest.approx(gap_deg, abs=3.0)
 
 
 @pytest.mark.parametrize("off_deg", [-80, 45])

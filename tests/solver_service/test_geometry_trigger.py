@@ -362,6 +362,20 @@ def test_scores_help_to_choose():
     assert with_scores > without
 
 
+def test_no_pose_of_four_lights_is_beyond_what_noise_explains():
+    scene = facing()
+    (a, _), (b, _) = scene.views(np.random.default_rng(1), 1.0)
+    methods = set()
+    for shift_px in np.linspace(2.0, 12.0, 21):
+        off = replace(a, table=a.table.copy())
+        off.pixels[0] += (0.0, shift_px)
+        found = solve(scene, (off, b), scene.sensed())
+        if isinstance(found, Fix):
+            methods.add(found.method)
+            assert found.method == "three_lights" or found.chi2 < 18.43
+    assert "refined" in methods
+
+
 @pytest.mark.parametrize(("shift_px", "reason"), [((30.0, 0.0), "range_gap"), ((0.0, 30.0), "twist_gap")])
 def test_lights_that_do_not_fit_each_other_give_no_pose(shift_px, reason):
     """One light is hidden, and a false candidate stands beside its place."""

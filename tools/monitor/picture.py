@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from buddyline.protocol.clock import S_NS
+from buddyline.protocol.clock import LIVE_WITHIN_NS, S_NS
 from buddyline.protocol.envelope import Envelope
 from buddyline.protocol.health import NO_LIGHT_S, stale_after_s
 from buddyline.protocol.messages import (
@@ -42,7 +42,6 @@ KEPT_NS: Final = 150 * S_NS
 POINT_SPACING_NS: Final = S_NS // 5
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
-LIVE_WITHIN_NS: Final = 60 * S_NS
 
 
 @dataclass(frozen=True)
