@@ -31,6 +31,10 @@ CLOCKS_APART_S: Final = 0.005
 CLOCK_OFF_S: Final = 0.002
 # Between two compasses: several times the sigma of calibrated compasses away from steel.
 HEADINGS_APART_RAD: Final = math.radians(20.0)
+# Exposures this far from their instant: the other node's are then matched with other places of both.
+TRIGGER_OFF_S: Final = 0.01
+# A detector that takes this share of a trigger's period is about to lose pictures.
+DETECT_SHARE: Final = 0.8
 # A Raspberry Pi slows down at 80 degrees.
 HOT_DEGC: Final = 70.0
 TOO_HOT_DEGC: Final = 80.0

@@ -170,6 +170,8 @@ class Dashboard:
         if self._last_rejected is None:
             return "no trigger without a pose so far"
         meaning, advice = REASONS[self._last_rejected.reason]
+        if self._solver is not None and self._solver.advice is not UNSET:
+            advice = ", ".join(self._solver.advice)
         return f"last without a pose: {meaning}" + (f"; {advice}" if advice else "")
 
     def _errors(self) -> PoseErrors:

@@ -209,8 +209,8 @@ def _cpu_seconds(children: list[Child]) -> dict[str, float]:
 def _show(service: Service, dashboard: Dashboard | TeamDashboard, seconds: float | None) -> bool:
     """Show the state until the end; return True if the time was over, False if the demo was stopped."""
     ends_s = None if seconds is None else time.monotonic() + seconds
-    interactive = sys.stderr.isatty()
-    coloured = "NO_COLOR" not in os.environ
+    interactive = sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+    coloured = not os.environ.get("NO_COLOR")
     arrows = ARROWS if "utf" in (sys.stderr.encoding or "").lower() else ASCII_ARROWS
     while not service.stop.wait(0.25 if interactive else 1.0):
         size = shutil.get_terminal_size()

@@ -92,6 +92,26 @@ class TestHttp:
         assert valid == "true"
         assert [float(n) for n in numbers] == pytest.approx([x, y, 12.5, placed.sigma_m])
 
+    def test_the_readme_s_c_reads_it(self, served: tuple[Answers, str], tmp_path: Path) -> None:
+        compiler = shutil.which("cc") or shutil.which("gcc")
+        if compiler is None:
+            pytest.skip("no C compiler is installed")
+        state, address = served
+        placed = placed_of()
+        state.place(placed, None, None)
+        found = re.search(r"```c\n(.*?)```", (REPOSITORY / "protocol" / "README.md").read_text(), re.DOTALL)
+        assert found is not None
+        source, program = tmp_path / "program.c", tmp_path / "program"
+        source.write_text(found[1].replace("8082", address.rpartition(":")[2]))
+        flags = ["-std=gnu11", "-Wall", "-Wextra", "-Wno-unused-result"]
+        subprocess.run([compiler, *flags, "-o", program, source], timeout=120, check=True)
+        done = subprocess.run([program], capture_output=True, text=True, timeout=120, check=True)
+        told = dict(line.replace('"', "").replace(":", "").split() for line in done.stdout.splitlines())
+        x, y, _ = placed.p_ned_m.tolist()
+        assert [float(told[name]) for name in ("x", "y", "z", "std")] == pytest.approx(
+            [x, y, 12.5, placed.sigma_m], abs=1e-6
+        )
+
     def test_a_page_of_another_site_does_not_read_it(self, served: tuple[Answers, str]) -> None:
         with pytest.raises(urllib.error.HTTPError, match="403"):
             get(f"{served[1]}/buddyline", Host="evil.example:80")

@@ -16,7 +16,7 @@ from buddyline.tools.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
 
 from tests.tools.evaluated import pose, rejection, track
-from tests.tools.watched import START_NS, at
+from tests.tools.watched import START_NS, at, solver_status
 
 OFF_M = np.array((0.0, 0.0, 0.02))
 NED = {"azimuth_rad": 1.0, "inclination_rad": 0.1}
@@ -153,3 +153,9 @@ def test_a_run_without_a_track_has_no_track_figures():
     summary = watch.dashboard.summary({})
     assert summary["tracks"] == {}
     assert "track" not in summary_text(summary)
+
+
+def test_what_the_solver_tells_the_divers_is_what_to_do():
+    watch = running()
+    watch.take(solver_status(at(31), advice=["turn b 20 deg left", "come 1.5 m closer"]))
+    assert "; turn b 20 deg left, come 1.5 m closer" in watch.dashboard.screen(200, 60)

@@ -467,3 +467,34 @@ class TestCoach:
         take(picture, solver_status(at(29), advice=["come 1.5 m closer"]), at(29))
         (said,) = findings(picture, at(29))
         assert (said.level, said.advice) == ("ok", "come 1.5 m closer")
+
+
+class TestMachines:
+    """What a node's status says of leak, trigger and load, on the page."""
+
+    @pytest.mark.parametrize(
+        ("changes", "name", "level", "word"),
+        [
+            ({"leak": True}, "leak", "problem", "Water in the housing of node a."),
+            ({"trigger_residual_s": -0.0123}, "trigger", "warning", "-12 ms from their instants"),
+            ({"detect_s": 0.085}, "load", "warning", "Node a needs 85 of 100 ms"),
+        ],
+    )
+    def test_what_is_out_of_bounds_is_said_and_takes_the_green_away(
+        self, changes: dict[str, float], name: str, level: str, word: str
+    ) -> None:
+        picture = watched()
+        take(picture, replace(status("a", at(29)), **changes), at(29))
+        first = findings(picture, at(29))[0]
+        assert (first.name, first.level) == (name, level)
+        assert word in first.text
+        assert word.rsplit(maxsplit=1)[-1] in words(picture, at(29))
+
+    def test_what_is_within_bounds_is_shown_and_no_finding(self) -> None:
+        picture = watched()
+        inside = {"leak": False, "trigger_residual_s": 0.001, "detect_s": 0.02}
+        take(picture, replace(status("a", at(29)), **inside), at(29))
+        assert [finding.level for finding in findings(picture, at(29))] == ["ok"]
+        page = panel.health(picture, at(29))
+        for fact in ("exposure +1.0 ms from its instant", "detector 20 ms", "dry"):
+            assert fact in page

@@ -10,11 +10,13 @@ from buddyline.protocol.health import (
     BEHIND_S,
     CLOCK_OFF_S,
     CLOCKS_APART_S,
+    DETECT_SHARE,
     HOT_DEGC,
     NO_POSE_S,
     REASONS_S,
     SILENT_S,
     TRACK_SIGMA_SHARE,
+    TRIGGER_OFF_S,
     WELL_S,
     stale_after_s,
 )
@@ -113,12 +115,15 @@ def _behind_s(picture: PairPicture, stamp_ns: int) -> float:
     return (max(said_ns, default=stamp_ns) - stamp_ns) / S_NS
 
 
-def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list[Finding]:
-    """Return the findings from a node's status: its problem (since since_ns), temperature, supply, battery and clock.
+def reported(name: str, status: NodeStatus, since_ns: int | None = None, period_s: float = 0.0) -> list[Finding]:
+    """Return the findings from a node's status: leak, its problem (since since_ns), heat, supply, battery, clock, load.
 
-    The node's own `problem` already names problems of supply, battery and load: here are their warnings alone.
+    The node's own `problem` already names problems of supply, battery, disk and load: here are their warnings alone.
+    period_s: of its triggers; 0: not known.
     """
     said = []
+    if status.leak is not UNSET and status.leak:
+        said.append(Finding("leak", "problem", f"Water in the housing of {name}.", "bring it up at once"))
     if status.problem:
         said.append(Finding(name, "problem", f"{_named(name)} reports: {status.problem}", "", since_ns))
     if status.temperature_degc is not UNSET and status.temperature_degc >= HOT_DEGC:
@@ -133,6 +138,12 @@ def reported(name: str, status: NodeStatus, since_ns: int | None = None) -> list
     if status.clock_offset_s is not UNSET and abs(status.clock_offset_s) > CLOCK_OFF_S:
         off = f"The clock of {name} is off by {status.clock_offset_s * 1e3:.1f} ms."
         said.append(Finding(name, "warning", off, "wait for chrony, or check the time server"))
+    if status.trigger_residual_s is not UNSET and abs(status.trigger_residual_s) > TRIGGER_OFF_S:
+        late = f"The pictures of {name} are {status.trigger_residual_s * 1e3:+.0f} ms from their instants."
+        said.append(Finding("trigger", "warning", late, "check the camera's trigger line and its settings"))
+    if status.detect_s is not UNSET and period_s and status.detect_s > DETECT_SHARE * period_s:
+        slow = f"{_named(name)} needs {status.detect_s * 1e3:.0f} of {period_s * 1e3:.0f} ms to find the lights."
+        said.append(Finding("load", "warning", slow, "lower its picture rate or size"))
     return said
 
 
@@ -174,7 +185,8 @@ def _node(node: NodePicture, now_ns: int, live: bool) -> list[Finding]:
             said.append(Finding(name, "warning", text, "check that sensor", node.heard_ns[topic.name]))
     if node.info is None and alive_ns:
         said.append(Finding(name, "warning", f"The calibration of {name} is not known.", "restart the node"))
-    return said + ([] if node.status is None else reported(name, node.status, node.problem_since_ns))
+    period_s = 0.0 if node.info is None else node.info.trigger_period_ns / S_NS
+    return said + ([] if node.status is None else reported(name, node.status, node.problem_since_ns, period_s))
 
 
 def _missing(picture: PairPicture) -> list[Finding]:

@@ -113,6 +113,12 @@ def _node_facts(node: NodePicture, now_ns: int) -> list[str]:
     facts += power_words(status)
     if status.clock_offset_s is not UNSET:
         facts.append(f"clock {status.clock_offset_s * 1e3:+.1f} ms")
+    if status.trigger_residual_s is not UNSET:
+        facts.append(f"exposure {status.trigger_residual_s * 1e3:+.1f} ms from its instant")
+    if status.detect_s is not UNSET:
+        facts.append(f"detector {status.detect_s * 1e3:.0f} ms")
+    if status.leak is not UNSET:
+        facts.append("WATER IN THE HOUSING" if status.leak else "dry")
     return facts
 
 
