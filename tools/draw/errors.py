@@ -126,6 +126,8 @@ def medians_over_range(
     medians_m = [row["bound_median_m"] for row in bound]
     axis.plot(middles_m, medians_m, color="0.6", linewidth=5, alpha=0.6, label="Cramér-Rao bound, median")
     for name, rows in methods.items():
+        if not rows:
+            continue
         middles_m = [(row["from_m"] + row["to_m"]) / 2 for row in rows]
         axis.plot(middles_m, [row["position_median_m"] for row in rows], "o-", label=name)
     axis.plot([1.5, 4.0], [0.08, 0.08], "k--", label="the paper reports, 1.5 to 4 m")
