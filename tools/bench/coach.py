@@ -183,7 +183,7 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
     heard_s = told_s - 1.0
     most = np.array([TURN_DEGPS] * 4 + [SWIM_MPS])
     while dive.without_s() > 0.05:
-        if dive.t_s - told_s > WITHIN_S:
+        if dive.t_s - told_s > WITHIN_S - TICK_S / 2:
             return math.inf
         if dive.t_s - heard_s > 1.0 - TICK_S / 2 and not asked.any():
             asked, heard_s = asked_for(dive.advice()), dive.t_s
