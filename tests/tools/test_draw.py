@@ -100,3 +100,12 @@ class TestPage:
 
     def test_alarms_are_marked(self) -> None:
         assert table([["a"], ["b"]], alarms=[1]).count('class="alarm"') == 1
+
+
+def test_a_far_value_does_not_stretch_an_axis():
+    values = np.linspace(2.0, 3.0, 101)
+    assert figures.inner_limits(values) is None
+    assert figures.inner_limits(np.array([2.0, 50.0])) is None
+    low, high = figures.inner_limits(np.append(values, 50.0))
+    assert 1.4 < low < 2.0
+    assert 3.0 < high < 3.6

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.tools.draw.figures import COLOURS, GAP_S, NO_POSE_COLOUR, broken, new_figure
+from buddyline.tools.draw.figures import COLOURS, GAP_S, NO_POSE_COLOUR, broken, inner_limits, new_figure
 from buddyline.tools.draw.survey import ELLIPSE_SD
 from buddyline.tools.monitor.picture import UNCERTAINTY, Point, columns
 from buddyline.tools.monitor.scene import Floats
@@ -44,9 +44,13 @@ def over_time(
             axis.plot(*joined, color=COLOURS[1], linewidth=1.0, label="track")
             if axis is axes[0]:
                 axis.legend(loc="upper right")
+        outside = 0
         if title == UNCERTAINTY:
             axis.set_yscale("log")
-        axis.set_title(title, loc="left")
+        elif (bounds := inner_limits(values)) is not None:
+            axis.set_ylim(*bounds)
+            outside = int(((values < bounds[0]) | (values > bounds[1])).sum())
+        axis.set_title(title + (f" ({outside} outside of what is drawn)" if outside else ""), loc="left")
     if depths:
         for node, line in sorted(depths.items()):
             axes[-1].plot([(ns - start_ns) / S_NS for ns, _ in line], [metres for _, metres in line], label=node)

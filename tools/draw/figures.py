@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 GAP_S: Final = 1.5
 COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
 NO_POSE_COLOUR: Final = "#d0483f"
+# With fewer values none is called far; beyond this many times the span of the inner 96 % an axis is stretched.
+MANY_VALUES: Final = 20
+STRETCHED: Final = 4.0
 # Letters that matplotlib's own font lacks are taken from the first of these that is installed and has them.
 FALLBACK_FONTS: Final = (
     "Noto Sans",
@@ -139,3 +142,17 @@ def broken(
     """Return times (n,) and values (n,) with NaN in each gap of time, so that no line crosses it."""
     gaps = np.flatnonzero(np.diff(t_s) > gap_s) + 1
     return tuple(np.insert(column.astype(float), gaps, np.nan) for column in (t_s, *values))
+
+
+def inner_limits(values: NDArray[np.float64]) -> tuple[float, float] | None:
+    """Return limits of an axis that few far values would stretch fourfold and more; None where there are none.
+
+    The page's plots have the same rule (limits in app.js); the caller says how many values are outside.
+    """
+    if len(values) <= MANY_VALUES:
+        return None
+    low, high = np.percentile(values, (2, 98), method="closest_observation").tolist()
+    span = high - low
+    if span <= 0.0 or values.max() - values.min() <= STRETCHED * span:
+        return None
+    return low - span / 2, high + span / 2
