@@ -410,7 +410,7 @@ class TestScene:
 
 class TestCoverage:
     def test_stretches_without_poses_are_found_with_their_reasons(self) -> None:
-        coverage = Coverage(0, 100 * S_NS, bins=100)
+        coverage = Coverage(0, 100 * S_NS)
         for k in range(100):
             coverage.add(k * S_NS, "ambiguous" if 40 <= k < 60 else None)
         assert coverage.without() == []
@@ -420,7 +420,7 @@ class TestCoverage:
         assert coverage.words(stretch) == "from 0:39.0 for 21 s: more than one arrangement fits (20)"
 
     def test_the_strip_shows_each_bin_s_colour_and_where_playback_stands(self) -> None:
-        coverage = Coverage(0, 100 * S_NS, bins=100)
+        coverage = Coverage(0, 100 * S_NS)
         for k in range(100):
             coverage.add(k * S_NS, "ambiguous" if k >= 50 else None)
         strip = coverage.strip(25 * S_NS)

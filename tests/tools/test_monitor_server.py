@@ -243,7 +243,7 @@ class TestDive:
         path = write_log(tmp_path / "dive.mcap", *messages)
         clock = ManualClock(at(1000))
         with Dive([path]) as dive:
-            coverage = Coverage(dive.start_ns, dive.end_ns, bins=99)
+            coverage = Coverage(dive.start_ns, dive.end_ns)
             cover(coverage, [path], None, threading.Event())
             yield DiveSession(Playback(dive, None), coverage, clock, playing=False), clock
 

@@ -11,6 +11,8 @@ from buddyline.tools.evaluation.stretches import Outcome, Stretch, stretches
 from buddyline.tools.health.words import duration_words, reason_words
 
 BINS: Final = 600
+# Of a short dive each part is as long as this at least: several triggers, so that their rate makes no stripes.
+LEAST_BIN_NS: Final = S_NS
 TRACK_LEGEND: Final = "green: a good track; yellow: partly; red: too uncertain; grey: no track"
 LEGEND: Final = "green: poses; yellow: some triggers without; red: most without; grey: nothing to solve"
 CSS: Final = (
@@ -24,9 +26,10 @@ _COLOURS: Final = np.array([(128, 128, 128, 50), (90, 154, 63, 255), (39, 162, 2
 class Coverage:
     """Counts poses and rejections by time; begin_ns and end_ns bound the dive."""
 
-    def __init__(self, begin_ns: int, end_ns: int, bins: int = BINS) -> None:
+    def __init__(self, begin_ns: int, end_ns: int) -> None:
         self.begin_ns = begin_ns
         self.end_ns = max(end_ns, begin_ns + 1)
+        bins = min(BINS, max((end_ns - begin_ns) // LEAST_BIN_NS, 1))
         self.solved = np.zeros(bins, int)
         self.rejected = np.zeros(bins, int)
         self.complete = False

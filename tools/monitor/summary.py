@@ -14,7 +14,7 @@ from buddyline.tools.estimate import Estimate, sigma_m
 from buddyline.tools.evaluation.poses import PoseErrors, pose_errors
 from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, tracks_figures
 from buddyline.tools.evaluation.truth import TruthTrack, inverted
-from buddyline.tools.monitor.coverage import BINS, Coverage
+from buddyline.tools.monitor.coverage import Coverage
 from buddyline.tools.monitor.outliers import TrackPath
 from buddyline.tools.monitor.panel import judged_picture
 from buddyline.tools.monitor.picture import PairPicture, Point
@@ -109,8 +109,7 @@ def summarize(dive: Dive, pair: Pair | None) -> Summary:
                 summary.dark_s = max(summary.dark_s, message.age_s, (lit_ns - (lit_before_ns or lit_ns)) / S_NS)
                 lit_before_ns = lit_ns
                 if summary.track_coverage is None:
-                    bins = min(BINS, (dive.end_ns - dive.start_ns) // MIN_SPACING_NS + 1)
-                    summary.track_coverage = Coverage(dive.start_ns, dive.end_ns, bins)
+                    summary.track_coverage = Coverage(dive.start_ns, dive.end_ns)
                 uncertain = sigma_m(message) >= TRACK_SIGMA_SHARE * message.range_m
                 summary.track_coverage.add(at_ns, "uncertain" if uncertain else None)
                 _keep(summary, summary.tracks, message, at_ns)
