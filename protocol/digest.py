@@ -23,6 +23,8 @@ from msgspec import UNSET
 LATE_NS: Final = 10 * S_NS
 # Messages that wait for their digest, of one topic of one node: minutes.
 MAX_WAITING: Final = 20_000
+# From one digest of a node to the next.
+MOST_DIGEST_NS: Final = 3 * S_NS // 2
 MAX_NODES: Final = 256
 # Digests of a boot that may come late: a day's.
 MAX_ABSENT: Final = 86_400
@@ -242,13 +244,16 @@ class DigestCheck:
                 yield Discrepancy(node, "missing", before.stamp_ns, digest.since_ns, words, before.boot)
         if newest is None and digest.seq:
             of.begins_ns = of.begins_ns if of.newest else digest.since_ns
-            words = f"the log has nothing of the node's first {digest.seq} s"
-            yield Discrepancy(node, "unsigned", digest.since_ns, digest.since_ns, words, digest.boot)
+            words = f"nothing is there of the node's first {digest.seq} s"
+            began_ns = max(digest.since_ns - digest.seq * MOST_DIGEST_NS, 0)
+            yield Discrepancy(node, "missing", began_ns, digest.since_ns, words, digest.boot)
+            absent.update(range(max(digest.seq - MAX_ABSENT, 0), digest.seq))
         elif newest is not None and digest.seq > newest.seq + 1:
             words = f"{digest.seq - newest.seq - 1} digests are missing"
             yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
             absent.update(range(newest.seq + 1, min(digest.seq, newest.seq + MAX_ABSENT)))
         absent.discard(digest.seq)
+        of.begins_ns = min(of.begins_ns, digest.since_ns)
         if newest is None or digest.seq > newest.seq:
             of.newest[digest.boot] = digest
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]

@@ -134,7 +134,7 @@ def whole(pages: list[bytes]) -> list[Logged] | None:
                 raise MessageError("a page of a log: too big to unpack")
             unpacked = zstandard.ZstdDecompressor().decompress(packed, max_output_size=MOST_UNPACKED_BYTES)
             page = msgspec.msgpack.decode(unpacked, type=Page)
-        except (zstandard.ZstdError, msgspec.DecodeError) as error:
+        except (zstandard.ZstdError, msgspec.DecodeError, UnicodeDecodeError) as error:
             raise MessageError(f"a page of a log: {error}") from error
         found[page.number] = page
     if not found or set(found) != set(range(len(found))) or not found[len(found) - 1].last:

@@ -277,10 +277,11 @@ class SolverService(Service):
         if self._work is not None and not self._work.may_speak:
             return
         unsaid = self._answered.unsaid(messages)
-        for message in unsaid:
-            self._publishers[key_of(message)].put(message)
+        # Noted first: a solver that is killed in between leaves a trigger without an outcome, not with two.
         if self._journal is not None:
             self._journal.add(unsaid)
+        for message in unsaid:
+            self._publishers[key_of(message)].put(message)
         self.core.saw_published(unsaid, self.clock.now_ns())
 
     def _said_before(self, bus: Bus) -> list[Outcome]:

@@ -67,10 +67,10 @@ class Filler:
 
     def want(self, one: Discrepancy) -> None:
         """Ask for what is missing, when its turn has come."""
-        if one.since_ns < self._began_ns:
+        if one.stretch is not None and one.since_ns < self._began_ns:
             return
-        # Missing digests may be of hours.
-        since_ns, end_ns = one.since_ns, one.until_ns
+        # Missing digests may be of hours, and begin before the recording.
+        since_ns, end_ns = max(one.since_ns, self._began_ns), one.until_ns
         with self._changed:
             while since_ns < end_ns:
                 until_ns = min(since_ns + MOST_NS, end_ns)

@@ -1,4 +1,4 @@
-"""Fuzz for as long as one likes: `python -m tests.fuzz --minutes 10 [decoders logs configuration solver]`.
+"""Fuzz for as long as one likes: `python -m tests.fuzz --minutes 10 [ros digests decoders logs configuration solver]`.
 
 Prints a line a target: how many cases, and how many different failures; each failure once, with its input.
 """

@@ -27,6 +27,13 @@ _INFO = m.NodeInfo(
 
 SOUND: tuple[m.Message, ...] = (
     _INFO,
+    m.Digest(
+        **_NODE,
+        boot="x",
+        seq=1,
+        since_ns=STAMP_NS - 10**9,
+        said=[m.Said(topic="imu", count=2, first_ns=STAMP_NS - 10, last_ns=STAMP_NS, sha256="0" * 32)],
+    ),
     m.Candidates(
         **_NODE,
         trigger=STAMP_NS // PERIOD_NS,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz.targets import TARGETS
 
-EXAMPLES = {"decoders": 200, "logs": 25, "configuration": 150, "solver": 10}
+EXAMPLES = {"ros": 60, "digests": 60, "decoders": 200, "logs": 25, "configuration": 150, "solver": 10}
 
 
 @pytest.mark.parametrize("name", TARGETS)

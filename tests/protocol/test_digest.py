@@ -217,7 +217,7 @@ def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:
     assert [one.kind for one in findings(lines[:-1], keys)].count("altered") == 0
     assert {one.kind for one in findings(lines[:-12], keys)} == {"unsigned"}
     late = [lines[0], *lines[19:]]
-    assert {one.kind for one in findings(late, keys)} == {"unsigned"}
+    assert {one.kind for one in findings(late, keys)} == {"missing", "unsigned"}
 
 
 @pytest.mark.slow

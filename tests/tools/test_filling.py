@@ -71,7 +71,7 @@ def test_an_answer_that_lacks_a_page_is_not_whole() -> None:
             whole([broken])
 
 
-@pytest.mark.parametrize("lost", ["some messages", "whole seconds", "all but the ends"])
+@pytest.mark.parametrize("lost", ["some messages", "whole seconds", "all but the ends", "the first digests"])
 def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
     writer, lines = own_log(tmp_path)
     rng = random.Random(3)
@@ -79,6 +79,7 @@ def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
         "some messages": {i for i in range(1, len(lines)) if rng.random() < 0.3 and "digest" not in lines[i][0]},
         "whole seconds": set(range(10, 28)),
         "all but the ends": set(range(10, len(lines) - 1)),
+        "the first digests": {2, 3, 9, 11, 18, 27},
     }[lost]
     network = LocalNetwork()
     node, topside = network.connect(), network.connect()
