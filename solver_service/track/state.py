@@ -64,16 +64,17 @@ class State:
     def plus(self, error: Floats) -> State:
         """Return the state that is off this one by an error (SIZE,).
 
-        R_X = exp(phi_X) R_X; r = exp(phi_A) r + dr, v and shove likewise: turning all about the vertical is then an
-        error in phi_A and phi_B alone, whatever r and v are (docs/track.md, consistency).
+        R_A = exp(phi_A) R_A, R_B = exp(phi_A) exp(phi_B - phi_A) R_B, r = exp(phi_A) (r + dr), v and shove likewise:
+        turning all about the vertical is then an error in phi_A and phi_B alone, whatever r and v are, and changes
+        nothing that pictures show, however large it is (docs/track.md, consistency).
         """
-        turn = rotation_exp(np.stack((error[PHI[0]], error[PHI[1]])))
+        turn = rotation_exp(np.stack((error[PHI[0]], error[PHI[1]] - error[PHI[0]])))
         return State(
-            r_m=turn[0] @ self.r_m + error[R_],
-            v_mps=turn[0] @ self.v_mps + error[V_],
-            R=orthonormal(turn @ self.R),
+            r_m=turn[0] @ (self.r_m + error[R_]),
+            v_mps=turn[0] @ (self.v_mps + error[V_]),
+            R=orthonormal(turn[0] @ np.stack((self.R[0], turn[1] @ self.R[1]))),
             shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
-            shove_mps=turn[0] @ self.shove_mps + error[SHOVE],
+            shove_mps=turn[0] @ (self.shove_mps + error[SHOVE]),
             gyro_bias_radps=self.gyro_bias_radps + error[21:27].reshape(2, 3),
             accel_bias_mps2=self.accel_bias_mps2 + error[27:33].reshape(2, 3),
             mount_rad=self.mount_rad + error[33:39].reshape(2, 3),
@@ -87,12 +88,12 @@ class State:
         """Return the error (SIZE,) by which this state is off another: other.plus(error) is this one."""
         error = np.empty(SIZE)
         error[PHI[0]] = phi = rotation_log(self.R[0] @ other.R[0].T)
-        error[PHI[1]] = rotation_log(self.R[1] @ other.R[1].T)
-        turn = rotation_exp(phi)
-        error[R_] = self.r_m - turn @ other.r_m
-        error[V_] = self.v_mps - turn @ other.v_mps
+        back = rotation_exp(-phi)
+        error[PHI[1]] = phi + rotation_log(back @ self.R[1] @ other.R[1].T)
+        error[R_] = back @ self.r_m - other.r_m
+        error[V_] = back @ self.v_mps - other.v_mps
         error[12:18] = (self.shake_rad - other.shake_rad).ravel()
-        error[SHOVE] = self.shove_mps - turn @ other.shove_mps
+        error[SHOVE] = back @ self.shove_mps - other.shove_mps
         error[21:27] = (self.gyro_bias_radps - other.gyro_bias_radps).ravel()
         error[27:33] = (self.accel_bias_mps2 - other.accel_bias_mps2).ravel()
         error[33:39] = (self.mount_rad - other.mount_rad).ravel()

@@ -74,6 +74,19 @@ def test_plus_and_minus_are_inverse(seed: int) -> None:
     assert np.allclose(T @ back, np.eye(MOVING))
 
 
+def test_a_turn_of_all_together_changes_nothing_that_pictures_show() -> None:
+    """However large: half a radian about the vertical beside errors of the rest."""
+    state = a_state(1)
+    error = 0.1 * np.random.default_rng(2).normal(0.0, 1.0, SIZE)
+    error[PHI[0]] = 0.0
+    turned = error.copy()
+    turned[PHI[0]], turned[PHI[1]] = (0.0, 0.0, 0.5), error[PHI[1]] + (0.0, 0.0, 0.5)
+    one, two = state.plus(error), state.plus(turned)
+    for vector in ("r_m", "v_mps", "shove_mps"):
+        assert two.R[0].T @ getattr(two, vector) == pytest.approx(one.R[0].T @ getattr(one, vector), abs=1e-9)
+    assert two.R[0].T @ two.R[1] == pytest.approx(one.R[0].T @ one.R[1], abs=1e-9)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_plain_errors_follow_from_the_states_own(seed: int) -> None:
     state = a_state(seed)
