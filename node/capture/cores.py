@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from buddyline.node.detect.detection import is_likely
 from buddyline.protocol.messages import Blob
@@ -19,18 +20,26 @@ CORE_PX: Final = (1.5, 24.0)
 """A core is measured within this share of the candidate's radius, but at least and at most so many px."""
 BRIGHTEST: Final = 0.9
 """A core's light is this quantile of its pixels: a hot pixel or a glint is not a core."""
+BANDS_RADII, BANDS_PX = 1.5, (4, 24)
+"""Bands are looked for as far as this many of the candidate's radii from it, but at least and at most so many px."""
+DIM: Final = 0.05
+"""Rows and columns with less than this share of the brightest one's light say nothing of bands."""
 SPARSE: Final = 8
 """Of the whole picture, one pixel in this many is measured, along rows and columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Core:
-    """The core of one lamp. light: of its brightest channel, as a share of what clips; a lower bound where clipped."""
+    """The core of one lamp. light: of its brightest channel, as a share of what clips; a lower bound where clipped.
+
+    banding: how much the light of the rows differs from that of the columns, see _banding; None at the border.
+    """
 
     u_px: float
     v_px: float
     light: float
     clipped: bool
+    banding: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +70,30 @@ def measure_cores(image: NDArray[np.uint8], lamps: Sequence[Blob], linear: NDArr
         if patch.size == 0:
             continue
         level = _brightest(patch if patch.ndim == 2 else patch.max(axis=2))
-        cores.append(Core(lamp.u_px, lamp.v_px, float(linear[level]), level >= CLIPPED))
+        banding = _banding(image, lamp, linear)
+        cores.append(Core(lamp.u_px, lamp.v_px, float(linear[level]), level >= CLIPPED, banding))
     return cores
+
+
+def _banding(image: NDArray[np.uint8], lamp: Blob, linear: NDArray[np.float64]) -> float | None:
+    """Return the standard deviation of a lamp's profile from row to row over that from column to column, logarithmic.
+
+    Of a round lamp, both profiles are alike, apart from the glow's lean, which is the columns' as a rule: therefore
+    their mean from both sides. Pulses make bands in the rows of a rolling shutter. None where the border is too near.
+    """
+    reach = math.ceil(min(max(BANDS_RADII * math.sqrt(lamp.area_px / math.pi), BANDS_PX[0]), BANDS_PX[1]))
+    u, v, margin = round(lamp.u_px), round(lamp.v_px), reach + 2
+    patch = image[max(v - margin, 0) : v + margin + 1, max(u - margin, 0) : u + margin + 1]
+    if patch.shape[0] != 2 * margin + 1 or patch.shape[1] != 2 * margin + 1:
+        return None
+    light = linear[patch if patch.ndim == 2 else patch.max(axis=2)].astype(np.float32)
+    side = 2 * reach + 1
+    light = np.asarray(cv2.getRectSubPix(light, (side, side), (margin + lamp.u_px - u, margin + lamp.v_px - v)))
+    middle = slice(reach - reach // 2, reach + reach // 2 + 1)
+    rows, columns = light[:, middle].mean(axis=1), light[middle].mean(axis=0)
+    columns = 0.5 * (columns + columns[::-1])
+    lit = columns > DIM * columns.max()
+    return float(np.log((rows[lit] + 0.01 * rows.max()) / columns[lit]).std()) if lit.any() else None
 
 
 def _brightest(levels: NDArray[np.uint8]) -> int:

@@ -146,6 +146,17 @@ def test_pulsed_lamps_are_noticed_and_whole_periods_mend_it():
     assert periods == pytest.approx(round(periods), abs=0.01)
 
 
+@pytest.mark.parametrize(("range_m", "pwm_hz"), [(3.0, 2000.0), (6.0, 1000.0)])
+def test_pulses_at_a_multiple_of_the_frame_rate_are_noticed_by_their_bands(range_m, pwm_hz):
+    scenario = {"environment": "night_reef", "seed": 3, "trajectory": "rest", "row_time_ns": 40_000, "other_lamps": 0}
+    scenario |= {"range_min_m": range_m, "range_max_m": range_m}
+    steady, pulsed = Node(**scenario), Node(**scenario, pwm_hz=pwm_hz)
+    errors = [np.median([x for _, found in node.run(30)[10:] for x in found]) for node in (steady, pulsed)]
+    assert errors[1] > errors[0] + 0.1
+    assert "from row to row" in pulsed.loop.problem
+    assert steady.loop.problem == ""
+
+
 def test_a_frame_that_does_not_say_its_exposure_changes_nothing():
     node = Node(environment="cavern", seed=3)
     before = node.loop.plan
