@@ -2,7 +2,8 @@
 
 Each scene is a dive at 5 Hz in one water. Its pictures have the exposure that the node's own loop chooses; with
 `--scene` they have the scene's. Pictures before the loop has locked count as well, but not those of the first second.
-Pictures of the scene, which the loop takes every few frames for people, do not count.
+Pictures of the scene, which the loop takes every few frames for people, do not count. With `--guided` the other node's
+lights are expected, as a solver with a track expects them: as far off as in `bench detect`.
 
 A light is one of the other node's that is in view. It is found by the candidate nearest to it, within 1 % of the
 picture's width. NEES: the mean squared error over the variance, per axis; 1 if sigma is true. Beyond: the share of
@@ -26,10 +27,12 @@ from buddyline.node.config import ExposureConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.detect.detection import LIKELY
 from buddyline.node.devices import Frame
+from buddyline.node.guide import Guide
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Blob
+from buddyline.protocol.messages import Blob, Expect, ExpectedLight
+from buddyline.tools.bench.detect import SIGMA
 from buddyline.tools.fit_score import score_error
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
@@ -108,6 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenes", type=int, default=3, metavar="N", help="in each water; default: 3")
     parser.add_argument("--seconds", type=float, default=24.0, help="of each scene; default: 24")
     parser.add_argument("--strange", type=int, default=1, metavar="N", help="other divers' lamps; default: 1")
+    parser.add_argument("--guided", action="store_true", help="with the other node's lights expected")
     parser.add_argument("--scene", action="store_true", help="with the scene's exposure instead of the lamps'")
 
 
@@ -119,7 +123,9 @@ def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     seen = {water: SeenLights() for water in args.environment}
     for water, found in seen.items():
         for seed in range(args.seed, args.seed + args.scenes):
-            for blobs, lights, of_lamp in look(water, seed, args.seconds, args.strange, scene=args.scene):
+            for blobs, lights, of_lamp in look(
+                water, seed, args.seconds, args.strange, scene=args.scene, guided=args.guided
+            ):
                 found.add(blobs, lights, of_lamp)
     every = [light for found in seen.values() for light in found.lights]
     return {
@@ -131,35 +137,57 @@ def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
 Picture = tuple[list[Blob], list[Light], list[bool]]
 
 
-def look(environment: str, seed: int, seconds: float, strange: int, *, scene: bool) -> Iterator[Picture]:
+def look(environment: str, seed: int, seconds: float, strange: int, *, scene: bool, guided: bool) -> Iterator[Picture]:
     """Yield of each picture of a scene the candidates, the lights in view, and which candidates are lamps."""
     world = simulated_world(environment, seed, other_lamps=strange)
     for node in (world.scenario.node_a, world.scenario.node_b):
-        for frame, blobs in _frames(world, node, round(seconds * S_NS / PERIOD_NS), scene=scene):
+        for frame, blobs in _frames(world, node, round(seconds * S_NS / PERIOD_NS), scene=scene, guided=guided):
             lights = _lights(world, node, frame, blobs)
             yield blobs, lights, _lamps(world, node, frame, blobs)
 
 
-def _frames(world: World, node: str, count: int, *, scene: bool) -> Iterator[tuple[Frame, list[Blob]]]:
+def _frames(world: World, node: str, count: int, *, scene: bool, guided: bool) -> Iterator[tuple[Frame, list[Blob]]]:
     """Yield a node's frames that count, each with its candidates."""
     from buddyline.node.sim.sensor import DelayedControls
 
     controls = DelayedControls()
     loop = ExposureLoop(ExposureConfig(), controls.range)
     focal_px = world.info(node, 0, PERIOD_NS).camera.fx_px
-    pipeline = Pipeline(node, "bench", PERIOD_NS, make_detector(focal_px=focal_px))
+    guide = Guide(node) if guided else None
+    pipeline = Pipeline(node, "bench", PERIOD_NS, make_detector(focal_px=focal_px), guide)
+    rng = np.random.default_rng(0)
     first = trigger_index(world.scenario.start_ns, PERIOD_NS) + 1
     for trigger in range(first, first + count):
         stamp_ns = trigger * PERIOD_NS
         exposure, context = (None, False) if scene else controls.take(trigger)
         frame = Frame(world.render(node, stamp_ns, exposure), stamp_ns, exposure=exposure, context=context)
+        if guide is not None:
+            guide.expect(_expectation(world, frame, node, rng))
         candidates = pipeline.candidates(frame)
         if candidates is None:
             continue
         if not scene:
-            controls.follow(loop.update(frame, candidates))
+            controls.follow(loop.update(frame, candidates, pipeline.expected))
         if not context and trigger >= first + FIRST_COUNTED:
             yield frame, candidates.blobs
+
+
+def _expectation(world: World, frame: Frame, node: str, rng: np.random.Generator) -> Expect:
+    sigma_px = SIGMA * frame.image.shape[1]
+    lights = [
+        ExpectedLight(
+            side=light.name,
+            u_px=light.u_px + sigma_px * rng.standard_normal(),
+            v_px=light.v_px + sigma_px * rng.standard_normal(),
+            covariance_px2=(sigma_px**2, 0.0, sigma_px**2),
+            rate_pxps=(0.0, 0.0),
+            sigma_rate_pxps=0.0,
+        )
+        for light in world.light_truth(node, frame.stamp_ns, 0).lights
+        if light.visible
+    ]
+    seen = next(other for other in (world.scenario.node_a, world.scenario.node_b) if other != node)
+    return Expect(node=node, seen=seen, stamp_ns=frame.stamp_ns, valid_ns=PERIOD_NS, lights=lights)
 
 
 def _lights(world: World, node: str, frame: Frame, blobs: Sequence[Blob]) -> list[Light]:
