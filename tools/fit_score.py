@@ -7,6 +7,7 @@ resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are 
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-SEEDS: Final = range(1000, 1040)
-HELD_OUT: Final = range(2000, 2010)
+SEEDS: Final = range(1000, 1050)
+HELD_OUT: Final = range(2000, 2012)
 """Seeds of the scenes: to fit, and to say how well it fits. Each makes a scene in every water."""
 VIEWS: Final = 6
 SECONDS: Final = 60.0
@@ -38,7 +39,11 @@ FAR: Final = (0.6, 1.4)
 """Greatest range of a scene, as a share of the water's own: lamps that only just show count as well."""
 DARK_SHARE: Final = 0.2
 """Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
-STOPS: Final = (0.0, 0.0, 0.0, -1.0, -2.0, -3.0, -5.0, 1.0)
+STOPS: Final = (0.0, 0.0, 1.0, -1.0, -2.0, -3.0)
+LAMPS_SHARE, LAMPS_MS = 0.5, (0.015, 0.25)
+"""Half of the scenes are exposed relative to the scene's exposure, half for lamps, as a node does nearly always: so
+many ms, evenly on a logarithmic scale."""
+OTHER_LAMPS: Final = (0, 0, 1, 2, 4, 8)
 SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
 GREY_SHARE: Final = 0.15
 DECOYS: Final = (
@@ -128,11 +133,11 @@ def _scene(environment: str, seed: int) -> Iterator[Sample]:
         height_px=height_px,
         range_max_m=float(far_m),
         decoys=() if rng.random() < CLEAN_SHARE else DECOYS[rng.integers(len(DECOYS))],
-        other_lamps=int(rng.integers(0, 5)),
+        other_lamps=int(rng.choice(OTHER_LAMPS)),
         dead_lamps=("a.left", "a.right", "b.left", "b.right") if dark else (),
     )
     world = World(scenario)
-    exposure = _exposure(world, float(STOPS[rng.integers(len(STOPS))]))
+    exposure = _exposure(world, rng)
     grey = rng.random() < GREY_SHARE
     detector = SourceDetector({}, None)
     for k in range(VIEWS):
@@ -142,14 +147,16 @@ def _scene(environment: str, seed: int) -> Iterator[Sample]:
         yield from _labelled(detector, picture[:, :, 1].copy() if grey else picture, world, node, stamp_ns)
 
 
-def _exposure(world: World, stops: float) -> Exposure | None:
-    """Return the scene's exposure, None, or one that is longer or shorter by so many stops, at the lowest gain."""
+def _exposure(world: World, rng: np.random.Generator) -> Exposure | None:
+    """Return an exposure for lamps, or one that is longer or shorter than the scene's; None for the scene's own."""
     from buddyline.node.capture.exposure import Exposure
     from buddyline.node.sim.sensor import scene_exposure
 
-    if stops == 0:
-        return None
-    return Exposure(round(scene_exposure(world.scenario.water).amount * 2.0**stops * MS_NS))
+    lamps_ms = math.exp(rng.uniform(*np.log(LAMPS_MS)))
+    stops = float(rng.choice(STOPS))
+    if rng.random() < LAMPS_SHARE:
+        return Exposure(round(lamps_ms * MS_NS))
+    return Exposure(round(scene_exposure(world.scenario.water).amount * 2.0**stops * MS_NS)) if stops else None
 
 
 def _labelled(

@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 from buddyline.node.detect.detection import CLIPPED, FOCAL_PX
-from buddyline.node.detect.lights import VEIL, Lights
+from buddyline.node.detect.lights import HALF, VEIL, Lights
 from buddyline.node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
 from numpy.typing import NDArray
 
@@ -31,10 +31,11 @@ _SHARES = np.linspace(0.0, 1.0, _RINGS, dtype=np.float32)
 _ROBUST_SD = 3.0
 
 # The model. The growth d ln w / d ln rho of a flat profile, for a core of 12 px in clear water; how much less it is in
-# veiled water, and for a core e times as large; its 1 sd. Then the `steepness` of the module's docstring.
-_GROWTH, _GROWTH_VEIL, _GROWTH_SIZE, _GROWTH_SD = 0.78, 0.55, 0.52, 0.35
-_STEEPNESS: Final = 0.75
-_STEEP_MAX: Final = 6.0
+# veiled water, and for a core e times as large; its 1 sd. Then the `steepness` of the module's docstring. All five are
+# fitted to the errors in pictures of two renderers, half and half: this project's simulator and the dives kept for
+# tuning. A water's own growth cannot be seen in its pictures, so the errors of large cores in one water are alike.
+_GROWTH, _GROWTH_VEIL, _GROWTH_SIZE, _GROWTH_SD = 0.3, 0.4, 0.6, 0.39
+_STEEPNESS: Final = 1.05
 # The rings, in radii of the core. The outermost is at least so many px from the centre.
 _INNER, _OUTER, _OUTER_MIN_PX = 0.6, 2.2, 11.0
 # Noise of a sample in grey levels, and of the model in the logarithm of the brightness, 1 sd.
@@ -45,24 +46,18 @@ _INFLATION: Final = 8.0
 # lean.
 _CORE_SHARE, _LEAN_SD = 0.3, 3.0
 
-# The terms of sigma, fitted by maximum likelihood to the errors in rendered pictures: this project's simulator at the
-# scene's exposure and at the lamps', as it is, as JPEG, and through a Bayer mosaic; and the dives kept for tuning.
+# The other terms of sigma, fitted by maximum likelihood to the same pictures: those of this project at the scene's
+# exposure and down to 6 stops below it, as they are, as JPEG, and through a Bayer mosaic.
 _FLOOR_PX: Final = 0.004
-# Scale of the least squares' own sigma, beside the root of the model's misfit. The second is for lights with a clipped
-# core: the samples around it are far from the source.
-_MISFIT_SCALE, _MISFIT_SCALE_CLIPPED = 0.5, 0.9
-_GROWTH_SCALE: Final = 1.4
-# Shares of the distance from the region's centre to the estimated source. The second is for lights without a clipped
-# core, whose estimate is less certain.
-_MOVED_SHARE, _MOVED_SHARE_UNCLIPPED = 0.12, 0.43
+# Scale of the least squares' own sigma, beside the root of the model's misfit; and the power by which it grows with the
+# light's halo, as its outline's radius at 0.3 of its height over that at half: glow follows the model less than a core.
+_MISFIT_SCALE, _HALO_POWER = 0.45, 2.2
 # Px per unit of elongation above the first value: a long core is partly hidden, or two lights merge in it.
-_LONG_FROM, _LONG_PX = 1.2, 3.0
-# For a light that shows only its scattered glow.
-_SCATTERED_PX: Final = 2.0
-# For a light that the border cuts: px, and share of the core's radius. Both fall to 0 at _CUT_RADII core radii plus
-# _CUT_FROM_PX from the border.
-_CUT_PX, _CUT_SHARE = 0.33, 0.15
-_CUT_RADII, _CUT_FROM_PX = 1.2, 4.0
+_LONG_FROM, _LONG_PX = 1.2, 1.6
+# Radii are at least this: what shows on no ray has the radius 0.
+_LEAST_PX: Final = 0.3
+# For a light that shows only its scattered glow: share of the glow's radius.
+_SCATTERED_SHARE: Final = 0.27
 # The middle of an outline that the border cuts is at least this share of its depth inside of the border, or the light
 # may be outside of the picture: then it may be anywhere within about this share of the depth.
 _OUTSIDE_FROM, _OUTSIDE_SHARE = 0.3, 0.5
@@ -83,24 +78,21 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) ->
     prior_px2 = (_CORE_SHARE * radius_px + 0.5) ** 2
     growth = _growth(radius_px * (FOCAL_PX / focal_px), lights.ground)
     equations = _Equations(image, lights, growth)
-    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px, lights.unclipped)
+    glow_px = np.maximum(lights.radii_px[:, HALF], _LEAST_PX)
+    halo = np.maximum(lights.radii_px[:, HALF + 1], _LEAST_PX) / glow_px
+    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px, halo)
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px
     square = moved * moved
     moved_px2 = square[:, 0] + square[:, 1]
     holds = equations.solvable & (moved_px2 <= (radius_px + 3.0) ** 2)
-    share = holds * (1.0 - lights.scattered)
-    own_px2 = _FLOOR_PX**2 + (_SCATTERED_PX * lights.scattered) ** 2 + variance_px2
+    direct = 1.0 - lights.scattered
+    own_px2 = _FLOOR_PX**2 + direct * variance_px2 + lights.scattered * (_SCATTERED_SHARE * glow_px) ** 2
     variance_px2 = np.where(holds, own_px2, prior_px2)
     variance_px2 += (_LONG_PX * np.maximum(lights.core_elongation - _LONG_FROM, 0.0)) ** 2
-    centre_px = start_px + share[:, None] * moved
-    inside_px = _to_border(centre_px, image)
-    cut = np.maximum(1.0 - inside_px / (_CUT_RADII * radius_px + _CUT_FROM_PX), 0.0)
-    variance_px2 += cut * _CUT_PX**2 + (_CUT_SHARE * cut * radius_px) ** 2
+    centre_px = start_px + (holds * direct)[:, None] * moved
     if lights.border_px.any():
-        variance_px2 += _outside_px(inside_px, *lights.border_px.T) ** 2
-    in_doubt = share * (_MOVED_SHARE + (_MOVED_SHARE_UNCLIPPED - _MOVED_SHARE) * lights.unclipped)
-    variance_px2 += 0.5 * in_doubt * in_doubt * moved_px2
+        variance_px2 += _outside_px(_to_border(centre_px, image), *lights.border_px.T) ** 2
     return Centres(centre_px, np.sqrt(variance_px2), lean * holds[:, None])
 
 
@@ -170,7 +162,7 @@ class _Equations:
         seen = self._seen.astype(np.float32)
         falling = difference / (np.maximum(count, 1.0) * (-2.0 * log_step)) * seen
         self._shift = falling / radius[:, 1:-1]
-        plain = np.where(self._seen, np.minimum(np.maximum(falling, 0.0), _STEEP_MAX), 1.0)
+        plain = np.where(self._seen, np.maximum(falling, 0.0), 1.0)
         self._growth = growth[:, None] + _STEEPNESS * plain
         self._log_step = log_step
         self.solvable = np.add.reduce(seen, axis=1) >= 4.0
@@ -183,15 +175,15 @@ class _Equations:
         np.divide(used, noise * noise + _MODEL_NOISE**2, out=weight)
         np.multiply(weight, self._y, out=self._weighted[:, :, 1])
 
-    def solve(self, prior_px2: Floats, prior_px: Floats, unclipped: Floats) -> tuple[Floats, Floats, Floats]:
+    def solve(self, prior_px2: Floats, prior_px: Floats, halo: Floats) -> tuple[Floats, Floats, Floats]:
         """Solve for the step to the source (N, 2), the lean (N, 2) and the step's variance (N,) per axis.
 
         The prior on the step has the mean prior_px (N, 2) and the variance prior_px2 (N,); the prior on the lean has
         the mean 0. The equations are solved twice: samples that the first solution does not explain (an obstacle,
         another light) have less weight in the second. The variance is that of the least squares times the misfit and
         a fitted scale. The misfit is the mean squared residual of the first solution over the variance that was
-        assumed: noise, JPEG and other lights show in it. The uncertainty of the growth is added. unclipped: (N,), as in
-        Lights.
+        assumed: noise, JPEG and other lights show in it. The uncertainty of the growth is added. halo: (N,), see
+        _HALO_POWER.
         """
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2
@@ -212,9 +204,8 @@ class _Equations:
         self._weighted /= robust[:, :, None]
         x, _ = self._least_squares(rows, prior)
         apart = x[2, :, :2, 0] - x[1, :, :2, 0]
-        scale = _MISFIT_SCALE_CLIPPED + (_MISFIT_SCALE - _MISFIT_SCALE_CLIPPED) * unclipped
-        variance = scale * scale * misfit * (x[0, :, 0, 1] + x[0, :, 1, 2])
-        variance += (0.5 * _GROWTH_SCALE) ** 2 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
+        variance = (_MISFIT_SCALE * halo**_HALO_POWER) ** 2 * misfit * (x[0, :, 0, 1] + x[0, :, 1, 2])
+        variance += 0.25 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
         return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
 
     def _rows(self) -> Floats:
@@ -224,7 +215,7 @@ class _Equations:
         at the outermost usable ring. The first axis: the expected growth, 1 sd less, 1 sd more.
         """
         assumed = np.array([[[0.0]], [[-_GROWTH_SD]], [[_GROWTH_SD]]], np.float32)
-        growth = np.maximum(self._growth + assumed, -0.3)
+        growth = np.maximum(self._growth + assumed, 0.0)
         log_share = (growth.reshape(-1, growth.shape[2]) @ _TRAPEZOIDS).reshape(growth.shape)
         log_share *= self._log_step
         last = np.where(self._seen, log_share, np.float32(-1e9)).max(axis=-1, keepdims=True)

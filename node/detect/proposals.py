@@ -13,17 +13,21 @@ from buddyline.node.detect.detection import CLIPPED, focal_of
 from numpy.typing import NDArray
 
 _OCTAVES = 5
+"""The coarsest one proposes lights of a fifth of the picture's width."""
 _BASE_FOCAL_PX = 564.0
 """Pictures are halved until the focal length is this or less: scales go with angles, not with a picture's width."""
-_CLUTTER_CELL = 4
+_CLUTTER_CELL, _CLUTTER_CELLS = 4, 7
+"""Clutter is the mean contrast of so many cells on a side; side of a cell, in px of its octave (two halvings)."""
 _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
-_CLUTTER_CELLS = 7
 _NOISE = 4.0
+"""Contrast in grey levels that stands out as little as the same amount of clutter: noise makes maxima, too."""
 CLEAR: Final = 5.0
 """From this value of `outstanding` upward, a place clearly stands out of its neighbourhood."""
 _ALWAYS, _AT_MOST = 16, 64
+"""So many places are found even if they do not clearly stand out, and at most so many."""
 _MEAN_OF_LOWER_HALF = 0.46
+"""Mean of the lower half of the absolute differences of two numbers with normal noise, in sd of the noise."""
 _NEIGHBOURS = np.ones((5, 5), np.uint8)
 
 _WINDOW = 5

@@ -69,13 +69,11 @@ def geometric_radii(first_px: Floats, last_px: Floats, share: Floats) -> Floats:
 class Shapes:
     """Outlines and moments of star-shaped regions around N places, in C channels at S levels.
 
-    edge_px: (C, S, N, K), distance from the place to the outline along each ray. is_open: (C, S, N, K), set for rays
-    that do not meet the outline. circle_px: (C, S, N, 3), the centroid relative to the place, and the radius of the
-    circle of equal area.
+    edge_px: (C, S, N, K), distance from the place to the outline along each ray; the last ring's where a ray does not
+    meet it. circle_px: (C, S, N, 3), the centroid relative to the place, and the radius of the circle of equal area.
     """
 
     edge_px: Floats
-    is_open: NDArray[np.bool_]
     circle_px: Floats
 
 
@@ -105,10 +103,8 @@ def find_shapes(level: Floats, rings: Rings, threshold: Floats) -> Shapes:
     below = outward[:, None] < threshold[..., None]
     if rings.inside is not None:
         below |= ~rings.inside.swapaxes(1, 2)
-    is_open = ~below[..., -1]
     below[..., -1] = True
     first = below.argmax(axis=4)
-    is_open &= first == many - 1
     before = np.maximum(first - 1, 0)
     start = np.arange(0, outward.size, many).reshape(channels, 1, places, RAYS)
     inner, outer = outward.take(start + before), outward.take(start + first)
@@ -124,7 +120,7 @@ def find_shapes(level: Floats, rings: Rings, threshold: Floats) -> Shapes:
     circle = np.empty((len(rows), 3), np.float32)
     np.divide((square * rows) @ _CENTROID, area[:, None], out=circle[:, :2])
     np.sqrt(area, out=circle[:, 2])
-    return Shapes(edge, is_open, circle.reshape(*first.shape[:3], 3))
+    return Shapes(edge, circle.reshape(*first.shape[:3], 3))
 
 
 def luminance(pixels: NDArray[np.uint8]) -> Floats:

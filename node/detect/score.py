@@ -26,31 +26,26 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     "plateau": (-1.2, 0.0),
     "halo": (0.0, 1.2),
     "out_of_round": (0.0, 1.0),
-    "open": (0.0, 1.0),
     "unclipped": (0.0, 0.3),
-    "ground": (0.0, 1.5),
 }
 """The features, with the limits to which they are clipped: nothing is extrapolated beyond what the fit has seen.
 
 For the logarithm of the odds of a lamp:
 stands_out: log of the contrast over noise plus clutter. texture: log of the same of the picture's ninth to sixteenth
-places, which are no lamps as a rule: shells and caustics come in fields. height: log of the peak above the ground over
+lights, which are no lamps as a rule: shells and caustics come in fields. height: log of the peak above the ground over
 50 levels. out_of_round: least elongation of the outlines from half height upward, minus 1; lower down, a bar that a
-lamp lights may hang on to it. open: share of rays without an edge. size: log of the radius at half height in px at
-FOCAL_PX. plateau: log of the radius at 0.9 of the height over that at 0.5; 0 for a flat top with sharp edges. halo: log
-of the radius at 0.3 over that at 0.5; 0 for a sharp edge. unclipped: how far the peak is below 240, in 100 levels.
-ground: grey level around, in 100 levels.
+lamp lights may hang on to it. size: log of the radius at half height in px at FOCAL_PX. plateau: log of the radius at
+0.9 of the height over that at 0.5; 0 for a flat top with sharp edges. halo: log of the radius at 0.3 over that at 0.5;
+0 for a sharp edge. unclipped: how far the peak is below 240, in 100 levels.
 """
 PRODUCTS: Final = (
     ("size", "size"),
     ("size", "halo"),
     ("size", "unclipped"),
-    ("texture", "unclipped"),
-    ("texture", "size"),
-    ("texture", "stands_out"),
+    ("plateau", "halo"),
 )
-"""Features that count together: a small lamp may be sharp and unclipped, a large one has a halo and clips; what stands
-out of a field of spots says less than what stands out of plain water."""
+"""Features that count together: a small lamp may be sharp and unclipped, a large one has a halo and clips; a flat top
+has sharp edges, or is a clipped core with a halo."""
 NAMES: Final = ("constant", *LIMITS, *(f"{a}_{b}" for a, b in PRODUCTS))
 
 _LOWEST: Final = np.array([low for low, _ in LIMITS.values()], np.float32)
@@ -60,7 +55,10 @@ _SECOND: Final = np.array([list(LIMITS).index(b) for _, b in PRODUCTS])
 
 
 def texture(outstanding: NDArray[np.float32]) -> float:
-    """Return how much a picture's ninth to sixteenth most outstanding places stand out; outstanding: (N,), falling."""
+    """Return how much a picture's ninth to sixteenth most outstanding lights stand out.
+
+    outstanding: (N,), falling, one place of each light: many lamps are no texture.
+    """
     return (float(outstanding[8:16].sum()) + 0.5 * max(16 - max(len(outstanding), 8), 0)) / 8.0
 
 
@@ -77,9 +75,7 @@ def features(lights: Lights, focal_px: float, textured: float) -> Floats:
     alone[:, 5] = r30 / r50
     np.log(alone[:, :6], out=alone[:, :6])
     alone[:, 6] = lights.roundest - 1.0
-    alone[:, 7] = lights.open_share
-    alone[:, 8] = (240.0 - lights.peak) / 100.0
-    alone[:, 9] = (lights.peak - lights.height) / 100.0
+    alone[:, 7] = (240.0 - lights.peak) / 100.0
     np.minimum(np.maximum(alone, _LOWEST, out=alone), _HIGHEST, out=alone)
     found[:, 0] = 1.0
     found[:, 1 + len(LIMITS) :] = alone[:, _FIRST] * alone[:, _SECOND]

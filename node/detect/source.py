@@ -24,11 +24,15 @@ from numpy.typing import NDArray
 
 _CONTRAST_MIN: Final = (4.0, 16.0)
 _CONTRAST_TO_NOISE: Final = 2.0
+"""A place needs so many sd of the noise as contrast, but at least and at most so many grey levels."""
 _MEMORY: Final = 0.8
+"""Share of the former pictures in the estimate of the noise."""
 _FAINTER: Final = 0.5
 """Share of the thresholds on contrast that holds where a light is expected."""
-_KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.5))
-"""(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.5 or more.
+_MAX_MEASURED: Final = 24
+"""More lights than this in one picture are not looked at."""
+_KEPT: Final = ((5, 0.0), (8, 0.02), (16, 0.3))
+"""(number, least score): 5 candidates are always kept, up to 8 with score 0.02 or more, up to 16 with 0.3 or more.
 
 The solver chooses among them with both gaps and the sensors; generous lists serve it better than strict ones.
 """
@@ -79,7 +83,7 @@ class SourceDetector:
             self._shape = image.shape
             self._near = RegionFinder(self._focal_of(image), self._finder.base_step_px, self._masks)
         self._water = water_level(image)
-        proposals = self._finder.find(self._contrast_min, self._values["clutter_gain"], self._layout(image))
+        proposals = _apart(self._finder.find(self._contrast_min, self._values["clutter_gain"], self._layout(image)))
         self._texture = texture(proposals.outstanding)
         return self._measured(image, proposals)
 
@@ -104,7 +108,7 @@ class SourceDetector:
             return None
         thresholds = self._contrast_min * _FAINTER, self._values["clutter_gain"] * _FAINTER
         proposals = self._near.find(image, regions, *thresholds)
-        return None if proposals is None else self._chosen(image, self._measured(image, proposals), _KEPT_NEAR)
+        return None if proposals is None else self._chosen(image, self._measured(image, _apart(proposals)), _KEPT_NEAR)
 
     def _measured(self, image: NDArray[np.uint8], proposals: Proposals) -> Examined | None:
         if len(proposals.radius_px) == 0:
@@ -138,6 +142,12 @@ class SourceDetector:
         noise = self._finder.noise()
         self._noise = noise if self._noise is None else _MEMORY * self._noise + (1.0 - _MEMORY) * noise
         return min(max(_CONTRAST_TO_NOISE * self._noise, _CONTRAST_MIN[0]), _CONTRAST_MIN[1])
+
+
+def _apart(proposals: Proposals) -> Proposals:
+    """Return one place of each light, the most outstanding first."""
+    kept = distinct(proposals.centre_px, proposals.radius_px, _MAX_MEASURED)
+    return Proposals(proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept])
 
 
 def _detections(lights: Lights, found: Centres, score: Floats, shape: tuple[int, ...]) -> list[Detection]:

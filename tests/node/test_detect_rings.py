@@ -25,21 +25,18 @@ def test_an_ellipse_has_its_middle_area_and_axes(angle_deg):
     assert (u, v) == pytest.approx((-4.0, 2.0), abs=0.3)
     assert radius == pytest.approx(np.sqrt(40.0 * 20.0), rel=0.03)
     assert elongation(shapes.edge_px[0, 0], shapes.circle_px[0, 0])[0] == pytest.approx(2.0, rel=0.04)
-    assert not shapes.is_open.any()
 
 
-def test_rays_that_find_no_edge_are_open_and_those_that_leave_the_picture_are_not():
+def test_rays_that_find_no_edge_end_at_the_last_ring_and_those_that_leave_the_picture_at_its_border():
     image = np.full((240, 320), 200, np.uint8)
     rings, shapes = outlined(image, (160.0, 120.0))
     assert rings.inside is None
-    assert shapes.is_open.all()
     assert shapes.edge_px == pytest.approx(90.0)
     rings, shapes = outlined(image, (20.0, 120.0))
     leftward = shapes.edge_px.shape[-1] // 2
     assert rings.inside is not None
-    assert not shapes.is_open[0, 0, 0, leftward]
-    assert shapes.is_open[0, 0, 0, 0]
     assert shapes.edge_px[0, 0, 0, leftward] == pytest.approx(20.5, abs=1.0)
+    assert shapes.edge_px[0, 0, 0, 0] == pytest.approx(90.0)
 
 
 def test_a_place_that_overlaps_an_earlier_one_is_left_out():

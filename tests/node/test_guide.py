@@ -82,7 +82,8 @@ def test_candidates_of_a_region_are_those_of_the_whole_picture():
         lamps = [tuple(rng.uniform((20, 20), (800, 596))) for _ in range(2)]
         picture = lamp_picture(lamps, size=SIZE, core_px=rng.uniform(1.0, 4.0), glow=rng.uniform(0, 300), seed=trial)
         detector = make_detector()
-        whole = [d.blob for d in detector.detect(picture) if d.blob.score > 0.5]
+        # A place on a light's flank, with a sigma of some px, may be found in one search and not in the other.
+        whole = [d.blob for d in detector.detect(picture) if d.blob.score > 0.5 and d.blob.sigma_px < 1.0]
         guide = Guide("a")
         guide.learn(0, detector.detect(picture), SIZE[0], whole=True)
         guide.expect(expect(1, *of_lamps([(u + 3.0, v - 4.0) for u, v in lamps])))
