@@ -23,6 +23,10 @@ from msgspec import UNSET
 LATE_NS: Final = 10 * S_NS
 # Messages that wait for their digest, of one topic of one node: minutes.
 MAX_WAITING: Final = 20_000
+# Of all together, 250 bytes each; topics that many messages wait of have equal shares.
+MAX_WAITING_TOGETHER: Final = 200_000
+# Digests of a node that wait to be judged, of at most 64 kB each.
+MAX_DUE: Final = 128
 # From one digest of a node to the next.
 MOST_DIGEST_NS: Final = 3 * S_NS // 2
 MAX_NODES: Final = 256
@@ -180,6 +184,7 @@ class DigestCheck:
         self.nodes: dict[str, Checked] = {}
         self._refuses = refuses
         self._must_sign = must_sign
+        self._lists = 0
 
     def add(self, key: str, payload: bytes, time_ns: int) -> Iterator[Discrepancy]:
         """Take a message; yield what is wrong with those of some seconds ago. time_ns: log time."""
@@ -200,11 +205,12 @@ class DigestCheck:
             if topic is INFO:
                 _take_certificate(of, key, payload)
             one = Undigested(payload_stamp_ns(payload) or 0, time_ns, hashlib.sha256(payload).digest())
+            self._lists += end_of(topic) not in of.waiting
             waiting = of.waiting[end_of(topic)]
             waiting.append(one)
-            if len(waiting) > MAX_WAITING:
+            if len(waiting) > min(MAX_WAITING, MAX_WAITING_TOGETHER // self._lists):
                 yield from _leftover(node, of, end_of(topic), [waiting.pop(0)])
-        while of.due and (of.due[0].time_ns + LATE_NS < time_ns or len(of.due) > MAX_WAITING):
+        while of.due and (of.due[0].time_ns + LATE_NS < time_ns or len(of.due) > MAX_DUE):
             yield from self._judge(node, of, of.due.pop(0))
 
     def finish(self) -> Iterator[Discrepancy]:

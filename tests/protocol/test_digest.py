@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from buddyline.protocol import digest as digest_module
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.digest import DigestBook, DigestCheck, Discrepancy, sealed, unsealed
@@ -218,6 +219,20 @@ def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:
     assert {one.kind for one in findings(lines[:-12], keys)} == {"unsigned"}
     late = [lines[0], *lines[19:]]
     assert {one.kind for one in findings(late, keys)} == {"missing", "unsigned"}
+
+
+def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(digest_module, "MAX_WAITING", 50)
+    monkeypatch.setattr(digest_module, "MAX_WAITING_TOGETHER", 200)
+    monkeypatch.setattr(digest_module, "MAX_DUE", 5)
+    check, book = DigestCheck(), DigestBook("a", "x", BEGAN_NS)
+    for k in range(1000):
+        node = f"n{k % 100}"
+        list(check.add(f"buddyline/node/{node}/depth", b'{"stamp_ns":%d}' % k, BEGAN_NS))
+        digest = book.digest(BEGAN_NS)
+        list(check.add(key_of(digest), sealed(digest, None), BEGAN_NS))
+    assert sum(len(one.waiting["depth"]) for one in check.nodes.values()) <= 200
+    assert len(check.nodes["a"].due) <= 5
 
 
 @pytest.mark.slow
