@@ -59,7 +59,7 @@ def findings(picture: PairPicture, now_ns: int, *, live: bool = True) -> list[Fi
                 Finding("pair", "warning", text, "wait a moment; if it stays, see the figures of nodes and solver")
             )
         else:
-            better = ", ".join(coached(picture, now_ns))
+            better = ", ".join(_told(picture, now_ns))
             said.append(Finding("pair", "ok", "All is well: both nodes send, and the solver finds the pose.", better))
     return worst_first(said)
 
@@ -69,9 +69,8 @@ def coached(picture: PairPicture, now_ns: int, why: str = "") -> list[str]:
 
     why: the rejection reason for which there is no pose; "" where there are poses.
     """
-    told, told_ns = picture.solver, picture.solver_ns or 0
-    if told is not None and told.advice is not UNSET and now_ns - told_ns <= stale_after_s(SOLVER_STATUS) * S_NS:
-        return told.advice
+    if told := _told(picture, now_ns):
+        return told
     kept = [
         (at_ns, estimate)
         for at_ns, estimate in ((picture.track_ns, picture.track), (picture.pose_ns, picture.pose))
@@ -82,6 +81,14 @@ def coached(picture: PairPicture, now_ns: int, why: str = "") -> list[str]:
         return []
     at_ns, estimate = max(kept, key=lambda one: one[0])
     return advise(infos, LastPlace.of(estimate, (now_ns - at_ns) / S_NS, why))
+
+
+def _told(picture: PairPicture, now_ns: int) -> list[str]:
+    """Return what the solver's status says now that the divers should do."""
+    status, at_ns = picture.solver, picture.solver_ns or 0
+    if status is None or status.advice is UNSET or now_ns - at_ns > stale_after_s(SOLVER_STATUS) * S_NS:
+        return []
+    return status.advice
 
 
 def _unproven(picture: PairPicture, now_ns: int, live: bool) -> list[str]:

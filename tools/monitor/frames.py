@@ -24,8 +24,10 @@ from buddyline.tools.monitor.picture import NodePicture, PairPicture, Point
 from buddyline.tools.monitor.scene import SceneFrame, ellipsoid, fields_of_view
 from buddyline.tools.pairs import Pair
 
-# Texts are made anew in every so many frames, so that they can be read.
-TEXTS_EVERY: Final = 6
+# The page's rate. Texts are made anew in every so many frames, so that they can be read; the banner more often.
+RATE_HZ: Final = 30.0
+TEXTS_EVERY: Final = 9
+BANNER_EVERY: Final = 3
 # Fields that can be plotted: numbers, of a list the first 36 (a covariance has as many), of objects the first few.
 MAX_ELEMENTS: Final = 36
 MAX_OBJECTS: Final = 4
@@ -71,10 +73,10 @@ class Viewer:
             said["reset"] = True
             self._reset = False
         said |= self._new_points(picture)
-        found = findings(picture, now_ns, live=self._live)
-        first = found[0]
-        banner = {"level": first.level, "text": sentence(first, now_ns), "advice": first.advice}
-        self._tell(said, "banner", banner)
+        if self._tick % BANNER_EVERY == 0:
+            first = findings(picture, now_ns, live=self._live)[0]
+            banner = {"level": first.level, "text": sentence(first, now_ns), "advice": first.advice}
+            self._tell(said, "banner", banner)
         if self._tick % TEXTS_EVERY == 0:
             self._tell(said, "figures", panel.figures(picture, now_ns))
             self._tell(said, "health", panel.health(picture, now_ns, live=self._live))

@@ -24,8 +24,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.topics import TRACK
-from buddyline.tools.monitor.frames import Viewer, fields
+from buddyline.tools.monitor.frames import RATE_HZ, Viewer, fields
 
 if TYPE_CHECKING:
     from buddyline.tools.monitor.overview import Overview
@@ -34,8 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-# The rate of the track.
-TICK_S: Final = 1.0 / TRACK.rate_hz
+TICK_S: Final = 1.0 / RATE_HZ
 MAX_VIEWERS: Final = 16
 MAX_COMMAND_BYTES: Final = 1024
 # Ports that are tried where the wanted one is in use.
@@ -168,6 +166,8 @@ class _Serving:
             ping_timeout=GONE_S / 2,
             close_timeout=1.0,
             server_header=None,
+            # A viewer gets 20 KB/s: to pack them costs more than to send them.
+            compression=None,
         ):
             while not stop.is_set():
                 await asyncio.sleep(0.1)
