@@ -237,8 +237,12 @@ class _Serving:
             due_s = time.monotonic()
             while True:
                 taken, commands[:] = list(commands), []
-                frame = await asyncio.to_thread(self._frame, session, viewer, taken)
-                await connection.send(frame.decode())
+                if server.live:
+                    # Quicker than the way to another thread and back. A stored dive may take long to find its place.
+                    frame = self._frame(session, viewer, taken)
+                else:
+                    frame = await asyncio.to_thread(self._frame, session, viewer, taken)
+                await connection.send(frame, text=True)
                 # A slow viewer gets fewer frames, never old ones.
                 due_s = max(due_s + TICK_S, time.monotonic())
                 await asyncio.sleep(due_s - time.monotonic())
