@@ -16,10 +16,10 @@ from buddyline.node.outlet import Outlet
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.security import RefusedError, SecurityError, check_identity, node_name
-from buddyline.protocol.topics import EXPECT, LOG
+from buddyline.protocol.topics import EXPECT, LOG, MARK
 
 if TYPE_CHECKING:
-    from buddyline.protocol.bus import Bus
+    from buddyline.protocol.bus import Bus, Received
 
 log = logging.getLogger(__name__)
 
@@ -29,11 +29,17 @@ REFUSED_RETRY_S: Final = 5.0
 class HubConnection:
     """Runs in a thread of its own, while the node records anyway.
 
-    guide: takes the solver's expectations; None: they are not used.
+    guide: takes the solver's expectations; None: they are not used. hear_mark: takes the marks of this node.
     """
 
     def __init__(
-        self, config: NodeConfig, outlet: Outlet, clock: Clock, clock_sync: ClockSync, guide: Guide | None
+        self,
+        config: NodeConfig,
+        outlet: Outlet,
+        clock: Clock,
+        clock_sync: ClockSync,
+        guide: Guide | None,
+        hear_mark: Callable[[Received], None],
     ) -> None:
         self._refusal = ""
         self._bus: Bus | None = None
@@ -43,6 +49,7 @@ class HubConnection:
         self._clock_sync = clock_sync
         self._guide = guide
         self._desk = LogDesk(Path(config.record.directory), config.node)
+        self._hear_mark = hear_mark
 
     @property
     def problem(self) -> str:
@@ -78,6 +85,7 @@ class HubConnection:
                 # Without history: an old expectation says nothing of the next picture.
                 bus.subscribe(EXPECT.key(config.node), self._guide.hear, history=False)
                 bus.watch_alive(self._guide.saw_process)
+            bus.subscribe(MARK.key(config.node), self._hear_mark, history=False)
             self._clock_sync.listen(bus)
             bus.answer(LOG.format(node=config.node), self._desk.answer)
             stop.wait()

@@ -123,7 +123,7 @@ class NodeService(Service):
         self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
-        self._hub = HubConnection(self.config, self.outlet, self.clock, self._clock_sync, self._guide)
+        self._hub = HubConnection(self.config, self.outlet, self.clock, self._clock_sync, self._guide, self._panel.hear)
         self.outlet.send(info)
 
     def _open_or_await_camera(self) -> CameraDevice:

@@ -51,10 +51,14 @@ BLINKING: Final = Pattern("blinking, twice a second", (0.25, 0.25))
 FLICKERING: Final = Pattern("flickering, five times a second", (0.1, 0.1))
 WINKING: Final = Pattern("on, with a short gap every second", (0.9, 0.1))
 
+LONG: Final = Pattern("2 s on, half a second off", (2.0, 0.5))
+
 ONE_BEEP: Final = Pattern("1 short", (0.1,), once=True)
 TWO_BEEPS: Final = Pattern("2 short", (0.1, 0.15, 0.1), once=True)
 THREE_BEEPS: Final = Pattern("3 short", (0.1, 0.15, 0.1, 0.15, 0.1), once=True)
+FOUR_BEEPS: Final = Pattern("4 short", (0.1, 0.15) * 3 + (0.1,), once=True)
 FIVE_BEEPS: Final = Pattern("5 short", (0.1, 0.15) * 4 + (0.1,), once=True)
+SHORT_AND_LONG: Final = Pattern("1 short, 1 long", (0.1, 0.15, 1.0), once=True)
 LONG_BEEP: Final = Pattern("1 long", (1.0,), once=True)
 ALARM: Final = Pattern("on and off, until it is dry", (0.5, 0.5))
 
@@ -79,9 +83,16 @@ HOLDS: Final = (
 )
 
 
+class Verdict(Enum):
+    """What the survey says of the leg that the node has just measured."""
+
+    GOOD = "the leg is good: go on"
+    AGAIN = "measure the leg again"
+
+
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What decides the lamp: the node's own status, and what the diver has asked for."""
+    """What decides the lamp: the node's own status, the survey's verdict, and what the diver has asked for."""
 
     leak: bool = False
     ending: bool = False
@@ -90,6 +101,7 @@ class Situation:
     timeless: bool = False
     started: bool = True
     sees_other: bool = False
+    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +123,8 @@ CODES: Final = (
     LampCode(
         "stopped: no lights, no pictures; sensors and candidates are recorded", lambda s: not s.started, THREE_FLASHES
     ),
+    LampCode(f"survey, for 10 s: {Verdict.AGAIN.value}", lambda s: s.verdict is Verdict.AGAIN, BLINKING),
+    LampCode(f"survey, for 10 s: {Verdict.GOOD.value}", lambda s: s.verdict is Verdict.GOOD, LONG),
     LampCode("records, and sees the other node's lights", lambda s: s.sees_other, TWO_FLASHES),
     LampCode("records", lambda _: True, ONE_FLASH),
 )
@@ -121,6 +135,7 @@ BEEPS: Final[dict[PanelAction, Pattern]] = {
     PanelAction.STOP: THREE_BEEPS,
     PanelAction.SHUT_DOWN: LONG_BEEP,
 }
+VERDICT_BEEPS: Final[dict[Verdict, Pattern]] = {Verdict.GOOD: SHORT_AND_LONG, Verdict.AGAIN: FOUR_BEEPS}
 FAULT_BEEP: Final = FIVE_BEEPS
 LEAK_BEEP: Final = ALARM
 

@@ -10,9 +10,11 @@ from buddyline.node.underwater.codes import (
     FAULT_BEEP,
     LEAK_BEEP,
     STEADY,
+    VERDICT_BEEPS,
     PanelAction,
     Pattern,
     Situation,
+    Verdict,
     code_of,
     hold_at,
 )
@@ -32,6 +34,7 @@ class PanelInput:
     booting: bool = False
     timeless: bool = False
     sees_other: bool = False
+    verdict: Verdict | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +73,7 @@ class PanelState:
     started: bool = True
     ending: bool = False
     fault: bool = False
+    verdict: Verdict | None = None
     contact: Contact = field(default_factory=Contact)
     lamp: Pattern = STEADY
     lamp_ns: int = 0
@@ -114,6 +118,7 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
         timeless=given.timeless,
         started=started,
         sees_other=given.sees_other,
+        verdict=given.verdict,
     )
     lamp = code_of(situation).lamp
     if contact.pressed_ns is not None:
@@ -124,6 +129,7 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
             started=started,
             ending=ending,
             fault=given.fault,
+            verdict=given.verdict,
             contact=contact,
             lamp=lamp,
             lamp_ns=state.lamp_ns if lamp == state.lamp else now_ns,
@@ -135,13 +141,15 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
 
 
 def _sound(state: PanelState, given: PanelInput, action: PanelAction | None, now_ns: int) -> tuple[Pattern | None, int]:
-    """Return what sounds, and since when: the leak before the answer to the button, before a new fault."""
+    """Return what sounds, and since when: the leak before the answer to the button, before a new fault and verdict."""
     if given.leak:
         return LEAK_BEEP, state.sound_ns if state.sound == LEAK_BEEP else now_ns
     if action is not None:
         return BEEPS[action], now_ns
     if given.fault and not state.fault:
         return FAULT_BEEP, now_ns
+    if given.verdict is not None and given.verdict is not state.verdict:
+        return VERDICT_BEEPS[given.verdict], now_ns
     if state.sound is None or not state.sound.once or state.sound.is_over((now_ns - state.sound_ns) / S_NS):
         return None, now_ns
     return state.sound, state.sound_ns

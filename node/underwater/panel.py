@@ -8,16 +8,20 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from buddyline.node.config import NodeConfig
-from buddyline.node.underwater.codes import PanelAction
+from buddyline.node.underwater.codes import PanelAction, Verdict
 from buddyline.node.underwater.machine import PanelInput, PanelState, step
 from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import S_NS, Clock
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.messages import Mark, Message, NodeStatus
 from buddyline.protocol.topics import CANDIDATES
 from msgspec import UNSET
+
+if TYPE_CHECKING:
+    from buddyline.protocol.bus import Received
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +29,7 @@ PERIOD_S: Final = 0.02
 # The status comes once a second. Without it the node is stuck, and the lamp must not tell that all is well.
 STATUS_WITHIN_NS: Final = 5 * S_NS
 COMMAND_WITHIN_S: Final = 10.0
+VERDICT_NS: Final = 10 * S_NS
 # A node has two lights.
 LIGHTS: Final = 2
 
@@ -49,6 +54,10 @@ class Panel:
         self._has_news = False
         self._news_ns: int | None = None
         self._refused = ""
+        self.refusals = Refusals(f"node {config.node}")
+        # The survey's last verdict: heard, and shown since then.
+        self._heard: Verdict | None = None
+        self._verdict: tuple[Verdict, int] | None = None
 
     @property
     def takes_pictures(self) -> bool:
@@ -79,6 +88,13 @@ class Panel:
         )
         self._has_news = True
 
+    def hear(self, received: Received) -> None:
+        """Take a mark of this node from the bus: the survey's verdict on the leg."""
+        envelope = self.refusals.open(received)
+        mark = None if envelope is None else envelope.message
+        if isinstance(mark, Mark) and mark.kind in ("alarm", "leg"):
+            self._heard = Verdict.GOOD if mark.kind == "leg" else Verdict.AGAIN
+
     def run(self, stop: threading.Event) -> None:
         """Read and drive the pins until stop is set."""
         if not self._pins.all:
@@ -94,12 +110,16 @@ class Panel:
         self._leak = self._leak if wet is None else wet
         if self._has_news:
             self._has_news, self._news_ns = False, now_ns
+        heard, self._heard = self._heard, None
+        if heard is not None:
+            self._verdict = heard, now_ns
         silent = self._news_ns is not None and now_ns - self._news_ns > STATUS_WITHIN_NS
         given = replace(
             view,
             pressed=None if pins.button is None else pins.button.read(),
             leak=self._leak,
             fault=view.fault or silent,
+            verdict=self._verdict[0] if self._verdict and now_ns - self._verdict[1] < VERDICT_NS else None,
         )
         self._state, action = step(self._state, given, now_ns)
         for pin, on in (

@@ -248,11 +248,12 @@ class Mark(Message, frozen=True, kw_only=True):
     """A note for the survey about a node at an instant, by a person or by an automatic check.
 
     kind: station: the node is at the station `name`, from the rest nearest to this instant until it moves. point: the
-    node is at a point of interest. note: the text `note` only. alarm: the survey's check `name` failed.
+    node is at a point of interest. note: the text `note` only. alarm: the survey's check `name` failed; measure again.
+    leg: the survey's verdict `good` on the present leg.
     """
 
     node: NodeId
     stamp_ns: StampNs
-    kind: Literal["station", "point", "note", "alarm"] = "station"
+    kind: Literal["station", "point", "note", "alarm", "leg"] = "station"
     name: Annotated[str, Meta(max_length=64)] = ""
     note: Annotated[str, Meta(max_length=1024)] = ""

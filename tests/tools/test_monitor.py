@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
-from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.envelope import Refusals, envelope_of
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import Message, RelativePose, SolverStatus
+from buddyline.protocol.messages import Mark, Message, RelativePose, SolverStatus
 from buddyline.protocol.topics import ATTITUDE, INFO, POSE, TRACK
 from buddyline.solver_service.coach import UNSEEN
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix, rotation_exp
@@ -388,6 +388,17 @@ class TestPanel:
             "Uncertainty of the position (1 sd)",
             "Gap between both nodes' ranges",
         }
+
+    def test_the_surveys_verdict_on_a_leg_is_shown_for_a_minute(self) -> None:
+        picture = watched(9)
+        for kind, name, said in (("leg", "good", "the leg is good"), ("alarm", "sights", "leg again (sights)")):
+            for node in "ab":
+                mark = Mark(node=node, stamp_ns=at(9), kind=kind, name=name, note="<5 m>")  # type: ignore[arg-type]
+                picture.take(envelope_of(mark, at(9)))
+            assert panel.health(picture, at(20)).count(f"{said}: &lt;5 m&gt;") == 1
+        picture.take(envelope_of(Mark(node="a", stamp_ns=at(10), kind="point"), at(10)))
+        assert "leg again" in panel.health(picture, at(20))
+        assert "Survey" not in panel.health(picture, at(9) + 61 * S_NS)
 
     @pytest.mark.parametrize("draw", [panel.figures, panel.health])
     def test_every_state_can_be_drawn(self, draw: Callable[[PairPicture, int], str]) -> None:

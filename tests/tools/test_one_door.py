@@ -24,7 +24,7 @@ from buddyline.tools.monitor.live import subscribe
 from buddyline.tools.monitor.overview import Overview
 from buddyline.tools.monitor.playback import Playback, cover
 from buddyline.tools.monitor.summary import summarize
-from buddyline.tools.survey.live import LiveAlarms, Watch
+from buddyline.tools.survey.live import LiveLegs, Watch
 from buddyline.tools.survey.readings import of_logs
 
 from tests.tools.evaluated import INFOS, PERIOD_NS, frame, pose, rejection, truth, write_log
@@ -63,8 +63,8 @@ def follower_of(bus, took):
 def watch_of(bus, took):
     watch = Watch(bus, Refusals("t"))
     depths = {}
-    watch._alarms = type("Spy", (LiveAlarms,), {"handle": lambda self, m: depths.update({m.node: m.depth_m}) or []})(
-        watch._alarms._settings, watch._alarms._limits
+    watch._legs = type("Spy", (LiveLegs,), {"handle": lambda self, m: depths.update({m.node: m.depth_m}) or []})(
+        watch._legs._settings, watch._legs._limits
     )
     watch.attach()
     return lambda: depths

@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, find_standings
-from buddyline.tools.survey.derive import Derived, ranges
-from buddyline.tools.survey.live import LiveAlarms
+from buddyline.tools.survey.derive import Derived, ranges, time_text
+from buddyline.tools.survey.live import OVER_NS, LiveLegs
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.readings import of_messages
@@ -231,20 +232,62 @@ def test_a_disturbed_field_is_noticed_and_its_compass_not_used():
     assert np.linalg.norm((adjusted.positions["5"].position_m - adjusted.positions["0"].position_m - end)[:2]) < 1.0
 
 
-def test_live_alarms_equal_the_offline_ones():
+def judged(messages):
+    """What is said of each leg while it is measured, at node a and without late words, and what afterwards."""
+    live = LiveLegs(SurveySettings(), AlarmSettings())
+    said = [mark for message in messages for mark in live.handle(message)]
+    assert [mark.note for mark in said if mark.node == "a"] == [mark.note for mark in said if mark.node == "b"]
+    found = []
+    for leg in derived(messages).legs:
+        late = f"leg of {time_text(leg.start_ns)}: "
+        meanwhile = [
+            mark
+            for mark in said
+            if mark.node == "a"
+            and (mark.note.startswith(late) or leg.start_ns <= mark.stamp_ns <= leg.end_ns + OVER_NS + S_NS)
+            and (mark.note.startswith(late) or not mark.note.startswith("leg of"))
+        ]
+        found.append((leg, meanwhile))
+    return found
+
+
+def test_each_leg_is_judged_at_its_tenth_second():
     rng = np.random.default_rng(11)
-    course = world.line(rng, 3)
+    course = world.line(rng, 6)
 
     def disturb(index, number):
-        return 20.0 if (index, number) == (0, 2) else 0.0
+        return 20.0 if (index, number) == (0, 6) else 0.0
 
-    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=8.0, swim_s=2.0, disturb=disturb)
-    live = LiveAlarms(SurveySettings(), AlarmSettings())
-    said = [mark for message in messages for mark in live.handle(message)]
-    assert {mark.kind for mark in said} == {"alarm"}
-    assert {"sights", "field"} <= {mark.name for mark in said}
-    assert {mark.node for mark in said if mark.name == "field"} == {"a"}
-    assert len(said) < 12
+    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=12.0, swim_s=3.0, disturb=disturb)
+    verdicts = judged(messages)
+    assert len(verdicts) == 6
+    for leg, said in verdicts:
+        assert 0 <= said[0].stamp_ns - leg.start_ns - 10 * S_NS <= 3 * S_NS
+        assert {mark.name for mark in said if mark.kind == "alarm"} == {text.partition(":")[0] for text in leg.alarms}
+    kinds = [said[0].kind for _, said in verdicts]
+    assert kinds[:5] == ["leg"] * 5
+    assert {mark.name for mark in verdicts[5][1]} >= {"sights", "field"}
+    assert "m, 1" in verdicts[0][1][0].note
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_every_alarm_is_said_in_the_water_and_few_others():
+    false = sound = alarmed = 0
+    for seed in range(5):
+        rng = np.random.default_rng([seed, 9])
+        course = world.line(rng, 10)
+        flaws = world.Flaws(compass_deg=(1.0, 1.5)[seed % 2], disturbed_share=(0.0, 0.1)[seed % 2])
+        for leg, said in judged(
+            world.dive(course, rng, flaws, float(rng.uniform(10.5, 16)), float(rng.uniform(3, 10)))
+        ):
+            signalled = any(mark.kind == "alarm" for mark in said)
+            assert signalled or not leg.alarms, leg.name
+            alarmed += bool(leg.alarms)
+            sound += not leg.alarms
+            false += signalled and not leg.alarms
+    assert alarmed > 10
+    assert false <= 0.02 * sound
 
 
 def stop(line, a=10.0, b=10.0):
@@ -350,11 +393,11 @@ def test_two_pairs_are_watched_live():
     course = world.line(rng, 3)
     messages = world.dive(course, rng, rest_s=8.0, swim_s=2.0)
     wrong = [replace(m, depth_m=m.depth_m + 3.0) if isinstance(m, Depth) and m.node == "b" else m for m in messages]
-    live = LiveAlarms(SurveySettings(), AlarmSettings())
+    live = LiveLegs(SurveySettings(), AlarmSettings())
     said = []
     for message in wrong:
         said += live.handle(message) + live.handle(renamed(message, a="c", b="d"))
-    assert {mark.node for mark in said if mark.name == "depth"} == {"a", "c"}
+    assert {mark.node for mark in said if mark.name == "depth"} == {"a", "b", "c", "d"}
 
 
 def test_a_second_dive_takes_numbers_of_its_own(messages):

@@ -237,7 +237,7 @@ def test_live_alarms_are_published_on_the_bus(messages):
         for info in infos:
             nodes.publisher(INFO, info.node).put(info)
         # Calibrations come by a subscription of their own: a leg is judged once both are there.
-        while len(watch._alarms._infos) < len({info.node for info in infos}):
+        while len(watch._legs._infos) < len({info.node for info in infos}):
             time.sleep(0.01)
         for message in messages:
             parsed = parse_key(key_of(message)) if not isinstance(message, Rejected) else None
@@ -249,4 +249,4 @@ def test_live_alarms_are_published_on_the_bus(messages):
             off = isinstance(message, Depth) and message.node == "b"
             publishers[topic, ids].put(replace(message, depth_m=message.depth_m + 3.0) if off else message)
         assert came.wait(PATIENCE_S), [one.note for one in heard]
-    assert {one.kind for one in heard} == {"alarm"}
+    assert "alarm" in {one.kind for one in heard} <= {"alarm", "leg"}

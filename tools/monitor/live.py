@@ -30,7 +30,8 @@ DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8080
 STATES: Final = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
 STREAMS: Final = (
-    *(topics.POSE, topics.TRACK, topics.REJECTED, topics.NET_POSE, topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH),
+    *(topics.POSE, topics.TRACK, topics.REJECTED, topics.NET_POSE),
+    *(topics.CANDIDATES, topics.ATTITUDE, topics.DEPTH, topics.MARK),
 )
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Rejected, RelativePose, Track, TrackMode
-from buddyline.protocol.topics import CANDIDATES, IMAGE, NODE_STATUS
+from buddyline.protocol.topics import CANDIDATES, IMAGE, MARK, NODE_STATUS
 from buddyline.tools.draw.marks import marked_svg
 from buddyline.tools.estimate import Estimate, known, range_sigma_m, sigma_m
 from buddyline.tools.health.finding import Finding
@@ -17,6 +17,7 @@ from buddyline.tools.health.words import duration_words, power_words, reason_wor
 from buddyline.tools.monitor.picture import NodePicture, PairPicture
 from msgspec import UNSET
 
+VERDICT_NS: Final = 60 * S_NS
 TRACK_WORDS: Final[dict[TrackMode, str]] = {
     "filter": "from what came before",
     "lag": "from what came up to a second later",
@@ -92,7 +93,19 @@ def health(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
         f'<tr><td><b>{escape(who).replace(" ", "&nbsp;")}</b></td><td class="dim">{escape(", ".join(facts))}</td></tr>'
         for who, facts in rows
     )
-    return f"{said}<table>{table}</table>{_rejections(picture)}"
+    return f"{said}{_verdict(picture, now_ns)}<table>{table}</table>{_rejections(picture)}"
+
+
+def _verdict(picture: PairPicture, now_ns: int) -> str:
+    """Return what `survey watch` has said of the leg, once for both nodes."""
+    said: dict[str, str] = {}
+    for node in picture.end_nodes():
+        age_ns = None if node is None else node.age_ns(MARK.name, now_ns)
+        if node is not None and node.mark is not None and age_ns is not None and age_ns < VERDICT_NS:
+            good = node.mark.kind == "leg"
+            verdict = "the leg is good" if good else f"measure the leg again ({node.mark.name})"
+            said[f"Survey: {verdict}: {node.mark.note}."] = " ok" if good else " warning"
+    return "".join(f'<div class="find{level}">{escape(text)}</div>' for text, level in said.items())
 
 
 def _finding(finding: Finding, now_ns: int) -> str:

@@ -22,6 +22,7 @@ from buddyline.protocol.messages import (
     Candidates,
     CompressedImage,
     Depth,
+    Mark,
     NodeInfo,
     NodeStatus,
     Rejected,
@@ -29,7 +30,7 @@ from buddyline.protocol.messages import (
     SolverStatus,
     Track,
 )
-from buddyline.protocol.topics import INFO, POSE, TRACK, Topic
+from buddyline.protocol.topics import INFO, MARK, POSE, TRACK, Topic
 from buddyline.tools.estimate import Estimate, sigma_m
 from buddyline.tools.health.words import duration_words
 from buddyline.tools.monitor.scene import Floats, SceneFrame, frame_of
@@ -42,6 +43,8 @@ KEPT_NS: Final = 150 * S_NS
 POINT_SPACING_NS: Final = S_NS // 5
 MAX_CANDIDATES: Final = 128
 MAX_REJECTED: Final = 8192
+# Marks of the survey's checks, not of persons.
+VERDICTS: Final = ("leg", "alarm")
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ class NodePicture:
     info: NodeInfo | None = None
     attitude: Attitude | None = None
     depth: Depth | None = None
+    mark: Mark | None = None
     status: NodeStatus | None = None
     image: CompressedImage | None = None
     candidates: deque[Candidates] = field(default_factory=lambda: deque(maxlen=MAX_CANDIDATES))
@@ -169,8 +173,9 @@ class NodePicture:
         return None if heard_ns is None else max(now_ns - heard_ns, 0)
 
     def alive_ns(self) -> int:
-        """Return the time of the newest message of any topic except NodeInfo; 0: none."""
-        return max((ns for what, ns in self.heard_ns.items() if what != INFO.name), default=0)
+        """Return the time of the newest message of its own, of any topic except NodeInfo; 0: none."""
+        others = (INFO.name, MARK.name)
+        return max((ns for what, ns in self.heard_ns.items() if what not in others), default=0)
 
     def shown(self) -> Candidates | None:
         """Return the candidates of the newest picture if they are still kept; without pictures the newest ones."""
@@ -182,7 +187,7 @@ class NodePicture:
     def take(self, envelope: Envelope) -> None:
         """Take one of the node's messages."""
         message, name = envelope.message, envelope.topic.name.removeprefix("node_")
-        if not hasattr(self, name):
+        if not hasattr(self, name) or (isinstance(message, Mark) and message.kind not in VERDICTS):
             return
         self.heard_ns[envelope.topic.name] = envelope.time_ns
         if isinstance(message, Candidates):

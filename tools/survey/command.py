@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "and as adjusted in th, because Therion weighs loops without correlations",
     )
     export.add_argument("-o", "--output", metavar="FILE", help="default: beside the project; - for stdout")
-    watch = add("publish an alarm on the bus when sights, magnetic fields or depths disagree", _watch, "watch")
+    watch = add("say on the bus, while the divers rest, whether their leg is good", _watch, "watch")
     add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long; default: at Ctrl-C")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Any, Final
@@ -20,7 +20,7 @@ from buddyline.tools.survey.gauges import StationDepth
 from buddyline.tools.survey.magnetism import usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station, Turn
 from buddyline.tools.survey.readings import PairReadings
-from buddyline.tools.survey.rests import rests
+from buddyline.tools.survey.rests import Rest, rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
@@ -76,7 +76,7 @@ class Derived:
         placed = {id(mark) for chain in chains for mark in chain.placed}
         points = [mark for mark in marks if mark.kind == "point" and mark.node in nodes]
         for mark in marks:
-            at = _time_text(mark.stamp_ns)
+            at = time_text(mark.stamp_ns)
             if mark.node not in nodes and mark.kind != "note":
                 self.faults += 1
                 known = ", ".join(sorted(nodes))
@@ -160,7 +160,7 @@ class _Chain:
         least = f"{settings.rest_s:g} s with {settings.rest_fixes} fixes"
         for rest in every:
             if rest.too_short:
-                out.add_problem(f"NO LEG: rest at {_time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
+                out.add_problem(f"NO LEG: rest at {time_text(rest.start_ns)}: {rest.too_short}; a leg takes {least}")
         # After a rest without a leg, it is a guess who has moved.
         doubtful = {id(rest) for before, rest in pairwise(every) if before.too_short}
         self.found = [rest for rest in every if not rest.too_short]
@@ -182,10 +182,8 @@ class _Chain:
         legs = []
         for rest, shot, standing, stations in zip(self.found, shots, self.standings, self.named, strict=True):
             leg = self._leg(shot, standing.station, standing.rear)
-            said = [standing.problem] if standing.problem else []
-            if id(rest) in doubtful and len(stations) < 2:
-                said.append("a rest before this one makes no leg; mark both nodes' stations, or they may be wrong")
-            legs.append(replace(leg, alarms=[*leg.alarms, *(f"stations: {text}" for text in said)]))
+            doubts = doubt_of(standing.problem, stations, after_lost=id(rest) in doubtful)
+            legs.append(replace(leg, alarms=[*leg.alarms, *doubts]))
         used = [np.isin(self.seen.triggers, shot.used) for shot in shots]
         self.turns = turns_of(readings, used, dive, settings)
         self.legs = alarms.disturbed_alike(legs, [alarms.off_fields(shot, self.usual, limits) for shot in shots])
@@ -205,9 +203,8 @@ class _Chain:
         for mark in sorted(self.marks, key=lambda one: id(one) in corrected):
             if mark.kind != "station" or mark.node not in self.readings.nodes or not STATION_NAME.match(mark.name):
                 continue
-            gaps = [max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0) for rest in self.found]
-            if gaps and min(gaps) <= MARK_NEAR_NS:
-                named[gaps.index(min(gaps))][mark.node] = mark.name
+            if (at := rest_of(mark, self.found)) is not None:
+                named[at][mark.node] = mark.name
                 self.placed.append(mark)
                 earlier = out.numbered.get(mark.name, self.dive)
                 if earlier != self.dive and mark.name not in joined:
@@ -247,6 +244,23 @@ class _Chain:
         return replace(leg, grade=alarms.grade(leg))
 
 
+def rest_of(mark: Mark, found: Sequence[Rest]) -> int | None:
+    """Return the rest that a mark belongs to: the nearest one, if it is near enough."""
+    gaps = [max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0) for rest in found]
+    return gaps.index(min(gaps)) if gaps and min(gaps) <= MARK_NEAR_NS else None
+
+
+def doubt_of(problem: str, stations: Mapping[str, str], *, after_lost: bool) -> list[str]:
+    """Return alarms of a leg's stations: the chain's problem, and that a rest without a leg was before it.
+
+    stations: by node, as marked.
+    """
+    said = [problem] if problem else []
+    if after_lost and len(stations) < 2:
+        said.append("a rest before this one makes no leg; mark both nodes' stations, or they may be wrong")
+    return [f"stations: {text}" for text in said]
+
+
 def one_leg(shot: Shot, station: dict[str, str], rear: str) -> Leg:
     """Return a shot as a leg from the rear node's station; station: by node."""
     fields: dict[str, Any] = {}
@@ -280,7 +294,8 @@ def _rounded(mean: Mean | None, digits: int, scale: float, *names: str) -> dict[
     return {name: round(scale * value, digits) for name, value in zip(names, values, strict=False)}
 
 
-def _time_text(stamp_ns: int) -> str:
+def time_text(stamp_ns: int) -> str:
+    """Return a time as UTC."""
     return datetime.fromtimestamp(stamp_ns // S_NS, UTC).isoformat().replace("+00:00", "Z")
 
 

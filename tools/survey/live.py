@@ -1,4 +1,4 @@
-"""Alarms during a dive: the survey's checks over the last seconds, published as marks."""
+"""Good or again: each rest is judged while the divers are still there, and the verdict is published as marks."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ import argparse
 import logging
 import threading
 from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, RelativePose
+from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
 from buddyline.protocol.security import SURVEYOR
-from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE
+from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, REJECTED
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
-from buddyline.tools.survey.derive import one_leg
-from buddyline.tools.survey.magnetism import Field, field_alarm, field_of, usual_field
-from buddyline.tools.survey.readings import NodeReadings, of_messages
-from buddyline.tools.survey.rests import rests
+from buddyline.tools.survey.chain import Stop, find_standings
+from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, time_text
+from buddyline.tools.survey.magnetism import Field, off_usual, usual_field
+from buddyline.tools.survey.project import STATION_NAME, Leg
+from buddyline.tools.survey.readings import of_messages
+from buddyline.tools.survey.rests import PAUSE_NS, Rest, rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
-from buddyline.tools.survey.shots import shoot
+from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
 
 if TYPE_CHECKING:
@@ -30,37 +33,67 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-WINDOW_NS: Final = 8 * S_NS
-CHECK_NS: Final = 2 * S_NS
-# The same alarm is not repeated within this time.
-QUIET_NS: Final = 20 * S_NS
-MEMORY: Final = 300
-LEARNED: Final = 5
+# A rest is judged after this time; a shorter one once it is over.
+JUDGED_NS: Final = 10 * S_NS
+CHECK_NS: Final = S_NS
+OVER_NS: Final = 6 * S_NS
+# What is kept: this long, and of the present rest from a little before its begin, up to the longest.
+WINDOW_NS: Final = 25 * S_NS
+BEFORE_NS: Final = 8 * S_NS
+LONGEST_NS: Final = 120 * S_NS
+MARKS: Final = 256
+# So many more rests have a node's usual field than have another one.
+WITNESSES: Final = 3
 
-_Stamped: TypeAlias = RelativePose | Attitude | Depth | Imu
+_Stamped: TypeAlias = RelativePose | Rejected | Attitude | Depth | Imu
 
 
-class LiveAlarms:
-    """Takes messages of any number of nodes, in any order; returns alarms as marks of the node most likely at fault."""
+@dataclass(eq=False)
+class _JudgedRest:
+    """A rest, what it gives, and the checks that were said to fail."""
+
+    rest: Rest
+    shot: Shot | None
+    said: set[str] | None = None
+
+
+@dataclass(eq=False)
+class _Pair:
+    """A pair's rests of this dive, all that it has seen of the present one, and when it was looked at last."""
+
+    nodes: tuple[str, str]
+    judged: list[_JudgedRest] = field(default_factory=list)
+    checked_ns: int = 0
+
+
+class LiveLegs:
+    """Takes messages of any number of nodes, in any order; returns the verdicts on rests, as marks of both nodes.
+
+    Mark of kind `leg` and name `good`: the leg carries no alarm. Of kind `alarm`: measure again; its name is the check.
+    A rest is judged by what `survey legs` would say of it. What later rests show of an earlier one (the usual
+    magnetic field) is said with that one's time.
+    """
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
         self._settings, self._limits = settings, limits
         self._infos: dict[str, NodeInfo] = {}
         # By kind and by the ids of its node or pair.
         self._recent: dict[tuple[type[Message], tuple[str, ...]], deque[_Stamped]] = {}
-        self._checked_ns: dict[tuple[str, str], int] = {}
-        self._said_ns: dict[str, int] = {}
-        self._fields: dict[str, deque[Field]] = {}
+        self._pairs: dict[tuple[str, str], _Pair] = {}
+        self._marks: deque[Mark] = deque(maxlen=MARKS)
 
     def handle(self, message: Message) -> list[Mark]:
         """Take one message."""
         if isinstance(message, NodeInfo):
             self._infos[message.node] = message
-        elif isinstance(message, RelativePose):
-            pair = message.node_a, message.node_b
-            self._keep(message, pair)
-            if abs(message.stamp_ns - self._checked_ns.get(pair, 0)) >= CHECK_NS:
-                self._checked_ns[pair] = message.stamp_ns
+        elif isinstance(message, Mark) and message.kind == "station" and STATION_NAME.match(message.name):
+            self._marks.append(message)
+        elif isinstance(message, RelativePose | Rejected):
+            nodes = message.node_a, message.node_b
+            pair = self._pairs.setdefault(nodes, _Pair(nodes))
+            self._keep(message, nodes)
+            if abs(message.stamp_ns - pair.checked_ns) >= CHECK_NS and set(nodes) <= set(self._infos):
+                pair.checked_ns = message.stamp_ns
                 return self._check(pair, message.stamp_ns)
         elif isinstance(message, Attitude | Depth | Imu):
             self._keep(message, (message.node,))
@@ -69,49 +102,113 @@ class LiveAlarms:
     def _keep(self, message: _Stamped, ids: tuple[str, ...]) -> None:
         recent = self._recent.setdefault((type(message), ids), deque())
         recent.append(message)
-        while abs(message.stamp_ns - recent[0].stamp_ns) > WINDOW_NS:
+        begins = [
+            pair.judged[-1].rest.start_ns - BEFORE_NS
+            for pair in self._pairs.values()
+            if pair.judged and set(ids) & set(pair.nodes)
+        ]
+        reach_ns = max([WINDOW_NS, *(message.stamp_ns - begin_ns for begin_ns in begins)])
+        while abs(message.stamp_ns - recent[0].stamp_ns) > min(reach_ns, LONGEST_NS):
             recent.popleft()
 
-    def _check(self, pair: tuple[str, str], now_ns: int) -> list[Mark]:
-        if not set(pair) <= set(self._infos):
+    def _check(self, pair: _Pair, now_ns: int) -> list[Mark]:
+        nodes = set(pair.nodes)
+        if (RelativePose, pair.nodes) not in self._recent:
             return []
-        sensed = (message for (_, ids), recent in self._recent.items() if {*ids} <= {*pair} for message in recent)
-        (readings,) = of_messages([*(self._infos[node] for node in pair), *sensed])
-        found = [(node.info.node, f"field: {text}") for node in readings.pair if (text := self._field(node, now_ns))]
+        sensed = (message for (_, ids), recent in self._recent.items() if {*ids} <= nodes for message in recent)
+        (readings,) = of_messages([*(self._infos[node] for node in pair.nodes), *sensed])
         seen = sights(readings, self._settings)
-        resting = [rest for rest in rests(readings, seen, self._settings) if not rest.too_short]
-        if resting:
-            shot = shoot(readings, seen, resting[-1].chosen, self._settings)
-            leg = one_leg(shot, {node: node for node in pair}, pair[0])
-            # The usual fields are learned here over minutes, not from one rest.
-            found += [(pair[0], text) for text in alarms.of_leg(leg, shot, {}, self._limits)]
-        return [mark for node, text in found if (mark := self._mark(node, text, now_ns))]
+        said = []
+        for rest in rests(readings, seen, self._settings):
+            known = next((one for one in pair.judged if _same(one.rest, rest)), None)
+            if known is not None and (known is not pair.judged[-1] or rest.too_short):
+                continue
+            over = now_ns - rest.end_ns > OVER_NS
+            if not over and (rest.too_short or now_ns - rest.start_ns < JUDGED_NS):
+                continue
+            shot = None if rest.too_short else shoot(readings, seen, rest.chosen, self._settings, rest.unused)
+            if known is None:
+                known = _JudgedRest(rest, shot)
+                pair.judged.append(known)
+            elif rest.end_ns > known.rest.end_ns:
+                known.rest, known.shot = rest, shot
+            said += self._judge(pair, now_ns)
+        return said
 
-    def _field(self, node: NodeReadings, now_ns: int) -> str:
-        """Return what is wrong with a node's present field, and learn the usual field from it; empty if nothing."""
-        now = field_of(node, now_ns - CHECK_NS, now_ns)
-        if now is None:
-            return ""
-        known = self._fields.setdefault(node.info.node, deque(maxlen=MEMORY))
-        text = field_alarm(now, usual_field(known), self._limits) if len(known) >= LEARNED else ""
-        known.append(now)
-        return text
+    def _judge(self, pair: _Pair, now_ns: int) -> list[Mark]:
+        """Return what is new to be said of all rests, the present one's verdict among it."""
+        legs = [one for one in pair.judged if one.shot is not None]
+        usual = {
+            node: self._usual([one.shot.ends[i].field for one in legs if one.shot is not None])
+            for i, node in enumerate(pair.nodes)
+        }
+        doubts = self._stations(pair, legs)
+        said = []
+        for one in pair.judged:
+            if one.shot is None:
+                text = f"{one.rest.too_short}; a leg takes {self._settings.rest_s:g} s"
+                found, words = {"rest": text}, ""
+            else:
+                leg = one_leg(one.shot, {node: node for node in pair.nodes}, pair.nodes[0])
+                texts = [*alarms.of_leg(leg, one.shot, usual, self._limits), *doubts[id(one)]]
+                found = {check: what for check, _, what in (text.partition(": ") for text in texts)}
+                words = _words(leg)
+            fresh = {check: what for check, what in found.items() if check not in (one.said or set())}
+            late = "" if one is pair.judged[-1] else f"leg of {time_text(one.rest.start_ns)}: "
+            for node in pair.nodes:
+                said += [
+                    Mark(node=node, stamp_ns=now_ns, kind="alarm", name=check, note=late + what)
+                    for check, what in fresh.items()
+                ]
+                if one.said is None and not found:
+                    said.append(Mark(node=node, stamp_ns=now_ns, kind="leg", name="good", note=words))
+            one.said = (one.said or set()) | set(found)
+        return said
 
-    def _mark(self, node: str, text: str, stamp_ns: int) -> Mark | None:
-        """Return an alarm (`check: what`) as a mark; None if it was published a moment ago."""
-        check, _, what = text.partition(": ")
-        key = f"{node} {check}"
-        if abs(stamp_ns - self._said_ns.get(key, -QUIET_NS)) < QUIET_NS:
-            return None
-        self._said_ns[key] = stamp_ns
-        return Mark(node=node, stamp_ns=stamp_ns, kind="alarm", name=check, note=what)
+    def _usual(self, fields: list[Field | None]) -> Field | None:
+        """Return a node's usual field; None until enough more rests have it than another one."""
+        usual = usual_field(fields)
+        others = sum(off_usual(one, usual, self._limits) > 1 for one in fields)
+        known = sum(one is not None for one in fields)
+        return usual if known - 2 * others >= WITNESSES else None
+
+    def _stations(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, list[str]]:
+        """Return what is doubtful about each leg's stations, by the id of its rest."""
+        named: list[dict[str, str]] = [{} for _ in legs]
+        for mark in self._marks:
+            at = rest_of(mark, [one.rest for one in legs])
+            if at is not None and mark.node in pair.nodes:
+                named[at][mark.node] = mark.name
+        stops = [
+            Stop(one.rest.line_m, {end.node: end.depth.value if end.depth else None for end in one.shot.ends}, stations)
+            for one, stations in zip(legs, named, strict=True)
+            if one.shot is not None
+        ]
+        first = self._settings.first if self._settings.first in pair.nodes else pair.nodes[0]
+        standings = find_standings(stops, self._settings.procedure, first)
+        lost = {id(pair.judged[i]) for i in range(1, len(pair.judged)) if pair.judged[i - 1].shot is None}
+        return {
+            id(one): doubt_of(standing.problem, stations, after_lost=id(one) in lost)
+            for one, standing, stations in zip(legs, standings, named, strict=True)
+        }
+
+
+def _same(one: Rest, other: Rest) -> bool:
+    """Tell whether two rests have time in common; refused poses beside a rest are of it."""
+    beside_ns = PAUSE_NS if other.too_short and one.too_short == "" else 0
+    return one.start_ns - beside_ns <= other.end_ns and other.start_ns <= one.end_ns + beside_ns
+
+
+def _words(leg: Leg) -> str:
+    seconds = (leg.end_ns - leg.start_ns) / S_NS
+    return f"{leg.distance_m:.2f} m, {seconds:.0f} s with {leg.fixes} fixes"
 
 
 class Watch:
-    """The alarms on a bus: attached, it listens to all nodes and pairs, and publishes marks."""
+    """The verdicts on a bus: attached, it listens to all nodes and pairs, and publishes marks."""
 
     def __init__(self, bus: Bus, refusals: Refusals) -> None:
-        self._alarms = LiveAlarms(SurveySettings(), AlarmSettings())
+        self._legs = LiveLegs(SurveySettings(), AlarmSettings())
         self._bus, self._refusals = bus, refusals
         self._publishers: dict[str, Publisher] = {}
         self._lock = threading.Lock()
@@ -120,18 +217,19 @@ class Watch:
         """Subscribe."""
         follow(self._bus, INFO.key_any(), self._refusals, self._take)
         # One subscription keeps the order: no pose may close a leg before the depths that were sent before it.
-        keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE))
+        keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE, REJECTED, MARK))
         follow(self._bus, keys, self._refusals, self._take, capacity=16384, history=False)
 
     def _take(self, envelope: Envelope) -> None:
         try:
             with self._lock:
-                marks = self._alarms.handle(envelope.message)
+                marks = self._legs.handle(envelope.message)
         except BuddylineError as error:
             log.warning("survey watch: %s: %s", envelope.key, error)
             return
         for mark in marks:
-            log.warning("%s: %s: %s", mark.node, mark.name, mark.note)
+            level = logging.INFO if mark.kind == "leg" else logging.WARNING
+            log.log(level, "%s: %s: %s", mark.node, mark.name, mark.note)
             if mark.node not in self._publishers:
                 self._publishers[mark.node] = self._bus.publisher(MARK, mark.node)
             self._publishers[mark.node].put(mark)

@@ -10,6 +10,7 @@ from buddyline.node.underwater.codes import (
     FAULT_BEEP,
     HOLDS,
     LEAK_BEEP,
+    VERDICT_BEEPS,
     PanelAction,
     Pattern,
     Situation,
@@ -47,6 +48,7 @@ def test_the_readmes_table_of_the_lamp_is_the_codes():
 
 def test_the_readmes_table_of_the_buzzer_is_the_codes():
     said = [(pattern.words, action.value) for action, pattern in BEEPS.items()]
+    said += [(pattern.words, verdict.value) for verdict, pattern in VERDICT_BEEPS.items()]
     said += [(FAULT_BEEP.words, "a fault begins"), (LEAK_BEEP.words, "water in the housing")]
     assert rows("| the buzzer | when |") == said
 

@@ -8,13 +8,16 @@ import pytest
 from buddyline.node.config import CameraConfig, NodeConfig, PanelConfig, PowerConfig, RecordConfig, load_node_config
 from buddyline.node.service import NodeService
 from buddyline.node.underwater import pins as pins_module
-from buddyline.node.underwater.codes import PanelAction
+from buddyline.node.underwater.codes import VERDICT_BEEPS, PanelAction, Verdict
 from buddyline.node.underwater.panel import Panel
 from buddyline.node.underwater.pins import PanelPins
+from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
+from buddyline.protocol.codec import encode
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import Mark, NodeStatus
+from buddyline.protocol.topics import MARK
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -79,6 +82,24 @@ def rig():
     rig.run(0.1)
     yield rig
     rig.panel.close()
+
+
+def test_the_surveys_verdict_is_shown_for_ten_seconds():
+    rig = Rig()
+    rig.news = (status(), [])
+    rig.run(1.0)
+    for kind, name, verdict in (("leg", "good", Verdict.GOOD), ("alarm", "sights", Verdict.AGAIN)):
+        rig.panel.hear(Received(MARK.key("a"), encode(Mark(node="a", stamp_ns=7, kind=kind, name=name)), 7, ""))
+        rig.run(0.1)
+        assert rig.panel._state.verdict is verdict
+        assert rig.panel._state.sound == VERDICT_BEEPS[verdict]
+        rig.run(10.0)
+        assert rig.panel._state.verdict is None
+    # A mark of a station, the node's own among them, and what is no mark, say nothing of the leg.
+    for payload in (encode(Mark(node="a", stamp_ns=7, kind="point")), b"{}"):
+        rig.panel.hear(Received(MARK.key("a"), payload, 7, ""))
+        rig.run(0.1)
+        assert rig.panel._state.verdict is None
 
 
 def test_a_press_is_a_mark_in_the_contracts_own_kind(rig):
