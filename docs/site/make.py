@@ -19,7 +19,7 @@ from buddyline.tools.cli import COMMANDS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
 PAGES: Final = {
-    "Learn": ["docs/tutorial.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
+    "Learn": ["docs/tutorial.md", "docs/install.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "docs/blueos.md", "protocol/README.md"],
     "Build and survey": ["docs/build/README.md", "node/README.md", "tools/survey/README.md"],
     "Reference": ["commands", "docs/glossary.md"],

@@ -153,8 +153,10 @@ def _compare(result: Result, directory: Path, viewer: Streams) -> None:
             first = bisect_left(stamps, row.seen["viewer"].first_ns)
             row.published = len(stamps) - first
             for name, stream in row.seen.items():
+                # Each from its own first one: on a loaded machine one of them may hear a node seconds before the other.
+                heard = bisect_left(stamps, stream.first_ns)
                 through = bisect_right(stamps, stream.last_ns)
-                row.lost[name] = through - first - stream.count
+                row.lost[name] = through - heard - stream.count
                 row.lost[name] += max(bisect_right(stamps, stamps[-1] - END_NS) - through, 0)
         else:
             row.lost["recorder"] = row.seen["viewer"].count - row.seen["recorder"].count
