@@ -6,6 +6,7 @@ cameras are right, down, forward, as in this project.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,6 +15,7 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.messages import (
+    NODE_ID_PATTERN,
     Attitude,
     CompressedImage,
     Depth,
@@ -128,6 +130,9 @@ class Translation:
     def _picture(self, image: CompressedImage) -> Iterator[RosMessage]:
         """Yield a picture, and its camera's calibration where that is known."""
         node = image.frame_id.removesuffix("_camera")
+        # Other programs choose their own frame names, which may be no part of a ROS name.
+        if not re.match(NODE_ID_PATTERN, node):
+            return
         header = self._header(image.stamp_ns, f"{name_of(node)}_camera")
         data = np.frombuffer(image.data, np.uint8)
         value = self._new(IMAGE_TYPE, header=header, format=image.format, data=data)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Message
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
 from buddyline.tools.ros_messages import RosMessage, Translation, name_of, type_store
@@ -138,6 +138,12 @@ def test_a_time_beyond_ros_range_is_refused_and_the_next_is_sent(store: Any) -> 
         list(translation.messages(depth("a", 2**31 * S_NS, 12.5)))
     (last,) = translation.messages(depth("a", 2**31 * S_NS - 1, 12.5))
     assert store.serialize_cdr(last.value, last.type_name)
+
+
+@pytest.mark.parametrize("frame_id", ["", "_camera", "a/b", "Front 1"])
+def test_a_picture_whose_frame_is_no_nodes_is_left_out(store: Any, frame_id: str) -> None:
+    image = CompressedImage(timestamp=FoxgloveTime(sec=1, nsec=0), frame_id=frame_id, data=b"x", format="jpeg")
+    assert list(Translation(store.types).messages(image)) == []
 
 
 def test_names_of_ros_begin_with_a_letter() -> None:
