@@ -184,6 +184,8 @@ class DigestCheck:
         self.nodes: dict[str, Checked] = {}
         self._refuses = refuses
         self._must_sign = must_sign
+        # Whether digests come in the order in which they were written.
+        self.in_order = True
         self._lists = 0
 
     def add(self, key: str, payload: bytes, time_ns: int) -> Iterator[Discrepancy]:
@@ -197,7 +199,9 @@ class DigestCheck:
         of = self.nodes.setdefault(node, Checked())
         if topic is DIGEST:
             try:
-                _insert(of.due, _Due(time_ns, *unsealed(key, payload)))
+                due = _Due(time_ns, *unsealed(key, payload))
+                if _insert(of.due, due) and self.in_order and due.digest.seq not in of.absent[due.digest.boot]:
+                    yield Discrepancy(node, "altered", time_ns - S_NS, time_ns, "digests in another order")
             except MessageError as error:
                 words = f"a digest cannot be read: {error}"
                 yield Discrepancy(node, "altered", time_ns - S_NS, time_ns, words)
@@ -277,12 +281,13 @@ class DigestCheck:
         return "" if "" in whys else whys[-1]
 
 
-def _insert(due: list[_Due], new: _Due) -> None:
-    """Put a digest in its place: one that came late goes before the later ones of its boot that wait."""
+def _insert(due: list[_Due], new: _Due) -> bool:
+    """Put a digest in its place, and return whether it is before others: one that came late goes before the later ones of its boot that wait."""
     at = len(due)
     while at and due[at - 1].digest.boot == new.digest.boot and due[at - 1].digest.seq > new.digest.seq:
         at -= 1
     due.insert(at, new)
+    return at < len(due) - 1
 
 
 def _take_certificate(of: Checked, key: str, payload: bytes) -> None:

@@ -65,7 +65,7 @@ def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[
         found: list[Discrepancy] = []
         # In a node's own log, in the order of the file: log times go back where its clock was set. A recording has
         # at its end what came late.
-        own = "boot" in reader.metadata()
+        own = check.in_order = "boot" in reader.metadata()
         streams = [one.stored(_is_told) if own else one.records(_is_told) for one in together]
         for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):
             found += check.add(record.key, record.payload, record.log_time_ns)
