@@ -282,7 +282,10 @@ class DigestCheck:
 
 
 def _insert(due: list[_Due], new: _Due) -> bool:
-    """Put a digest in its place, and return whether it is before others: one that came late goes before the later ones of its boot that wait."""
+    """Put a digest in its place, and return whether others wait behind it.
+
+    One that came late goes before the later ones of its boot.
+    """
     at = len(due)
     while at and due[at - 1].digest.boot == new.digest.boot and due[at - 1].digest.seq > new.digest.seq:
         at -= 1

@@ -20,9 +20,11 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.compasses import Contradiction
 
-# Witnesses are remembered for this time. Fewer than this are not believed.
+# Witnesses are remembered for this time. Two seconds of them are believed: at most MOST, and no fewer than FEWEST.
 MEMORY_NS: Final = 30 * S_NS
-FEWEST: Final = 15
+BELIEVED_NS: Final = 2 * S_NS
+MOST: Final = 15
+FEWEST: Final = 5
 # Two lights from equal range are a chance that passes with the motion: so large a share of the triggers must show it.
 LEAST_SHARE: Final = 0.3
 # Scatter of the contradiction, at most, as a share of the change that a third's bar would have caused.
@@ -64,7 +66,7 @@ class Witnesses:
 
     def _judge(self) -> Witnessed | None:
         shown = [found for _, found in self._seen if found is not None]
-        if len(shown) < max(FEWEST, LEAST_SHARE * len(self._seen)):
+        if len(shown) < max(self._believed(), LEAST_SHARE * len(self._seen)):
             return None
         log_range = np.log([one.range_m for one in shown])
         gap_rad, gap_scatter = _about_mean([one.gap.gap_rad for one in shown])
@@ -74,6 +76,11 @@ class Witnesses:
         if not by_steel and gap_scatter > MOST_SCATTER**2 * by_a_third:
             return None
         return Witnessed(gap_rad, gap_scatter)
+
+    def _believed(self) -> float:
+        """Return how many witnesses two seconds of triggers are."""
+        apart_ns = (self._seen[-1][0] - self._seen[0][0]) / max(len(self._seen) - 1, 1)
+        return min(max(BELIEVED_NS / max(apart_ns, 1.0), FEWEST), MOST)
 
 
 def _about_mean(angles_rad: list[float]) -> tuple[float, float]:

@@ -42,7 +42,8 @@ LEFT_OUT = {
     r"^buddyline survey watch": "runs until Ctrl-C; tests/tools/test_survey_legs.py",
     r"^buddyline setup": "a Raspberry Pi; tests/tools/test_setup_pi.py, tests/chroots.py",
     r"^buddyline node --config": "a real camera and sensors; tests/node/test_service.py",
-    r"^buddyline (hub|solver)( --config \S+)?$": "run until Ctrl-C; the fixture runs them",
+    r"^buddyline (hub|solver)( --config \S+| --share)?$": "run until Ctrl-C; the fixture runs them",
+    r"^buddyline solve .* --authority ": "logs of nodes that have keys; tests/tools/test_authenticity.py",
     r"^buddyline experiments": "takes minutes; tests/tools/test_experiments.py",
 }
 SHORTER = {

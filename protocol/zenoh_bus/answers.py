@@ -83,8 +83,8 @@ class AnswerDesk:
                 return
 
 
-def ask(session: zenoh.Session, key: str, text: str, timeout_s: float) -> list[bytes]:
-    """Ask on key; return the payloads that have come, in their order."""
+def ask(session: zenoh.Session, key: str, text: str, timeout_s: float, cancel: zenoh.CancellationToken) -> list[bytes]:
+    """Ask on key; return the payloads that have come within the time, or until cancelled, in their order."""
     replies = session.get(
         f"{key}?{text}",
         target=zenoh.QueryTarget.ALL,
@@ -92,6 +92,7 @@ def ask(session: zenoh.Session, key: str, text: str, timeout_s: float) -> list[b
         priority=zenoh.Priority.BACKGROUND,
         congestion_control=zenoh.CongestionControl.DROP,
         timeout=timeout_s,
+        cancellation_token=cancel,
     )
     found = {
         int.from_bytes(reply.ok.attachment.to_bytes()[:4], "little"): reply.ok.payload.to_bytes()

@@ -143,6 +143,7 @@ class ZenohBus(Bus):
         self._cache_s = cache_s
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._answers: list[AnswerDesk] = []
+        self._asking = zenoh.CancellationToken()
         self._budget = LinkBudget()
         self._link = Link(session, self._budget)
         self._watchdog = Watchdog(session, self._link)
@@ -221,7 +222,7 @@ class ZenohBus(Bus):
 
     def ask(self, key: str, text: str, timeout_s: float) -> list[bytes]:
         """Ask a question on key; return what has come of the answer within this time, in its order."""
-        return ask(self._session, key, text, timeout_s)
+        return ask(self._session, key, text, timeout_s, self._asking)
 
     def declare_alive(self, name: str) -> None:
         """Show others that this process is alive, until it closes the bus or dies."""
@@ -255,6 +256,11 @@ class ZenohBus(Bus):
         own = str(self._session.zid())
         keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         return any(not key.endswith(f"/{own}") for key in keys)
+
+    def close(self) -> None:
+        """Close publishers and subscriptions and leave the bus; a second call does nothing."""
+        self._asking.cancel()
+        super().close()
 
     @property
     def shed(self) -> dict[str, int]:

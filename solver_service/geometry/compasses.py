@@ -29,8 +29,8 @@ class HeadingGap:
     """How a pose compares with both headings.
 
     gap_rad: what to add to B's heading so that both agree with the pose. variance: the pose's part in the gap's
-    variance, rad^2. azimuth_rad: of the line of sight, by A's heading. agrees: whether noise explains the gap, or where
-    a bias was learned, its difference from that. contradicts: whether it speaks against the pose.
+    variance, rad^2. azimuth_rad: of the line of sight, by A's heading. agrees: whether noise explains the gap, or
+    its difference from a learned bias. contradicts: whether it speaks against the pose.
     """
 
     gap_rad: float
@@ -63,10 +63,10 @@ def compare_headings(
     follows: bool,
 ) -> HeadingGap:
     """Judge a gap; sensors_variance: of both headings' difference, rad^2; follows: earlier poses predict this one."""
-    off_rad, expected = gap_rad, sensors_variance + variance
-    if learned is not None:
+    agrees = gap_rad * gap_rad < EXPLAINED_CHI2 * (sensors_variance + variance)
+    if learned is not None and not agrees:
+        # What was learned beside steel does not hold at the next station; what the compasses state may.
         off_rad = math.remainder(gap_rad - learned.offset_rad, 2.0 * math.pi)
-        expected = learned.variance + variance
-    agrees = off_rad * off_rad < EXPLAINED_CHI2 * expected
+        agrees = off_rad * off_rad < EXPLAINED_CHI2 * (learned.variance + variance)
     contradicts = not agrees and not (follows and abs(gap_rad) <= MOST_APART_RAD)
     return HeadingGap(gap_rad, variance, azimuth_rad, agrees, contradicts)

@@ -61,7 +61,7 @@ _THREE_PROBABILITY: Final = 0.98
 _FOLLOWED_PROBABILITY: Final = 0.999
 # Four lights that no earlier pose supports. In dives among strangers' lamps, most wrong poses were less likely than
 # this, and few right ones.
-_ALONE_PROBABILITY: Final = 0.997
+_ALONE_PROBABILITY: Final = 0.99
 # chi^2 of two degrees of freedom from which on a gross error is likelier than the noise.
 _GROSS_CHI2: Final = 11.3
 # Where a position is known better than this share of the range (1 sd), a false light does not make it wrong.

@@ -44,6 +44,8 @@ TOGETHER_S: Final = 0.005
 ATTITUDE_EVERY_S: Final = 0.5
 # A light nearer to the picture's edge need not be found: part of its spot is outside.
 EDGE_PX: Final = 2.0
+# A clock that is off more than this looks like a walk of the biases.
+KNOWN_CLOCK_S: Final = 0.008
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
@@ -141,7 +143,7 @@ class TrackSteps(TrackIntake):
             by_shares = estimate.by_shares.copy()
             by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts)
             estimate.by_shares = by_shares
-        if estimate.confirmed and estimate.learns_walk:
+        if estimate.confirmed and estimate.learns_walk and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
             estimate.walking = estimate.walking.stepped(F, walk, (not parts[0].without, not parts[1].without))
         for node, part in enumerate(parts):
             if part.without != estimate.without[node]:
@@ -333,7 +335,7 @@ class TrackSteps(TrackIntake):
             if teaches:
                 estimate.shares = estimate.shares.taught(y, S_inverse, moved)
             estimate.by_shares = estimate.by_shares - before @ H.T @ (S_inverse @ moved)
-        if estimate.confirmed and estimate.learns_walk:
+        if estimate.confirmed and estimate.learns_walk and before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
             estimate.walking = estimate.walking.taught(y, S_inverse, H, before @ H.T @ S_inverse)
         # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:

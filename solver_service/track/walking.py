@@ -18,9 +18,10 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.shaking import LONGEST_STEP, MOST_CHI2
 from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, SIZE
 
-# Before the dive tells: densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s. Between
-# good units' and those that fins shake and water cools; e times as much or as little are 1 sd.
-FIRST: Final = np.array((2.5e-4, 4e-3))
+# Before the dive tells: densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s, as of units
+# that fins shake and water cools: from too steady a bias a dive with clocks far off does not find their offset. e times
+# as much or as little are 1 sd.
+FIRST: Final = np.array((5e-4, 8e-3))
 FIRST_INFORMATION: Final = 0.25
 LEAST: Final = 2.0 * np.log(0.1 * FIRST)
 MOST: Final = 2.0 * np.log(10.0 * FIRST)

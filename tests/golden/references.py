@@ -18,9 +18,8 @@ FOLDER = Path(__file__).parent / "references"
 SIGMAS = 1e-6
 PIXELS = 1e-6
 # Another OpenCV or processor decodes a JPEG, and blurs a picture, to within a grey level: not to the same bits.
-# What is made of pictures is then compared as loosely as this: poses by a quarter of their sigma (OpenCV 4.10 in place
-# of 5.0 moves one by 0.11), and those candidates that are likelier lamps than not.
-LOOSE_SIGMAS = 0.25
+# What is made of pictures is then compared as loosely as this, and those candidates that are likelier lamps than not.
+LOOSE_SIGMAS = 0.1
 LOOSE_PIXELS = 0.05
 LOOSE_SCORE = 0.5
 SHOWN = 12

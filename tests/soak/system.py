@@ -167,9 +167,11 @@ def _compare(result: Result, directory: Path, viewer: Streams) -> None:
             # Poses and rejections are in the order of triggers; a late one's stamp may be before another's.
             if stream.disordered and stamps is not None:
                 result.failures.append(f"{key}: {name}: {stream.disordered} out of order")
+    # The recorder has filled in, from the nodes' logs, what they saw before they were on the bus.
+    first = min(viewer.triggers, default=0)
     for name, streams in seen.items():
         complete_to = max(streams.triggers, default=0) - 2 * RATE_HZ
-        due = {trigger for trigger in streams.triggers if trigger <= complete_to}
+        due = {trigger for trigger in streams.triggers if first <= trigger <= complete_to}
         outcomes = Counter(streams.outcomes)
         result.triggers = len(due)
         without, doubled = len(due - outcomes.keys()), sum(outcomes.values()) - len(outcomes)

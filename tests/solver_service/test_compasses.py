@@ -9,7 +9,7 @@ from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
 from buddyline.solver_service.geometry.observation import Heading
 from buddyline.solver_service.geometry.trigger import Settings
-from buddyline.solver_service.witness import FEWEST, Witnesses
+from buddyline.solver_service.witness import BELIEVED_NS, Witnesses
 
 from tests.solver_service.conftest import dive_messages
 from tests.solver_service.strangers import messages_of, outcome, strangers_dive
@@ -78,7 +78,7 @@ def test_a_third_partys_bar_gives_no_pose_before_headings_are_learned():
 )
 def test_what_stays_at_a_rest_is_taken_for_steel(gap_deg, scatter_deg, steel):
     witnesses, told = Witnesses(), []
-    for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, FEWEST)):
+    for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, BELIEVED_NS // 200_000_000)):
         gap = HeadingGap(math.radians(off_deg), 1e-4, 0.5, agrees=False, contradicts=True)
         told.append(witnesses.take(k * 200_000_000, Contradiction(gap, 4.0)))
     assert not any(told[:-1])

@@ -33,6 +33,10 @@ SWIM_MPS, TIE_S = 0.4, 20.0
 STRETCH = 3
 
 
+# As long as the manual asks for.
+REST_S = 10.0
+
+
 @dataclass(frozen=True)
 class Campaign:
     """Surveys of one kind. disturbed: three stations in a row turn compasses by 6 to 20 degrees, each by its own."""
@@ -64,7 +68,7 @@ def measure(campaign, seed, directory, figures):
         course,
         rng,
         campaign.flaws,
-        8.0,
+        REST_S,
         4.0,
         disturb=lambda _, station: bad.get(station, 0.0),
         pause_s=pause_s,
