@@ -22,7 +22,7 @@ test: .venv/.test names
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	cd build/names && ../../$(BIN)/lint-imports --config ../../pyproject.toml
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
 # The same tests on each Python, and with the lowest and the newest packages: five times as long.
 matrix: .venv/.test
