@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
 from buddyline.protocol.errors import BuddylineError
 
@@ -24,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _whole(file: dict[str, str]) -> argparse.ArgumentParser:
+def _whole(file: Mapping[str, object]) -> argparse.ArgumentParser:
     """Return one parser of all commands. What takes a value without choices completes as a file."""
     from buddyline.tools.cli import COMMANDS
 

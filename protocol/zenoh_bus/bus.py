@@ -259,7 +259,7 @@ class ZenohBus(Bus):
 
     def close(self) -> None:
         """Close publishers and subscriptions and leave the bus; a second call does nothing."""
-        self._asking.cancel()
+        self._asking.cancel()  # type: ignore[no-untyped-call]
         super().close()
 
     @property

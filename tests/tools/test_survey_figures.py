@@ -35,8 +35,8 @@ def test_loops_close_within_their_sigmas():
         assert 0.8 < rms(figures[name]) < 1.2
 
 
-# A known fault, of lines without gyroscopes: 1.45 on 14 dives. A compass beside steel must be witnessed for two seconds,
-# which loses legs there; what is left of the others' disturbance is not in the ellipse.
+# A known fault, of lines without gyroscopes: 1.45 on 14 dives. A compass beside steel must be witnessed for two
+# seconds, which loses legs there; what is left of the others' disturbance is not in the ellipse.
 BESIDE_STEEL = pytest.param("lines-4deg-disturbed", 2.0, marks=pytest.mark.xfail(reason="the ellipse is too small"))
 
 
