@@ -110,6 +110,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "sample.mcap").read_bytes()[:900_000])
     (tmp_path / "sample.mcap").unlink()
     (tmp_path / "found.mcap").unlink()
+    about = re.search(r"```toml\n(title.*?)```", (REPOSITORY / "docs" / "dives.md").read_text(), re.DOTALL)
+    assert about is not None
+    (tmp_path / "about.toml").write_text(about[1])
     shutil.copytree(REPOSITORY / "node" / "examples", tmp_path / "node" / "examples")
     return tmp_path
 
