@@ -54,8 +54,8 @@ class Service:
         self._threads: list[threading.Thread] = []
         self._heartbeat_s: dict[str, float] = {}
 
-    def spawn(self, name: str, target: Callable[[], None]) -> None:
-        """Start a thread of this service."""
+    def spawn(self, name: str, target: Callable[[], None]) -> threading.Thread:
+        """Start a thread of this service, and return it."""
 
         def run() -> None:
             try:
@@ -68,6 +68,7 @@ class Service:
         thread = threading.Thread(target=run, name=name, daemon=True)
         self._threads.append(thread)
         thread.start()
+        return thread
 
     def heartbeat(self) -> None:
         """Report that the calling thread is not stuck. From its first call on, the thread is watched."""

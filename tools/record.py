@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
             filler = Filler(bus, recording.fill, bus.clock.now_ns(), client.stop)
             recording.filler = filler
             subscription = follow(bus, EVERYTHING, client.refusals, recording.take, capacity=65536)
-            client.spawn("fill", filler.run)
+            filling = client.spawn("fill", filler.run)
             log.info("record: %s into %s; Ctrl-C ends", client.config.connect, args.output)
             before = 0
             while not client.stop.wait(LOOK_S):
@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
                     print(f"\r{words}", end="\x1b[K", file=sys.stderr, flush=True)
                     before = total
             bus.close()
+            # The bus has taken its question back.
+            filling.join()
             recording.dropped = subscription.dropped
 
         status = client.run(record)

@@ -173,7 +173,7 @@ def test_a_truncated_log_is_solved_as_far_as_it_goes(capsys, dive_log, tmp_path)
             if i % 50 == 0:
                 writer.flush()
     data = (tmp_path / "chunked.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 6 // 10])
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 4 // 10])
     status, out, err = run(capsys, "solve", tmp_path / "cut.mcap", "-o", tmp_path / "out.mcap", "--json")
     assert status == 1
     assert "cut.mcap: breaks off at byte" in err
