@@ -18,6 +18,7 @@ from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import MAX_SAID, Digest, NodeInfo, Said
 from buddyline.protocol.topics import DIGEST, IMAGE, INFO, MARK, Topic, parse_key
 from msgspec import UNSET
+from msgspec.structs import replace
 
 # A digest is judged when the log is this far ahead of it: messages of other keys may arrive after it.
 LATE_NS: Final = 10 * S_NS
@@ -30,7 +31,9 @@ MAX_DUE: Final = 128
 # From one digest of a node to the next.
 MOST_DIGEST_NS: Final = 3 * S_NS // 2
 MAX_NODES: Final = 256
-# Digests of a boot that may come late: a day's.
+# Runs of a node in one log; one that ends every few seconds has hundreds in an hour.
+MAX_BOOTS: Final = 1024
+# Digests of a node that may come late: a day's.
 MAX_ABSENT: Final = 86_400
 _SIGNATURE: Final = b',"signature":"'
 
@@ -163,7 +166,7 @@ class Checked:
     signed: int = 0
     certificates: list[str] = field(default_factory=list)
     waiting: dict[str, list[Undigested]] = field(default_factory=lambda: defaultdict(list))
-    # By boot: the newest judged digest.
+    # By boot: the newest judged digest, without its sums.
     newest: dict[str, Digest] = field(default_factory=dict)
     # By boot: the numbers of the digests that are missing before that.
     absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
@@ -200,7 +203,8 @@ class DigestCheck:
         if topic is DIGEST:
             try:
                 due = _Due(time_ns, *unsealed(key, payload))
-                if _insert(of.due, due) and self.in_order and due.digest.seq not in of.absent[due.digest.boot]:
+                absent = of.absent.get(due.digest.boot, ())
+                if _insert(of.due, due) and self.in_order and due.digest.seq not in absent:
                     yield Discrepancy(node, "altered", time_ns - S_NS, time_ns, "digests in another order")
             except MessageError as error:
                 words = f"a digest cannot be read: {error}"
@@ -209,11 +213,12 @@ class DigestCheck:
             if topic is INFO:
                 _take_certificate(of, key, payload)
             one = Undigested(payload_stamp_ns(payload) or 0, time_ns, hashlib.sha256(payload).digest())
-            self._lists += end_of(topic) not in of.waiting
-            waiting = of.waiting[end_of(topic)]
+            name = end_of(topic)
+            self._lists += name not in of.waiting
+            waiting = of.waiting[name]
             waiting.append(one)
             if len(waiting) > min(MAX_WAITING, MAX_WAITING_TOGETHER // self._lists):
-                yield from _leftover(node, of, end_of(topic), [waiting.pop(0)])
+                yield from _leftover(node, of, name, [waiting.pop(0)])
         while of.due and (of.due[0].time_ns + LATE_NS < time_ns or len(of.due) > MAX_DUE):
             yield from self._judge(node, of, of.due.pop(0))
 
@@ -242,6 +247,9 @@ class DigestCheck:
         if not signature and self._must_sign:
             yield Discrepancy(node, "unsigned", digest.since_ns, digest.stamp_ns, "is not signed", digest.boot)
         newest = of.newest.get(digest.boot)
+        if newest is None and len(of.newest) >= MAX_BOOTS:
+            yield Discrepancy(node, "altered", *second, f"digests of more than {MAX_BOOTS} runs of the node")
+            return
         absent = of.absent[digest.boot]
         if newest is not None and digest.seq <= newest.seq and digest.seq not in absent:
             yield Discrepancy(node, "altered", *second, "a digest comes again, or late")
@@ -257,15 +265,15 @@ class DigestCheck:
             words = f"nothing is there of the node's first {digest.seq} s"
             began_ns = max(digest.since_ns - digest.seq * MOST_DIGEST_NS, 0)
             yield Discrepancy(node, "missing", began_ns, digest.since_ns, words, digest.boot)
-            absent.update(range(max(digest.seq - MAX_ABSENT, 0), digest.seq))
+            _expect_late(of, digest, 0)
         elif newest is not None and digest.seq > newest.seq + 1:
             words = f"{digest.seq - newest.seq - 1} digests are missing"
             yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
-            absent.update(range(newest.seq + 1, min(digest.seq, newest.seq + MAX_ABSENT)))
+            _expect_late(of, digest, newest.seq + 1)
         absent.discard(digest.seq)
         of.begins_ns = min(of.begins_ns, digest.since_ns)
         if newest is None or digest.seq > newest.seq:
-            of.newest[digest.boot] = digest
+            of.newest[digest.boot] = replace(digest, said=[])
         found = [one for stretch in digest.said for one in _compare(node, of, digest, stretch)]
         yield from found
         if not found:
@@ -277,8 +285,18 @@ class DigestCheck:
             return ""
         if not of.certificates:
             return "no calibration of the node has its certificate"
-        whys = [self._refuses(node, certificate, signature, signed) for certificate in of.certificates]
-        return "" if "" in whys else whys[-1]
+        why = ""
+        for certificate in of.certificates:
+            why = self._refuses(node, certificate, signature, signed)
+            if not why:
+                break
+        return why
+
+
+def _expect_late(of: Checked, digest: Digest, first: int) -> None:
+    """Note the digests from number `first` up to this one as absent; the newest ones, if they are too many."""
+    room = MAX_ABSENT - sum(map(len, of.absent.values()))
+    of.absent[digest.boot].update(range(max(first, digest.seq - room), digest.seq))
 
 
 def _insert(due: list[_Due], new: _Due) -> bool:
@@ -311,21 +329,22 @@ def sum_of(leaves: list[bytes]) -> str:
 
 def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[Discrepancy]:
     """Compare the messages of a stretch, which then no longer wait."""
-    waiting = of.waiting[stretch.topic]
+    # Not entered for a topic that has none: any text may stand in a digest.
+    waiting = of.waiting.get(stretch.topic, [])
     inside = [one for one in waiting if stretch.first_ns <= one.stamp_ns <= stretch.last_ns]
     # Where a clock was set back, or a message was said again, there are others among them.
     for begin in range(len(inside) - stretch.count + 1):
         found = inside[begin : begin + stretch.count]
         if sum_of([one.sha256 for one in found]) == stretch.sha256:
-            _remove(of, stretch.topic, found)
+            _remove(waiting, found)
             of.right[stretch.topic] = stretch.sha256
             return
     if not inside and of.right.get(stretch.topic) == stretch.sha256:
         return  # the same message said again, which logs that were put together have once
-    if stretch.topic == IMAGE.name:
+    if stretch.topic == end_of(IMAGE):
         return  # pictures are not all recorded, and not all kept; what is there without a digest is named
     distinct = list({one.sha256: one for one in inside}.values())
-    _remove(of, stretch.topic, inside)
+    _remove(waiting, inside)
     by_stamp = sorted(distinct, key=lambda one: one.stamp_ns)
     kind: Kind = "altered"
     if sum_of([one.sha256 for one in by_stamp]) == stretch.sha256:
@@ -338,9 +357,9 @@ def _compare(node: str, of: Checked, digest: Digest, stretch: Said) -> Iterator[
     yield Discrepancy(node, kind, digest.since_ns, digest.stamp_ns, words, digest.boot, stretch, have)
 
 
-def _remove(of: Checked, topic: str, gone: list[Undigested]) -> None:
+def _remove(waiting: list[Undigested], gone: list[Undigested]) -> None:
     known = set(map(id, gone))
-    of.waiting[topic] = [one for one in of.waiting[topic] if id(one) not in known]
+    waiting[:] = [one for one in waiting if id(one) not in known]
 
 
 def _leftover(node: str, of: Checked, topic: str, left: list[Undigested]) -> Iterator[Discrepancy]:

@@ -13,6 +13,7 @@ from typing import IO, Final, NamedTuple
 
 import msgspec
 import zstandard
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.salvage import CHANNEL_NOTE, MAGIC, ChunkAt, MalformedError, read_chunk, record_at
 from mcap.exceptions import McapError
@@ -24,7 +25,7 @@ PAGE_BYTES: Final = 32 * 1024
 MOST_PAGE_BYTES: Final = 128 * 1024
 MOST_UNPACKED_BYTES: Final = 1024 * 1024
 # A question's stretch: what is beyond it is left out of the answer.
-MOST_NS: Final = 60 * 1_000_000_000
+MOST_NS: Final = 60 * S_NS
 _QUESTION: Final = re.compile(
     r"boot=([0-9a-z]{1,32});since=(\d{1,19});until=(\d{1,19});topics=([a-z_]{1,32}(?:\+[a-z_]{1,32}){0,31})"
 )

@@ -30,6 +30,8 @@ PAUSE_S: Final = 0.1
 AGAIN_S: Final = 2.0
 # Each may be a second of a node; the oldest are given up.
 MAX_GAPS: Final = 20_000
+# Of one gap in the digests, which may state any time; what is older is not asked for.
+MOST_MISSING_NS: Final = 24 * 3600 * S_NS
 
 # Key, payload, log time.
 Write = Callable[[str, bytes, int], None]
@@ -70,7 +72,8 @@ class Filler:
         if one.stretch is not None and one.since_ns < self._began_ns:
             return
         # Missing digests may be of hours, and begin before the recording.
-        since_ns, end_ns = max(one.since_ns, self._began_ns), one.until_ns
+        end_ns = one.until_ns
+        since_ns = max(one.since_ns, self._began_ns, end_ns - MOST_MISSING_NS)
         with self._changed:
             while since_ns < end_ns:
                 until_ns = min(since_ns + MOST_NS, end_ns)

@@ -11,7 +11,7 @@ from buddyline.protocol import digest as digest_module
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
 from buddyline.protocol.digest import DigestBook, DigestCheck, Discrepancy, sealed, unsealed
-from buddyline.protocol.messages import Attitude, Depth, Message
+from buddyline.protocol.messages import Attitude, Depth, Digest, Message, Said
 from buddyline.protocol.signing import Signer, Trust
 from buddyline.protocol.topics import DIGEST, INFO, key_of, topic_of
 from msgspec import UNSET
@@ -233,6 +233,22 @@ def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         list(check.add(key_of(digest), sealed(digest, None), BEGAN_NS))
     assert sum(len(one.waiting["depth"]) for one in check.nodes.values()) <= 200
     assert len(check.nodes["a"].due) <= 5
+
+
+def test_digests_of_invented_runs_topics_and_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(digest_module, "MAX_BOOTS", 5)
+    monkeypatch.setattr(digest_module, "MAX_ABSENT", 100)
+    check = DigestCheck()
+    for k in range(50):
+        line = Said(topic=f"t{k}", count=1, first_ns=0, last_ns=0, sha256="0" * 32)
+        digest = Digest(node="a", stamp_ns=BEGAN_NS, boot=f"x{k}", seq=2**62, since_ns=BEGAN_NS, said=[line])
+        list(check.add(key_of(digest), sealed(digest, None), BEGAN_NS + k))
+    found = list(check.finish())
+    of = check.nodes["a"]
+    assert len(of.newest) == len(of.absent) == 5
+    assert sum(map(len, of.absent.values())) == 100
+    assert not of.waiting
+    assert "digests of more than 5 runs of the node" in {one.words for one in found}
 
 
 @pytest.mark.slow

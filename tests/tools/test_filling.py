@@ -8,16 +8,18 @@ from pathlib import Path
 
 import pytest
 from buddyline.node.log_desk import LogDesk
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
+from buddyline.protocol.digest import Discrepancy
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.log_pages import PAGE_BYTES, Logged, Question, pages_of, whole
+from buddyline.protocol.log_pages import MOST_NS, PAGE_BYTES, Logged, Question, pages_of, whole
 from buddyline.protocol.messages import Depth
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import LOG, key_of
 from buddyline.tools.authenticity import check_logs
-from buddyline.tools.filling import Filler
+from buddyline.tools.filling import MOST_MISSING_NS, Filler
 from buddyline.tools.record import Recording
 
 from tests.processes import until
@@ -116,3 +118,11 @@ def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
         assert len(recorded) == len(lines) + went_on
         told = check_logs([reader], None)
     assert told[0].startswith(f"{tmp_path}/top.mcap: node a: 6 s are as the node wrote them")
+
+
+def test_a_digest_of_centuries_ahead_asks_for_a_day() -> None:
+    filler = Filler(LocalNetwork().connect(), lambda *_: None, BEGAN_NS, threading.Event())
+    filler.want(Discrepancy("a", "missing", BEGAN_NS, 2**63 - 1, "1 digests are missing", "x"))
+    assert len(filler.open) == MOST_MISSING_NS // MOST_NS
+    filler.want(Discrepancy("b", "missing", BEGAN_NS, BEGAN_NS + 90 * S_NS, "9 digests are missing", "x"))
+    assert [one.node for one in filler.open].count("b") == 2
