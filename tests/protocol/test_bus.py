@@ -1,84 +1,21 @@
-"""The contract of every bus: within one process, and over Zenoh with a real hub on loopback."""
+"""The contract of every bus: which messages come, in which order, and what is refused."""
 
 from __future__ import annotations
 
 import math
-import threading
 import time
-from collections.abc import Callable, Iterator
 
 import pytest
 from buddyline.protocol import topics
-from buddyline.protocol.bus import Bus, Received
 from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import decode, payload_stamp_ns
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.local_bus import LocalNetwork, key_matches
-from buddyline.protocol.messages import Candidates, CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
-from buddyline.protocol.zenoh_bus import connect, open_hub
+from buddyline.protocol.local_bus import key_matches
+from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
 
-from tests.processes import PATIENCE_S, free_endpoint, until
+from tests.processes import until
+from tests.protocol.buses import NOW_NS, Connect, depth, rejected, status, triggers
 from tests.protocol.inbox import Inbox
-
-NOW_NS = 1_700_000_000_000_000_000
-
-Connect = Callable[[], Bus]
-
-
-@pytest.fixture(scope="module")
-def endpoint() -> Iterator[str]:
-    with open_hub(free_endpoint()) as hub:
-        yield hub.endpoint
-
-
-@pytest.fixture(params=["local", "zenoh"])
-def client(request: pytest.FixtureRequest) -> Iterator[Connect]:
-    """A function that connects one more client to the same bus; all are closed at the end."""
-    buses: list[Bus] = []
-    clock = ManualClock(NOW_NS)
-    network = LocalNetwork(clock)
-
-    def local() -> Bus:
-        return network.connect()
-
-    def zenoh() -> Bus:
-        endpoint = request.getfixturevalue("endpoint")
-        bus = connect(endpoint, stop=threading.Event(), on_wait=lambda _: None, clock=clock)
-        assert bus is not None
-        return bus
-
-    def make() -> Bus:
-        buses.append(local() if request.param == "local" else zenoh())
-        return buses[-1]
-
-    yield make
-    for bus in buses:
-        bus.close()
-
-
-def rejected(trigger: int) -> Rejected:
-    return Rejected(node_a="a", node_b="b", stamp_ns=trigger, trigger=trigger, reason="late")
-
-
-def triggers(inbox: Inbox) -> list[int]:
-    return [decode(received.payload, Rejected).trigger for received in inbox.received]
-
-
-def status(node: str, uptime_s: float) -> NodeStatus:
-    return NodeStatus(
-        node=node,
-        stamp_ns=0,
-        boot="x",
-        software="",
-        uptime_s=uptime_s,
-        rates_hz={},
-        drops={},
-        ages_s={},
-    )
-
-
-def depth(stamp_ns: int, node: str = "a") -> Depth:
-    return Depth(node=node, stamp_ns=stamp_ns, depth_m=1.0, sigma_m=0.1)
 
 
 def test_a_message_arrives_as_it_was_sent(client: Connect) -> None:
@@ -231,102 +168,6 @@ def test_an_invalid_node_id_is_refused(client: Connect) -> None:
         client().publisher(topics.DEPTH, "a/b")
 
 
-def test_a_slow_handler_loses_the_oldest_messages_and_they_are_counted(client: Connect) -> None:
-    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
-    begun, go_on = threading.Event(), threading.Event()
-
-    def slow(received: Received) -> None:
-        begun.set()
-        assert go_on.wait(PATIENCE_S)
-        inbox(received)
-
-    subscription = client().subscribe("buddyline/pair/a/b/rejected", slow, capacity=5)
-    publisher.put(rejected(0))
-    assert begun.wait(PATIENCE_S)
-    for trigger in range(1, 31):
-        publisher.put(rejected(trigger))
-    until(lambda: subscription.dropped >= 25)
-    go_on.set()
-    inbox.wait_for(6)
-    assert triggers(inbox) == [0, 26, 27, 28, 29, 30]
-    assert (subscription.dropped, subscription.missed) == (25, 0)
-
-
-def test_a_blocked_handler_does_not_starve_another(client: Connect) -> None:
-    bus, node, inbox = client(), client(), Inbox()
-    go_on = threading.Event()
-    bus.subscribe("buddyline/pair/*/*/rejected", lambda _: go_on.wait(PATIENCE_S) and None, capacity=2)
-    bus.subscribe("buddyline/node/*/depth", inbox)
-    stuck, depths = node.publisher(topics.REJECTED, "a", "b"), node.publisher(topics.DEPTH, "a")
-    for i in range(200):
-        stuck.put(rejected(i))
-        depths.put(depth(i))
-    assert [decode(r.payload, Depth).stamp_ns for r in inbox.wait_for(200)] == list(range(200))
-    go_on.set()
-
-
-def test_an_exception_in_a_handler_becomes_the_buss_failure(client: Connect) -> None:
-    bus, node, inbox = client(), client(), Inbox()
-    failed = threading.Event()
-
-    def broken(received: Received) -> None:
-        raise ZeroDivisionError("a bug")
-
-    bus.on_failure(lambda _: failed.set())
-    bus.subscribe("buddyline/node/*/depth", broken)
-    bus.subscribe("buddyline/pair/*/*/rejected", inbox)
-    assert bus.failure is None
-    node.publisher(topics.DEPTH, "a").put(depth(1))
-    assert failed.wait(PATIENCE_S)
-    assert isinstance(bus.failure.__cause__, ZeroDivisionError)
-    assert "buddyline/node/*/depth" in str(bus.failure)
-    node.publisher(topics.REJECTED, "a", "b").put(rejected(1))
-    inbox.wait_for(1)
-    late: list[Exception] = []
-    bus.on_failure(late.append)
-    assert late == [bus.failure]
-
-
-def test_processes_that_start_and_end_are_reported(client: Connect) -> None:
-    first, second, watcher, messages = client(), client(), client(), Inbox()
-    changes: list[tuple[str, bool]] = []
-    watcher.subscribe(topics.EVERYTHING, messages)
-    first.declare_alive("node/a")
-    until(lambda: watcher.is_alive("node/a"))
-    watcher.watch_alive(lambda name, alive: changes.append((name, alive)))
-    until(lambda: len(changes) == 1)
-    second.declare_alive("solver")
-    until(lambda: len(changes) == 2)
-    first.close()
-    until(lambda: len(changes) == 3)
-    assert changes == [("node/a", True), ("solver", True), ("node/a", False)]
-    assert not watcher.is_alive("node/a")
-    assert messages.received == []
-
-
-def test_another_process_of_the_same_name_is_alive(client: Connect) -> None:
-    first, second = client(), client()
-    changes: list[tuple[str, bool]] = []
-    assert not first.is_alive("node/a")
-    first.declare_alive("node/a")
-    assert not first.is_alive("node/a")
-    until(lambda: second.is_alive("node/a"))
-    assert not second.is_alive("node/b")
-    second.declare_alive("node/a")
-    until(lambda: first.is_alive("node/a"))
-    first.watch_alive(lambda name, alive: changes.append((name, alive)))
-    until(lambda: len(changes) == 1)
-    second.close()
-    until(lambda: not first.is_alive("node/a"))
-    assert changes == [("node/a", True)]
-
-
-@pytest.mark.parametrize("name", ["", "node/*", "node//a", "a/", "@x"])
-def test_an_alive_name_that_cannot_be_a_key_is_refused(client: Connect, name: str) -> None:
-    with pytest.raises(ValueError, match="alive name"):
-        client().declare_alive(name)
-
-
 def test_previews_are_capped_and_never_kept(client: Connect) -> None:
     node, inbox, late = client(), Inbox(), Inbox()
     image = CompressedImage(timestamp=FoxgloveTime(sec=1, nsec=0), frame_id="a_camera", data=b"jpeg", format="jpeg")
@@ -348,68 +189,6 @@ def test_previews_are_capped_and_never_kept(client: Connect) -> None:
     bus.subscribe(topics.EVERYTHING, late)
     node.publisher(topics.DEPTH, "a").put(depth(1))
     assert [r.key for r in late.wait_for(1)] == ["buddyline/node/a/depth"]
-
-
-def test_a_closed_bus_sends_nothing_and_leaves_no_thread(client: Connect) -> None:
-    before = set(threading.enumerate())
-    bus = client()
-    publisher = bus.publisher(topics.DEPTH, "a")
-    bus.publisher(topics.IMAGE, "a")
-    bus.subscribe(topics.EVERYTHING, Inbox())
-    bus.watch_alive(lambda name, alive: None)
-    assert publisher.put(depth(1))
-    bus.close()
-    bus.close()
-    assert not publisher.put(depth(2))
-    assert set(threading.enumerate()) - before == set()
-
-
-def test_a_bus_closes_while_another_thread_publishes(client: Connect) -> None:
-    """As a device's thread does."""
-    bus = client()
-    publisher = bus.publisher(topics.DEPTH, "a")
-    begun, ended, sent_after_close = threading.Event(), threading.Event(), []
-
-    def publish() -> None:
-        while not ended.is_set():
-            publisher.put_bytes(b"{}")
-            begun.set()
-        sent_after_close.append(publisher.put_bytes(b"{}"))
-
-    device = threading.Thread(target=publish, daemon=True)
-    device.start()
-    assert begun.wait(PATIENCE_S)
-    try:
-        bus.close()
-    finally:
-        ended.set()
-        device.join(PATIENCE_S)
-    assert sent_after_close == [False]
-
-
-def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
-    publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
-    for trigger in range(200):
-        publisher.put(rejected(trigger))
-    client().subscribe("buddyline/pair/a/b/rejected", inbox).close()
-    assert triggers(inbox) == list(range(200))
-
-
-def test_a_handler_can_publish(client: Connect) -> None:
-    """As the solver does."""
-    solver, node, inbox = client(), client(), Inbox()
-    answers = solver.publisher(topics.REJECTED, "a", "b")
-
-    def answer(received: Received) -> None:
-        answers.put(rejected(decode(received.payload, Candidates).trigger))
-
-    solver.subscribe("buddyline/node/*/candidates", answer)
-    client().subscribe("buddyline/pair/*/*/rejected", inbox)
-    node.publisher(topics.CANDIDATES, "a").put(
-        Candidates(node="a", stamp_ns=1, trigger=3, seq=0, boot="x", width_px=640, height_px=480, blobs=[])
-    )
-    inbox.wait_for(1)
-    assert triggers(inbox) == [3]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,40 @@
+"""What the tests of the bus's contract send, and how they connect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from buddyline.protocol.bus import Bus
+from buddyline.protocol.codec import decode
+from buddyline.protocol.messages import Depth, NodeStatus, Rejected
+
+from tests.protocol.inbox import Inbox
+
+NOW_NS = 1_700_000_000_000_000_000
+
+Connect = Callable[[], Bus]
+
+
+def rejected(trigger: int) -> Rejected:
+    return Rejected(node_a="a", node_b="b", stamp_ns=trigger, trigger=trigger, reason="late")
+
+
+def triggers(inbox: Inbox) -> list[int]:
+    return [decode(received.payload, Rejected).trigger for received in inbox.received]
+
+
+def status(node: str, uptime_s: float) -> NodeStatus:
+    return NodeStatus(
+        node=node,
+        stamp_ns=0,
+        boot="x",
+        software="",
+        uptime_s=uptime_s,
+        rates_hz={},
+        drops={},
+        ages_s={},
+    )
+
+
+def depth(stamp_ns: int, node: str = "a") -> Depth:
+    return Depth(node=node, stamp_ns=stamp_ns, depth_m=1.0, sigma_m=0.1)
