@@ -72,8 +72,7 @@ class LinkBudget:
                     self._left_out[topic.name] += 1
                     self._shed_s = now_s
                     return False
-                self._tokens = max(self._tokens - cost, -self._limit)
-            self._offered += cost
+            self._spend(cost)
             self._sent[topic.name] += 1
             return True
 
@@ -86,20 +85,17 @@ class LinkBudget:
             if self._limit is None or now_s - self._clear_s > BEHIND_S:
                 return False
             self._refill(now_s, self._limit)
-            self._tokens = max(self._tokens - size_bytes - OVERHEAD_BYTES, -self._limit)
-            self._offered += size_bytes + OVERHEAD_BYTES
+            self._spend(float(size_bytes + OVERHEAD_BYTES))
             return True
 
     def admits_spare(self, size_bytes: int, now_s: float) -> bool:
         """Return whether the link has room for what can wait; if so, count it as sent."""
-        cost = float(size_bytes + OVERHEAD_BYTES)
         with self._lock:
             if self._limit is not None:
                 self._refill(now_s, self._limit)
                 if self._tokens < SPARE_SHARE * self._limit:
                     return False
-                self._tokens = max(self._tokens - cost, -self._limit)
-            self._offered += cost
+            self._spend(float(size_bytes + OVERHEAD_BYTES))
             return True
 
     def observe(self, state: TcpState, now_s: float) -> None:
@@ -141,6 +137,12 @@ class LinkBudget:
     def _refill(self, now_s: float, limit: float) -> None:
         self._tokens = min(self._tokens + (now_s - self._tokens_s) * limit, limit)
         self._tokens_s = now_s
+
+    def _spend(self, cost: float) -> None:
+        """Count bytes as sent. At most a second's budget is owed."""
+        if self._limit is not None:
+            self._tokens = max(self._tokens - cost, -self._limit)
+        self._offered += cost
 
     def _keeps(self, topic: Topic, now_s: float) -> bool:
         """Return whether a message is among those of its topic that are always sent."""

@@ -15,6 +15,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Rejected
@@ -139,11 +140,10 @@ def main() -> int:
         tally: Tally = system.finish()
         for line in doubled(observer):
             print(line, file=sys.stderr)
-    recovered_s.sort()
     found = {
         "rounds": len(recovered_s),
         "faults": dict(sorted(faults.items())),
-        "recovery_s": {"median": recovered_s[len(recovered_s) // 2], "worst": recovered_s[-1]},
+        "recovery_s": {"median": median(recovered_s), "worst": max(recovered_s)} if recovered_s else {},
         **vars(tally),
     }
     print(json.dumps(found, indent=2))
