@@ -1,4 +1,4 @@
-"""Say whether logs are what their nodes wrote, by the nodes' digests (protocol.digest)."""
+"""Say whether logs are what their nodes wrote, by the nodes' digests (protocol.digest_check)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.digest import DigestCheck, Discrepancy, Refuses, is_covered
+from buddyline.protocol.digest import is_covered
+from buddyline.protocol.digest_check import DigestCheck, Discrepancy, Refuses
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.pictures import SUFFIX
 from buddyline.protocol.topics import DIGEST, parse_key
@@ -29,16 +30,16 @@ _WORDS: Final = {
 }
 
 
-def digest_check(authority: Path | str | None) -> DigestCheck:
+def digest_check(authority: Path | str | None, *, in_order: bool = True) -> DigestCheck:
     """Return a check that accepts the authority's nodes; without the package cryptography, one of the sums alone."""
     try:
         from buddyline.protocol.signing import Trust
     except ImportError:
         if authority is not None:
             log.warning("signatures are not checked: the package cryptography is missing (`make install EXTRAS=keys`)")
-        return DigestCheck()
+        return DigestCheck(in_order=in_order)
     refuses: Refuses = Trust(authority).refuses
-    return DigestCheck(refuses, must_sign=authority is not None)
+    return DigestCheck(refuses, must_sign=authority is not None, in_order=in_order)
 
 
 def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[str]:
@@ -49,23 +50,23 @@ def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[
     lines: list[str] = []
     folders = {reader.path.parent for reader in readers}
     for reader in readers:
-        pictures = reader.path.with_suffix(SUFFIX)
-        nodes = _nodes(reader)
-        signed = [node for node in nodes if DIGEST.key(node) in reader.keys]
         if reader.path.parent.suffix == SUFFIX and reader.path.parent.with_suffix(".mcap").parent in folders:
             continue
+        nodes = _nodes(reader)
+        signed = [node for node in nodes if DIGEST.key(node) in reader.keys]
         if authority is not None:
             unsigned = [f"{reader.path}: node {node}: is not signed" for node in nodes if node not in signed]
             losses.report(unsigned)
             lines += unsigned
         if not signed:
             continue
-        check = digest_check(authority)
-        together = [reader, *(one for one in readers if one.path.parent == pictures)]
-        found: list[Discrepancy] = []
         # In a node's own log, in the order of the file: log times go back where its clock was set. A recording has
         # at its end what came late.
-        own = check.in_order = "boot" in reader.metadata()
+        own = "boot" in reader.metadata()
+        check = digest_check(authority, in_order=own)
+        pictures = reader.path.with_suffix(SUFFIX)
+        together = [reader, *(one for one in readers if one.path.parent == pictures)]
+        found: list[Discrepancy] = []
         streams = [one.stored(_is_told) if own else one.records(_is_told) for one in together]
         for record in heapq.merge(*streams, key=lambda record: record.log_time_ns):
             found += check.add(record.key, record.payload, record.log_time_ns)

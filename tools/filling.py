@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.digest import Discrepancy, end_of, sum_of
+from buddyline.protocol.digest import end_of, sum_of
+from buddyline.protocol.digest_check import Discrepancy
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.log_pages import MOST_NS, Logged, Question, whole
 from buddyline.protocol.topics import DIGEST, LOG

@@ -11,7 +11,8 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from buddyline.protocol.digest import Discrepancy, end_of
+from buddyline.protocol.digest import end_of
+from buddyline.protocol.digest_check import Discrepancy
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import DIGEST, EVERYTHING, parse_key
 from buddyline.tools.authenticity import digest_check, report

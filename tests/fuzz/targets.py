@@ -20,7 +20,7 @@ from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import ManualClock
 from buddyline.protocol.codec import decode, encode, payload_stamp_ns
 from buddyline.protocol.config import Config, ConfigError, parse_config
-from buddyline.protocol.digest import DigestCheck
+from buddyline.protocol.digest_check import DigestCheck
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.protocol.log_pages import Logged, Question, pages_of, whole

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from buddyline.protocol import digest as digest_module
+from buddyline.protocol import digest_check as module
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode, payload_stamp_ns
-from buddyline.protocol.digest import DigestBook, DigestCheck, Discrepancy, sealed, unsealed
+from buddyline.protocol.digest import DigestBook, sealed, unsealed
+from buddyline.protocol.digest_check import DigestCheck, Discrepancy
 from buddyline.protocol.messages import Attitude, Depth, Digest, Message, Said
 from buddyline.protocol.signing import Signer, Trust
 from buddyline.protocol.topics import DIGEST, INFO, key_of, topic_of
@@ -222,9 +223,9 @@ def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:
 
 
 def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(digest_module, "MAX_WAITING", 50)
-    monkeypatch.setattr(digest_module, "MAX_WAITING_TOGETHER", 200)
-    monkeypatch.setattr(digest_module, "MAX_DUE", 5)
+    monkeypatch.setattr(module, "MAX_WAITING", 50)
+    monkeypatch.setattr(module, "MAX_WAITING_TOGETHER", 200)
+    monkeypatch.setattr(module, "MAX_DUE", 5)
     check, book = DigestCheck(), DigestBook("a", "x", BEGAN_NS)
     for k in range(1000):
         node = f"n{k % 100}"
@@ -236,8 +237,8 @@ def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_digests_of_invented_runs_topics_and_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(digest_module, "MAX_BOOTS", 5)
-    monkeypatch.setattr(digest_module, "MAX_ABSENT", 100)
+    monkeypatch.setattr(module, "MAX_BOOTS", 5)
+    monkeypatch.setattr(module, "MAX_ABSENT", 100)
     check = DigestCheck()
     for k in range(50):
         line = Said(topic=f"t{k}", count=1, first_ns=0, last_ns=0, sha256="0" * 32)

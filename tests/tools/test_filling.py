@@ -10,7 +10,7 @@ import pytest
 from buddyline.node.log_desk import LogDesk
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
-from buddyline.protocol.digest import Discrepancy
+from buddyline.protocol.digest_check import Discrepancy
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import LocalNetwork
