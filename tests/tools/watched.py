@@ -15,6 +15,8 @@ from buddyline.protocol.messages import (
     SolverStatus,
 )
 from buddyline.protocol.topics import key_of
+from buddyline.tools.health.pair import findings
+from buddyline.tools.health.words import sentence
 from buddyline.tools.monitor.picture import PairPicture
 from msgspec import UNSET, UnsetType
 
@@ -112,3 +114,17 @@ def watched(ticks: int = 30) -> PairPicture:
 def feed(picture: PairPicture, k: int, nodes: str = "ab") -> None:
     for message in tick(k, nodes):
         take(picture, message, at(k))
+
+
+def unsolved() -> PairPicture:
+    """A picture of a pair whose solver says nothing after eleven triggers."""
+    picture = watched(11)
+    for k in range(11, 61):
+        take(picture, frame("a", k), at(k))
+        take(picture, frame("b", k), at(k))
+    return picture
+
+
+def words(picture: PairPicture, now_ns: int, *, live: bool = True) -> str:
+    """All findings as a person reads them, each with what to do."""
+    return " ".join(sentence(finding, now_ns) + finding.advice for finding in findings(picture, now_ns, live=live))
