@@ -38,7 +38,7 @@ LEFT_OUT = {
     r"^sudo |^git |^scp ": "another machine, or root",
     r"^make ": "the tests of the Makefile run it, or .ci/run",
     r"^\. \.venv": "the programs are on the path",
-    r"^buddyline (view|monitor)": "a page until Ctrl-C; tests/tools/test_monitor.py",
+    r"^buddyline (view|monitor)": "a page until Ctrl-C; tests/tools/test_monitor_browser.py",
     r"^buddyline survey watch": "runs until Ctrl-C; tests/tools/test_survey_legs.py",
     r"^buddyline setup": "a Raspberry Pi; tests/tools/test_setup_pi.py, tests/chroots.py",
     r"^buddyline node --config": "a real camera and sensors; tests/node/test_service.py",

@@ -6,40 +6,35 @@ import base64
 import json
 import shutil
 import signal
-import socket
 import subprocess
-import sys
 import tarfile
-import threading
 import time
-import urllib.request
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.tools.browsed import (
+    PATIENCE_MS,
+    SCREENSHOTS,
+    SIZES,
+    Browser,
+    Line,
+    Processes,
+    chromium_browser,
+    free_port,
+    looking,
+    wait_for_server,
+)
 from tests.tools.evaluated import INFOS, rejection, write_log
 from tests.tools.watched import at, image, tick
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 pytest.importorskip("websockets", reason="websockets is not installed")
-CHROMIUM = shutil.which("chromium")
-if CHROMIUM is None:
-    pytest.skip("chromium is not installed", allow_module_level=True)
 
-ROOT = Path(__file__).parents[2]
-SCREENSHOTS = ROOT / "build" / "screenshots"
-SIZES = {"desk": (1280, 800), "phone": (390, 844), "tablet": (820, 1180)}
-FLAGS = [
-    *("--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync"),
-]
-# On a busy machine the browser may need a minute for a single look at the page.
-PATIENCE_MS = 240_000
 NODE_TOML = """
 node = "{node}"
 connect = "{endpoint}"
@@ -57,188 +52,17 @@ start_ns = {start_ns}
 """
 
 
-class Browser:
-    """One page of a headless Chromium, and all that it asked for and complained of."""
-
-    def __init__(self, page: Any, name: str) -> None:
-        self.page = page
-        self.requests: list[str] = []
-        self.complaints: list[str] = []
-        self._name = name
-        page.set_default_timeout(PATIENCE_MS)
-        page.on("request", lambda request: self.requests.append(request.url))
-        page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
-
-    def wait_for(self, text: str, timeout_s: float = PATIENCE_MS / 1e3) -> None:
-        """Wait until the page says this."""
-        try:
-            self.page.wait_for_function(
-                "text => document.body.innerText.includes(text)", arg=text, timeout=timeout_s * 1e3, polling=100
-            )
-        except sync_api.TimeoutError:
-            said = self.page.inner_text("body")
-            pytest.fail(f"no {text!r} in {timeout_s:g} s; complaints {self.complaints}; the page says:\n{said}")
-
-    def wait_for_green(self, green: bool = True) -> None:
-        """Wait until the page says that all is well, or no longer does."""
-        wanted = f"() => ({GREEN})() === {str(green).lower()}"
-        try:
-            self.page.wait_for_function(wanted, timeout=PATIENCE_MS, polling=50)
-        except sync_api.TimeoutError:
-            pytest.fail(f"not {'green' if green else 'fallen'}; the page says:\n{self.page.inner_text('body')}")
-
-    def screenshot(self, what: str) -> None:
-        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-        self.page.screenshot(path=str(SCREENSHOTS / f"{self._name}-{what}.png"), timeout=PATIENCE_MS)
-
-    def colours(self, selector: str = "canvas") -> int:
-        """Return how many different colours a part of the page shows."""
-        import cv2
-        import numpy as np
-
-        data = self.page.locator(selector).first.screenshot(timeout=PATIENCE_MS)
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).reshape(-1, 3)
-        return len(np.unique(pixels, axis=0))
-
-    def check_clean(self, *allowed: str) -> None:
-        outside = [
-            url for url in self.requests if not url.startswith(("data:", "blob:", "http://127.0.0.1:", *allowed))
-        ]
-        assert outside == []
-        assert self.complaints == []
-
-
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with chromium_browser() as browser:
         yield browser
-        browser.close()
-
-
-@contextmanager
-def looking(chromium: Any, name: str, size: str = "desk") -> Iterator[Browser]:
-    width, height = SIZES[size]
-    page = chromium.new_page(viewport={"width": width, "height": height})
-    try:
-        yield Browser(page, f"{name}-{size}")
-    finally:
-        page.close()
-
-
-class Processes:
-    """`buddyline` commands, ended by their own ids."""
-
-    def __init__(self, directory: Path) -> None:
-        self._directory = directory
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
-
-    def start(self, name: str, *words: str) -> None:
-        with open(self._directory / f"{name}.log", "ab") as log:
-            self.running[name] = subprocess.Popen(
-                [sys.executable, "-P", "-m", "buddyline", *words],
-                cwd=ROOT,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-            )
-
-    def kill(self, name: str) -> None:
-        child = self.running.pop(name)
-        child.kill()
-        child.wait(10)
-
-    def end(self) -> None:
-        for child in self.running.values():
-            child.terminate()
-        for child in self.running.values():
-            try:
-                child.wait(10)
-            except subprocess.TimeoutExpired:
-                child.kill()
-                child.wait(10)
 
 
 @pytest.fixture
-def processes(tmp_path: Path) -> Iterator[Processes]:
-    started = Processes(tmp_path)
+def processes() -> Iterator[Processes]:
+    started = Processes()
     yield started
     started.end()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_for_server(address: str) -> None:
-    ends_s = time.monotonic() + 60
-    while True:
-        try:
-            urllib.request.urlopen(address, timeout=5).close()
-        except OSError:
-            if time.monotonic() > ends_s:
-                raise
-            time.sleep(0.1)
-        else:
-            return
-
-
-GREEN = """() => document.getElementById("banner").className === "ok"
-    && Number(getComputedStyle(document.getElementById("well")).opacity) > 0.5"""
-
-
-class Line:
-    """A line between page and monitor that can be cut: what is sent then waits, as on a dead network."""
-
-    def __init__(self, port: int) -> None:
-        self._to = port
-        self._open = threading.Event()
-        self._open.set()
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self._listener.getsockname()[1])
-        self._sockets: list[socket.socket] = [self._listener]
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def cut(self) -> None:
-        self._open.clear()
-
-    def mend(self) -> None:
-        self._open.set()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                near = self._listener.accept()[0]
-            except OSError:
-                return
-            self._sockets.append(near)
-            try:
-                far = socket.create_connection(("127.0.0.1", self._to))
-            except OSError:
-                near.close()
-                continue
-            self._sockets.append(far)
-            for one, other in ((near, far), (far, near)):
-                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
-
-    def _carry(self, one: socket.socket, other: socket.socket) -> None:
-        try:
-            while data := one.recv(65536):
-                self._open.wait()
-                other.sendall(data)
-        except OSError:
-            pass
-        for each in (one, other):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self._open.set()
-        for each in self._sockets:
-            each.close()
 
 
 def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Processes, tmp_path: Path) -> None:
@@ -284,10 +108,10 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         # Whatever is cut, green falls; it comes again by itself.
         for name in ("monitor", "solver", "b", "hub"):
             seen.wait_for_green()
-            processes.running[name].send_signal(signal.SIGSTOP)
+            processes.running[name].send(signal.SIGSTOP)
             seen.wait_for_green(False)
             seen.screenshot(f"{name}-stopped")
-            processes.running[name].send_signal(signal.SIGCONT)
+            processes.running[name].send(signal.SIGCONT)
         seen.wait_for_green()
         line.cut()
         seen.wait_for("No news from the monitor")
