@@ -25,7 +25,7 @@ OLD_S: Final = 20.0
 VAGUE_SHARE: Final = 0.2
 # Why there is no pose where lights are not found: too little is in the picture, or only what is no light.
 UNSEEN: Final = ("too_few_candidates", "ambiguous")
-# Who looks at the other and does not find the lights comes closer by this share of the range, but not below NEAR_M.
+# A diver who looks at the other and finds no lights comes closer by this share of the range, but not below NEAR_M.
 CLOSER_SHARE: Final = 0.25
 NEAR_M: Final = 2.0
 
@@ -63,7 +63,7 @@ class LastPlace:
         """Return B's lights in A's present camera frame, and A's lights in B's, (2, 3) each."""
         turn_a, turn_b = self.turned or (np.eye(3), np.eye(3))
         of_a, of_b = (np.array((info.light_left_m, info.light_right_m)) for info in (info_a, info_b))
-        # How B was turned does not matter for its direction, only for its bar: a fraction of the range.
+        # B's turn moves only B's lights about its camera, by little beside the range: its direction stays.
         in_a: Floats = (of_b @ (self.R @ turn_b).T + self.t_m) @ turn_a
         in_b: Floats = (of_a @ turn_a.T - self.t_m) @ (self.R @ turn_b)
         return in_a, in_b

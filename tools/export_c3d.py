@@ -12,7 +12,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.export_network import load_markers
 from buddyline.tools.newfile import new_file
 
-# A C3D file has one rate and no times: rows that are missing are frames without markers. So many frames fit into it.
+# A C3D file has one rate and no times: a missing row is a frame without markers. It has at most so many frames.
 MOST_FRAMES: Final = 65535
 
 
@@ -44,7 +44,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = np.where(np.isnan(points[:1]), -1.0, 0.0)
     with new_file(output) as part, tempfile.TemporaryDirectory(dir=part.parent) as folder:
-        # The library gives every name its own ending.
+        # The library appends .c3d to a name without it.
         written = Path(folder) / "all.c3d"
         file.write(str(written))
         written.rename(part)

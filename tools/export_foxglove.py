@@ -369,8 +369,9 @@ class _Channels:
         self._ids[topic] = self._writer.register_channel(topic, encoding, self._schemas[name])
 
     def _write(self, topic: str, stamp_ns: int, data: bytes) -> None:
-        self._writer.add_message(self._ids[topic], stamp_ns, data, stamp_ns, self.count & 0xFFFFFFFF)
-        self.topics[topic] = self.topics.get(topic, 0) + 1
+        count = self.topics.get(topic, 0)
+        self._writer.add_message(self._ids[topic], stamp_ns, data, stamp_ns, count & 0xFFFFFFFF)
+        self.topics[topic] = count + 1
 
 
 def _why(rejection: Rejected) -> str:

@@ -60,8 +60,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
             if envelope.topic.name in SERIES:
                 for name, values in _series(msgspec.to_builtins(envelope.message)):
                     recording.log(f"{entity}/{name}", rerun.Scalars(values))
-            if envelope.topic.name in (track, *SERIES, "candidates", "image"):
-                drawing.take(entity, envelope.message, is_track=envelope.topic.name == track)
+            drawing.take(entity, envelope.message, is_track=envelope.topic.name == track)
             count += 1
         recording.disconnect()
     return count

@@ -33,13 +33,17 @@ WATERS: Final[tuple[Environment, ...]] = ("cavern", "night_reef", "lake", "basin
 START_NS: Final = 1_764_000_000 * S_NS
 TICK_NS: Final = S_NS // 10
 TICK_S: Final = TICK_NS / S_NS
-# The fix must be there within this time of the first words. Without words for so long there are none.
+# A fix counts if it comes within this time after the first words.
 WITHIN_S: Final = 5.0
+# So long the divers swim undisturbed before one turns away.
 SETTLE_S: Final = 8.0
+# A dive that has not found its fix, or not lost it, by then does not count.
 LOSE_WITHIN_S: Final = 40.0
 REACTION_S: Final = 0.5
 TURN_DEGPS: Final = 45.0
 SWIM_MPS: Final = 0.5
+MOST: Final = np.array([TURN_DEGPS] * 4 + [SWIM_MPS])
+"""The greatest rates of what is steered, in the order of `Steering`."""
 # In this time a diver reaches a rate, and gives it up.
 RAMP_S: Final = 0.4
 
@@ -52,9 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 class Steering(NodesMotion):
-    """A motion, and what each diver adds to it: a turn to the right and down (deg) of A, of B, and B's way (m) from A.
+    """A motion, and what the divers add to it: A's turn right and down, B's turn right and down, B's way away from A.
 
-    rates: of what is added, a second. They change smoothly, so that inertial units feel what divers can do.
+    rates (5,): of what is added, deg/s and m/s. They change as smoothly as divers can change them.
     """
 
     def __init__(self, base: NodesMotion) -> None:
@@ -67,7 +71,7 @@ class Steering(NodesMotion):
         """Go on by a tick, toward these rates."""
         _, value, rates, change = self._pieces[-1]
         value, rates = value + rates * TICK_S + change * TICK_S**2 / 2, rates + change * TICK_S
-        most = np.array([TURN_DEGPS] * 4 + [SWIM_MPS]) / RAMP_S
+        most = MOST / RAMP_S
         self._pieces.append((self._until_s, value, rates, np.clip((wanted - rates) / TICK_S, -most, most)))
         self._until_s += TICK_S
         self.rates = rates
@@ -181,7 +185,6 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
             return None
     told_s, asked = dive.t_s, np.zeros(5)
     heard_s = told_s - 1.0
-    most = np.array([TURN_DEGPS] * 4 + [SWIM_MPS])
     while dive.without_s() > 0.05:
         if dive.t_s - told_s > WITHIN_S - TICK_S / 2:
             return math.inf
@@ -191,7 +194,7 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
             dive.tick(still)
             continue
         # The rate falls toward the end, so that it is reached without going too far.
-        dive.tick(np.clip(asked / RAMP_S, -most, most))
+        dive.tick(np.clip(asked / RAMP_S, -MOST, MOST))
         asked = asked - dive.motion.rates * TICK_S
         asked[np.abs(asked) < (1.0, 1.0, 1.0, 1.0, 0.05)] = 0.0
     return dive.t_s - told_s

@@ -3,7 +3,7 @@
 Each scene is a dive at 5 Hz in one water. Its pictures have the exposure that the node's own loop chooses; with
 `--scene` they have the scene's. Pictures before the loop has locked count as well, but not those of the first second.
 Pictures of the scene, which the loop takes every few frames for people, do not count. With `--guided` the other node's
-lights are expected, as a solver with a track expects them: as far off as in `bench detect`.
+lights are expected, as a solver with a track expects them, with the errors that `bench detect` gives them.
 
 A light is one of the other node's that is in view. It is found by the candidate nearest to it, within 1 % of the
 picture's width. NEES: the mean squared error over the variance, per axis; 1 if sigma is true. Beyond: the share of

@@ -16,9 +16,10 @@ from buddyline.tools.evaluation.rotation import Floats
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# On paper between its margins, at its own size: then the letters have theirs.
+# The width of a printed page between its margins, inches: a figure that is not scaled keeps the size of its letters.
 PRINTED_IN: Final = 7.2
-MOST_NUMBERS: Final = 13.0
+# Up to this distance from A, m, each metre of an axis has its number.
+NUMBERED_M: Final = 13.0
 FILES: Final = ("trajectory.png", "errors_over_time.png", "errors_over_range.png", "normalized_error.png")
 
 
@@ -49,8 +50,7 @@ def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Fi
     """Draw B before A in each dive, from above and from the side; of each its true positions (n, 3), m. Grid: 1 m."""
     figure, axes = new_figure(PRINTED_IN, 0.5 + 1.9 * len(dives), len(dives), 2)
     for row, (title, (true_m, curves)) in enumerate(dives.items()):
-        # Each metre has its line; of a long dive not each has its number.
-        step_m = 1.0 if np.abs(true_m).max() < MOST_NUMBERS else 5.0
+        step_m = 1.0 if np.abs(true_m).max() < NUMBERED_M else 5.0
         for axis, across, name in ((axes[2 * row], 0, "right"), (axes[2 * row + 1], 1, "down")):
             axis.plot(true_m[:, 2], true_m[:, across], ".", color="0.7", markersize=3, label="truth")
             for curve in curves:
@@ -61,7 +61,7 @@ def trajectories(dives: Mapping[str, tuple[Floats, Sequence[ErrorCurve]]]) -> Fi
                 one.set_major_locator(_multiples(step_m))
                 one.set_minor_locator(_multiples(1.0))
             axis.grid(visible=True, which="both")
-            # As a surveyor draws it: what is right of A, or below it, is below the line of sight.
+            # What is right of A, or below it, is drawn below A.
             axis.invert_yaxis()
         axes[2 * row].set_title(f"{title}: from above", loc="left")
         axes[2 * row + 1].set_title("from the side", loc="left")

@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 GAP_S: Final = 1.5
 COLOURS: Final = ("tab:orange", "tab:blue", "tab:green", "tab:pink")
 NO_POSE_COLOUR: Final = "#d0483f"
-# With fewer values none is called far; beyond this many times the span of the inner 96 % an axis is stretched.
+# Up to so many values none is left out.
 MANY_VALUES: Final = 20
+# An axis is stretched if all values span more than this many times what their inner 96 % span.
 STRETCHED: Final = 4.0
 # Letters that matplotlib's own font lacks are taken from the first of these that is installed and has them.
 FALLBACK_FONTS: Final = (
@@ -145,9 +146,9 @@ def broken(
 
 
 def inner_limits(values: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Return limits of an axis that few far values would stretch fourfold and more; None where there are none.
+    """Return limits without the few far values that would stretch the axis; None if no value would.
 
-    The page's plots have the same rule (limits in app.js); the caller says how many values are outside.
+    The page's plots have the same rule (`limits` in app.js). The caller says how many values are outside.
     """
     if len(values) <= MANY_VALUES:
         return None

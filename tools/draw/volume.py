@@ -26,8 +26,11 @@ LEVELS_M: Final = (0.005, 0.02, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class SeenVolume:
-    """north_m (N,), east_m (E,): a grid at depth down_m. sigma_m (N, E): RMS bound of a coordinate there, from one
-    trigger, for a node that looks at a fixed one or between them, as is best; NaN where it would not be placed."""
+    """How well a node would be placed at each point of a grid: north_m (N,), east_m (E,), all at depth down_m.
+
+    sigma_m (N, E): bound of a coordinate from one trigger, RMS of the three; NaN where there would be no useful place.
+    The node looks at one of the fixed nodes, or between them: whichever is best.
+    """
 
     north_m: Floats
     east_m: Floats
@@ -54,7 +57,6 @@ def seen_volume(fixed: Mapping[str, NodeInfo], moving: NodeInfo, also_m: Floats)
     x, y = (axis.ravel() for axis in np.meshgrid(north, east, indexing="ij"))
     p = np.stack((x, y, np.full(len(x), down)), axis=-1)
     best = np.full(len(p), np.inf)
-    # It looks at one of the fixed nodes, or between them.
     for target in np.concatenate((places, places.mean(0, keepdims=True)))[: None if len(places) > 1 else 1]:
         q = _looking(np.arctan2(target[1] - y, target[0] - x))
         information = np.zeros((len(p), 6, 6))

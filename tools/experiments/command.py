@@ -49,8 +49,8 @@ BOUND_HEAD = ("range", "poses", "bound, RMS, m", "RMS / RMS", "bound, median, m"
 BOUND_NOTE = (
     "<p>The bound (Cramér-Rao) is of one trigger's four lights with the noise of their places in the pictures. RMS is "
     "compared with the bound's RMS, the median with the median of errors at the bound. ±: by how much the ratio varies "
-    "by chance (1 sd) in so few poses; no unbiased estimator is below 1 but by chance, and ours uses nothing else than "
-    "these lights for a pose from four.</p>"
+    "by chance (1 sd) in so few poses. Only by chance is an unbiased estimator below 1. Our pose from four lights uses "
+    "nothing but these lights.</p>"
 )
 
 

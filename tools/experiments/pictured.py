@@ -17,7 +17,7 @@ from buddyline.tools.experiments.runs import OURS, Rendered
 
 MOST_MARKED: Final = 6
 LETTERS: Final = 2.2
-# Some 140 dots an inch: more is noise, which makes the file large.
+# Scale that gives about 140 dots an inch on paper. More would show noise alone, and make the file large.
 ON_PAPER: Final = 0.6
 
 

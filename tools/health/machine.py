@@ -74,7 +74,7 @@ def clock_chip(*, kept: bool, stamps: bool) -> Finding:
         "clock chip",
         "warning",
         "none: after the start the time is that of the last shutdown, until chrony has a source",
-        "start with the tether connected, or add one: node/README.md, Synchronise the clocks",
+        "start with the tether connected, or add a clock chip: node/README.md, Synchronise the clocks",
     )
 
 

@@ -11,7 +11,7 @@ from buddyline.tools.evaluation.stretches import Outcome, Stretch, stretches
 from buddyline.tools.health.words import duration_words, reason_words
 
 BINS: Final = 600
-# Of a short dive each part is as long as this at least: several triggers, so that their rate makes no stripes.
+# No bin is shorter: with several triggers in each, a slow trigger rate makes no stripes.
 LEAST_BIN_NS: Final = S_NS
 TRACK_LEGEND: Final = "green: a good track; yellow: partly; red: too uncertain; grey: no track"
 LEGEND: Final = "green: poses; yellow: some triggers without; red: most without; grey: nothing to solve"

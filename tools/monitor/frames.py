@@ -28,7 +28,7 @@ from buddyline.tools.pairs import Pair
 RATE_HZ: Final = 30.0
 TEXTS_EVERY: Final = 9
 BANNER_EVERY: Final = 3
-# Fields that can be plotted: numbers, of a list the first 36 (a covariance has as many), of objects the first few.
+# Numbers can be plotted: of a list the first 36 (a covariance has 36), of a list of objects those of the first four.
 MAX_ELEMENTS: Final = 36
 MAX_OBJECTS: Final = 4
 MAX_FIELDS: Final = 4000
@@ -45,7 +45,7 @@ class Viewer:
 
     def __init__(self, *, live: bool) -> None:
         self.pair: Pair | None = None
-        # Of each chosen field, `key field`, the time of the value that was told last.
+        # The time of the last value told, by chosen field (`key field`).
         self._probed_ns: dict[str, int] = {}
         self._live = live
         self._tick = 0

@@ -17,10 +17,10 @@ from buddyline.tools.draw.marks import marked_svg
 from buddyline.tools.evaluation.poses import nees
 from buddyline.tools.monitor.panel import chosen_lights
 
-# 99.9 % of chi-squared with 3 degrees of freedom: of honest poses one in a thousand is further from the truth.
+# The 99.9 % point of chi-squared with 3 degrees of freedom: one in a thousand honest poses is beyond it.
 GATE: Final = 16.266
 MAX_LISTED: Final = 12
-# Between two samples of the track further apart than this nothing is interpolated.
+# The track is not interpolated across a longer gap.
 GAP_NS: Final = S_NS // 2
 
 

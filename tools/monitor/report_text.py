@@ -48,10 +48,14 @@ def methods_html(numbers: dict[str, Any], summary: Summary) -> str:
     said.append(f"Ranges were {poses['range_least_m']:.1f} to {poses['range_most_m']:.1f} m.")
     if track:
         said.append(
-            f"The track between triggers, from every light, attitudes, depths and inertial units as far as there were "
-            f"any, was estimated {TRACK_MADE[track['mode']]}; its position's 1 sd is below {TRACK_SIGMA_SHARE:.0%} of "
-            f"the range during {track['covered'] or 0.0:.1%} of the time between the first and the last pose."
+            f"The track between triggers was estimated {TRACK_MADE[track['mode']]}. It uses every light, and the "
+            "attitudes, depths and inertial samples that the nodes sent."
         )
+        if track["covered"] is not None:
+            said.append(
+                f"Its position's 1 sd is below {TRACK_SIGMA_SHARE:.0%} of the range during {track['covered']:.1%} of "
+                "the time between the first and the last pose."
+            )
     north = "true north" if infos and infos[0].declination_rad else "magnetic north"
     if numbers["error_budget"]["compass_m"] is not None:
         said.append(f"North-east-down is by {a}'s attitude sensor, from {north}.")
@@ -92,8 +96,10 @@ def _clock(budget: dict[str, Any]) -> str:
 def outliers_html(numbers: dict[str, Any], found: Sequence[Outlier] | None, start_ns: int) -> str:
     """Return the outliers with their pictures."""
     told = numbers["outliers"]
-    if told is None or not numbers["poses"]:
-        return "<p>Not judged: the log holds no track of this pair.</p>" if numbers["poses"] else ""
+    if not numbers["poses"]:
+        return ""
+    if told is None:
+        return "<p>Not judged: the log holds no track of this pair.</p>"
     said = (
         f"{told['found']} of {told['judged']} poses are further from the track than 99.9 % of honest ones would be "
         f"({math.sqrt(GATE):.1f} sigma of their own covariance)."
