@@ -4,11 +4,10 @@
 set -eu
 
 connect="tls/$HUB_ADDRESS:$HUB_PORT"
-if [ ! -e keys/hub.toml ]; then
-  buddyline keys init --hub "$HUB_ADDRESS"
-  buddyline keys solver
-  buddyline keys viewer
-fi
+[ -e keys/hub.toml ] || buddyline keys init --hub "$HUB_ADDRESS"
+for client in solver viewer; do
+  [ -e "keys/$client.toml" ] || buddyline keys "$client"
+done
 for node in $NODES; do
   [ -e "keys/node-$node.toml" ] || buddyline keys node "$node"
 done

@@ -215,7 +215,7 @@ function series(title) {
   return [found.map((p) => age(p[0])), values.map((v, k) => (found[k][1] ? null : v)),
     values.map((v, k) => (found[k][1] ? v : null))];
 }
-// Limits of an axis: of all but the outermost 1 %, where those outside are far off; said beside the plot.
+// Limits of an axis, without the few values far beyond the inner 96 %; how many they are is said beside the plot.
 function limits(values) {
   const sorted = values.filter((v) => v != null).sort((a, b) => a - b), n = sorted.length;
   if (!n) return null;
