@@ -70,10 +70,16 @@ class Assembly:
 
 @dataclass(frozen=True, slots=True)
 class DepthReading:
-    """A gauge's depth at a leg's end (0, 1), m: its noise, and its slow error (1 sd)."""
+    """A gauge's depth at a leg's end (0, 1), m: its noise, and its slow error (1 sd).
+
+    station: as the leg names it. gauge: its dive and node. time_s: of the leg's middle, since that of the dive's first.
+    """
 
     leg: int
     end: int
+    station: str
+    gauge: tuple[int, str]
+    time_s: float
     depth_m: float
     noise_m: float
     slow_m: float
@@ -83,48 +89,47 @@ class DepthReading:
         """Its key in Observations.rows."""
         return self.leg, "depth_to" if self.end else "depth_from"
 
+    @property
+    def what(self) -> str:
+        """Its name in words."""
+        return f"gauge of {self.gauge[1]}"
+
 
 def readings_of(legs: Sequence[Leg]) -> list[DepthReading]:
     """Return all depths that were read."""
-    both = ((number, end, depth) for number, leg in enumerate(legs) for end, depth in enumerate(depths_of(leg)))
-    return [DepthReading(number, end, *depth) for number, end, depth in both if depth is not None]
+    middles_s = [(leg.start_ns + leg.end_ns) / 2 / S_NS for leg in legs]
+    first_s: dict[int, float] = {}
+    for leg, middle_s in zip(legs, middles_s, strict=True):
+        first_s[leg.dive] = min(first_s.get(leg.dive, math.inf), middle_s)
+    found = []
+    for number, (leg, middle_s) in enumerate(zip(legs, middles_s, strict=True)):
+        ends = (leg.from_, leg.from_node), (leg.to, leg.to_node)
+        for end, ((station, node), depth) in enumerate(zip(ends, depths_of(leg), strict=True)):
+            if depth is not None:
+                gauge, time_s = (leg.dive, node), middle_s - first_s[leg.dive]
+                found.append(DepthReading(number, end, station, gauge, time_s, *depth))
+    return found
 
 
 class _GaugeTerms:
     """Unknowns of all gauges."""
 
-    def __init__(
-        self, of: Observations, legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]
-    ) -> None:
-        self._of, self._legs, self._tides = of, legs, tides
-        self._at_s = [(leg.start_ns + leg.end_ns) / 2 / S_NS for leg in legs]
-        self._start_s: dict[int, float] = {}
-        for leg, at_s in zip(legs, self._at_s, strict=True):
-            self._start_s[leg.dive] = min(self._start_s.get(leg.dive, math.inf), at_s)
+    def __init__(self, of: Observations, readings: Sequence[DepthReading], tides: Sequence[int]) -> None:
+        self._of, self._tides = of, tides
         slow: dict[tuple[int, str], list[float]] = defaultdict(list)
         for one in readings:
-            slow[self._gauge(one)].append(one.slow_m)
+            slow[one.gauge].append(one.slow_m)
         self._slow_m = {key: max(median(values), LEAST_NOISE_M) for key, values in slow.items()}
         self._first = min((dive for dive, _ in slow), default=1)
         # By dive and node: zero and drift, and the dive's level and tide, None where they are no unknowns.
         self._columns: dict[tuple[int, str], tuple[int, int, int | None, int | None]] = {}
 
-    def _gauge(self, one: DepthReading) -> tuple[int, str]:
-        leg = self._legs[one.leg]
-        return leg.dive, leg.to_node if one.end else leg.from_node
-
-    def what(self, one: DepthReading) -> str:
-        """Return the reading's name in words."""
-        return f"gauge of {self._gauge(one)[1]}"
-
     def terms(self, one: DepthReading, sign: float) -> list[tuple[int, float]]:
         """Return zero, drift, level and tide of one reading."""
-        key = self._gauge(one)
-        zero, drift, level, tide = self._columns.get(key) or self._unknowns(key)
-        time_s = self._at_s[one.leg] - self._start_s[key[0]]
-        terms = [(zero, sign), (drift, sign * time_s / DRIFT_S)]
+        zero, drift, level, tide = self._columns.get(one.gauge) or self._unknowns(one.gauge)
+        terms = [(zero, sign), (drift, sign * one.time_s / DRIFT_S)]
         terms += [(level, sign)] if level is not None else []
-        return [*terms, (tide, sign * time_s)] if tide is not None else terms
+        return [*terms, (tide, sign * one.time_s)] if tide is not None else terms
 
     def _unknowns(self, key: tuple[int, str]) -> tuple[int, int, int | None, int | None]:
         of, (dive, node), slow_m = self._of, key, self._slow_m[key]
@@ -140,17 +145,10 @@ class _GaugeTerms:
 
 def depths_of(leg: Leg) -> tuple[tuple[float, float, float] | None, tuple[float, float, float] | None]:
     """Return the depths read at the leg's start and end, each with its noise and its slow error (1 sd), m."""
-    return from_depth(leg), to_depth(leg)
-
-
-def from_depth(leg: Leg) -> tuple[float, float, float] | None:
-    """Return the depth read at the leg's start, its noise and its slow error (1 sd), m; None if not read."""
-    return _depth(leg.depth_from_m, leg.depth_from_sigma_m, leg.depth_from_noise_m)
-
-
-def to_depth(leg: Leg) -> tuple[float, float, float] | None:
-    """Return the depth read at the leg's end."""
-    return _depth(leg.depth_to_m, leg.depth_to_sigma_m, leg.depth_to_noise_m)
+    return (
+        _depth(leg.depth_from_m, leg.depth_from_sigma_m, leg.depth_from_noise_m),
+        _depth(leg.depth_to_m, leg.depth_to_sigma_m, leg.depth_to_noise_m),
+    )
 
 
 def _depth(depth_m: object, sigma_m: object, noise_m: object) -> tuple[float, float, float] | None:
@@ -160,20 +158,19 @@ def _depth(depth_m: object, sigma_m: object, noise_m: object) -> tuple[float, fl
     return float(depth_m), float(noise), math.sqrt(max(sigma_m**2 - noise**2, 0.0))
 
 
-def depths_alone(legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]) -> Observations:
+def depths_alone(readings: Sequence[DepthReading], tides: Sequence[int]) -> Observations:
     """Return the observations of all gauges alone, a row for each reading: stations' depths are unknowns by name."""
     of = Observations([])
-    gauges = _GaugeTerms(of, legs, readings, tides)
+    gauges = _GaugeTerms(of, readings, tides)
     for one in readings:
-        name = legs[one.leg].to if one.end else legs[one.leg].from_
-        terms = [(of.unknown(name, early=True), 1.0), *gauges.terms(one, 1.0)]
-        of.rows[one.key] = of.add("number", -1, -1, one.depth_m, one.noise_m, terms, leg=one.leg, what=gauges.what(one))
+        terms = [(of.unknown(one.station, early=True), 1.0), *gauges.terms(one, 1.0)]
+        of.rows[one.key] = of.add("number", -1, -1, one.depth_m, one.noise_m, terms, leg=one.leg, what=one.what)
     return of
 
 
 def _add_depths(to: Assembly, tides: Sequence[int], level_m: float, *, free_level: bool = False) -> None:
     of, readings = to.observations, readings_of(to.legs)
-    gauges = _GaugeTerms(of, to.legs, readings, tides)
+    gauges = _GaugeTerms(of, readings, tides)
     for one in readings:
         terms = gauges.terms(one, -1.0)
         if free_level:
@@ -186,7 +183,7 @@ def _add_depths(to: Assembly, tides: Sequence[int], level_m: float, *, free_leve
             one.noise_m,
             terms,
             leg=one.leg,
-            what=gauges.what(one),
+            what=one.what,
         )
 
 
@@ -202,11 +199,10 @@ def assemble(
     origin_m: Floats,
     north_along: tuple[str, str] | None = None,
 ) -> Observations:
-    """Return all observations of these legs. fixed: with the altitudes that count, NaN elsewhere. origin_m: (3,), of
-    which coordinates are relative.
+    """Return all observations of these legs.
 
-    north_along: stations whose
-    line is the north of a survey without any direction.
+    fixed: with the altitudes that count, NaN elsewhere. origin_m: (3,), to which coordinates are relative.
+    north_along: stations whose line is the north of a survey without any direction.
     """
     of = Observations(stations)
     to = Assembly(of, legs, ends, turns_rad)
@@ -258,7 +254,7 @@ def assemble(
 def _add_rises(to: Assembly, tides: Sequence[int]) -> None:
     """Let each leg keep the difference of its own two readings."""
     of, readings = to.observations, readings_of(to.legs)
-    gauges = _GaugeTerms(of, to.legs, readings, tides)
+    gauges = _GaugeTerms(of, readings, tides)
     for start, end in pairwise(readings):
         if start.leg != end.leg:
             continue

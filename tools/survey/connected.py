@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.survey.assembly import Fixed, assemble, from_depth, to_depth
+from buddyline.tools.survey.assembly import Fixed, assemble, depths_of
 from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
@@ -228,7 +228,7 @@ class Survey:
             mean = read[0] + sum(wrap(one - read[0]) for one in read) / len(read)
             azimuth = wrap(mean), float(sigma[sighted[0]]) / math.sqrt(len(sighted))
         rise: tuple[float, float] | None = None
-        if self.project.adjust.depth == "absolute" and from_depth(leg) and to_depth(leg):
+        if self.project.adjust.depth == "absolute" and all(depths_of(leg)):
             rise = up_m[end] - up_m[start], math.sqrt(2) * ABSOLUTE_DEPTH_SIGMA_M
         elif (row := rows.get((number, "rise"))) is not None:
             rise = float(solution.model.value[row] - solution.terms[row]), float(sigma[row])

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.assembly import TIDE_M_PER_S, DepthReading, depths_alone, readings_of
 from buddyline.tools.survey.observations import Solution
 from buddyline.tools.survey.project import Leg
@@ -55,8 +54,8 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
     readings = readings_of(legs)
     if not readings:
         return Gauges({}, {}, [])
-    tides, fit = _with_tides(legs, readings)
-    visits = _visits(legs, readings)
+    tides, fit = _with_tides(readings)
+    visits = _visits(readings)
     columns = np.array([fit.observations.unknown(name) for name in visits])
     sigmas_m = np.sqrt(fit.variances(columns))
     depths = {
@@ -64,33 +63,31 @@ def adjust_gauges(legs: Sequence[Leg], limits: AlarmSettings | None = None) -> G
         for name, column, sigma_m in zip(visits, columns.tolist(), sigmas_m.tolist(), strict=True)
     }
     rates = {dive: 3600.0 * fit.unknown(f"tide in dive {dive}")[0] for dive in tides}
-    return Gauges(depths, rates, _alarms(legs, fit, visits, limits or AlarmSettings()))
+    return Gauges(depths, rates, _alarms(fit, visits, limits or AlarmSettings()))
 
 
 def tides_of(legs: Sequence[Leg]) -> list[int]:
     """Return the dives whose gauges' readings show a tide."""
     readings = readings_of(legs)
-    return _with_tides(legs, readings)[0] if readings else []
+    return _with_tides(readings)[0] if readings else []
 
 
-def _with_tides(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> tuple[list[int], Solution]:
+def _with_tides(readings: Sequence[DepthReading]) -> tuple[list[int], Solution]:
     tides: list[int] = []
-    fit = _fit(legs, readings, tides)
-    for dive in _revisiting(legs, readings):
-        rate, explained = _tide(legs, readings, fit, dive)
+    fit = _fit(readings, tides)
+    for dive in _revisiting(readings):
+        rate, explained = _tide(readings, fit, dive)
         if abs(rate) < POSSIBLE_TIDE * TIDE_M_PER_S and explained > SHOWN_CHI2:
             tides = [*tides, dive]
-            fit = _fit(legs, readings, tides)
+            fit = _fit(readings, tides)
     return tides, fit
 
 
-def _tide(legs: Sequence[Leg], readings: Sequence[DepthReading], fit: Solution, dive: int) -> tuple[float, float]:
-    """Return the rate of a tide, m/s, as one more unknown would have it, and by what chi^2 would fall."""
-    of_dive = [one for one in readings if legs[one.leg].dive == dive]
-    rows = np.array([fit.observations.rows[one.key] for one in of_dive])
-    time_s = np.array([(legs[one.leg].start_ns + legs[one.leg].end_ns) / 2 / S_NS for one in of_dive])
+def _tide(readings: Sequence[DepthReading], fit: Solution, dive: int) -> tuple[float, float]:
+    """Return the rate of a dive's tide, m/s, if it were one more unknown, and by how much chi^2 would fall."""
+    of_dive = [one for one in readings if one.gauge[0] == dive]
     by = np.zeros(len(fit.misfit))
-    by[rows] = time_s - time_s.min()
+    by[[fit.observations.rows[one.key] for one in of_dive]] = [one.time_s for one in of_dive]
     weighed = fit.weights * by
     (at, columns), values = fit.at, fit.values
     push = np.bincount(columns, values * weighed[at], len(fit.x)).astype(float)
@@ -99,31 +96,28 @@ def _tide(legs: Sequence[Leg], readings: Sequence[DepthReading], fit: Solution, 
     return right / float(information), right**2 / float(information)
 
 
-def _fit(legs: Sequence[Leg], readings: Sequence[DepthReading], tides: Sequence[int]) -> Solution:
-    return depths_alone(legs, readings, tides).adjust(np.empty((0, 3)), linear=True)
+def _fit(readings: Sequence[DepthReading], tides: Sequence[int]) -> Solution:
+    return depths_alone(readings, tides).adjust(np.empty((0, 3)), linear=True)
 
 
-def _visits(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> dict[str, list[DepthReading]]:
+def _visits(readings: Sequence[DepthReading]) -> dict[str, list[DepthReading]]:
     """Return each station's readings."""
     visits: dict[str, list[DepthReading]] = {}
     for one in readings:
-        visits.setdefault(legs[one.leg].to if one.end else legs[one.leg].from_, []).append(one)
+        visits.setdefault(one.station, []).append(one)
     return visits
 
 
-def _revisiting(legs: Sequence[Leg], readings: Sequence[DepthReading]) -> list[int]:
+def _revisiting(readings: Sequence[DepthReading]) -> list[int]:
     """Return the dives in which enough stations were visited with a long time between."""
-    times_ns: dict[tuple[int, str], list[int]] = {}
+    times_s: dict[tuple[int, str], list[float]] = {}
     for one in readings:
-        leg = legs[one.leg]
-        times_ns.setdefault((leg.dive, leg.to if one.end else leg.from_), []).append(leg.start_ns)
-    again = Counter(dive for (dive, _), at in times_ns.items() if max(at) - min(at) > APART_S * S_NS)
+        times_s.setdefault((one.gauge[0], one.station), []).append(one.time_s)
+    again = Counter(dive for (dive, _), at_s in times_s.items() if max(at_s) - min(at_s) > APART_S)
     return sorted(dive for dive, count in again.items() if count >= LEAST_STATIONS)
 
 
-def _alarms(
-    legs: Sequence[Leg], fit: Solution, visits: dict[str, list[DepthReading]], limits: AlarmSettings
-) -> list[str]:
+def _alarms(fit: Solution, visits: dict[str, list[DepthReading]], limits: AlarmSettings) -> list[str]:
     said = []
     noise_m, of = fit.model.sigma, fit.observations
     off_sigma_m = noise_m * np.sqrt(fit.redundancies)
@@ -134,10 +128,7 @@ def _alarms(
         off_m = fit.misfit[rows]
         away = np.abs(off_m) > limits.depth_sigmas * off_sigma_m[rows]
         if (checked & away).any() and np.ptp(off_m) > limits.depth_m:
-            texts = []
-            for row in rows.tolist():
-                node = of.what[row].removeprefix("gauge of ")
-                texts.append(f"{fit.model.value[row]:.2f} m by {node} in dive {legs[of.leg[row]].dive}")
+            texts = [f"{one.depth_m:.2f} m by {one.gauge[1]} in dive {one.gauge[0]}" for one in of_station]
             sigmas = float((np.abs(off_m) / np.maximum(off_sigma_m[rows], 1e-9))[checked].max())
             said.append(
                 f"ALARM: gauges at station {name} differ by {sigmas:.1f} sd: {', '.join(texts)}; is it one station?"
