@@ -1,7 +1,7 @@
 """`buddyline setup pi`: what node/README.md asks for on Raspberry Pi OS, step by step; without --apply it only says it.
 
 A step that is done is left alone, so the command can be called again: when nothing is left to do, it runs `doctor`.
-What it writes counts from the next start of the Pi on.
+What it writes takes effect when the Pi starts again.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def steps(args: argparse.Namespace, user: str, root: Path) -> Iterator[SetupStep
         tether = pi.TETHER.format(address=pi.address_of(config, args.address))
         # NetworkManager takes no file that others may read.
         yield _file("address", root / TETHER_FILE[1:], tether, 0o600)
-    yield _folder(root / config.record.directory.lstrip("/"), user)
+    # A relative one is below the service's working directory.
+    yield _folder(root / str(install_service.STATE / config.record.directory)[1:], user)
     yield from _service(args, user, root, config)
 
 

@@ -6,6 +6,7 @@ import logging
 import subprocess
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -54,9 +55,9 @@ class Panel:
         self._has_news = False
         self._news_ns: int | None = None
         self._refused = ""
-        self.refusals = Refusals(f"node {config.node}")
-        # The survey's last verdict: heard, and shown since then.
-        self._heard: Verdict | None = None
+        self._refusals = Refusals(f"node {config.node}")
+        # The survey's last verdict: from the bus's thread, and as shown, with the time since when.
+        self._heard: deque[Verdict] = deque(maxlen=1)
         self._verdict: tuple[Verdict, int] | None = None
 
     @property
@@ -90,10 +91,10 @@ class Panel:
 
     def hear(self, received: Received) -> None:
         """Take a mark of this node from the bus: the survey's verdict on the leg."""
-        envelope = self.refusals.open(received)
+        envelope = self._refusals.open(received)
         mark = None if envelope is None else envelope.message
         if isinstance(mark, Mark) and mark.kind in ("alarm", "leg"):
-            self._heard = Verdict.GOOD if mark.kind == "leg" else Verdict.AGAIN
+            self._heard.append(Verdict.GOOD if mark.kind == "leg" else Verdict.AGAIN)
 
     def run(self, stop: threading.Event) -> None:
         """Read and drive the pins until stop is set."""
@@ -110,9 +111,8 @@ class Panel:
         self._leak = self._leak if wet is None else wet
         if self._has_news:
             self._has_news, self._news_ns = False, now_ns
-        heard, self._heard = self._heard, None
-        if heard is not None:
-            self._verdict = heard, now_ns
+        if self._heard:
+            self._verdict = self._heard.popleft(), now_ns
         silent = self._news_ns is not None and now_ns - self._news_ns > STATUS_WITHIN_NS
         given = replace(
             view,

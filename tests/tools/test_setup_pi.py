@@ -117,6 +117,13 @@ def test_each_step_is_done_once(machine, monkeypatch):
     assert [step.name for step in machine.steps(clock_chip="pi5") if not step.done] == ["devices"]
 
 
+def test_a_relative_folder_for_logs_is_where_the_service_writes(machine):
+    machine.config.write_text(machine.config.read_text().replace('"/var/lib/buddyline"', '"dives"'))
+    (step,) = (step for step in machine.steps() if step.name == "folder")
+    step.do()
+    assert (machine.root / "var" / "lib" / "buddyline" / "dives").is_dir()
+
+
 def test_what_stands_in_the_way_is_named(machine, capsys, monkeypatch):
     (machine.folder / "bin" / "apt-get").write_text("#!/bin/sh\nexit 100\n")
     with pytest.raises(BuddylineError, match=r"`apt-get update` ended with 100"):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import TypeAlias
 
 import numpy as np
-from buddyline.tools.survey.assembly import EXACT_M, depths_of
+from buddyline.tools.survey.assembly import EXACT_M, Fixed, depths_of
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.blunders import Blunder, find_blunders
 from buddyline.tools.survey.connected import Survey, held_depths
@@ -205,7 +205,7 @@ def find_loops(survey: Survey, solution: Solution) -> list[Loop]:
                 tree[other], level[other] = (name, number, sign), level[name] + 1
                 queue.append(other)
     in_tree = {step[1] for step in tree.values() if step is not None}
-    read = _AsRead(survey, solution, held_depths(survey.project))
+    as_read = cache(partial(_as_read, survey, solution, held_depths(survey.project)))
     found = []
     for closing, (start, end) in enumerate(survey.ends):
         if closing in in_tree or start not in tree or end not in tree:
@@ -217,60 +217,52 @@ def find_loops(survey: Survey, solution: Solution) -> list[Loop]:
             back, number, sign = tree[ways[side][-1]]  # type: ignore[misc]
             ways[side].append(back)
             steps.append((number, sign if side == 0 else -sign))
-        if (loop := read.loop(ways, *zip(*steps, strict=True))) is not None:
-            found.append(loop)
+        numbers, signs = zip(*steps, strict=True)
+        parts = np.array([as_read(number) for number in numbers])
+        if not np.isnan(parts).any():
+            found.append(_loop(fixed, ways, numbers, signs, parts))
     return found
 
 
-class _AsRead:
-    """Legs' vectors as read, each made at its first use."""
+def _as_read(survey: Survey, solution: Solution, depths_m: dict[str, float], number: int) -> Floats:
+    """Return a leg as read, (7,): east, north, up by the gauges' own readings, their variances, and the length.
 
-    def __init__(self, survey: Survey, solution: Solution, depths_m: dict[str, float]) -> None:
-        self._survey, self._solution, self._depths_m = survey, solution, depths_m
-        # East, north, up by the gauges' own readings; the variances of these, and the length. NaN: no vector.
-        self._numbers = np.full((len(survey.legs), 7), np.nan)
+    All are NaN for a leg that has no vector. depths_m: the held depths.
+    """
+    leg, turn_rad = survey.legs[number], survey.turns_rad[number]
+    line = line_of(leg, measures_of(leg, survey.project, turn_rad, depths_m), turn_rad)
+    if line is None:
+        return np.full(7, np.nan)
+    vector_m, variances = line.vector_m.copy(), np.diag(line.covariance).copy()
+    start, end = depths_of(leg)
+    if start is not None and end is not None and not line.by_clino:
+        # Held depths close by construction, so V is of each leg's own readings.
+        vector_m[2] = start[0] - end[0] + solution.correction(number, "depth_from")
+        vector_m[2] -= solution.correction(number, "depth_to") + solution.correction(number, "rise")
+        noises = leg.depth_from_noise_m, leg.depth_to_noise_m
+        sigmas = (leg.depth_from_sigma_m, leg.depth_to_sigma_m) if UNSET in noises else noises
+        variances[2] += sum(sd**2 for sd in sigmas if sd is not UNSET) - line.rise_sigma_m**2
+    return np.array([*vector_m, *variances, line.length_m])
 
-    def _numbers_of(self, number: int) -> Floats:
-        survey, solution = self._survey, self._solution
-        leg, turn_rad = survey.legs[number], survey.turns_rad[number]
-        line = line_of(leg, measures_of(leg, survey.project, turn_rad, self._depths_m), turn_rad)
-        if line is None:
-            return np.full(7, np.nan)
-        vector_m, variances = line.vector_m.copy(), np.diag(line.covariance).copy()
-        start, end = depths_of(leg)
-        if start is not None and end is not None and not line.by_clino:
-            # Held depths close by construction, so V is of each leg's own readings.
-            vector_m[2] = start[0] - end[0] + solution.correction(number, "depth_from")
-            vector_m[2] -= solution.correction(number, "depth_to") + solution.correction(number, "rise")
-            noises = leg.depth_from_noise_m, leg.depth_to_noise_m
-            sigmas = (leg.depth_from_sigma_m, leg.depth_to_sigma_m) if UNSET in noises else noises
-            variances[2] += sum(sd**2 for sd in sigmas if sd is not UNSET) - line.rise_sigma_m**2
-        return np.array([*vector_m, *variances, line.length_m])
 
-    def loop(
-        self, ways: tuple[list[str], list[str]], numbers: tuple[int, ...], signs: tuple[float, ...]
-    ) -> Loop | None:
-        """Return the loop of two ways that meet, or end at two fixed points; None if a leg in it has no vector."""
-        for number in numbers:
-            if math.isnan(self._numbers[number, 0]):
-                self._numbers[number] = self._numbers_of(number)
-        parts = self._numbers[list(numbers)]
-        if np.isnan(parts).any():
-            return None
-        vector, variances, length_m = np.array(signs) @ parts[:, :3], parts[:, 3:6].sum(axis=0), parts[:, 6].sum()
-        fixed, (out, back) = self._survey.fixed, ways
-        joined = out[-1] == back[-1]
-        for name, sign in () if joined else ((out[-1], 1.0), (back[-1], -1.0)):
-            position_m, sigmas_m = fixed[name]
-            vector = vector + sign * np.nan_to_num(position_m)
-            variances = variances + sigmas_m**2
-        if not joined and any(math.isnan(fixed[name][0][2]) for name in (out[-1], back[-1])):
-            vector[2] = 0.0
-        return Loop(
-            (*reversed(out), *(back[:-1] if joined else back)),
-            float(length_m),
-            _triple(vector),
-            math.hypot(vector[0], vector[1]) / math.sqrt(variances[0] + variances[1]),
-            abs(float(vector[2])) / math.sqrt(max(float(variances[2]), EXACT_M**2)),
-            numbers,
-        )
+def _loop(
+    fixed: Fixed, ways: tuple[list[str], list[str]], numbers: tuple[int, ...], signs: tuple[float, ...], parts: Floats
+) -> Loop:
+    """Return the loop of two ways that meet, or end at two fixed points. parts: (legs, 7), see _as_read."""
+    vector, variances, length_m = np.array(signs) @ parts[:, :3], parts[:, 3:6].sum(axis=0), parts[:, 6].sum()
+    out, back = ways
+    joined = out[-1] == back[-1]
+    for name, sign in () if joined else ((out[-1], 1.0), (back[-1], -1.0)):
+        position_m, sigmas_m = fixed[name]
+        vector = vector + sign * np.nan_to_num(position_m)
+        variances = variances + sigmas_m**2
+    if not joined and any(math.isnan(fixed[name][0][2]) for name in (out[-1], back[-1])):
+        vector[2] = 0.0
+    return Loop(
+        (*reversed(out), *(back[:-1] if joined else back)),
+        float(length_m),
+        _triple(vector),
+        math.hypot(vector[0], vector[1]) / math.sqrt(variances[0] + variances[1]),
+        abs(float(vector[2])) / math.sqrt(max(float(variances[2]), EXACT_M**2)),
+        numbers,
+    )
