@@ -6,8 +6,8 @@
     .venv/bin/python -m tests.chroots trixie --arch arm64    # emulated by qemu-user, under proot
 
 Each system is made by debootstrap in a folder for temporary files and kept; the clone in it is made anew, of what is
-committed. Each line says the seconds since the beginning, and the processor's seconds, which do not count what else the
-machine does. Needs root, debootstrap and Debian's packages; for arm64 also qemu-user-static and proot.
+committed. Each line says the seconds since the beginning, and the processor's seconds: those do not depend on what else
+the machine does. Needs root, debootstrap and Debian's packages; for arm64 also qemu-user-static and proot.
 """
 
 from __future__ import annotations
@@ -38,15 +38,14 @@ CAMERA_VERSION = "0.3.31"
 
 
 class FailedError(Exception):
-    """A command in the system ended badly; its last lines."""
+    """A command in the system failed; the text has its last lines."""
 
 
-class System:
-    """A Debian in a folder."""
+class Debian:
+    """A Debian system in a folder."""
 
     def __init__(self, suite: str, arch: str) -> None:
         self.root, self._emulated = CHROOTS / f"{suite}-{arch}", arch == "arm64"
-        self._began_s = time.monotonic()
         if not (self.root / "made").exists():
             shutil.rmtree(self.root, ignore_errors=True)
             self._make(suite, arch)
@@ -64,7 +63,7 @@ class System:
         (self.root / "made").touch()
 
     def run(self, script: str, user: str = "root", wanted: tuple[int, ...] = (0,), awaited: str = "") -> str:
-        """Run a shell's script; return what it printed. awaited: say when this comes first."""
+        """Run a shell's script; return what it printed. awaited: print when a line first has this text."""
         home = "/root" if user == "root" else f"/home/{user}"
         variables = {
             "PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "HOME": home, "LANG": "C.UTF-8",
@@ -103,7 +102,7 @@ def _cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def first_pose(system: System) -> None:
+def first_pose(system: Debian) -> None:
     """Do what README.md's first lines say."""
     system.run(f"apt-get update; apt-get install -y {' '.join(PACKAGES)}")
     # Those of this machine: it may reach the package index through a proxy of its own.
@@ -118,14 +117,14 @@ def first_pose(system: System) -> None:
     system.say("`make demo` of 30 s has ended")
 
 
-def tests(system: System) -> None:
+def tests(system: Debian) -> None:
     """Run the default suite."""
     said = system.run("cd /root/buddyline; make test 2>&1", wanted=(0, 2))
     print("".join(f"{'':22}{line}\n" for line in said.splitlines()[-12:]), end="")
     system.say("`make test` has ended")
 
 
-def setup_pi(system: System) -> None:
+def setup_pi(system: Debian) -> None:
     """Do what node/README.md says, on a system that has what Raspberry Pi OS has beside Debian."""
     _stand_in(system.root / "stand-ins")
     config = "sed -i s,tls/192.168.2.1,tls/127.0.0.1, ~/a.toml"
@@ -193,7 +192,7 @@ def main() -> int:
     args = parser.parse_args()
     if os.geteuid() != 0:
         parser.error("needs root")
-    system = System(args.suite, args.arch)
+    system = Debian(args.suite, args.arch)
     try:
         first_pose(system)
         if args.tests:

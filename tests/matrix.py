@@ -3,9 +3,10 @@
     make matrix                                                       # all of it: five times the default suite
     .venv/bin/python -m tests.matrix --only 3.11-lowest tests/node    # one of them, some of the tests
 
-`pinned` has the versions of constraints.txt, `lowest` the lowest of each package that is named, `newest` what is newest
-today. The lowest are older than the newest Pythons, so they are tried on the oldest alone. Each environment is made in
-build/matrix and kept. A Python is taken from the path or from pyenv; one that is missing is named, and is no failure.
+`pinned` has the versions of constraints.txt, `lowest` the lowest of each package that pyproject.toml names, `newest`
+the newest of all. The lowest are older than the newest Pythons, so they are tried on the oldest alone. Each environment
+is made in build/matrix and kept. A Python is taken from the path or from pyenv; one that is missing is named, and is no
+failure.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def main() -> int:
         print(f"== {entry}", flush=True)
         try:
             made = environment(entry, python)
-            # An old package warns of what it uses of a new one that nobody named: matplotlib 3.8 of pyparsing 3.3.
+            # An old package may call what a newer one has deprecated, as matplotlib 3.8 does of pyparsing 3.3.
             calm = ("-W", "ignore::DeprecationWarning") if entry.endswith("lowest") else ()
             call(made, "-m", "pytest", *calm, *words)
             results[entry] = "passed"

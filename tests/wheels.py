@@ -26,7 +26,7 @@ def interpreter(version):
         return Path(sys.executable)
     found = shutil.which(f"python{version}")
     others = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python{version}"))
-    # One on the path may be pyenv's own, which runs no Python that is not chosen.
+    # The one on the path may be a shim of pyenv, which fails unless this version is chosen.
     works = (
         Path(one) for one in (found, *others) if one and run(one, "-c", "import ensurepip", cwd=".").returncode == 0
     )

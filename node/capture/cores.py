@@ -23,7 +23,7 @@ BRIGHTEST: Final = 0.9
 BANDS_RADII, BANDS_PX = 1.5, (4, 24)
 """Bands are looked for as far as this many of the candidate's radii from it, but at least and at most so many px."""
 DIM: Final = 0.05
-"""Rows and columns with less than this share of the brightest one's light say nothing of bands."""
+"""Rows are not compared where the column has less than this share of the brightest column's light."""
 SPARSE: Final = 8
 """Of the whole picture, one pixel in this many is measured, along rows and columns."""
 
@@ -76,10 +76,11 @@ def measure_cores(image: NDArray[np.uint8], lamps: Sequence[Blob], linear: NDArr
 
 
 def _banding(image: NDArray[np.uint8], lamp: Blob, linear: NDArray[np.float64]) -> float | None:
-    """Return the standard deviation of a lamp's profile from row to row over that from column to column, logarithmic.
+    """Return how much a lamp's light over the rows differs from that over the columns; None too near to the border.
 
-    Of a round lamp, both profiles are alike, apart from the glow's lean, which is the columns' as a rule: therefore
-    their mean from both sides. Pulses make bands in the rows of a rolling shutter. None where the border is too near.
+    It is the standard deviation of the logarithm of the two profiles' ratio. A round lamp has two like profiles, but
+    its glow leans, as a rule sideways: so the mean of the columns' profile and its mirror image is taken. Pulses make
+    bands in the rows of a rolling shutter.
     """
     reach = math.ceil(min(max(BANDS_RADII * math.sqrt(lamp.area_px / math.pi), BANDS_PX[0]), BANDS_PX[1]))
     u, v, margin = round(lamp.u_px), round(lamp.v_px), reach + 2

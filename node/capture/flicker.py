@@ -28,7 +28,7 @@ class FlickerWatch:
     """Compares each core's light per ms of exposure with the frames before and after, and its rows with its columns.
 
     Pulses at a whole multiple of the frame rate look the same in all frames. With a rolling shutter they still make
-    bands, and where no band's edge crosses a lamp, the lamp is as good as steady.
+    bands. A lamp that no band's edge crosses is as good as steady.
     """
 
     def __init__(self) -> None:

@@ -89,8 +89,8 @@ class Lights(NamedTuple):
 def measure_lights(image: NDArray[np.uint8], proposals: Proposals, water: float) -> Lights:
     """Measure the proposed places in a BGR (H, W, 3) or grey (H, W) picture. water: its water_level.
 
-    The places are distinct, see there. A place beside a light is left out: it is darker than half the light's height,
-    and so has no outline.
+    The places do not overlap (see distinct). A place beside a light is left out: it is darker than half the light's
+    height, and so has no outline.
     """
     kept = slice(max(_ALWAYS_MEASURED, int(np.count_nonzero(proposals.outstanding >= CLEAR))))
     centre, radius_px, outstanding = proposals.centre_px[kept], proposals.radius_px[kept], proposals.outstanding[kept]

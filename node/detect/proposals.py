@@ -17,7 +17,7 @@ _OCTAVES = 5
 _BASE_FOCAL_PX = 564.0
 """Pictures are halved until the focal length is this or less: scales go with angles, not with a picture's width."""
 _CLUTTER_CELL, _CLUTTER_CELLS = 4, 7
-"""Clutter is the mean contrast of so many cells on a side; side of a cell, in px of its octave (two halvings)."""
+"""Side of a cell, in px of its octave (two halvings). Clutter is the mean contrast of so many cells on a side."""
 _WORD = 8
 _WITHIN_WORD = np.arange(_WORD)
 _NOISE = 4.0

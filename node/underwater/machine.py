@@ -141,7 +141,7 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
 
 
 def _sound(state: PanelState, given: PanelInput, action: PanelAction | None, now_ns: int) -> tuple[Pattern | None, int]:
-    """Return what sounds, and since when: the leak before the answer to the button, before a new fault and verdict."""
+    """Return what sounds, and since when: the leak comes before the button's answer, a new fault, a new verdict."""
     if given.leak:
         return LEAK_BEEP, state.sound_ns if state.sound == LEAK_BEEP else now_ns
     if action is not None:

@@ -31,8 +31,6 @@ HANDS = 5
 # Swimming past the other and on to the next station, at this speed, and then tying off.
 SWIM_MPS, TIE_S = 0.4, 20.0
 STRETCH = 3
-
-
 # As long as the manual asks for.
 REST_S = 10.0
 

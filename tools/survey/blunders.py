@@ -21,10 +21,11 @@ MOST_BLUNDERS: Final = 10
 FALSE_ALARM: Final = 0.01
 # A station's name has three unknowns; an explanation by one is taken before it unless this much better.
 NAME_COST: Final = 8.0
-# A median of squares is as certain as a variance of this share of its observations; stated sds, as one of so many.
+# Of the variance factor: a median of n squares is as certain as a mean of this share of them; the stated sds count as a
+# mean of so many.
 MEDIAN_SHARE: Final = 0.37
 STATED_WORTH: Final = 20.0
-# An instrument's error is suspected where the survey tells at least this share of it, not what is known beforehand.
+# An instrument's error is suspected only where the survey, not its prior, tells at least this share of it.
 TOLD_SHARE: Final = 0.1
 # An explanation is listed with the best one if it explains this share as much.
 AS_GOOD: Final = 0.8
@@ -84,7 +85,7 @@ class _Suspect:
 def variance_factor(solution: Solution) -> tuple[float, float]:
     """Return how much larger than stated residuals are, squared, at least 1, and its degrees of freedom.
 
-    It is by their median, which few blunders move, beside what the stated sds are worth.
+    It is the weighted mean of what their median says, which few blunders move, and of 1, which the stated sds say.
     """
     shown = (solution.redundancies > CHECKED) & (solution.model.leg >= 0)
     freedom = MEDIAN_SHARE * max(solution.freedom - 1, 0)
@@ -94,9 +95,10 @@ def variance_factor(solution: Solution) -> tuple[float, float]:
 
 
 def critical_chi2(hypotheses: int, freedom: float) -> float:
-    """Return what one unknown must explain to be suspected, over the variance factor, of which `freedom` is known.
+    """Return the chi^2, over the variance factor, that one unknown must explain to be suspected.
 
-    It is FALSE_ALARM's over all hypotheses, by Student's distribution (Wallace 1959).
+    FALSE_ALARM is the chance that any hypothesis on a sound survey exceeds it. freedom: of the variance factor, which
+    makes it a matter of Student's distribution (Wallace 1959).
     """
     z = NormalDist().inv_cdf(1 - FALSE_ALARM / (2 * max(hypotheses, 1))) * (8 * freedom + 3) / (8 * freedom + 1)
     return freedom * math.expm1(z**2 / freedom)

@@ -37,12 +37,12 @@ log = logging.getLogger(__name__)
 JUDGED_NS: Final = 10 * S_NS
 CHECK_NS: Final = S_NS
 OVER_NS: Final = 6 * S_NS
-# What is kept: this long, and of the present rest from a little before its begin, up to the longest.
+# Messages are kept for this time; in a longer rest from BEFORE_NS before its start, but at most for LONGEST_NS.
 WINDOW_NS: Final = 25 * S_NS
 BEFORE_NS: Final = 8 * S_NS
 LONGEST_NS: Final = 120 * S_NS
 MARKS: Final = 256
-# So many more rests have a node's usual field than have another one.
+# A node's usual field is known when so many more rests have it than have another one.
 WITNESSES: Final = 3
 
 _Stamped: TypeAlias = RelativePose | Rejected | Attitude | Depth | Imu
@@ -70,8 +70,8 @@ class LiveLegs:
     """Takes messages of any number of nodes, in any order; returns the verdicts on rests, as marks of both nodes.
 
     Mark of kind `leg` and name `good`: the leg carries no alarm. Of kind `alarm`: measure again; its name is the check.
-    A rest is judged by what `survey legs` would say of it. What later rests show of an earlier one (the usual
-    magnetic field) is said with that one's time.
+    A rest is judged by what `survey legs` would say of it. Later rests may show more of an earlier one, by the usual
+    magnetic field: then the note begins with the earlier leg's time.
     """
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:

@@ -17,7 +17,7 @@ class Normal:
     """N = A^T W A of rows A (m, n) as coordinates (row, column, value) and their weights (m,); positive definite.
 
     blocks: (n,), unknowns of one number are eliminated together; -1: last, for those that stand in very many rows.
-    before: equations of the same pattern, whose order of elimination is taken.
+    before: equations of the same pattern; their order of elimination is used again.
     Raises BuddylineError if an unknown is not determined.
     """
 
@@ -131,7 +131,7 @@ class Normal:
         of_front = np.cumsum(opens[:-1]) - 1
         parents = np.where(following[bounds[1:] - 1] >= 0, of_front[following[bounds[1:] - 1]], -1)
         children = np.bincount(parents[parents >= 0], minlength=len(parents)).tolist()
-        # Each group is of the front that its first unknown is in. None is the last place, with nothing.
+        # Each group is found in the front that has its first unknown. The place `count`, after all unknowns, is for -1.
         places = [np.where(one >= 0, place[one], count) for one in (groups, columns)]
         wanted = []
         for one in places:

@@ -196,7 +196,8 @@ class Model:
             self.base_m[known] = of.vectors_m[self.leg[self.lines][known]]
         self.by_reading = ~np.isnan(self.base_m[:, 0])
         self.heights = np.flatnonzero((self.kind >= _EAST) & (self.kind <= _UP))
-        # What is known beforehand of an unknown of robust observations: their long tails speak against it as well.
+        # The rows that hold the prior of an unknown of robust observations. These have long tails, which pull at the
+        # prior as well, so it is not suspected.
         tailed = np.zeros(self.count, dtype=bool)
         tailed[self.term_column[self.robust[self.term_row]]] = True
         self.told_by_robust = np.zeros(len(self.value), dtype=bool)
@@ -362,10 +363,10 @@ class Solution:
         return np.asarray(np.where(r > CHECKED, self.weights * self.misfit**2 / np.where(r > CHECKED, r, 1.0), 0.0))
 
     def effect(self, errors: Sequence[tuple[Ints, Floats]]) -> list[float]:
-        """Return what errors explain, each a chi^2 of at most q degrees of freedom where it is not there.
+        """Return the chi^2 that each error explains: of at most q degrees of freedom if there is no such error.
 
         An error: a list of rows, and the (r, q) changes of their readings by its q unknowns; all have the same q.
-        What no residual would show of it explains nothing.
+        The part of an error that no residual shows is left out.
         """
         q = errors[0][1].shape[1]
         unknowns, derivatives = self.design
