@@ -222,7 +222,7 @@ def report(parser: argparse.ArgumentParser) -> None:
         "--about",
         type=Path,
         metavar="FILE.toml",
-        help="what it says of the dive: title, site, people (a list), instrument, text; each may be left out",
+        help="what the report says of the dive: title, site, people (a list), instrument, text; each may be left out",
     )
     _authority(parser)
     parser.add_argument(

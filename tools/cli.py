@@ -192,7 +192,11 @@ COMMANDS: Final = (
         "measure the errors of poses, track and candidates against truth",
         ("evaluate poses.mcap --truth dive.truth.mcap",),
     ),
-    Command("export", "write poses or the track for other programs", ("export poses.mcap --format tum -o poses.tum",)),
+    Command(
+        "export",
+        "write poses, the track, all nodes or the whole log for other programs",
+        ("export poses.mcap --format tum -o poses.tum",),
+    ),
     Command(
         "view",
         "look at a stored dive in the browser, from any moment on",

@@ -51,7 +51,12 @@ method=link-local
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the card and the running Pi are told alike."""
-    parser.add_argument("--config", required=True, metavar="FILE.toml", help="the node's, with its certificate beside")
+    parser.add_argument(
+        "--config",
+        required=True,
+        metavar="FILE.toml",
+        help="the node's configuration; `image` needs the files of its [tls] beside it",
+    )
     parser.add_argument("--clock-from", metavar="IP", help="the node whose clock this one follows; default: a's")
     parser.add_argument("--clock-chip", choices=tuple(CLOCK_CHIPS), default="none", help="default: %(default)s")
 
