@@ -54,16 +54,19 @@ def check_logs(readers: Sequence[DiveLogReader], authority: str | None) -> list[
             continue
         nodes = _nodes(reader)
         signed = [node for node in nodes if DIGEST.key(node) in reader.keys]
+        if not signed and authority is None:
+            continue
+        # In a node's own log, in the order of the file: log times go back where its clock was set. A recording has
+        # at its end what came late.
+        own = "boot" in reader.metadata()
+        # Before anything is said of signatures: it refuses an authority that is no certificate.
+        check = digest_check(authority, in_order=own)
         if authority is not None:
             unsigned = [f"{reader.path}: node {node}: is not signed" for node in nodes if node not in signed]
             losses.report(unsigned)
             lines += unsigned
         if not signed:
             continue
-        # In a node's own log, in the order of the file: log times go back where its clock was set. A recording has
-        # at its end what came late.
-        own = "boot" in reader.metadata()
-        check = digest_check(authority, in_order=own)
         pictures = reader.path.with_suffix(SUFFIX)
         together = [reader, *(one for one in readers if one.path.parent == pictures)]
         found: list[Discrepancy] = []

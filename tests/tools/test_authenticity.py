@@ -40,6 +40,13 @@ def test_backfill_names_what_was_altered(keys: Path, tmp_path: Path, capfd: pyte
     assert "forged.mcap: node a: is not what the node wrote" in capfd.readouterr().err
 
 
+def test_an_authority_that_is_none_is_named_first(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    topside, own = (log_of(tmp_path / f"{name}.mcap", []) for name in ("top", "a"))
+    words = ["backfill", topside, own, "-o", str(tmp_path / "x.mcap"), "--authority", str(tmp_path / "none.crt")]
+    assert main(words) == 2
+    assert "none.crt: is not a certificate in PEM" in capfd.readouterr().err
+
+
 def test_a_log_without_digests_is_named_where_an_authority_is(keys: Path, tmp_path: Path) -> None:
     lines = [line for line in written("a", keys) if not line[0].endswith("/digest")]
     own, topside = log_of(tmp_path / "a.mcap", lines), log_of(tmp_path / "top.mcap", lines[:10])
