@@ -1,15 +1,16 @@
-"""A third party's bar gives no pose; a compass that is far off costs poses until the motion has shown it."""
+"""A third party's bar gives no pose. Steel beside a compass costs those of two seconds, a compass far off more."""
 
 import math
 
 import numpy as np
 import pytest
+from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import RelativePose
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.compasses import Contradiction, HeadingGap, compare_headings
 from buddyline.solver_service.geometry.observation import Heading
 from buddyline.solver_service.geometry.trigger import Settings
-from buddyline.solver_service.witness import BELIEVED_NS, Witnesses
+from buddyline.solver_service.witness import FEWEST, MOST, Witnesses
 
 from tests.solver_service.conftest import dive_messages
 from tests.solver_service.strangers import messages_of, outcome, strangers_dive
@@ -35,9 +36,11 @@ def test_what_two_compasses_can_explain(sign):
     assert judged(20 * sign) == contradicts
     assert judged(40 * sign) == contradicts
     assert judged(156 * sign) == contradicts
-    # Learned: it is believed, and left for what follows from earlier poses alone.
+    # A pose agrees with what was learned, or with the compasses as they are, at the next station.
     assert judged(80 * sign, 82 * sign) == agrees
     assert judged(92 * sign, 82 * sign) == agrees
+    assert judged(15 * sign, 82 * sign) == agrees
+    # One that agrees with neither is believed only if it follows from earlier poses.
     assert judged(80 * sign, 0) == contradicts
     assert judged(80 * sign, 0, follows=True) == neither
     assert judged(175 * sign, 90 * sign, follows=True) == contradicts
@@ -77,14 +80,26 @@ def test_a_third_partys_bar_gives_no_pose_before_headings_are_learned():
     ("gap_deg", "scatter_deg", "steel"), [(20, 3, True), (-25, 3, True), (40, 3, False), (0, 12, False)]
 )
 def test_what_stays_at_a_rest_is_taken_for_steel(gap_deg, scatter_deg, steel):
-    witnesses, told = Witnesses(), []
-    for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, BELIEVED_NS // 200_000_000)):
-        gap = HeadingGap(math.radians(off_deg), 1e-4, 0.5, agrees=False, contradicts=True)
-        told.append(witnesses.take(k * 200_000_000, Contradiction(gap, 4.0)))
+    told = at_rest(5, 2 * 5, gap_deg, scatter_deg)
     assert not any(told[:-1])
     assert (told[-1] is not None) == steel
     if told[-1]:
         assert math.degrees(told[-1].offset_rad) == pytest.approx(gap_deg, abs=3.0)
+
+
+@pytest.mark.parametrize(("rate_hz", "needed"), [(1, FEWEST), (2, FEWEST), (4, 8), (10, MOST), (20, MOST)])
+def test_as_many_witnesses_are_needed_as_two_seconds_have_triggers(rate_hz, needed):
+    told = at_rest(rate_hz, MOST + 1, 20, 3)
+    assert [k for k, one in enumerate(told, start=1) if one] == list(range(needed, MOST + 2))
+
+
+def at_rest(rate_hz, count, gap_deg, scatter_deg):
+    """What so many triggers of nodes that do not move have witnessed, one after another."""
+    witnesses, told = Witnesses(), []
+    for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, count)):
+        gap = HeadingGap(math.radians(off_deg), 1e-4, 0.5, agrees=False, contradicts=True)
+        told.append(witnesses.take(k * S_NS // rate_hz, Contradiction(gap, 4.0)))
+    return told
 
 
 @pytest.mark.parametrize("off_deg", [-80, 45])

@@ -1,4 +1,7 @@
-"""What a step and a picture count as unknown: a sudden turn, and the clock while the velocity is unknown."""
+"""What a step and a picture count as unknown: a sudden turn, and the clock while the velocity is unknown.
+
+And when the biases' walk is learned.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,9 @@ from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
 from buddyline.solver_service.track.state import CLOCK, MOVING, SIZE, V_, State
-from buddyline.solver_service.track.stepping import HOLD_S, _widened
+from buddyline.solver_service.track.stepping import HOLD_S, KNOWN_CLOCK_S, _widened
 from buddyline.solver_service.track.strapdown import Noise
+from buddyline.solver_service.track.walking import Walking
 
 from tests.solver_service.track.dives import Setting, filter_of, make
 from tests.solver_service.track.test_track_jacobians import LIGHTS_M, a_state
@@ -80,6 +84,29 @@ def test_a_start_does_not_doubt_its_clock_and_a_confirmed_track_does(monkeypatch
     track.advance(frames[-1])
     assert len(confirmed) > 20
     assert all(confirmed)
+
+
+def test_a_walk_is_learned_only_once_the_clock_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    dive = make(1, Setting(seconds=8.0))
+    track = filter_of(dive.records, dive.fixes)
+    learned: list[Floats] = []
+    taught = Walking.taught
+
+    def noted(walking: Walking, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> Walking:
+        learned.append(y)
+        return taught(walking, y, S_inverse, H, gain)
+
+    monkeypatch.setattr(Walking, "taught", noted)
+    unknown = 0
+    for stamp_ns in sorted(frame.stamp_ns for record in dive.records for frame in record.frames):
+        before = len(learned)
+        track.advance(stamp_ns)
+        main = track.main
+        if main is not None and main.confirmed and main.covariance[CLOCK, CLOCK] > KNOWN_CLOCK_S**2:
+            unknown += 1
+            assert len(learned) == before
+    assert unknown > 0
+    assert learned
 
 
 class Told:
