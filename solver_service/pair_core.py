@@ -95,7 +95,7 @@ class PairCore:
     def settle(self, told_ns: int = -1) -> list[Message]:
         """Solve all matched triggers at once; return the outcomes in the order of the triggers, then the track.
 
-        told_ns: outcomes up to there are nothing to the track.
+        told_ns: the track gets only later outcomes.
         """
         if not (self._unsettled or self._settled):
             return []

@@ -40,7 +40,7 @@ class Answer(msgspec.Struct):
 
 
 class SharedWork:
-    """What this solver does of the shared work. Call it with the service's lock held, but for `pulse`.
+    """What this solver does of the shared work. Hold the service's lock for each call but `pulse`.
 
     now_s: a clock that nobody sets.
     """
@@ -123,6 +123,7 @@ class SharedWork:
         known = [one for one in said if (one.node_a, one.node_b) == task]
         heard = self._heard.get((node_a, node_b))
         if heard is not None:
+            # Only pair, trigger and time count: any reason will do that is not `late`.
             known.append(
                 Rejected(
                     node_a=node_a, node_b=node_b, stamp_ns=heard.stamp_ns, trigger=heard.trigger, reason="ambiguous"

@@ -1,12 +1,15 @@
 """Two compasses that are far apart, or a third party's bar: let the triggers that follow tell.
 
-A pose that both headings contradict is no pose, unless it is shown that the compasses are off. A small contradiction
-that stays is steel's: strangers' lamps that happen to fit do so for a moment, and for a contradiction as small, a third
-whose bar both see would have to stand almost between them. A large one the motion must show. Of two nodes that
-look at each other, both lines of sight turn together, so that the contradiction stays the same wherever they go. Of two
-that look at a third's bar, a line of sight turns with one of them alone. And where the third itself comes nearer to
-both by a share p of the range, the lines of sight, theta apart, turn against each other by 2 p tan(theta / 2): by p and
-more, where they are a quarter turn apart. Nodes that rest tell nothing of it.
+A pose that both headings contradict is no pose, until later triggers have shown that the compasses are off.
+
+A small contradiction that stays for two seconds is steel's, whether the nodes move or rest. Strangers' lamps fit by
+chance, for a moment. And a third whose bar both see would have to stand almost between them.
+
+A large contradiction can be judged by the motion only. If two nodes look at each other, both lines of sight turn
+together, and the contradiction stays the same wherever they go. If they look at a third's bar, each line of sight turns
+by the motion of its own node alone. If the third itself comes nearer to both by a share p of the range, the lines of
+sight, theta apart, turn against each other by 2 p tan(theta / 2): by 2 p where they are a quarter turn apart. Nodes
+that rest show nothing.
 """
 
 from __future__ import annotations
@@ -20,17 +23,19 @@ import numpy as np
 from buddyline.protocol.clock import S_NS
 from buddyline.solver_service.geometry.compasses import Contradiction
 
-# Witnesses are remembered for this time. Two seconds of them are believed: at most MOST, and no fewer than FEWEST.
+# Witnesses are remembered for MEMORY_NS. As many are needed as there are triggers in BELIEVED_NS, but at least FEWEST
+# (below 2.5 Hz they take longer) and at most MOST (above 7.5 Hz they take less).
 MEMORY_NS: Final = 30 * S_NS
 BELIEVED_NS: Final = 2 * S_NS
 MOST: Final = 15
 FEWEST: Final = 5
-# Two lights from equal range are a chance that passes with the motion: so large a share of the triggers must show it.
+# At least this share of the remembered triggers must be witnesses: a third's lights at equal range are a chance that
+# passes with the motion.
 LEAST_SHARE: Final = 0.3
 # Scatter of the contradiction, at most, as a share of the change that a third's bar would have caused.
 MOST_SCATTER: Final = 0.35
-# Steel and iron put compasses 10 to 25 degrees off, at stations by a wreck or in a mine. What is off by up to this, and
-# scatters by no more than compasses' noise (1 sd), is taken for steel's.
+# A contradiction is taken for steel's if its mean is below MOST_STEEL_RAD, and its scatter (1 sd) below MOST_NOISE_RAD,
+# as compasses' noise is. At stations by a wreck or in a mine, compasses are 10 to 25 degrees off.
 MOST_STEEL_RAD: Final = math.radians(30.0)
 MOST_NOISE_RAD: Final = math.radians(6.0)
 
@@ -78,7 +83,7 @@ class Witnesses:
         return Witnessed(gap_rad, gap_scatter)
 
     def _believed(self) -> float:
-        """Return how many witnesses two seconds of triggers are."""
+        """Return how many witnesses are needed: those of BELIEVED_NS, by the mean time between triggers."""
         apart_ns = (self._seen[-1][0] - self._seen[0][0]) / max(len(self._seen) - 1, 1)
         return min(max(BELIEVED_NS / max(apart_ns, 1.0), FEWEST), MOST)
 

@@ -1,4 +1,4 @@
-"""Heading as a check of its own: can two compasses, and how far they may disagree, explain a pose?
+"""Heading as a check of its own: does a pose agree with two compasses, within what they may be off?
 
 Two nodes that look at a third party's two lights from equal range get a pose that passes range, twist, tilt and depth.
 In that pose they face each other. By their compasses their lines of sight are theta apart, so the headings are 180
@@ -20,7 +20,8 @@ from buddyline.solver_service.geometry.observation import Heading
 # for the noise of a reading.
 MOST_APART_RAD: Final = math.radians(100.0)
 # Squared sigmas of a gap that noise explains: one right pose in a hundred has a larger one. If one pose of four lights
-# in a hundred is of strangers' lamps, and their gaps are spread evenly, then one in eighty at this gap is (6 degrees).
+# in a hundred is of strangers' lamps, and their gaps are spread evenly, then of the poses with this gap one in eighty
+# is (for a sigma of 6 degrees).
 EXPLAINED_CHI2: Final = 6.63
 
 

@@ -119,10 +119,10 @@ class Settings:
     """How triggers are solved.
 
     checks: what may speak for or against a hypothesis. min_probability: of the published pose, against chance and
-    every other; min_oriented_probability: the same where both attitudes speak, because a right pose is then mostly
-    certain. range_min_m: nearer, no picture of 60 degrees holds a bar of 0.57 m. gate_sigma: both gaps, in standard
-    deviations. speed_mps, turn_radps: relative motion where the prior knows none (1 sd); skew_sigma_s: how well the
-    clocks agree (1 sd).
+    every other; min_oriented_probability: the same where both attitudes speak, because a right pose is then nearly
+    certain; more is asked of one that no earlier pose supports. range_min_m: nearer, no picture of 60 degrees holds a
+    bar of 0.57 m. gate_sigma: both gaps, in standard deviations. speed_mps, turn_radps: relative motion where the prior
+    knows none (1 sd); skew_sigma_s: how well the clocks agree (1 sd).
     """
 
     method: Method = "refined"

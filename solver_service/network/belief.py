@@ -77,8 +77,8 @@ class Member:
 class NetBelief:
     """The state and covariance of all members, moved on by inertial samples and updated by the nodes' own sensors.
 
-    intake: what all nodes have told. places: of the fixed nodes, by index. members, state, covariance, rates_radps
-    and t_s: as they are now.
+    intake: what all nodes have told. places: of the fixed nodes, by index. members, state, covariance, rates_radps,
+    shaking and t_s: as they are now.
     """
 
     def __init__(self, intake: TrackIntake) -> None:

@@ -66,8 +66,10 @@ class TrackIntake:
     def add_imu(
         self, node: int, stamps_ns: Stamps, accel_mps2: Floats, gyro_radps: Floats, fast: Floats | None = None
     ) -> None:
-        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame; fast (N, 7): the fast part of
-        both, and the camera's sudden turn."""
+        """Take inertial samples (N,), (N, 3), (N, 3) in the body frame.
+
+        fast (N, 7): the fast part of both, and the camera's sudden turn.
+        """
         if not len(stamps_ns):
             return
         self.seconds(node, int(stamps_ns[0]))

@@ -90,8 +90,8 @@ class Samples:
         """Give the grid (M,) from start_s to end_s, the values (M, 6) there, and which intervals are told (M - 1,).
 
         The values are without `shares` of their fast part, which comes last with the camera's sudden turn (M, 7), None
-        where they are not known.
-        known_s: nothing later than this is looked at, so that more samples do not change the answer.
+        where they are not known. known_s: nothing later than this is looked at, so that more samples do not change the
+        answer.
         """
         last = int(np.searchsorted(self.times_s, known_s, side="right"))
         t, values = self._t[:last], self._values[:last]

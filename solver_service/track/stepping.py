@@ -44,7 +44,8 @@ TOGETHER_S: Final = 0.005
 ATTITUDE_EVERY_S: Final = 0.5
 # A light nearer to the picture's edge need not be found: part of its spot is outside.
 EDGE_PX: Final = 2.0
-# A clock that is off more than this looks like a walk of the biases.
+# How much the biases walk is learned only while the clocks' offset is known better than this, 1 sd: an unknown offset
+# looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
@@ -110,7 +111,7 @@ class TrackSteps(TrackIntake):
         return parts[0], parts[1]
 
     def _with_sudden(self, variances: Floats, parts: tuple[Increment, Increment]) -> Floats:
-        """Give the variances (3,) of shaking with what is taken off of a camera's own sudden turns."""
+        """Give the variances (3,) of shaking with what the shares take off a camera's own sudden turns."""
         lost = [samples.shares[1] * part.sudden_rad for samples, part in zip(self.samples, parts, strict=True)]
         widened: Floats = variances + np.square((*lost, 0.0))
         return widened

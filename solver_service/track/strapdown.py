@@ -43,7 +43,8 @@ class Noise:
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
     gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
     gyro's bias, and of the attitude filter's own error, which stands in place of the mount (by its stated sigmas,
-    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk, as learned (walking.py).
+    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk; a pair's track has learned ones
+    (walking.py), the network these.
     """
 
     gyro_rad: float

@@ -1,9 +1,9 @@
 """How much the inertial units' biases walk, learned from the residuals.
 
-Good units' biases walk a tenth as far as those of poor ones. A walk that is believed too small makes tilt, mount and
-north-east-down seem better known than they are; one that is believed too large gives away what the units tell. A walk
-shows only over seconds, in how the residuals' means change: so the likelihood's whole slope is followed, by the
-covariance and by the state.
+Good units' biases walk a sixth as far as those of poor ones, or less. If the assumed walk is too small, tilt, mount and
+north-east-down seem better known than they are; if it is too large, what the units tell is wasted. A walk shows only
+over seconds, in how the residuals' means change. So the likelihood's whole slope is followed: its part by the
+covariance, and its part by the state.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.shaking import LONGEST_STEP, MOST_CHI2
 from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, SIZE
 
-# Before the dive tells: densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s, as of units
-# that fins shake and water cools: from too steady a bias a dive with clocks far off does not find their offset. e times
-# as much or as little are 1 sd.
+# Densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s, before anything is learned: those
+# of poor units, which fins shake and water cools. With steadier biases to begin with, the offset of clocks that are far
+# apart may not be found. 1 sd is a factor of e, by FIRST_INFORMATION.
 FIRST: Final = np.array((5e-4, 8e-3))
 FIRST_INFORMATION: Final = 0.25
 LEAST: Final = 2.0 * np.log(0.1 * FIRST)
@@ -34,7 +34,7 @@ _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 class Walking:
     """The logs (2,) of both walks' variances per s, of gyros and accelerometers, and their information (2, 2).
 
-    spread (2, SIZE, SIZE), moved (SIZE, 2): how covariance and state change by the logs.
+    spread (2, SIZE, SIZE), moved (SIZE, 2): derivatives of the track's covariance and state by the logs.
     """
 
     logs: Floats = field(default_factory=lambda: 2.0 * np.log(FIRST))
@@ -44,14 +44,14 @@ class Walking:
 
     @property
     def densities(self) -> tuple[float, float]:
-        """Of the gyros' and the accelerometers' biases."""
+        """Densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s."""
         gyro, accel = np.exp(0.5 * self.logs).tolist()
         return gyro, accel
 
     def stepped(self, F: Floats, walk: Floats, walking: tuple[bool, bool]) -> Walking:
-        """Go on by a step with the transition's rows F (MOVING, SIZE), in which biases walked by walk (SIZE - MOVING,).
+        """Go on by a step with the transition's rows F (MOVING, SIZE).
 
-        walking: of which nodes there is a unit.
+        walk (SIZE - MOVING,): the variances that the step adds to the constants. walking: which nodes have a unit.
         """
         spread, moved = self.spread.copy(), self.moved.copy()
         across = F @ self.spread
