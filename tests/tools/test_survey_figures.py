@@ -37,7 +37,9 @@ def test_loops_close_within_their_sigmas():
 
 # A known fault, of lines without gyroscopes: 1.45 on 14 dives. A compass beside steel must be witnessed for two
 # seconds, which loses legs there; what is left of the others' disturbance is not in the ellipse.
-BESIDE_STEEL = pytest.param("lines-4deg-disturbed", 2.0, marks=pytest.mark.xfail(reason="the ellipse is too small"))
+BESIDE_STEEL = pytest.param(
+    "lines-4deg-disturbed", 2.0, marks=pytest.mark.xfail(strict=True, reason="the ellipse is too small")
+)
 
 
 @pytest.mark.parametrize(("name", "worse"), [("lines", 1.5), BESIDE_STEEL])
