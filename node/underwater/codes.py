@@ -49,6 +49,7 @@ THREE_FLASHES: Final = Pattern("three flashes every 3 s", (0.15, 0.25, 0.15, 0.2
 SLOW: Final = Pattern("1 s on, 1 s off", (1.0, 1.0))
 BLINKING: Final = Pattern("blinking, twice a second", (0.25, 0.25))
 FLICKERING: Final = Pattern("flickering, five times a second", (0.1, 0.1))
+TWO_GAPS: Final = Pattern("two short gaps every 2 s", (1.4, 0.2, 0.2, 0.2))
 WINKING: Final = Pattern("on, with a short gap every second", (0.9, 0.1))
 
 LONG: Final = Pattern("2 s on, half a second off", (2.0, 0.5))
@@ -57,6 +58,7 @@ ONE_BEEP: Final = Pattern("1 short", (0.1,), once=True)
 TWO_BEEPS: Final = Pattern("2 short", (0.1, 0.15, 0.1), once=True)
 THREE_BEEPS: Final = Pattern("3 short", (0.1, 0.15, 0.1, 0.15, 0.1), once=True)
 FOUR_BEEPS: Final = Pattern("4 short", (0.1, 0.15) * 3 + (0.1,), once=True)
+LONG_AND_SHORT: Final = Pattern("1 long, 1 short", (1.0, 0.15, 0.1), once=True)
 FIVE_BEEPS: Final = Pattern("5 short", (0.1, 0.15) * 4 + (0.1,), once=True)
 SHORT_AND_LONG: Final = Pattern("1 short, 1 long", (0.1, 0.15, 1.0), once=True)
 LONG_BEEP: Final = Pattern("1 long", (1.0,), once=True)
@@ -88,6 +90,7 @@ class Verdict(Enum):
 
     GOOD = "the leg is good: go on"
     AGAIN = "measure the leg again"
+    EARLIER = "measure an earlier leg again: the monitor names it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +127,7 @@ CODES: Final = (
         "stopped: no lights, no pictures; sensors and candidates are recorded", lambda s: not s.started, THREE_FLASHES
     ),
     LampCode(f"survey, for 10 s: {Verdict.AGAIN.value}", lambda s: s.verdict is Verdict.AGAIN, BLINKING),
+    LampCode(f"survey, for 10 s: {Verdict.EARLIER.value}", lambda s: s.verdict is Verdict.EARLIER, TWO_GAPS),
     LampCode(f"survey, for 10 s: {Verdict.GOOD.value}", lambda s: s.verdict is Verdict.GOOD, LONG),
     LampCode("records, and sees the other node's lights", lambda s: s.sees_other, TWO_FLASHES),
     LampCode("records", lambda _: True, ONE_FLASH),
@@ -135,7 +139,11 @@ BEEPS: Final[dict[PanelAction, Pattern]] = {
     PanelAction.STOP: THREE_BEEPS,
     PanelAction.SHUT_DOWN: LONG_BEEP,
 }
-VERDICT_BEEPS: Final[dict[Verdict, Pattern]] = {Verdict.GOOD: SHORT_AND_LONG, Verdict.AGAIN: FOUR_BEEPS}
+VERDICT_BEEPS: Final[dict[Verdict, Pattern]] = {
+    Verdict.GOOD: SHORT_AND_LONG,
+    Verdict.AGAIN: FOUR_BEEPS,
+    Verdict.EARLIER: LONG_AND_SHORT,
+}
 FAULT_BEEP: Final = FIVE_BEEPS
 LEAK_BEEP: Final = ALARM
 

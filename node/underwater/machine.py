@@ -26,7 +26,7 @@ STEADY_NS: Final = 40 * MS_NS
 
 @dataclass(frozen=True, slots=True)
 class PanelInput:
-    """pressed: the button now; None without one. The rest: see Situation."""
+    """pressed: the button now; None without one. verdict_ns: since when it is shown. The rest: see Situation."""
 
     pressed: bool | None = None
     leak: bool = False
@@ -35,6 +35,7 @@ class PanelInput:
     timeless: bool = False
     sees_other: bool = False
     verdict: Verdict | None = None
+    verdict_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ class PanelState:
     ending: bool = False
     fault: bool = False
     verdict: Verdict | None = None
+    verdict_ns: int = 0
     contact: Contact = field(default_factory=Contact)
     lamp: Pattern = STEADY
     lamp_ns: int = 0
@@ -130,6 +132,7 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
             ending=ending,
             fault=given.fault,
             verdict=given.verdict,
+            verdict_ns=given.verdict_ns,
             contact=contact,
             lamp=lamp,
             lamp_ns=state.lamp_ns if lamp == state.lamp else now_ns,
@@ -148,7 +151,7 @@ def _sound(state: PanelState, given: PanelInput, action: PanelAction | None, now
         return BEEPS[action], now_ns
     if given.fault and not state.fault:
         return FAULT_BEEP, now_ns
-    if given.verdict is not None and given.verdict is not state.verdict:
+    if given.verdict is not None and (given.verdict is not state.verdict or given.verdict_ns != state.verdict_ns):
         return VERDICT_BEEPS[given.verdict], now_ns
     if state.sound is None or not state.sound.once or state.sound.is_over((now_ns - state.sound_ns) / S_NS):
         return None, now_ns

@@ -31,6 +31,9 @@ PERIOD_S: Final = 0.02
 STATUS_WITHIN_NS: Final = 5 * S_NS
 COMMAND_WITHIN_S: Final = 10.0
 VERDICT_NS: Final = 10 * S_NS
+# So long while another verdict waits; so many may wait.
+HURRIED_NS: Final = 4 * S_NS
+VERDICTS: Final = 4
 # A node has two lights.
 LIGHTS: Final = 2
 
@@ -56,9 +59,11 @@ class Panel:
         self._news_ns: int | None = None
         self._refused = ""
         self._refusals = Refusals(f"node {config.node}")
-        # The survey's last verdict: from the bus's thread, and as shown, with the time since when.
-        self._heard: deque[Verdict] = deque(maxlen=1)
-        self._verdict: tuple[Verdict, int] | None = None
+        # The survey's verdicts, each on a rest: from the bus's thread; the last one; the one shown, and since when.
+        self._heard: deque[Verdict] = deque(maxlen=VERDICTS)
+        self._last_heard: tuple[Verdict, object] | None = None
+        self._verdict: Verdict | None = None
+        self._verdict_ns = 0
 
     @property
     def takes_pictures(self) -> bool:
@@ -93,8 +98,14 @@ class Panel:
         """Take a mark of this node from the bus: the survey's verdict on the leg."""
         envelope = self._refusals.open(received)
         mark = None if envelope is None else envelope.message
-        if isinstance(mark, Mark) and mark.kind in ("alarm", "leg"):
-            self._heard.append(Verdict.GOOD if mark.kind == "leg" else Verdict.AGAIN)
+        if not isinstance(mark, Mark) or mark.kind not in ("alarm", "leg"):
+            return
+        verdict = Verdict.GOOD if mark.kind == "leg" else Verdict.EARLIER if mark.earlier else Verdict.AGAIN
+        # A rest with two alarms is one verdict; the same verdict on another rest is another one.
+        rest = mark.stamp_ns if mark.leg_ns is UNSET else mark.leg_ns
+        if self._last_heard != (verdict, rest):
+            self._last_heard = verdict, rest
+            self._heard.append(verdict)
 
     def run(self, stop: threading.Event) -> None:
         """Read and drive the pins until stop is set."""
@@ -111,15 +122,19 @@ class Panel:
         self._leak = self._leak if wet is None else wet
         if self._has_news:
             self._has_news, self._news_ns = False, now_ns
-        if self._heard:
-            self._verdict = self._heard.popleft(), now_ns
+        shown_ns = now_ns - self._verdict_ns
+        if self._heard and (self._verdict is None or shown_ns >= HURRIED_NS):
+            self._verdict, self._verdict_ns = self._heard.popleft(), now_ns
+        elif shown_ns >= VERDICT_NS:
+            self._verdict = None
         silent = self._news_ns is not None and now_ns - self._news_ns > STATUS_WITHIN_NS
         given = replace(
             view,
             pressed=None if pins.button is None else pins.button.read(),
             leak=self._leak,
             fault=view.fault or silent,
-            verdict=self._verdict[0] if self._verdict and now_ns - self._verdict[1] < VERDICT_NS else None,
+            verdict=self._verdict,
+            verdict_ns=self._verdict_ns,
         )
         self._state, action = step(self._state, given, now_ns)
         for pin, on in (

@@ -249,7 +249,8 @@ class Mark(Message, frozen=True, kw_only=True):
 
     kind: station: the node is at the station `name`, from the rest nearest to this instant until it moves. point: the
     node is at a point of interest. note: the text `note` only. alarm: the survey's check `name` failed; measure again.
-    leg: the survey's verdict `good` on the present leg.
+    leg: the survey's verdict `good` on the present leg. leg_ns: begin of the rest that a verdict is about. earlier:
+    that is not the present rest.
     """
 
     node: NodeId
@@ -257,3 +258,5 @@ class Mark(Message, frozen=True, kw_only=True):
     kind: Literal["station", "point", "note", "alarm", "leg"] = "station"
     name: Annotated[str, Meta(max_length=64)] = ""
     note: Annotated[str, Meta(max_length=1024)] = ""
+    leg_ns: StampNs | UnsetType = UNSET
+    earlier: bool = False

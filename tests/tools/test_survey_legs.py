@@ -9,7 +9,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, find_standings
-from buddyline.tools.survey.derive import Derived, ranges, time_text
+from buddyline.tools.survey.derive import Derived, ranges
 from buddyline.tools.survey.live import OVER_NS, LiveLegs
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import Leg
@@ -239,14 +239,10 @@ def judged(messages):
     assert [mark.note for mark in said if mark.node == "a"] == [mark.note for mark in said if mark.node == "b"]
     found = []
     for leg in derived(messages).legs:
-        late = f"leg of {time_text(leg.start_ns)}: "
-        meanwhile = [
-            mark
-            for mark in said
-            if mark.node == "a"
-            and (mark.note.startswith(late) or leg.start_ns <= mark.stamp_ns <= leg.end_ns + OVER_NS + S_NS)
-            and (mark.note.startswith(late) or not mark.note.startswith("leg of"))
-        ]
+        meanwhile = [mark for mark in said if mark.node == "a" and abs(mark.leg_ns - leg.start_ns) < 3 * S_NS]
+        for mark in meanwhile:
+            assert mark.earlier or mark.stamp_ns <= leg.end_ns + OVER_NS + S_NS
+            assert mark.note.startswith(f"leg {leg.name} of ") is mark.earlier
         found.append((leg, meanwhile))
     return found
 
@@ -269,6 +265,22 @@ def test_each_leg_is_judged_at_its_tenth_second():
     assert kinds[:5] == ["leg"] * 5
     assert {mark.name for mark in verdicts[5][1]} >= {"sights", "field"}
     assert "m, 1" in verdicts[0][1][0].note
+
+
+def test_an_alarm_of_an_earlier_leg_says_which():
+    rng = np.random.default_rng(11)
+    course = world.line(rng, 6)
+
+    def disturb(index, number):
+        return 20.0 if (index, number) == (0, 0) else 0.0
+
+    # The usual field is known only later: then the first leg's alarm comes.
+    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=12.0, swim_s=3.0, disturb=disturb)
+    (_, said), *others = judged(messages)
+    late = [mark for mark in said if mark.earlier]
+    assert "field" in {mark.name for mark in late}
+    assert all(mark.stamp_ns - mark.leg_ns > 20 * S_NS for mark in late)
+    assert not any(mark.earlier for _, said in others for mark in said)
 
 
 @pytest.mark.slow

@@ -103,7 +103,8 @@ def _verdict(picture: PairPicture, now_ns: int) -> str:
         age_ns = None if node is None else node.age_ns(MARK.name, now_ns)
         if node is not None and node.mark is not None and age_ns is not None and age_ns < VERDICT_NS:
             good = node.mark.kind == "leg"
-            verdict = "the leg is good" if good else f"measure the leg again ({node.mark.name})"
+            which = "an earlier leg" if node.mark.earlier else "the leg"
+            verdict = "the leg is good" if good else f"measure {which} again ({node.mark.name})"
             said[f"Survey: {verdict}: {node.mark.note}."] = " ok" if good else " warning"
     return "".join(f'<div class="find{level}">{escape(text)}</div>' for text, level in said.items())
 

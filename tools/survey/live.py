@@ -7,7 +7,7 @@ import logging
 import threading
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
@@ -50,10 +50,11 @@ _Stamped: TypeAlias = RelativePose | Rejected | Attitude | Depth | Imu
 
 @dataclass(eq=False)
 class _JudgedRest:
-    """A rest, what it gives, and the checks that were said to fail."""
+    """A rest, what it gives, and the checks that were said to fail. start_ns: as first judged."""
 
     rest: Rest
     shot: Shot | None
+    start_ns: int
     said: set[str] | None = None
 
 
@@ -71,7 +72,7 @@ class LiveLegs:
 
     Mark of kind `leg` and name `good`: the leg carries no alarm. Of kind `alarm`: measure again; its name is the check.
     A rest is judged by what `survey legs` would say of it. Later rests may show more of an earlier one, by the usual
-    magnetic field: then the note begins with the earlier leg's time.
+    magnetic field: then the mark is of an earlier leg, and its note begins with that leg's name and time.
     """
 
     def __init__(self, settings: SurveySettings, limits: AlarmSettings) -> None:
@@ -128,7 +129,7 @@ class LiveLegs:
                 continue
             shot = None if rest.too_short else shoot(readings, seen, rest.chosen, self._settings, rest.unused)
             if known is None:
-                known = _JudgedRest(rest, shot)
+                known = _JudgedRest(rest, shot, rest.start_ns)
                 pair.judged.append(known)
             elif rest.end_ns > known.rest.end_ns:
                 known.rest, known.shot = rest, shot
@@ -142,26 +143,37 @@ class LiveLegs:
             node: self._usual([one.shot.ends[i].field for one in legs if one.shot is not None])
             for i, node in enumerate(pair.nodes)
         }
-        doubts = self._stations(pair, legs)
+        stations = self._stations(pair, legs)
         said = []
         for one in pair.judged:
+            which, doubts = stations.get(id(one), ("rest", []))
             if one.shot is None:
                 text = f"{one.rest.too_short}; a leg takes {self._settings.rest_s:g} s"
                 found, words = {"rest": text}, ""
             else:
                 leg = one_leg(one.shot, {node: node for node in pair.nodes}, pair.nodes[0])
-                texts = [*alarms.of_leg(leg, one.shot, usual, self._limits), *doubts[id(one)]]
+                texts = [*alarms.of_leg(leg, one.shot, usual, self._limits), *doubts]
                 found = {check: what for check, _, what in (text.partition(": ") for text in texts)}
                 words = _words(leg)
             fresh = {check: what for check, what in found.items() if check not in (one.said or set())}
-            late = "" if one is pair.judged[-1] else f"leg of {time_text(one.rest.start_ns)}: "
-            for node in pair.nodes:
-                said += [
-                    Mark(node=node, stamp_ns=now_ns, kind="alarm", name=check, note=late + what)
-                    for check, what in fresh.items()
-                ]
-                if one.said is None and not found:
-                    said.append(Mark(node=node, stamp_ns=now_ns, kind="leg", name="good", note=words))
+            earlier = one is not pair.judged[-1]
+            late = f"{which} of {time_text(one.start_ns)}: " if earlier else ""
+            new: list[tuple[Literal["alarm", "leg"], str, str]]
+            new = [("alarm", check, late + what) for check, what in fresh.items()]
+            new += [("leg", "good", words)] if one.said is None and not found else []
+            said += [
+                Mark(
+                    node=node,
+                    stamp_ns=now_ns,
+                    kind=kind,
+                    name=name,
+                    note=note,
+                    leg_ns=one.start_ns,
+                    earlier=earlier,
+                )
+                for node in pair.nodes
+                for kind, name, note in new
+            ]
             one.said = (one.said or set()) | set(found)
         return said
 
@@ -172,8 +184,8 @@ class LiveLegs:
         known = sum(one is not None for one in fields)
         return usual if known - 2 * others >= WITNESSES else None
 
-    def _stations(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, list[str]]:
-        """Return what is doubtful about each leg's stations, by the id of its rest."""
+    def _stations(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, tuple[str, list[str]]]:
+        """Return each leg's name, and what is doubtful about its stations, by the id of its rest."""
         named: list[dict[str, str]] = [{} for _ in legs]
         for mark in self._marks:
             at = rest_of(mark, [one.rest for one in legs])
@@ -187,10 +199,12 @@ class LiveLegs:
         first = self._settings.first if self._settings.first in pair.nodes else pair.nodes[0]
         standings = find_standings(stops, self._settings.procedure, first)
         lost = {id(pair.judged[i]) for i in range(1, len(pair.judged)) if pair.judged[i - 1].shot is None}
-        return {
-            id(one): doubt_of(standing.problem, stations, after_lost=id(one) in lost)
-            for one, standing, stations in zip(legs, standings, named, strict=True)
-        }
+        found = {}
+        for one, standing, stations in zip(legs, standings, named, strict=True):
+            ends = sorted(standing.station, key=lambda node: node != standing.rear)
+            name = "leg " + "-".join(standing.station[node] for node in ends)
+            found[id(one)] = name, doubt_of(standing.problem, stations, after_lost=id(one) in lost)
+        return found
 
 
 def _same(one: Rest, other: Rest) -> bool:

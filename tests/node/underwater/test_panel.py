@@ -95,6 +95,24 @@ def test_the_surveys_verdict_is_shown_for_ten_seconds():
         assert rig.panel._state.sound == VERDICT_BEEPS[verdict]
         rig.run(10.0)
         assert rig.panel._state.verdict is None
+    # Two alarms of one leg are one verdict; on the next leg the same verdict sounds again, and an earlier leg's waits.
+    beeps = []
+    for leg_ns, earlier, after_s in (
+        (1, False, 0.1),
+        (1, False, 0.1),
+        (2, True, 0.1),
+        (3, False, 4.0),
+        (3, False, 4.0),
+    ):
+        mark = Mark(node="a", stamp_ns=9, kind="alarm", name="sights", leg_ns=leg_ns, earlier=earlier)
+        rig.panel.hear(Received(MARK.key("a"), encode(mark), 7, ""))
+        rig.run(after_s)
+        beeps.append((rig.panel._state.verdict, rig.panel._state.verdict_ns))
+    rig.run(10.0)
+    verdicts, begun_ns = zip(*beeps, strict=True)
+    assert verdicts == (Verdict.AGAIN,) * 3 + (Verdict.EARLIER, Verdict.AGAIN)
+    assert len(set(begun_ns)) == 3
+    assert rig.panel._state.verdict is None
     # A mark of a station, the node's own among them, and what is no mark, say nothing of the leg.
     for payload in (encode(Mark(node="a", stamp_ns=7, kind="point")), b"{}"):
         rig.panel.hear(Received(MARK.key("a"), payload, 7, ""))
