@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import socket
 import subprocess
@@ -18,11 +19,35 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 PATIENCE_S = 180.0
 
 
+# The kernel gives ports from 32768 on to connections and to sockets that ask for any: such a port may be taken between
+# the choice and its use, and a client that tries again and again may even connect to itself.
+PORTS = range(20_000, 32_000)
+_reserved: list[socket.socket] = []
+_ports = random.SystemRandom()
+
+
 def free_endpoint() -> str:
-    """Return a loopback endpoint that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """Return a loopback endpoint whose port, of TCP and UDP, is free, and that no other test process gets."""
+    while True:
+        port = _ports.choice(PORTS)
+        if _reserve(port):
+            return f"tcp/127.0.0.1:{port}"
+
+
+def _reserve(port: int) -> bool:
+    """Keep a port from other test processes until this one ends; return False if it is in use."""
+    mark = socket.socket(socket.AF_UNIX)
+    try:
+        if sys.platform == "linux":
+            mark.bind(f"\0buddyline test port {port}")
+        for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+            with socket.socket(socket.AF_INET, kind) as probe:
+                probe.bind(("127.0.0.1", port))
+    except OSError:
+        mark.close()
+        return False
+    _reserved.append(mark)
+    return True
 
 
 def until(condition: Callable[[], object], pause_s: float = 0.005) -> None:

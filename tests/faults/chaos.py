@@ -21,12 +21,13 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Rejected
 
 from tests.faults.observer import Observer, Tally
-from tests.faults.scenarios import BACK_S, RATE_HZ, ip, namespace
+from tests.faults.scenarios import RATE_HZ, ip, namespace
 from tests.faults.system import System
 
 NAMES = ("hub", "solver", "a", "b", "recorder")
 LONGEST_S = 8.0
 PAUSE_S = 6.0
+RECOVER_S = 90.0
 
 Undo = Callable[[], object]
 
@@ -96,7 +97,7 @@ class Chaos:
             print(f"{time.time() % 10_000:.3f} all are back", file=sys.stderr, flush=True)
             since_ns = time.time_ns()
             try:
-                self._system.observer.wait_for_match(since_ns, 3 * BACK_S)
+                self._system.observer.wait_for_match(since_ns, RECOVER_S)
             except TimeoutError:
                 faults["not recovered"] += 1
                 self.explain()
@@ -114,6 +115,18 @@ def doubled(observer: Observer) -> list[str]:
         at_s, age_s = receive_ns / S_NS % 10_000, (receive_ns - outcome.stamp_ns) / S_NS
         by_trigger[outcome.trigger].append(f"{word} at {at_s:.3f} s, {age_s:.2f} s old")
     return [f"{trigger}: {'; '.join(words)}" for trigger, words in sorted(by_trigger.items()) if len(words) > 1]
+
+
+def unanswered(observer: Observer) -> list[str]:
+    """Return a line for each trigger without an outcome: its frames, when they were received, and how old."""
+    answered = {outcome.trigger for outcome, _ in observer.outcomes}
+    by_trigger: dict[int, list[str]] = defaultdict(list)
+    for frame, receive_ns in observer.frames:
+        at_s, age_s = receive_ns / S_NS % 10_000, (receive_ns - frame.stamp_ns) / S_NS
+        by_trigger[frame.trigger].append(f"{frame.node} {frame.boot} {frame.seq} at {at_s:.3f} s, {age_s:.2f} s old")
+    return [
+        f"{trigger}: {'; '.join(words)}" for trigger, words in sorted(by_trigger.items()) if trigger not in answered
+    ]
 
 
 def main() -> int:
@@ -135,10 +148,10 @@ def main() -> int:
         observer = system.observe()
         for one in NAMES[1:]:
             chaos.spawn(one)
-        observer.wait_for_match(0, 2 * BACK_S)
+        observer.wait_for_match(0, RECOVER_S)
         faults, recovered_s = chaos.do(args.seconds, rng)
         tally: Tally = system.finish()
-        for line in doubled(observer):
+        for line in [*doubled(observer), "without an outcome:", *unanswered(observer)]:
             print(line, file=sys.stderr)
     found = {
         "rounds": len(recovered_s),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -20,6 +19,8 @@ from buddyline.tools.live import follow, open_bus_within
 # Frames exposed in the last moment before a node was stopped may not have been sent.
 END_NS = S_NS
 CONNECT_S = 20.0
+# The longest wait for the outcomes of the last frames.
+SETTLE_S = 30.0
 
 Frame = tuple[str, str, int]  # node, boot, seq
 Outcome = Rejected | RelativePose
@@ -91,12 +92,14 @@ class Observer:
         first = [r for o, r in self.outcomes if o.stamp_ns >= since_ns and _matched(o)]
         return min(first)
 
-    def settle(self, quiet_s: float = 3.0, timeout_s: float = 20.0) -> None:
-        """Wait until nothing has come for a while."""
-        ends_s = time.monotonic() + timeout_s
+    def settle(self, timeout_s: float = SETTLE_S) -> None:
+        """Wait until all triggers have an outcome."""
+
+        def all_answered() -> bool:
+            return {frame.trigger for frame, _ in self.frames} <= {outcome.trigger for outcome, _ in self.outcomes}
+
         with self._changed:
-            while time.monotonic() < ends_s and self._changed.wait(quiet_s):
-                pass
+            self._changed.wait_for(all_answered, timeout_s)
 
     def tally(self, logs: Iterable[Path]) -> Tally:
         """Compare with the nodes' own logs, from the first frame of each boot that was on the bus."""

@@ -18,9 +18,10 @@ from buddyline.protocol.divelog import DiveLogReader
 
 from tests.faults.observer import Tally
 from tests.faults.system import System
+from tests.processes import PATIENCE_S
 
 RATE_HZ = 5.0
-BACK_S = 30.0
+BACK_S = PATIENCE_S
 CUT_S = 15.0
 FREEZE_S = 5.0
 

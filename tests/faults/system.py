@@ -30,8 +30,6 @@ rate_hz = {preview_hz}
 environment = "basin"
 """
 
-# A node may have to render its pictures first.
-START_S = 60.0
 READY = {"hub": "listens", "a": "connected", "b": "connected", "solver": "connected", "recorder": "into"}
 READY |= {"monitor": "look at"}
 
@@ -89,7 +87,7 @@ class System:
     def start(self, *names: str) -> None:
         """Start processes, each once the one before is ready."""
         for name in names:
-            self.spawn(name).wait_for(READY[name], timeout=START_S)
+            self.spawn(name).wait_for(READY[name])
 
     def observe(self) -> Observer:
         """Connect the observer; the hub must be there."""

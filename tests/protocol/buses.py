@@ -15,6 +15,13 @@ NOW_NS = 1_700_000_000_000_000_000
 Connect = Callable[[], Bus]
 
 
+def wait_until_heard(bus: Bus, keys: str, count: int) -> None:
+    """Wait until a client has so many messages: then the hub knows their publishers, and where their history is."""
+    inbox = Inbox()
+    bus.subscribe(keys, inbox)
+    inbox.wait_for(count)
+
+
 def rejected(trigger: int) -> Rejected:
     return Rejected(node_a="a", node_b="b", stamp_ns=trigger, trigger=trigger, reason="late")
 

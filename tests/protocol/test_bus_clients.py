@@ -11,7 +11,7 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.messages import Candidates, Depth
 
 from tests.processes import PATIENCE_S, until
-from tests.protocol.buses import Connect, depth, rejected, triggers
+from tests.protocol.buses import Connect, depth, rejected, triggers, wait_until_heard
 from tests.protocol.inbox import Inbox
 
 
@@ -92,6 +92,7 @@ def test_closing_lets_the_handler_finish_the_queue(client: Connect) -> None:
     publisher, inbox = client().publisher(topics.REJECTED, "a", "b"), Inbox()
     for trigger in range(200):
         publisher.put(rejected(trigger))
+    wait_until_heard(client(), "buddyline/pair/a/b/rejected", 200)
     client().subscribe("buddyline/pair/a/b/rejected", inbox).close()
     assert triggers(inbox) == list(range(200))
 

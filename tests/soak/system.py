@@ -16,7 +16,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.tools.measure.load import Load, load_of
 
 from tests.faults.system import System
-from tests.processes import Process
+from tests.processes import PATIENCE_S, Process
 from tests.soak.meter import Stream, Streams, Viewer, stamps_of, streams_of
 
 RATE_HZ = 30.0
@@ -81,10 +81,11 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
         pace = stack.enter_context(Process(module="buddyline.tools.measure.pace"))
         _measure(result, processes, viewer, pace, seconds, every_s, show)
         statuses = {name: processes[name].end() for name in ("a", "b")}
-        # The solver takes a pause of 2.5 s for the end of a dive; the recorder then needs a second for its messages.
-        _settle(viewer)
+        _wait_at_most(PATIENCE_S, lambda: set(viewer.streams.triggers) <= set(viewer.streams.outcomes))
         statuses["solver"] = processes["solver"].end()
-        time.sleep(1.0)
+        # The recorder writes what it has once a second.
+        outcomes = set(viewer.streams.outcomes)
+        _wait_at_most(PATIENCE_S, lambda: outcomes <= set(streams_of(directory / "recorder.mcap").outcomes))
         statuses |= {name: processes[name].end() for name in processes if name not in statuses and name != "hub"}
         result.failures += [f"{name}: exit status {status}" for name, status in statuses.items() if status]
         for name, process in processes.items():
@@ -95,12 +96,11 @@ def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute
     return result
 
 
-def _settle(viewer: Viewer) -> None:
-    """Wait until no outcome has come for four seconds: a loaded machine has a backlog."""
-    before = None
-    while (now := sum(n for key, n in viewer.counts().items() if key.endswith(("/pose", "/rejected")))) != before:
-        before = now
-        time.sleep(4.0)
+def _wait_at_most(seconds: float, condition: Callable[[], bool]) -> None:
+    """Wait for a condition, which may never come: a loaded machine has a backlog."""
+    ends_s = time.monotonic() + seconds
+    while not condition() and time.monotonic() < ends_s:
+        time.sleep(0.5)
 
 
 def _measure(

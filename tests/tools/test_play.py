@@ -17,6 +17,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.play import Player, _selected, _span
 from msgspec.structs import replace
 
+from tests.processes import PATIENCE_S
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 from tests.tools.evaluated import track
 
@@ -150,7 +151,7 @@ def test_fast_playback_without_a_solver_does_not_wait(log, monkeypatch):
         late = [replace(frame, time_ns=frame.time_ns + k * S_NS) for k, frame in enumerate(frames)]
         playing = threading.Thread(target=lambda: [player.send(frame) for frame in late])
         playing.start()
-        playing.join(20)
+        playing.join(PATIENCE_S)
         stop.set()
         playing.join()
     assert player.sent == len(frames)

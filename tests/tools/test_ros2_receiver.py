@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.topics import ATTITUDE, DEPTH, INFO, POSE
 
+from tests.processes import free_endpoint
 from tests.tools.evaluated import INFOS, pose
 from tests.tools.watched import at, attitude, depth
 
@@ -65,9 +65,7 @@ def receiver(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
 def port() -> Iterator[int]:
     from buddyline.protocol.zenoh_bus import open_hub
 
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        number = int(probe.getsockname()[1])
+    number = int(free_endpoint().rpartition(":")[2])
     with open_hub(f"tcp/127.0.0.1:{number}"):
         yield number
 
