@@ -22,7 +22,8 @@ class Outlet:
     """Records and publishes; safe to use from several threads.
 
     Messages sent while there is no bus are in the log only. When the bus connects, the last message of each
-    latest-only topic (info, status) is sent again. boot: of this run; signer: signs the digests of what was sent.
+    latest-only topic (info, status) is sent again. All are of this node. boot: of this run; signer:
+    signs the digests of what was sent.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class Outlet:
         self._bus: Bus | None = None
         self._publishers: dict[str, Publisher] = {}
         self._latest: dict[str, Message] = {}
+        self._keys: dict[str, str] = {}
         self._book = DigestBook(node, boot, clock.now_ns())
         self._sign = None if signer is None else signer.sign
 
@@ -61,7 +63,10 @@ class Outlet:
         topic = topic_of(message)
         self._book.add(topic, payload_stamp_ns(payload) or 0, payload)
         if record:
-            self._recorder.write(key_of(message), payload, self._clock.now_ns())
+            key = self._keys.get(topic.name)
+            if key is None:
+                key = self._keys[topic.name] = key_of(message)
+            self._recorder.write(key, payload, self._clock.now_ns())
         self.sent[topic.name] += 1
         if topic.latest_only:
             self._latest[topic.name] = message

@@ -280,11 +280,16 @@ class NodeService(Service):
 
     def _read(self, source: Source) -> None:
         while not self.stop.is_set():
+            steps = self.clock.steps
             messages = source.next_messages(self.stop)
             if messages is None:
                 self._ended.add(source.name)
                 return
             self._last_s[source.name] = time.monotonic()
+            if steps != self.clock.steps:
+                # Some of their stamps are of the clock before it was set.
+                self.drops["clock_set"] += len(messages)
+                continue
             for message in messages:
                 self.outlet.send(message)
 

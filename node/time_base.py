@@ -15,7 +15,7 @@ from typing import Final
 
 from buddyline.node.chrony import ChronyError, Tracking, read_tracking
 from buddyline.node.drivers.readout import boottime_ns, clock_offset_ns
-from buddyline.protocol.clock import MS_NS, S_NS
+from buddyline.protocol.clock import MS_NS, S_NS, sleep_ns
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +66,7 @@ class NodeClock:
 
     def wait_until_ns(self, instant_ns: int, stop: threading.Event) -> bool:
         """Sleep until instant_ns; return True if stop is set before then."""
-        remaining_ns = instant_ns - self.now_ns()
-        return stop.wait(remaining_ns / S_NS) if remaining_ns > 0 else stop.is_set()
+        return sleep_ns(instant_ns - self.now_ns(), stop)
 
     def reading(self) -> tuple[int, int]:
         """Return the present time, and CLOCK_MONOTONIC_RAW at the same instant."""

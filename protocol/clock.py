@@ -8,6 +8,7 @@ from typing import Protocol
 
 S_NS = 1_000_000_000
 MS_NS = 1_000_000
+SHORT_NS = 20 * MS_NS
 # A message whose stamp is this near to the receive time is of a live dive; any other, of a stored dive that is played.
 LIVE_WITHIN_NS = 60 * S_NS
 
@@ -24,6 +25,18 @@ class Clock(Protocol):
         ...
 
 
+def sleep_ns(duration_ns: int, stop: threading.Event) -> bool:
+    """Sleep; return True if stop is set at the end, or for a long sleep, before it.
+
+    A short sleep costs half as much as waiting for an event, and a stop can wait for its end.
+    """
+    if duration_ns > SHORT_NS:
+        return stop.wait(duration_ns / S_NS)
+    if duration_ns > 0 and not stop.is_set():
+        time.sleep(duration_ns / S_NS)
+    return stop.is_set()
+
+
 class SystemClock:
     """The machine's own wall clock."""
 
@@ -33,8 +46,7 @@ class SystemClock:
 
     def wait_until_ns(self, instant_ns: int, stop: threading.Event) -> bool:
         """Sleep until instant_ns; return True if stop is set before then."""
-        remaining_ns = instant_ns - time.time_ns()
-        return stop.wait(max(remaining_ns, 0) / S_NS) if remaining_ns > 0 else stop.is_set()
+        return sleep_ns(instant_ns - time.time_ns(), stop)
 
 
 class ManualClock:

@@ -44,7 +44,7 @@ class DigestBook:
         if not is_covered(topic):
             return
         name = end_of(topic)
-        count, first_ns, last_ns, hashed = self._open.get(name, (0, stamp_ns, -1, hashlib.sha256()))
+        count, first_ns, last_ns, hashed = self._open.get(name) or (0, stamp_ns, -1, hashlib.sha256())
         # Pictures are recorded and shown each at its own rate: each is a stretch of its own.
         if count and (stamp_ns <= last_ns or topic is IMAGE):
             self._end(name)

@@ -258,6 +258,7 @@ EVERYTHING: Final = "buddyline/**"
 LOG: Final = "buddyline/node/{node}/log"
 
 _NODE_ID = re.compile(NODE_ID_PATTERN)
+_FIRST: Final = {topic.schema: topic for topic in reversed(TOPICS)}
 _PATTERNS: Final = [
     (
         topic,
@@ -290,10 +291,10 @@ def topic_of(message: Message) -> Topic:
         return TRACK_LAG
     if isinstance(message, messages.NodePose) and message.mode == "truth":
         return NET_TRUTH
-    for topic in TOPICS:
-        if topic.schema is type(message):
-            return topic
-    raise TypeError(f"no topic carries {type(message).__name__}")
+    topic = _FIRST.get(type(message))
+    if topic is None:
+        raise TypeError(f"no topic carries {type(message).__name__}")
+    return topic
 
 
 def key_of(message: Message) -> str:

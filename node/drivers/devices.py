@@ -17,7 +17,16 @@ from buddyline.node.drivers.depth import SurfaceZero, depth_m, load_zero, save_z
 from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.registry import NONE, check_names, open_depth, open_imu
-from buddyline.node.drivers.samples import DepthDevice, DepthSample, DeviceError, ImuDevice, ImuSample, Vector
+from buddyline.node.drivers.samples import (
+    DepthDevice,
+    DepthSample,
+    DeviceError,
+    ImuDevice,
+    ImuReading,
+    ImuSample,
+    SettlingError,
+    Vector,
+)
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import Depth, Imu, Message, Vector3
 from msgspec import UNSET, UnsetType
@@ -25,6 +34,9 @@ from msgspec import UNSET, UnsetType
 log = logging.getLogger(__name__)
 
 IMU_PERIOD_NS: Final = 10 * MS_NS
+# So many readings are decoded, estimated, recorded and sent together, 50 ms: no later than the picture of the same
+# instant has been read out and searched.
+BLOCK: Final = 5
 LONGEST_WAIT_NS: Final = 50 * MS_NS
 REOPEN_NS: Final = 2 * S_NS
 
@@ -47,7 +59,7 @@ class Metronome:
 
 
 class ImuSource:
-    """The inertial unit at 100 Hz, and the attitude estimated from it."""
+    """The inertial unit at 100 Hz, and the attitude estimated from it, BLOCK samples at a time."""
 
     name = "imu"
 
@@ -65,6 +77,7 @@ class ImuSource:
         self._attitude = attitude
         self._clock = clock
         self._device: ImuDevice | None = None
+        self._readings: list[ImuReading] = []
         self._turn = Metronome(IMU_PERIOD_NS, clock)
         self._health = DeviceHealth(self.name)
         self._compass = DeviceHealth("compass")
@@ -81,25 +94,51 @@ class ImuSource:
         return self._bus.retries
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
-        """Wait for the next sample."""
+        """Wait for the next block of samples; a failure ends it early."""
         while not self._turn.wait(stop):
-            try:
-                if self._device is None:
-                    self._device = self._open()
-                sample = self._device.read()
-            except DeviceError as error:
-                self._health.update(str(error))
-                if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
-                    return None
+            failed = self._fetch()
+            if not failed and len(self._readings) < BLOCK:
                 continue
-            self._health.update(self._device.problem)
-            return self._messages(sample)
-        return None
+            samples, problem = self._decode()
+            self._health.update(failed or problem)
+            if samples:
+                return [message for sample in samples for message in self._messages(sample)]
+            if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
+                return None
+        samples, _ = self._decode()
+        return [message for sample in samples for message in self._messages(sample)] or None
+
+    def _fetch(self) -> str:
+        """Take a reading; return why there is none, "" if there is."""
+        try:
+            if self._device is None:
+                self._device = self._open()
+            self._readings.append(self._device.fetch())
+        except DeviceError as error:
+            return str(error)
+        return ""
+
+    def _decode(self) -> tuple[list[ImuSample], str]:
+        """Return the samples of the readings, and what is wrong with the device ("" if nothing)."""
+        readings, self._readings = self._readings, []
+        device, samples, settling = self._device, [], ""
+        if device is None:
+            return [], ""
+        for reading in readings:
+            try:
+                samples.append(device.decode(reading))
+                settling = ""
+            except SettlingError as error:
+                settling = str(error)
+            except DeviceError as error:
+                return samples, str(error)
+        return samples, settling or device.problem
 
     def _messages(self, sample: ImuSample) -> list[Message]:
         # The attitude is to be the same from the log, which has no more than this.
         degc = self._temperature(sample)
-        sample = replace(sample, temperature_degc=None if degc is UNSET else degc)
+        if degc != sample.temperature_degc:
+            sample = replace(sample, temperature_degc=None if degc is UNSET else degc)
         messages: list[Message] = [
             Imu(
                 node=self._node,

@@ -6,13 +6,14 @@ from typing import Final, Protocol, Self
 
 import numpy as np
 from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.l3gd20h import GYRO_RADPS_PER_COUNT, L3gd20h
+from buddyline.node.drivers.l3gd20h import GYRO_RADPS_PER_COUNT, L3gd20h, decode_gyro, decode_temperature
 from buddyline.node.drivers.lis3mdl import Lis3mdl
+from buddyline.node.drivers.lis3mdl import decode_mag as decode_lis3mdl
 from buddyline.node.drivers.lsm6ds import Lsm6ds, Lsm6ds33, Lsm6dso
-from buddyline.node.drivers.lsm303d import ACCEL_MPS2_PER_COUNT, Lsm303d
-from buddyline.node.drivers.samples import DeviceError, ImuSample, Vector
+from buddyline.node.drivers.lsm303d import ACCEL_MPS2_PER_COUNT, Lsm303d, decode_accel
+from buddyline.node.drivers.samples import DeviceError, ImuReading, ImuSample, SettlingError, Vector
 from buddyline.node.drivers.st_chip import WHO_AM_I, StChip
-from buddyline.node.drivers.watch import FULL_SCALE_COUNTS, SensorWatch, SettingsWatch, SettlingError
+from buddyline.node.drivers.watch import FULL_SCALE_COUNTS, SensorWatch, SettingsWatch
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from numpy.typing import NDArray
@@ -34,17 +35,16 @@ class MotionSensor(Protocol):
     @property
     def watches(self) -> tuple[SensorWatch, SensorWatch]: ...  # noqa: D102
 
-    @property
-    def temperature_degc(self) -> float | None:
-        """Of the gyroscope, when it was read last; None before that."""
-        ...
-
     def start(self) -> None:
         """Check the identities and write the settings."""
         ...
 
-    def read_motion(self) -> tuple[Vector, Vector]:
-        """Return specific force in m/s2 and angular rate in rad/s, (3,) each."""
+    def read_motion(self) -> bytes:
+        """Return the newest reading, for `decode`."""
+        ...
+
+    def decode(self, data: bytes) -> tuple[Vector, Vector, float]:
+        """Return specific force in m/s2 and angular rate in rad/s, (3,) each, and the gyroscope's degrees C."""
         ...
 
 
@@ -55,7 +55,11 @@ class Magnetometer(Protocol):
         """Check the identity and write the settings."""
         ...
 
-    def read_mag(self) -> Vector:
+    def read_mag(self) -> bytes:
+        """Return the newest reading, for `decode_mag`."""
+        ...
+
+    def decode_mag(self, data: bytes) -> Vector:
         """Return the magnetic field in T, (3,)."""
         ...
 
@@ -72,19 +76,18 @@ class MotionChipPair:
             SensorWatch("L3GD20H gyroscope", l3gd20h, FULL_SCALE_COUNTS * GYRO_RADPS_PER_COUNT),
         )
 
-    @property
-    def temperature_degc(self) -> float | None:
-        """Of the gyroscope, when it was read last; None before that."""
-        return self._l3gd20h.temperature_degc
-
     def start(self) -> None:
         """Check the identities and write the settings."""
         self._lsm303d.start()
         self._l3gd20h.start()
 
-    def read_motion(self) -> tuple[Vector, Vector]:
-        """Return specific force in m/s2 and angular rate in rad/s, (3,) each."""
-        return self._lsm303d.read_accel(), self._l3gd20h.read_gyro()
+    def read_motion(self) -> bytes:
+        """Return six bytes of the accelerometer and eight of the gyroscope."""
+        return self._lsm303d.read_accel() + self._l3gd20h.read_gyro()
+
+    def decode(self, data: bytes) -> tuple[Vector, Vector, float]:
+        """Return specific force in m/s2 and angular rate in rad/s, (3,) each, and the gyroscope's degrees C."""
+        return decode_accel(data[:6]), decode_gyro(data[8:]), decode_temperature(data[6:])
 
 
 class SoughtLis3mdl:
@@ -105,11 +108,15 @@ class SoughtLis3mdl:
             )
         self._chip.start()
 
-    def read_mag(self) -> Vector:
-        """Return the magnetic field in T, (3,)."""
+    def read_mag(self) -> bytes:
+        """Return the newest reading, for `decode_mag`."""
         if self._chip is None:
             raise self._bus.error(Lis3mdl.ADDRESSES[0], WHO_AM_I, f"{Lis3mdl.NAME}: not started")
         return self._chip.read_mag()
+
+    def decode_mag(self, data: bytes) -> Vector:
+        """Return the magnetic field in T, (3,)."""
+        return decode_lis3mdl(data)
 
 
 class ImuBoard:
@@ -165,40 +172,52 @@ class ImuBoard:
         self._accel_watch.restart(now_ns)
         self._gyro_watch.restart(now_ns)
 
-    def read(self) -> ImuSample:
-        """Return the newest sample; raise DeviceError if there is none. The next call tries again."""
+    def fetch(self) -> ImuReading:
+        """Read the chips; raise DeviceError if they do not answer. The next call tries again."""
         try:
             if not self._motion_ready:
                 self._start_motion()
             stamp_ns = self._clock.now_ns()
-            accel_mps2, gyro_radps = self._motion.read_motion()
+            motion = self._motion.read_motion()
+            self._settings.look(stamp_ns)
+        except DeviceError:
+            self._lose_motion()
+            raise
+        return ImuReading(stamp_ns, motion, self._read_mag(stamp_ns))
+
+    def decode(self, reading: ImuReading) -> ImuSample:
+        """Return the sample of a reading, in their order; raise DeviceError if the chips did not measure it."""
+        stamp_ns, R = reading.stamp_ns, self._R_body_chip
+        accel_mps2, gyro_radps, temperature_degc = self._motion.decode(reading.motion)
+        try:
             saturated = [
                 name
-                for name, watch, reading in (
+                for name, watch, values in (
                     ("accelerometer", self._accel_watch, accel_mps2),
                     ("gyroscope", self._gyro_watch, gyro_radps),
                 )
-                if watch.is_saturated(reading, stamp_ns)
+                if watch.is_saturated(values, stamp_ns)
             ]
-            self._settings.look(stamp_ns)
         except SettlingError:
             raise
         except DeviceError:
-            # The cause may have reset the board's other chips as well.
-            self._motion_ready = self._mag_ready = False
-            self._mag_retry_ns = 0
+            self._lose_motion()
             raise
-        mag_t = self._read_mag(stamp_ns)
         self._note_saturation(saturated, stamp_ns)
-        R = self._R_body_chip
+        mag = self._magnetometer
         return ImuSample(
             stamp_ns,
             R @ accel_mps2,
             R @ gyro_radps,
-            None if mag_t is None else R @ mag_t,
+            None if mag is None or reading.mag is None else R @ mag.decode_mag(reading.mag),
             bool(saturated),
-            self._motion.temperature_degc,
+            temperature_degc,
         )
+
+    def _lose_motion(self) -> None:
+        # The cause may have reset the board's other chips as well.
+        self._motion_ready = self._mag_ready = False
+        self._mag_retry_ns = 0
 
     def _note_saturation(self, names: list[str], now_ns: int) -> None:
         if names:
@@ -206,7 +225,7 @@ class ImuBoard:
         elif self._saturated and not 0 <= now_ns - self._saturated_ns < SATURATION_SHOWN_NS:
             self._saturated = ""
 
-    def _read_mag(self, now_ns: int) -> Vector | None:
+    def _read_mag(self, now_ns: int) -> bytes | None:
         waiting = self._mag_retry_ns - MAG_RETRY_NS <= now_ns < self._mag_retry_ns
         if self._magnetometer is None or (not self._mag_ready and waiting):
             return None
@@ -214,14 +233,14 @@ class ImuBoard:
             if not self._mag_ready:
                 self._magnetometer.start()
                 self._mag_ready = True
-            mag_t = self._magnetometer.read_mag()
-            if not mag_t.any():
+            data = self._magnetometer.read_mag()
+            if not any(data):
                 raise DeviceError(f"{self.name}: the magnetometer reads zero on all axes")
         except DeviceError as error:
             self._lose_mag(now_ns, error)
             return None
         self._mag_problem = ""
-        return mag_t
+        return data
 
     def _lose_mag(self, now_ns: int, error: DeviceError) -> None:
         self._mag_ready = False

@@ -39,10 +39,6 @@ class L3gd20h(StChip):
         (0x20, 0x6F),  # CTRL1: 200 Hz, all axes on
     )
 
-    temperature_degc: float | None = None
-
-    def read_gyro(self) -> Vector:
-        """Return the angular rate in rad/s, (3,)."""
-        data = self.bus.read(self.address, OUT_TEMPERATURE | AUTO_INCREMENT, 8)
-        self.temperature_degc = decode_temperature(data)
-        return decode_gyro(data[2:])
+    def read_gyro(self) -> bytes:
+        """Return eight bytes: temperature, status, and six of the rates, for `decode_gyro`."""
+        return self.bus.read(self.address, OUT_TEMPERATURE | AUTO_INCREMENT, 8)

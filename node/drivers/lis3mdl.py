@@ -32,6 +32,10 @@ class Lis3mdl(StChip):
         (0x22, 0x00),  # CTRL_REG3: continuous conversion
     )
 
-    def read_mag(self) -> Vector:
+    def read_mag(self) -> bytes:
+        """Return the six bytes of the magnetometer."""
+        return self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6)
+
+    def decode_mag(self, data: bytes) -> Vector:
         """Return the magnetic field in T, (3,)."""
-        return decode_mag(self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6))
+        return decode_mag(data)

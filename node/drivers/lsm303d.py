@@ -39,10 +39,14 @@ class Lsm303d(StChip):
         (0x26, 0x00),  # CTRL7: continuous conversion
     )
 
-    def read_accel(self) -> Vector:
-        """Return the specific force in m/s2, (3,)."""
-        return decode_accel(self.bus.read(self.address, OUT_ACCEL | AUTO_INCREMENT, 6))
+    def read_accel(self) -> bytes:
+        """Return the six bytes of the accelerometer, for `decode_accel`."""
+        return self.bus.read(self.address, OUT_ACCEL | AUTO_INCREMENT, 6)
 
-    def read_mag(self) -> Vector:
+    def read_mag(self) -> bytes:
+        """Return the six bytes of the magnetometer."""
+        return self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6)
+
+    def decode_mag(self, data: bytes) -> Vector:
         """Return the magnetic field in T, (3,)."""
-        return decode_mag(self.bus.read(self.address, OUT_MAG | AUTO_INCREMENT, 6))
+        return decode_mag(data)

@@ -38,7 +38,6 @@ class Lsm6ds(StChip):
         (0x11, 0x54),  # CTRL2_G: 208 Hz, +-500 deg/s
     )
 
-    temperature_degc: float | None = None
     _counts_per_degc = 256.0
 
     def start(self) -> None:
@@ -59,11 +58,13 @@ class Lsm6ds(StChip):
         """Return the chips whose settings are to be checked."""
         return (self,)
 
-    def read_motion(self) -> tuple[Vector, Vector]:
-        """Return specific force in m/s2 and angular rate in rad/s, (3,) each."""
-        data = self.bus.read(self.address, OUT_TEMPERATURE, 14)
-        self.temperature_degc = decode_temperature(data, self._counts_per_degc)
-        return decode_motion(data[2:])
+    def read_motion(self) -> bytes:
+        """Return the fourteen bytes of temperature, gyroscope and accelerometer."""
+        return self.bus.read(self.address, OUT_TEMPERATURE, 14)
+
+    def decode(self, data: bytes) -> tuple[Vector, Vector, float]:
+        """Return specific force in m/s2 and angular rate in rad/s, (3,) each, and the temperature in degrees C."""
+        return *decode_motion(data[2:]), decode_temperature(data, self._counts_per_degc)
 
 
 class Lsm6ds33(Lsm6ds):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
@@ -20,6 +20,18 @@ class DeviceError(BuddylineError):
 
 class AbsentError(DeviceError):
     """A device that is absent, or in use elsewhere; it may become available later."""
+
+
+class SettlingError(DeviceError):
+    """A chip that was just started and has no reading yet; it needs no restart."""
+
+
+class ImuReading(NamedTuple):
+    """What an inertial unit's chips said, as bytes. mag: None without a magnetometer."""
+
+    stamp_ns: int
+    motion: bytes
+    mag: bytes | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +71,8 @@ class BatterySample:
 class ImuDevice(Protocol):
     """Accelerometer, gyroscope and, on most boards, magnetometer.
 
+    It is read a hundred times a second, and its readings are decoded some at a time: the processor's caches are cold
+    after each wait, and a reading then costs several times what the next one does.
     problem: what is wrong although samples come; "" if nothing.
     """
 
@@ -67,8 +81,16 @@ class ImuDevice(Protocol):
     @property
     def problem(self) -> str: ...  # noqa: D102
 
-    def read(self) -> ImuSample:
-        """Return the newest sample; raise DeviceError if there is none. The next call tries again."""
+    def fetch(self) -> ImuReading:
+        """Return the newest reading; raise DeviceError if there is none. The next call tries again."""
+        ...
+
+    def decode(self, reading: ImuReading) -> ImuSample:
+        """Return the sample of a reading, in their order; raise DeviceError if the chips did not measure it.
+
+        SettlingError: they have just been started. Any other: they are started again, and what was read meanwhile does
+        not count.
+        """
         ...
 
 

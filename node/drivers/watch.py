@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from buddyline.node.drivers.samples import DeviceError, Vector
+from buddyline.node.drivers.samples import DeviceError, SettlingError, Vector
 from buddyline.node.drivers.st_chip import StChip
 from buddyline.protocol.clock import MS_NS, S_NS
 
@@ -18,10 +18,6 @@ ZERO_READINGS: Final = 3
 SETTLING_NS: Final = 500 * MS_NS
 CHECK_NS: Final = S_NS
 FULL_SCALE_COUNTS: Final = 32_700  # of 32,768
-
-
-class SettlingError(DeviceError):
-    """A chip that was just started and has no reading yet; it needs no restart."""
 
 
 class SensorWatch:

@@ -40,14 +40,14 @@ def bus_rates(board: str, bit_hz: int) -> str:
             imu, depth = open_imu(bus, board, clock=clock), open_depth(bus, clock=clock)
             began_ns = clock.now_ns()
             for _ in range(200):
-                imu.read()
+                imu.decode(imu.fetch())
             alone_hz = 200 * S_NS / (clock.now_ns() - began_ns)
             began_ns = next_ns = clock.now_ns()
             samples = depths = busy_ns = worst_ns = 0
             while (now_ns := clock.now_ns()) < began_ns + SECONDS * S_NS:
                 if next_ns <= now_ns:
                     worst_ns = max(worst_ns, now_ns - next_ns)
-                    imu.read()
+                    imu.decode(imu.fetch())
                     samples += 1
                     next_ns += IMU_PERIOD_NS
                 elif depth.next_due_ns <= now_ns:

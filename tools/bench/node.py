@@ -1,7 +1,8 @@
 """The cost of a whole node: time from a picture in memory to its candidates on the bus, processor, memory, log.
 
-The node runs in this process as on a Pi: a picture at each trigger, an inertial unit at 100 Hz with its attitude
-filter, depth at 20 Hz, detector, log, recorded pictures and previews, and a real hub on loopback. Another process has
+The node runs in this process as on a Pi: a picture at each trigger, the drivers of a MinIMU-9 v6 at 100 Hz with its
+attitude filter and of a Bar30 at 20 Hz over a bus in memory, detector, log, recorded pictures and previews, and a real
+hub on loopback. Another process has
 rendered the pictures before; each is copied from memory, as the camera's driver does. The measured time begins with
 that copy, and ends when the bus has taken the candidates. Exposure, readout and the camera's own pipeline are not in
 it.
@@ -17,7 +18,7 @@ import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 from buddyline.node.attitude import VqfAttitude
@@ -30,14 +31,14 @@ from buddyline.node.config import (
     SimulationConfig,
 )
 from buddyline.node.devices import Frame, Source
-from buddyline.node.drivers.devices import ImuSource
-from buddyline.node.drivers.i2c import I2cBus
-from buddyline.node.drivers.samples import ImuSample
+from buddyline.node.drivers.devices import DepthSource, ImuSource
+from buddyline.node.drivers.registry import open_depth, open_imu
 from buddyline.node.geomagnetism import MagnetometerCalibration
 from buddyline.node.service import NodeService
 from buddyline.protocol.clock import S_NS, Clock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, Message, NodeInfo
+from buddyline.tools.bench.prepared_bus import PreparedBus
 from buddyline.tools.measure.children import Child, free_endpoint
 from buddyline.tools.measure.load import load_of, thread_times_s
 from numpy.typing import NDArray
@@ -47,9 +48,6 @@ WARM_UP_S: Final = 5.0
 # A thread with less of a core is not named.
 SHOWN: Final = 2e-4
 CONNECT_S: Final = 20.0
-IMU_NOISE: Final = (0.01, 0.001, 3e-7)
-FORCE_MPS2: Final = np.array([0.0, 0.0, -9.81])
-FIELD_T: Final = np.array([2.2e-5, 0.0, 4.4e-5])
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -139,33 +137,6 @@ class PreparedCamera:
         """Nothing to free."""
 
 
-class PreparedImu:
-    """An inertial unit at rest, with noise, without the cost of a bus."""
-
-    name = "prepared"
-    problem = ""
-
-    def __init__(self) -> None:
-        rng = np.random.default_rng(1)
-        self._noise = rng.normal(size=(1000, 3, 3)) * np.array(IMU_NOISE)[:, None]
-        self._number = 0
-
-    def read(self) -> ImuSample:
-        """Return a sample with the present time."""
-        self._number += 1
-        accel, gyro, mag = self._noise[self._number % len(self._noise)]
-        return ImuSample(time.time_ns(), accel + FORCE_MPS2, gyro, mag + FIELD_T)
-
-
-class NoBus:
-    """Replaces the I2C bus of a device that needs none."""
-
-    retries = 0
-
-    def close(self) -> None:
-        """Nothing to free."""
-
-
 class MeasuredNode(NodeService):
     """A node that measures each frame. times_s: from the start of the copy until the bus has taken the candidates."""
 
@@ -188,14 +159,14 @@ class MeasuredNode(NodeService):
 
 
 def _sensors(config: NodeConfig, clock: Clock) -> list[Source]:
-    from buddyline.node.sim.devices import SimulatedSensor, scenario_of
-    from buddyline.node.sim.world import World
-
-    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
-    calibrated = MagnetometerCalibration(np.full(3, 1e-12), np.eye(3))
-    imu = ImuSource(config.node, cast(I2cBus, NoBus()), PreparedImu, VqfAttitude(calibrated), clock)
-    depth = SimulatedSensor("depth", 20, lambda stamp_ns: world.depth(config.node, stamp_ns), clock)
-    return [imu, depth]
+    bus = PreparedBus()
+    zero_path = Path(config.record.directory) / "surface.json"
+    attitude = VqfAttitude(MagnetometerCalibration(np.full(3, 1e-12), np.eye(3)))
+    density_kgpm3 = config.sensors.water_density_kgpm3
+    return [
+        ImuSource(config.node, bus, lambda: open_imu(bus, clock=clock), attitude, clock),
+        DepthSource(config.node, bus, lambda: open_depth(bus, clock=clock), density_kgpm3, zero_path, clock),
+    ]
 
 
 def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from buddyline.node.attitude import VqfAttitude, attitudes
 from buddyline.node.config import CalibrationConfig, NodeConfig, RecordConfig, SensorsConfig
-from buddyline.node.drivers.devices import Metronome, open_sensors
+from buddyline.node.drivers.devices import BLOCK, Metronome, open_sensors
 from buddyline.node.drivers.ms5837 import compensate_30ba
 from buddyline.node.geomagnetism import MagnetometerCalibration
 from buddyline.protocol.clock import MS_NS, S_NS, ManualClock
@@ -237,6 +237,51 @@ def test_a_nack_in_mid_dive_is_named_until_it_is_over(config, clock, board, gaug
     imu.close()
 
 
+def test_what_was_read_before_a_failure_or_the_end_is_not_lost(config, clock, board):
+    imu, _ = open_sensors(config, clock)
+    stop = threading.Event()
+    waits = 0
+    plain = clock.wait_until_ns
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        nonlocal waits
+        waits += 1
+        board[0x6B].absent = 9 <= waits < 12
+        if waits == 15:
+            stop.set()
+        return plain(instant_ns, event)
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    blocks = [imu.next_messages(stop) for _ in range(4)]
+    imu.close()
+    assert [len(block or ()) for block in blocks] == [BLOCK, 3, 3, 0]
+    stamps_ns = [message.stamp_ns for block in blocks for message in block or ()]
+    assert [(b - a) // (10 * MS_NS) for a, b in pairwise(stamps_ns)] == [1] * 7 + [4, 1, 1]
+
+
+def test_readings_after_a_lost_setting_are_not_published(config, clock, board):
+    """The chip resets in mid-block: what it says from then on, in the same block, does not count."""
+    imu, _ = open_sensors(config, clock)
+    assert len(imu.next_messages(NEVER)) == BLOCK
+    waits = 0
+    plain = clock.wait_until_ns
+
+    def wait(instant_ns: int, event: threading.Event) -> bool:
+        nonlocal waits
+        waits += 1
+        if waits == 3:
+            board[0x6B].power_cycle()
+        return plain(instant_ns, event)
+
+    clock.wait_until_ns = wait  # type: ignore[method-assign]
+    assert len(imu.next_messages(NEVER)) == 2
+    assert imu.problem
+    after = imu.next_messages(NEVER)
+    assert all(np.linalg.norm(message.accel_mps2) == pytest.approx(9.8, abs=0.02) for message in after)
+    assert imu.problem == ""
+    imu.close()
+
+
 def test_the_name_none_leaves_a_sensor_out(config, clock, adapter):
     only = NodeConfig(node="a", sensors=SensorsConfig(name="i2c", imu="none"), record=config.record)
     (depth,) = open_sensors(only, clock)
@@ -291,8 +336,9 @@ def test_the_mount_comes_from_the_configuration(config, clock, board):
         node="a", sensors=SensorsConfig(name="i2c", mount_xyzw=(1.0, 0.0, 0.0, 0.0)), record=config.record
     )
     imu, _ = open_sensors(upside_down, clock)
-    (sample,) = (m for m in imu.next_messages(NEVER) if isinstance(m, Imu))
-    assert sample.accel_mps2[2] > 9.7
+    samples = [m for m in imu.next_messages(NEVER) if isinstance(m, Imu)]
+    assert all(sample.accel_mps2[2] > 9.7 for sample in samples)
+    assert len(samples) == BLOCK
     imu.close()
 
 

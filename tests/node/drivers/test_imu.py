@@ -11,7 +11,7 @@ from buddyline.node.drivers.i2c import I2cBus
 from buddyline.node.drivers.imu import Lsm6dsOnlyBoard, MinImu9V3, MinImu9V5, MinImu9V6
 from buddyline.node.drivers.ms5837 import Ms5837
 from buddyline.node.drivers.registry import open_depth, open_imu
-from buddyline.node.drivers.samples import DeviceError
+from buddyline.node.drivers.samples import DeviceError, ImuDevice, ImuSample
 from buddyline.node.drivers.watch import FROZEN_READINGS, SETTLING_NS
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.errors import BuddylineError
@@ -31,6 +31,10 @@ def plug(adapter: Adapter, name: str, sky: Sky) -> dict[int, StWire]:
     }[name]()
     adapter.chips.update(chips)
     return chips
+
+
+def read(device: ImuDevice) -> ImuSample:
+    return device.decode(device.fetch())
 
 
 def test_vectors_are_little_endian_and_signed():
@@ -69,20 +73,20 @@ def test_a_magnetometer_that_is_silent_at_the_start_is_named_and_found_later(nam
     chips[0x1E].absent = True
     device = open_imu(bus, "auto" if choice == "auto" else name, clock=clock)
     for _ in range(5):
-        assert device.read().mag_t is None
+        assert read(device).mag_t is None
         assert "no magnetometer" in device.problem
         assert "address 0x1e" in device.problem
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
     chips[0x1E].absent = False
     clock.set_ns(clock.now_ns() + S_NS)
-    assert device.read().mag_t is not None
+    assert read(device).mag_t is not None
     assert device.problem == ""
 
 
 def test_a_board_named_without_a_magnetometer_has_no_problem(adapter, bus, clock, sky):
     plug(adapter, "lsm6ds", sky)
     device = open_imu(bus, "lsm6ds", clock=clock)
-    assert device.read().mag_t is None
+    assert read(device).mag_t is None
     assert device.problem == ""
 
 
@@ -91,7 +95,7 @@ def test_a_sample_is_in_si_units_and_stamped(unit, adapter, bus, clock, sky):
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
     clock.set_ns(clock.now_ns() + S_NS)
-    sample = device.read()
+    sample = read(device)
     assert sample.stamp_ns == clock.now_ns()
     assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
     assert sample.accel_mps2[2] < 0
@@ -108,7 +112,7 @@ def test_the_mount_turns_all_three_vectors(unit, adapter, bus, clock, sky):
     sky.noisy = False
     sky.accel, sky.gyro, sky.mag = (0, 100, 16384), (0, 1000, 0), (1000, 500, 0)
     plug(adapter, unit, sky)
-    sample = open_imu(bus, unit, np.diag([1.0, -1.0, -1.0]), clock).read()
+    sample = read(open_imu(bus, unit, np.diag([1.0, -1.0, -1.0]), clock))
     assert sample.accel_mps2[2] < -9.7
     assert sample.gyro_radps[1] == pytest.approx(-math.radians(17.5))
     if sample.mag_t is not None:
@@ -159,17 +163,17 @@ def test_a_brown_out_in_mid_dive_is_set_up_again(unit, adapter, bus, clock, sky)
     """The chip NACKs for a while, then is back with everything at its defaults: asleep."""
     chips = plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
-    device.read()
+    read(device)
     for chip in chips.values():
         chip.absent = True
     for _ in range(5):
         with pytest.raises(DeviceError, match="no answer"):
-            device.read()
+            read(device)
     for chip in chips.values():
         chip.absent = False
         chip.power_cycle()
     clock.set_ns(clock.now_ns() + 2 * S_NS)
-    sample = device.read()
+    sample = read(device)
     assert np.linalg.norm(sample.accel_mps2) == pytest.approx(9.80, abs=0.01)
     assert (sample.mag_t is None) == (unit == "lsm6ds")
 
@@ -177,14 +181,14 @@ def test_a_brown_out_in_mid_dive_is_set_up_again(unit, adapter, bus, clock, sky)
 def test_an_unnoticed_brown_out_publishes_no_wrong_sample(unit, adapter, bus, clock, sky):
     chips = plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
-    device.read()
+    read(device)
     for chip in chips.values():
         chip.power_cycle()
     good = 0
     for _ in range(60):
         clock.set_ns(clock.now_ns() + 30 * MS_NS)
         try:
-            sample = device.read()
+            sample = read(device)
         except DeviceError:
             continue
         good += 1
@@ -207,14 +211,14 @@ def test_a_gyroscope_that_resets_alone_is_set_up_again_and_its_zeros_are_not_pub
     sky.gyro = (300, -200, 100)
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
-    device.read()
+    read(device)
     stop_gyro(adapter, unit)
     clock.set_ns(clock.now_ns() + 10 * MS_NS)
     with pytest.raises(DeviceError, match="has reset"):
-        device.read()
+        read(device)
     for _ in range(50):
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
-        assert device.read().gyro_radps.any()
+        assert read(device).gyro_radps.any()
 
 
 def test_a_setting_lost_without_zeros_is_found_within_a_second(unit, adapter, bus, clock, sky):
@@ -228,7 +232,7 @@ def test_a_setting_lost_without_zeros_is_found_within_a_second(unit, adapter, bu
     for _ in range(105):
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
         try:
-            sample = device.read()
+            sample = read(device)
         except DeviceError as error:
             errors.append(str(error))
     assert len(errors) == 1
@@ -243,10 +247,10 @@ def test_a_slowly_starting_chip_is_waited_for_and_publishes_no_zero(unit, adapte
     for _ in range(20):
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
         with pytest.raises(DeviceError, match="no reading yet"):
-            device.read()
+            read(device)
     sky.silent, sky.gyro = set(), (300, -200, 100)
     clock.set_ns(clock.now_ns() + 10 * MS_NS)
-    assert device.read().gyro_radps.any()
+    assert read(device).gyro_radps.any()
 
 
 def test_a_gyroscope_that_stays_at_zero_is_never_published(unit, adapter, bus, clock, sky):
@@ -258,7 +262,7 @@ def test_a_gyroscope_that_stays_at_zero_is_never_published(unit, adapter, bus, c
     for _ in range(100):
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
         with pytest.raises(DeviceError) as raised:
-            device.read()
+            read(device)
         said.add(str(raised.value))
     assert any("gyroscope: reads zero" in text for text in said)
 
@@ -267,19 +271,19 @@ def test_full_scale_is_flagged_and_three_g_is_within_it(unit, adapter, bus, cloc
     sky.accel = (0, 0, -3 * 16384)
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
-    sample = device.read()
+    sample = read(device)
     assert sample.accel_mps2[2] == pytest.approx(-3 * 9.8, abs=0.1)
     assert not sample.saturated
     sky.accel, sky.gyro = (0, 0, -5 * 16384), (0, 40_000, 0)
     clock.set_ns(clock.now_ns() + 10 * MS_NS)
-    assert device.read().saturated
+    assert read(device).saturated
     assert "accelerometer and gyroscope at full scale" in device.problem
     sky.accel, sky.gyro = (0, 0, -16384), (0, 0, 0)
     clock.set_ns(clock.now_ns() + S_NS)
-    assert not device.read().saturated
+    assert not read(device).saturated
     assert "full scale" in device.problem
     clock.set_ns(clock.now_ns() + 2 * S_NS)
-    device.read()
+    read(device)
     assert device.problem == ""
 
 
@@ -295,12 +299,12 @@ def test_a_frozen_chip_is_noticed_and_set_up_again(unit, adapter, bus, clock, sk
     plug(adapter, unit, sky)
     device = open_imu(bus, unit, clock=clock)
     for _ in range(FROZEN_READINGS):
-        device.read()
+        read(device)
     with pytest.raises(DeviceError, match="stopped"):
-        device.read()
+        read(device)
     sky.noisy = True
     for _ in range(FROZEN_READINGS * 3):
-        device.read()
+        read(device)
 
 
 @pytest.mark.parametrize("name", ["minimu9_v5", "minimu9_v6"])
@@ -310,7 +314,7 @@ def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sk
     chips[0x1E].absent = True
     transfers = []
     for _ in range(100):
-        sample = device.read()
+        sample = read(device)
         assert sample.mag_t is None
         assert "address 0x1e" in device.problem
         clock.set_ns(clock.now_ns() + 10 * MS_NS)
@@ -319,7 +323,7 @@ def test_without_its_magnetometer_the_rest_goes_on(name, adapter, bus, clock, sk
     chips[0x1E].absent = False
     chips[0x1E].power_cycle()
     clock.set_ns(clock.now_ns() + S_NS)
-    assert device.read().mag_t is not None
+    assert read(device).mag_t is not None
     assert device.problem == ""
 
 
@@ -345,7 +349,7 @@ def test_100_hz_and_the_depth_fit_on_one_bus(clock, monkeypatch, sky, bit_hz, un
         for turn in range(200):
             clock.set_ns(max(clock.now_ns(), start_ns + turn * 10 * MS_NS))
             before_ns = clock.now_ns()
-            imu.read()
+            read(imu)
             depths += depth.step(clock.now_ns()) is not None
             longest_ns = max(longest_ns, clock.now_ns() - before_ns)
     assert longest_ns < 5 * MS_NS
@@ -363,6 +367,6 @@ def test_a_hanging_depth_sensor_delays_the_imu_once(bus, adapter, clock, sky):
         depth.step(clock.now_ns())
     stalled_ns = clock.now_ns()
     for _ in range(10):
-        imu.read()
+        read(imu)
         assert depth.step(clock.now_ns()) is None
     assert clock.now_ns() == stalled_ns

@@ -157,6 +157,22 @@ def test_samples_come_at_20_hz_between_imu_readings(bus: I2cBus, chip: Ms5837Wir
     assert all(b - a == 50 * MS_NS for a, b in pairwise(stamps))
 
 
+def test_the_temperature_is_converted_for_every_fourth_pressure(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
+    device = Ms5837.open(bus, None, clock)
+    temperatures = []
+    before = chip.conversions
+    while len(temperatures) < 12:
+        clock.set_ns(device.next_due_ns)
+        sample = device.step(clock.now_ns())
+        if sample is not None:
+            temperatures.append(sample.temperature_degc)
+            chip.d2 = D2_30BA + (100_000 if len(temperatures) > 4 else 0)
+    assert chip.conversions - before == 12 + 3
+    assert temperatures[:5] == [19.81] * 5
+    assert len(set(temperatures[5:8])) == 1
+    assert temperatures[8] > 22.0
+
+
 def test_no_step_waits(bus: I2cBus, chip: Ms5837Wire, clock: ManualClock):
     """Waiting is the caller's: a step that slept would move the manual clock."""
     device = Ms5837.open(bus, None, clock)
