@@ -150,6 +150,16 @@ class PreviewConfig(Config, frozen=True, kw_only=True):
     quality: Annotated[int, Meta(ge=1, le=100)] = 70
 
 
+class StationTagsConfig(Config, frozen=True, kw_only=True):
+    """[station_tags]: printed tags on line markers, which name the node's station. side_m: of the black square; 0: off.
+
+    within_m: a tag further away is another station's.
+    """
+
+    side_m: Annotated[float, Meta(ge=0, le=1)] = 0.06
+    within_m: Positive = 1.0
+
+
 class PanelConfig(Config, frozen=True, kw_only=True):
     """[panel]: one button, lamp, buzzer, dive lights and leak probe at the Pi's pins; all optional.
 
@@ -256,6 +266,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     calibration: CalibrationConfig | None = None
     record: RecordConfig = field(default_factory=RecordConfig)
     preview: PreviewConfig = field(default_factory=PreviewConfig)
+    station_tags: StationTagsConfig = field(default_factory=StationTagsConfig)
     panel: PanelConfig = field(default_factory=PanelConfig)
     power: PowerConfig = field(default_factory=PowerConfig)
     simulation: SimulationConfig = field(default_factory=SimulationConfig)

@@ -30,6 +30,7 @@ from buddyline.node.images import Images
 from buddyline.node.outlet import Outlet
 from buddyline.node.pipeline import Pipeline
 from buddyline.node.power.watch import PowerWatch
+from buddyline.node.station_tags import StationTags
 from buddyline.node.time_base import NodeClock, wait_for_time
 from buddyline.node.underwater.panel import Panel
 from buddyline.protocol.clock import S_NS, Clock
@@ -123,6 +124,7 @@ class NodeService(Service):
         self._power = PowerWatch(self.config)
         self._panel = Panel(self.config, self.clock, self.outlet.send)
         self._images = Images(self.config, self.outlet)
+        self._station_tags = StationTags(self.config.node, self.config.station_tags, info.camera.fx_px)
         self._hub = HubConnection(self.config, self.outlet, self.clock, self._clock_sync, self._guide, self._panel.hear)
         self.outlet.send(info)
 
@@ -268,6 +270,8 @@ class NodeService(Service):
             self._lights_seen.append(sum(map(is_likely, candidates.blobs)))
             if self._panel.takes_pictures and self._power.takes_pictures:
                 self._images.send(frame)
+                if (mark := self._station_tags.read(frame)) is not None:
+                    self.outlet.send(mark)
 
     def _expose(self, frame: Frame, candidates: Candidates) -> None:
         """Lock the camera's exposure to the other node's lamps, where it can be changed."""

@@ -250,7 +250,8 @@ class Mark(Message, frozen=True, kw_only=True):
     kind: station: the node is at the station `name`, from the rest nearest to this instant until it moves. point: the
     node is at a point of interest. note: the text `note` only. alarm: the survey's check `name` failed; measure again.
     leg: the survey's verdict `good` on the present leg. leg_ns: begin of the rest that a verdict is about. earlier:
-    that is not the present rest.
+    that is not the present rest. tag: number of the printed tag that the node's own camera read; it names the station
+    of this rest, or of the next one.
     """
 
     node: NodeId
@@ -260,3 +261,4 @@ class Mark(Message, frozen=True, kw_only=True):
     note: Annotated[str, Meta(max_length=1024)] = ""
     leg_ns: StampNs | UnsetType = UNSET
     earlier: bool = False
+    tag: Count | UnsetType = UNSET

@@ -267,16 +267,30 @@ def test_each_leg_is_judged_at_its_tenth_second():
     assert "m, 1" in verdicts[0][1][0].note
 
 
+def test_a_station_that_is_seen_again_is_recognized_while_the_nodes_are_there():
+    rng = np.random.default_rng(5)
+    course = world.loop(rng, 4)
+    course.marks.clear()
+    *others, (leg, said) = judged(world.dive(course, rng, rest_s=10.5, swim_s=1.0))
+    # Nobody has said that the last station is the first: it is asked, and keeps its number.
+    assert leg.name == "3-4"
+    assert "station 4 may be 0: " in said[0].note
+    assert " sd: if it is, mark it" in said[0].note
+    assert not any("may be" in mark.note for _, said in others for mark in said)
+
+
 def test_an_alarm_of_an_earlier_leg_says_which():
     rng = np.random.default_rng(11)
-    course = world.line(rng, 6)
+    course = world.line(rng, 5)
 
     def disturb(index, number):
         return 20.0 if (index, number) == (0, 0) else 0.0
 
     # The usual field is known only later: then the first leg's alarm comes.
-    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=12.0, swim_s=3.0, disturb=disturb)
-    (_, said), *others = judged(messages)
+    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=10.5, swim_s=1.0, disturb=disturb)
+    tag = Mark(node="b", stamp_ns=world.START_NS, name="T100", tag=100)
+    (leg, said), *others = judged([messages[0], tag, *messages[1:]])
+    assert leg.name == "0-T100"
     late = [mark for mark in said if mark.earlier]
     assert "field" in {mark.name for mark in late}
     assert all(mark.stamp_ns - mark.leg_ns > 20 * S_NS for mark in late)

@@ -40,14 +40,14 @@ STYLES: Final = {"svx": ("auto", "diving", "normal"), "th": ("auto", "diving")}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    does = parser.add_subparsers(dest="does", required=True, metavar="{legs,adjust,report,export,watch}")
+    does = parser.add_subparsers(dest="does", required=True, metavar="{legs,adjust,report,export,watch,tags}")
 
     def add(text: str, runs: Callable[[argparse.Namespace], int], example: str) -> argparse.ArgumentParser:
         one = subcommand(does, example.split(maxsplit=1)[0], text, f"survey {example}")
         one.set_defaults(survey=runs)
-        if runs is not _watch:
+        if runs not in (_watch, _tags):
             one.add_argument("project", metavar="PROJECT.toml", type=Path)
-        if runs not in (_watch, _legs):
+        if runs not in (_watch, _tags, _legs):
             one.add_argument(
                 "--depth",
                 choices=("absolute", "readings"),
@@ -83,6 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     watch = add("say on the bus, while the divers rest, whether their leg is good", _watch, "watch")
     add_client_arguments(watch, SURVEYOR)
     watch.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this long; default: at Ctrl-C")
+    tags = add("write pages of station tags to print", _tags, "tags 100 139 -o tags.pdf")
+    tags.add_argument("first", type=int, help="number of the first tag, from 100 on")
+    tags.add_argument("last", type=int, help="number of the last one, up to 586")
+    tags.add_argument("--side-mm", type=above_zero, default=60.0, metavar="MM", help="of the black square; default: 60")
+    tags.add_argument("-o", "--output", required=True, metavar="TAGS.pdf", help="- for stdout")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -95,6 +100,22 @@ def _watch(args: argparse.Namespace) -> int:
     from buddyline.tools.survey.live import run_watch
 
     return run_watch(args, args.seconds)
+
+
+def _tags(args: argparse.Namespace) -> int:
+    from buddyline.node.station_tags import NUMBERS
+    from buddyline.tools.draw import figures
+    from buddyline.tools.draw.tag_sheet import tag_sheet, tags_on_a_page
+    from buddyline.tools.newfile import write_output
+
+    figures.check()
+    numbers = range(args.first, args.last + 1)
+    if not numbers or numbers[0] not in NUMBERS or numbers[-1] not in NUMBERS:
+        raise BuddylineError(f"tags {args.first} {args.last}: numbers are from {NUMBERS[0]} to {NUMBERS[-1]}")
+    if not all(tags_on_a_page(args.side_mm)):
+        raise BuddylineError(f"--side-mm {args.side_mm:g}: no such tag fits on a page of A4")
+    write_output(args.output, figures.pdf(tag_sheet(numbers, args.side_mm)))
+    return 0
 
 
 def _legs(args: argparse.Namespace) -> int:

@@ -25,6 +25,7 @@ from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
 from buddyline.tools.survey.turns import turns_of
+from msgspec import UNSET
 from msgspec.structs import replace
 
 # A mark belongs to the nearest rest, but not to one further away than this.
@@ -91,7 +92,7 @@ class Derived:
                     continue
                 if mark.note and mark.note not in self.notes[mark.name]:
                     self.notes[mark.name].append(mark.note)
-                if id(mark) not in placed and not points:
+                if id(mark) not in placed and not points and mark.tag is UNSET:
                     self.faults += 1
                     self.add_problem(f"mark {mark.name} at {at}: no rest near it")
         for mark in points:
@@ -191,7 +192,8 @@ class _Chain:
     def _named(self, out: Derived, corrected: set[int]) -> list[dict[str, str]]:
         """Return, for each rest, the stations that are known by node: by marks, or by another pair's leg meanwhile.
 
-        A mark belongs to the rest nearest to it; of two marks one by hand (corrected) counts, else the later one.
+        A mark belongs to the rest nearest to it; of two marks one by hand (corrected) counts, else a person's before a
+        tag's, else the later one.
         """
         named: list[dict[str, str]] = [{} for _ in self.found]
         for leg in out.legs:
@@ -200,7 +202,7 @@ class _Chain:
                     both = {leg.from_node: leg.from_, leg.to_node: leg.to}
                     stations |= {node: name for node, name in both.items() if node in self.readings.nodes}
         joined: set[str] = set()
-        for mark in sorted(self.marks, key=lambda one: id(one) in corrected):
+        for mark in sorted(self.marks, key=lambda one: (id(one) in corrected, one.tag is UNSET)):
             if mark.kind != "station" or mark.node not in self.readings.nodes or not STATION_NAME.match(mark.name):
                 continue
             if (at := rest_of(mark, self.found)) is not None:
@@ -245,9 +247,15 @@ class _Chain:
 
 
 def rest_of(mark: Mark, found: Sequence[Rest]) -> int | None:
-    """Return the rest that a mark belongs to: the nearest one, if it is near enough."""
-    gaps = [max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0) for rest in found]
-    return gaps.index(min(gaps)) if gaps and min(gaps) <= MARK_NEAR_NS else None
+    """Return the rest that a mark belongs to: the nearest one, if it is near enough.
+
+    A tag is read at a station before the rest there; after a rest it may be the next station's, or one swum past.
+    """
+    gaps = [(max(rest.start_ns - mark.stamp_ns, mark.stamp_ns - rest.end_ns, 0), i) for i, rest in enumerate(found)]
+    if mark.tag is not UNSET:
+        gaps = [(gap_ns, i) for gap_ns, i in gaps if mark.stamp_ns <= found[i].end_ns]
+    gap_ns, nearest = min(gaps, default=(MARK_NEAR_NS + 1, 0))
+    return nearest if gap_ns <= MARK_NEAR_NS else None
 
 
 def doubt_of(problem: str, stations: Mapping[str, str], *, after_lost: bool) -> list[str]:

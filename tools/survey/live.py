@@ -18,15 +18,17 @@ from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, RE
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
-from buddyline.tools.survey.chain import Stop, find_standings
+from buddyline.tools.survey.chain import Standing, Stop, find_standings
 from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, time_text
 from buddyline.tools.survey.magnetism import Field, off_usual, usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg
 from buddyline.tools.survey.readings import of_messages
+from buddyline.tools.survey.recognition import recognized
 from buddyline.tools.survey.rests import PAUSE_NS, Rest, rests
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from buddyline.tools.survey.shots import Shot, shoot
 from buddyline.tools.survey.sights import sights
+from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher
@@ -41,7 +43,7 @@ OVER_NS: Final = 6 * S_NS
 WINDOW_NS: Final = 25 * S_NS
 BEFORE_NS: Final = 8 * S_NS
 LONGEST_NS: Final = 120 * S_NS
-MARKS: Final = 256
+MARKS: Final = 2048
 # A node's usual field is known when so many more rests have it than have another one.
 WITNESSES: Final = 3
 
@@ -143,18 +145,23 @@ class LiveLegs:
             node: self._usual([one.shot.ends[i].field for one in legs if one.shot is not None])
             for i, node in enumerate(pair.nodes)
         }
-        stations = self._stations(pair, legs)
+        standings = self._standings(pair, legs)
         said = []
+        measured: list[Leg] = []
         for one in pair.judged:
-            which, doubts = stations.get(id(one), ("rest", []))
             if one.shot is None:
+                which = "rest"
                 text = f"{one.rest.too_short}; a leg takes {self._settings.rest_s:g} s"
                 found, words = {"rest": text}, ""
             else:
-                leg = one_leg(one.shot, {node: node for node in pair.nodes}, pair.nodes[0])
+                standing, doubts = standings[id(one)]
+                leg = one_leg(one.shot, standing.station, standing.rear)
+                measured.append(leg)
+                which = f"leg {leg.name}"
                 texts = [*alarms.of_leg(leg, one.shot, usual, self._limits), *doubts]
                 found = {check: what for check, _, what in (text.partition(": ") for text in texts)}
-                words = _words(leg)
+                words = _words(leg) if one.said is None and not found else ""
+                words += _question(measured) if words and one is pair.judged[-1] else ""
             fresh = {check: what for check, what in found.items() if check not in (one.said or set())}
             earlier = one is not pair.judged[-1]
             late = f"{which} of {time_text(one.start_ns)}: " if earlier else ""
@@ -184,10 +191,10 @@ class LiveLegs:
         known = sum(one is not None for one in fields)
         return usual if known - 2 * others >= WITNESSES else None
 
-    def _stations(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, tuple[str, list[str]]]:
-        """Return each leg's name, and what is doubtful about its stations, by the id of its rest."""
+    def _standings(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, tuple[Standing, list[str]]]:
+        """Return each leg's stations, and what is doubtful about them, by the id of its rest."""
         named: list[dict[str, str]] = [{} for _ in legs]
-        for mark in self._marks:
+        for mark in sorted(self._marks, key=lambda one: one.tag is UNSET):
             at = rest_of(mark, [one.rest for one in legs])
             if at is not None and mark.node in pair.nodes:
                 named[at][mark.node] = mark.name
@@ -199,12 +206,10 @@ class LiveLegs:
         first = self._settings.first if self._settings.first in pair.nodes else pair.nodes[0]
         standings = find_standings(stops, self._settings.procedure, first)
         lost = {id(pair.judged[i]) for i in range(1, len(pair.judged)) if pair.judged[i - 1].shot is None}
-        found = {}
-        for one, standing, stations in zip(legs, standings, named, strict=True):
-            ends = sorted(standing.station, key=lambda node: node != standing.rear)
-            name = "leg " + "-".join(standing.station[node] for node in ends)
-            found[id(one)] = name, doubt_of(standing.problem, stations, after_lost=id(one) in lost)
-        return found
+        return {
+            id(one): (standing, doubt_of(standing.problem, stations, after_lost=id(one) in lost))
+            for one, standing, stations in zip(legs, standings, named, strict=True)
+        }
 
 
 def _same(one: Rest, other: Rest) -> bool:
@@ -216,6 +221,15 @@ def _same(one: Rest, other: Rest) -> bool:
 def _words(leg: Leg) -> str:
     seconds = (leg.end_ns - leg.start_ns) / S_NS
     return f"{leg.distance_m:.2f} m, {seconds:.0f} s with {leg.fixes} fixes"
+
+
+def _question(legs: list[Leg]) -> str:
+    """Return which earlier station an end of the last leg may be, in words, or ""."""
+    try:
+        found = recognized(legs)
+    except BuddylineError:
+        return ""
+    return f"; {found[0].question}: if it is, mark it" if found else ""
 
 
 class Watch:

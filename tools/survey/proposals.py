@@ -33,11 +33,16 @@ class Proposal:
     ratio: float
 
     @property
+    def question(self) -> str:
+        """The question alone."""
+        return f"station {self.station} may be {self.other}: {self.apart_m:.2f} m away, {self.sigmas:.1f} sd"
+
+    @property
     def text(self) -> str:
         """The question, and what to do if the answer is yes."""
         return (
-            f"station {self.station} may be {self.other}: {self.apart_m:.2f} m away, {self.sigmas:.1f} sd; the loop "
-            f'would close with H {self.ratio:.1f}. If it is: [[equate]] stations = ["{self.other}", "{self.station}"]'
+            f"{self.question}; the loop would close with H {self.ratio:.1f}. If it is: "
+            f'[[equate]] stations = ["{self.other}", "{self.station}"]'
         )
 
 

@@ -9,10 +9,21 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    Imu,
+    Mark,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+)
 from buddyline.tools.dives import open_each
 from buddyline.tools.evaluation.rotation import multiply, normalized
 from buddyline.tools.survey.averages import Floats, Ints
+from buddyline.tools.survey.blinks import find_blinks
 from msgspec import UNSET
 
 # An attitude is interpolated between neighbours no further apart than this.
@@ -23,7 +34,7 @@ COLUMNS: Final[dict[type[Message], dict[str, int]]] = {
     Depth: {"depth_m": 1, "sigma_m": 1},
     Imu: {"accel_mps2": 3, "gyro_radps": 3, "mag_t": 3},
 }
-TOPICS: Final = ("pose", "rejected", "info", "attitude", "depth", "imu", "mark")
+TOPICS: Final = ("pose", "rejected", "info", "attitude", "depth", "imu", "mark", "candidates")
 
 
 class Series:
@@ -111,6 +122,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
     marks: dict[Mark, None] = {}
     infos: dict[str, NodeInfo] = {}
     samples: dict[tuple[type[Message], str], dict[int, Message]] = {}
+    pictures: dict[str, dict[int, Candidates]] = {}
     for message in messages:
         if isinstance(message, RelativePose | Rejected):
             outcomes.setdefault((message.node_a, message.node_b), {}).setdefault(message.trigger, message)
@@ -118,6 +130,8 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
             infos.setdefault(message.node, message)
         elif isinstance(message, Mark):
             marks[message] = None
+        elif isinstance(message, Candidates):
+            pictures.setdefault(message.node, {}).setdefault(message.trigger, message)
         elif isinstance(message, Attitude | Depth | Imu):
             samples.setdefault((type(message), message.node), {}).setdefault(message.stamp_ns, message)
 
@@ -126,6 +140,10 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
             raise BuddylineError(f"{name}: holds no NodeInfo of node {node}; name its log as well")
         return NodeReadings(infos[node], *(Series(kind, samples.get((kind, node), {})) for kind in COLUMNS))
 
+    for pair, of_pair in outcomes.items():
+        poses = {trigger: one for trigger, one in of_pair.items() if isinstance(one, RelativePose)}
+        for node in pair:
+            marks |= dict.fromkeys(find_blinks(pictures.get(node, {}).values(), poses))
     found = []
     for (a, b), of_pair in outcomes.items():
         in_time = sorted(of_pair.values(), key=lambda outcome: outcome.stamp_ns)
