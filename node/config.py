@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 from buddyline.node.geomagnetism import EarthField, MagnetometerCalibration, earth_field
+from buddyline.protocol.blinking import DARK_SLOTS
 from buddyline.protocol.config import Config, ConfigError, load_config
 from buddyline.protocol.messages import (
     ArTag,
+    Blink,
     CameraModel,
     FixedPlace,
     NodeId,
@@ -180,6 +182,17 @@ class PanelConfig(Config, frozen=True, kw_only=True):
         return {name: number for name in names if (number := getattr(self, name)) is not None}
 
 
+class BlinkConfig(Config, frozen=True, kw_only=True):
+    """[blink]: a lamp that blinks by a code, so that others know whose it is (protocol/blinking.py).
+
+    code: another one for each node. lamp: which of the two is switched. pin: of its switch.
+    """
+
+    code: Annotated[int, Meta(ge=0, lt=len(DARK_SLOTS))]
+    lamp: Literal["left", "right", "both"] = "left"
+    pin: Pin
+
+
 class FixedConfig(Config, frozen=True, kw_only=True):
     """[fixed]: a node that stands still, such as one on a tripod: its place and attitude in the frame of a net.
 
@@ -233,7 +246,8 @@ class PowerConfig(Config, frozen=True, kw_only=True):
 class SimulationConfig(Config, frozen=True, kw_only=True):
     """[simulation]: the world of the simulated camera and sensors; the same for all nodes.
 
-    more_nodes: further nodes. fixed_nodes: which of all stand still.
+    more_nodes: further nodes. fixed_nodes: which of all stand still. blinking: whether each node's left lamp blinks by
+    a code of its own.
     """
 
     environment: str = "cavern"
@@ -243,6 +257,7 @@ class SimulationConfig(Config, frozen=True, kw_only=True):
     node_b: NodeId = "b"
     more_nodes: list[NodeId] = field(default_factory=list)
     fixed_nodes: list[NodeId] = field(default_factory=list)
+    blinking: bool = False
 
 
 class NodeConfig(Config, frozen=True, kw_only=True):
@@ -254,6 +269,7 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     node: NodeId
     role: Literal["full", "camera"] = "full"
     fixed: FixedConfig | None = None
+    blink: BlinkConfig | None = None
     connect: str = "tcp/127.0.0.1:7447"
     namespace: str = ""
     tls: Tls | None = None
@@ -308,10 +324,13 @@ class NodeConfig(Config, frozen=True, kw_only=True):
     def check_pins(self) -> None:
         """Raise ConfigError for a pin with two uses."""
         used = {number: "the I2C bus" for number in I2C_PINS.get(self.sensors.i2c_bus, ()) if self.uses_i2c}
-        for name, number in self.panel.pins.items():
+        pins = {f"panel.{name}": number for name, number in self.panel.pins.items()}
+        if self.blink is not None:
+            pins["blink.pin"] = self.blink.pin
+        for name, number in pins.items():
             if number in used:
-                raise ConfigError(f"panel.{name} = {number}: this pin is in use by {used[number]}")
-            used[number] = f"panel.{name}"
+                raise ConfigError(f"{name} = {number}: this pin is in use by {used[number]}")
+            used[number] = name
 
     def node_info(self, stamp_ns: int, software: str, sha256: str, row_time_ns: int) -> NodeInfo:
         """Return NodeInfo from [calibration]; raise ConfigError if there is none."""
@@ -344,9 +363,12 @@ class NodeConfig(Config, frozen=True, kw_only=True):
         )
 
     def in_net(self, info: NodeInfo) -> NodeInfo:
-        """Return a NodeInfo with the configured role and place, where they are not the usual ones."""
+        """Return a NodeInfo with the configured role, place and blinking, where they are not the usual ones."""
         role: Role | UnsetType = info.role if self.role == "full" else self.role
-        return replace(info, role=role, fixed=info.fixed if self.fixed is None else self.fixed.place)
+        blink: Blink | UnsetType = info.blink
+        if self.blink is not None:
+            blink = Blink(code=self.blink.code, lamp=self.blink.lamp, slot_ns=self.trigger_period_ns)
+        return replace(info, role=role, fixed=info.fixed if self.fixed is None else self.fixed.place, blink=blink)
 
     def check_fixed(self) -> None:
         """Raise ConfigError for a place that is none."""

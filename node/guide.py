@@ -3,6 +3,7 @@
 A guided search looks at regions around these places only. The whole picture is searched wherever regions may hide
 something: at least once a second; when an expected light is not in its region; when an expectation is too wide; when
 the last picture did not show the expected light; when there are too many lamps. A wrong expectation costs one search.
+A lamp that is dark by its code is not looked for, and is followed through its dark pictures.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 from buddyline.node.detect.detection import LIKELY, Detection, Region, is_likely, score_of
+from buddyline.protocol.blinking import lit
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.messages import Expect
 from buddyline.protocol.topics import EXPECT
+from msgspec import UNSET
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Received
@@ -62,24 +65,27 @@ class Followed:
 
 @dataclass(frozen=True, slots=True)
 class Foretold:
-    """Where the solver expects a light: sigma_px at the picture's time."""
+    """Where the solver expects a light: sigma_px at the picture's time. dark: its lamp is switched off then."""
 
     u_px: float
     v_px: float
     sigma_px: float
     radius_px: float
+    dark: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class SearchPlan:
     """What to do with a picture. foretold: where lights are expected. regions: to search; None for the whole picture.
 
-    anchors: of the first regions, the score that a candidate needs in each; without one the light is lost.
+    anchors: of the first regions, the score that a candidate needs in each; without one the light is lost. dark: where
+    lamps are that are switched off.
     """
 
     foretold: tuple[Foretold, ...]
     regions: tuple[Region, ...] | None = None
     anchors: tuple[float, ...] = ()
+    dark: tuple[Foretold, ...] = ()
 
     def is_lost(self, found: Sequence[Detection]) -> bool:
         """Return whether a light that should be in its region is in none of its candidates."""
@@ -133,34 +139,49 @@ class Guide:
 
     def plan(self, stamp_ns: int, width_px: int, height_px: int, *, whole: bool = False) -> SearchPlan:
         """Return how to search the picture taken at stamp_ns. whole: search the whole picture in any case."""
-        foretold = self._foretell(stamp_ns, width_px, height_px)
+        places = self._foretell(stamp_ns, width_px, height_px)
+        foretold = tuple(place for place in places or () if not place.dark)
+        dark = tuple(place for place in places or () if place.dark)
         since_ns = math.inf if self._whole_ns is None else stamp_ns - self._whole_ns
         step_s = (stamp_ns - self._stamp_ns) / S_NS
-        if whole or foretold is None or not 0 <= since_ns < WHOLE_EVERY_NS or step_s <= 0.0:
-            return SearchPlan(tuple(foretold or ()))
+        if whole or places is None or not 0 <= since_ns < WHOLE_EVERY_NS or step_s <= 0.0:
+            return SearchPlan(foretold, dark=dark)
         lamps = [_moved(one, step_s, width_px) for one in self._followed]
         # A solver that expects nothing has no track, and needs whole pictures to start one.
         planned = None if self._solvers else _around_steady(lamps)
         if foretold:
             planned = _around_expected(foretold, lamps)
         if planned is None or len(planned[0]) > MAX_REGIONS:
-            return SearchPlan(tuple(foretold))
+            return SearchPlan(foretold, dark=dark)
         regions, anchors = planned
         if any(region.radius_px > WIDEST * width_px for region in regions):
-            return SearchPlan(tuple(foretold))
-        return SearchPlan(tuple(foretold), tuple(regions), tuple(anchors))
+            return SearchPlan(foretold, dark=dark)
+        return SearchPlan(foretold, tuple(regions), tuple(anchors), dark)
 
     def learn(
-        self, stamp_ns: int, found: Sequence[Detection], width_px: int, *, whole: bool, sized: bool = True
+        self,
+        stamp_ns: int,
+        found: Sequence[Detection],
+        width_px: int,
+        *,
+        whole: bool,
+        sized: bool = True,
+        dark: Sequence[Foretold] = (),
     ) -> None:
-        """Follow the candidates of the picture taken at stamp_ns.
+        """Follow the candidates of the picture taken at stamp_ns, and the lamps that were dark in it.
 
         whole: whether all of it was searched. sized: whether the lights have the size that they have in the next
         picture. A picture with another exposure shows another size, and does not count as the last whole picture.
         """
         step_s = (stamp_ns - self._stamp_ns) / S_NS
         before = [_moved(one, step_s, width_px) for one in self._followed] if 0.0 < step_s < 1.0 else []
-        self._followed = [_follow(d, before, self._followed, step_s, sized=sized) for d in found]
+        hidden = [
+            lamp
+            for lamp, radius_px in before
+            if any(math.hypot(lamp.u_px - at.u_px, lamp.v_px - at.v_px) <= at.radius_px for at in dark)
+            and not any(_away(d, lamp.u_px, lamp.v_px) <= radius_px for d in found)
+        ]
+        self._followed = [_follow(d, before, self._followed, step_s, sized=sized) for d in found] + hidden
         self._stamp_ns = stamp_ns
         if whole:
             self.whole += 1
@@ -183,7 +204,9 @@ class Guide:
             if not -AHEAD_NS <= ahead_ns <= min(message.valid_ns, EXPECT.stale_s * S_NS):
                 continue
             ahead_s = ahead_ns / S_NS
+            shines = (True, True) if message.blink is UNSET else lit(message.blink, stamp_ns)
             for light in message.lights:
+                dark = not shines[0 if light.side == "left" else 1]
                 uu, uv, vv = light.covariance_px2
                 widest_px2 = 0.5 * (uu + vv) + math.hypot(0.5 * (uu - vv), uv)
                 sigma_px = math.sqrt(widest_px2) + light.sigma_rate_pxps * abs(ahead_s)
@@ -194,7 +217,7 @@ class Guide:
                     self.refused += 1
                     return None
                 if -0.5 <= u <= width_px - 0.5 and -0.5 <= v <= height_px - 0.5:
-                    found.append(Foretold(u, v, max(sigma_px, 0.1 * FLOOR * width_px), radius_px))
+                    found.append(Foretold(u, v, max(sigma_px, 0.1 * FLOOR * width_px), radius_px, dark))
         return found
 
 

@@ -96,7 +96,7 @@ class Pipeline:
         whole = found is None
         if found is None:
             found = self._detector.detect(image)
-        guide.learn(stamp_ns, found, width, whole=whole, sized=lamps)
+        guide.learn(stamp_ns, found, width, whole=whole, sized=lamps, dark=plan.dark)
         elsewhere = UNSET if whole else guide.elsewhere(len(found))
         found, self.expected = expected_first(found, plan.foretold)
         return found, elsewhere

@@ -17,6 +17,7 @@ import cv2
 import msgspec
 from buddyline.node import __version__
 from buddyline.node.awaited import AwaitedCamera
+from buddyline.node.blinker import Blinker
 from buddyline.node.capture.loop import ExposureLoop
 from buddyline.node.clock_sync import ClockSync
 from buddyline.node.config import NodeConfig
@@ -122,7 +123,9 @@ class NodeService(Service):
         self.recorder = Recorder(path, metadata=metadata, pictures=self.pictures)
         self.outlet = Outlet(self.config.node, self.recorder, self.clock, self.boot, self._signer)
         self._power = PowerWatch(self.config)
-        self._panel = Panel(self.config, self.clock, self.outlet.send)
+        self._panel = panel = Panel(self.config, self.clock, self.outlet.send)
+        blink, slot_ns = self.config.blink, self.config.trigger_period_ns
+        self._blinker = None if blink is None else Blinker(blink, slot_ns, self.clock, lambda: panel.shines)
         self._images = Images(self.config, self.outlet)
         self._station_tags = StationTags(self.config.node, self.config.station_tags, info.camera.fx_px)
         self._hub = HubConnection(self.config, self.outlet, self.clock, self._clock_sync, self._guide, self._panel.hear)
@@ -181,6 +184,9 @@ class NodeService(Service):
         self.spawn("bus", lambda: self._hub.run(self.stop, lambda error: self.fail("bus", error)))
         self.spawn("power", lambda: self._power.run(self.stop))
         self.spawn("panel", lambda: self._panel.run(self.stop))
+        if self._blinker is not None:
+            blinker = self._blinker
+            self.spawn("blink", lambda: blinker.run(self.stop))
 
     def close(self) -> int:
         """Stop all threads, write the log's end; return the exit status."""
@@ -196,6 +202,8 @@ class NodeService(Service):
             log.info("%s: log %s", self.name, self.recorder.path)
         self.camera.close()
         self._panel.close()
+        if self._blinker is not None:
+            self._blinker.close()
         self._power.close()
         for source in self.sources:
             source.close()
@@ -386,6 +394,8 @@ class NodeService(Service):
         if self._clock_sync.problem and self.config.camera.name != "simulated":
             problems.append(f"clock: {self._clock_sync.problem}")
         problems += self._panel.problems + self._power.problems
+        if self._blinker is not None and self._blinker.problem:
+            problems.append(f"blink: {self._blinker.problem}")
         if self.clock.problem:
             problems.append(self.clock.problem)
         if self.recorder.error is not None:

@@ -60,6 +60,12 @@ class NetTracker:
         pairs = self._filter.main.detection if self._filter is not None else ()
         return {(self._nodes[observer], self._nodes[other]) for observer, other in pairs}
 
+    def detection(self, observer: str, other: str) -> tuple[float, float]:
+        """Return how likely the other's left and right lamp are found where they are lit and in the picture."""
+        pair = self._nodes.index(observer), self._nodes.index(other)
+        left, right = self._filter.main.detection[pair].tolist() if self._filter is not None else (1.0, 1.0)
+        return left, right
+
     @property
     def problems(self) -> list[str]:
         """What is wrong, and what was (it says so)."""
@@ -154,7 +160,8 @@ class NetTracker:
                 self._taken_ns = self._told_ns = self._first_ns - S_NS
             self._infos[node] = info
             self._nodes.append(node)
-            self._filter.add_node(track_node_of(info, rig), self._place(info), shines=info.has_lights)
+            blink = None if info.blink is UNSET else info.blink
+            self._filter.add_node(track_node_of(info, rig), self._place(info), shines=info.has_lights, blink=blink)
             # Its messages of the last second, from before it was known here.
             self._feed(self._filter, len(self._nodes) - 1, self._streams[node], self._taken_ns - S_NS, self._taken_ns)
 

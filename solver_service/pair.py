@@ -7,21 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.blinking import lit
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, NodeInfo
 from buddyline.solver_service.alignment import ClockAlignment
+from buddyline.solver_service.blinking import LampFollower
 from buddyline.solver_service.geometry.fix import Fix, NoFix
-from buddyline.solver_service.geometry.observation import Heading, Observation, Sensed, Settings
+from buddyline.solver_service.geometry.observation import Heading, Observation, Sensed, Settings, View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.trigger import TriggerReadings, read_triggers
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
 from buddyline.solver_service.results import view_of
+from msgspec import UNSET
 
 # Limits of one batch: its triggers, and their combinations of pairs of candidates. Larger arrays do not fit into the
 # processor's caches and, with crowded pictures, into memory.
@@ -46,6 +49,12 @@ class Matched:
     rig_b: Rig
     sensed_a: Sensed
     sensed_b: Sensed
+
+    @property
+    def dark(self) -> bool:
+        """Whether a lamp is switched off by its code."""
+        seen = (self.info_a, self.frame_b), (self.info_b, self.frame_a)
+        return any(info.blink is not UNSET and not all(lit(info.blink, frame.stamp_ns)) for info, frame in seen)
 
 
 def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
@@ -73,6 +82,7 @@ class PairSolver:
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._rarity = Rarity()
+        self._followers = LampFollower(), LampFollower()
 
     def solve(self, matched: Sequence[Matched]) -> list[Fix | NoFix]:
         """Return one result for each trigger.
@@ -89,6 +99,8 @@ class PairSolver:
         self._prior.reset()
         self._headings.reset()
         self._rarity.reset()
+        for follower in self._followers:
+            follower.forget()
 
     def heading(self, stamp_ns: int) -> Heading | None:
         """Return the difference of the two headings' biases at stamp_ns; None without an estimate."""
@@ -106,16 +118,32 @@ class PairSolver:
 
     def _read(self, batch: Sequence[Matched]) -> TriggerReadings:
         observations = [
-            Observation(view_of(one.frame_a), view_of(one.frame_b), one.sensed_a, one.sensed_b) for one in batch
+            Observation(
+                view_a=self._view(0, one.frame_a, one.info_b),
+                view_b=self._view(1, one.frame_b, one.info_a),
+                sensed_a=one.sensed_a,
+                sensed_b=one.sensed_b,
+            )
+            for one in batch
         ]
         return read_triggers(observations, batch[0].rig_a, batch[0].rig_b, self.settings)
+
+    def _view(self, node: int, frame: Candidates, other: NodeInfo) -> View:
+        """Return a frame of node a (0) or b (1), with what the other node's code says of its candidates."""
+        view = view_of(frame)
+        if other.blink is UNSET:
+            return view
+        whole = frame.elsewhere is UNSET
+        told = self._followers[node].take(frame.stamp_ns, view.pixels, frame.width_px, other.blink, whole=whole)
+        return replace(view, blinking=told)
 
     def _decide(self, matched: Matched, readings: TriggerReadings, place: int) -> Fix | NoFix:
         stamp_ns = matched.stamp_ns
         try:
             learned = self._prior.predict(stamp_ns), self._headings.predict(stamp_ns)
             found = readings.decide(place, *learned, self._rarity.factor)
-            self._rarity.take(found)
+            if not matched.dark:
+                self._rarity.take(found)
             self._headings.take(stamp_ns, found)
             if isinstance(found, Fix):
                 self._remember(matched, found)

@@ -255,6 +255,7 @@ class PairTracker:
                 stamp_ns=stamps_ns[node],
                 valid_ns=EXPECT_VALID_NS,
                 lights=[_expected_light(light) for light in lights],
+                blink=self._infos[1 - node].blink,
             )
             for node, lights in foresee(track, to_ns, stamps_ns).items()
             if lights

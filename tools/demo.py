@@ -45,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
     )
+    parser.add_argument("--blink", action="store_true", help="each node's left lamp blinks by a code of its own")
     parser.add_argument(
         "--record",
         metavar="DIR",
@@ -70,6 +71,7 @@ seed = {seed}
 start_ns = {start_ns}
 more_nodes = {more_nodes}
 fixed_nodes = {fixed_nodes}
+blinking = {blinking}
 """
 
 
@@ -147,6 +149,7 @@ def _start(
                     start_ns=scenario.start_ns,
                     more_nodes=json.dumps(scenario.more_nodes),
                     fixed_nodes=json.dumps(scenario.fixed_nodes),
+                    blinking=json.dumps(args.blink),
                 )
             )
             children.append(Child("node", "--config", str(config), name=f"node {node}"))

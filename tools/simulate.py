@@ -62,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     world.add_argument(
         "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
     )
+    world.add_argument("--blink", action="store_true", help="each node's left lamp blinks by a code of its own")
     world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
     world.add_argument("--tags", action="store_true", help="two AR tags on each node, for comparison")
     world.add_argument("--undisturbed", action="store_true", help="no diver looks away, nothing passes before a light")
@@ -93,6 +94,14 @@ def run(args: argparse.Namespace) -> int:
     from buddyline.tools.newfile import new_dive_log
 
     cv2.setNumThreads(1)
+    plan = DivePlan(
+        seconds=args.seconds,
+        rate_hz=args.rate,
+        images=args.images,
+        exposure=args.exposure,
+        imu=args.imu,
+        lost_share=args.lost,
+    )
     scenario = Scenario(
         environment=args.environment,
         seed=args.seed,
@@ -120,16 +129,9 @@ def run(args: argparse.Namespace) -> int:
         inertial=args.inertial,
         dead_lamps=tuple(args.dead_lamp),
         decoys=tuple(args.decoy),
+        blink_slot_ns=plan.period_ns if args.blink else 0,
         pwm_hz=args.pwm_hz,
         strobe_s=args.strobe_s,
-    )
-    plan = DivePlan(
-        seconds=args.seconds,
-        rate_hz=args.rate,
-        images=args.images,
-        exposure=args.exposure,
-        imu=args.imu,
-        lost_share=args.lost,
     )
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
     with (

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import cast
 
 from buddyline.node.capture.exposure import Exposure
-from buddyline.node.config import CameraConfig, NodeConfig, SimulationConfig
+from buddyline.node.config import CameraConfig, NodeConfig
 from buddyline.node.devices import Frame
 from buddyline.node.sim.scenario import ENVIRONMENTS, Environment, Scenario
 from buddyline.node.sim.sensor import DelayedControls
@@ -22,8 +22,9 @@ IMU_HZ = 100
 DEPTH_HZ = 10
 
 
-def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> Scenario:
+def scenario_of(config: NodeConfig) -> Scenario:
     """Return the scenario that a configuration describes; raise ConfigError for an unknown environment."""
+    simulation, camera = config.simulation, config.camera
     if simulation.environment not in ENVIRONMENTS:
         raise ConfigError(f"simulation.environment = {simulation.environment!r}: known are {', '.join(ENVIRONMENTS)}")
     return Scenario(
@@ -34,8 +35,9 @@ def scenario_of(simulation: SimulationConfig, width_px: int, height_px: int) -> 
         node_b=simulation.node_b,
         more_nodes=tuple(simulation.more_nodes),
         fixed_nodes=tuple(simulation.fixed_nodes),
-        width_px=width_px,
-        height_px=height_px,
+        blink_slot_ns=config.trigger_period_ns if simulation.blinking else 0,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
     )
 
 
@@ -58,8 +60,7 @@ class SimulatedCamera:
     def __init__(self, config: NodeConfig, clock: Clock) -> None:
         self._fixed = fixed_exposure(config.camera)
         self.exposure_control = None if self._fixed else DelayedControls()
-        camera = config.camera
-        self._world = World(scenario_of(config.simulation, camera.width_px, camera.height_px))
+        self._world = World(scenario_of(config))
         self._node = config.node
         self._clock = clock
         self._period_ns = config.trigger_period_ns
@@ -123,7 +124,7 @@ def open_camera(config: NodeConfig, clock: Clock) -> SimulatedCamera:
 
 def open_sensors(config: NodeConfig, clock: Clock) -> list[SimulatedSensor]:
     """Open the simulated attitude, depth gauge and inertial unit."""
-    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    world = World(scenario_of(config))
     node = config.node
     return [
         SimulatedSensor("attitude", ATTITUDE_HZ, lambda stamp_ns: world.attitude(node, stamp_ns), clock),

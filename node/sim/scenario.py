@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from string import ascii_lowercase
 from typing import Final, Literal, TypeAlias, get_args
 
+from buddyline.protocol.blinking import DARK_SLOTS
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import CameraModel
+from buddyline.protocol.messages import Blink, CameraModel
 from buddyline.protocol.topics import check_node_id
 
 Environment: TypeAlias = Literal["cavern", "night_reef", "lake", "basin", "day_reef"]
@@ -89,6 +90,7 @@ class Scenario:
     the start. clock_drift: what B's clock gains, s a second. Further nodes have B's clock. magnetometer_off_rad:
     constant error of B's heading that its sigma does not include. inertial: quality of the inertial units.
     dead_lamps: lights that are dark for the whole dive, such as "b.left".
+    blink_slot_ns: length of the slots in which each node's left lamp blinks by a code of its own; 0: no lamp blinks.
     pwm_hz: frequency at which the lights are dimmed by pulses (0: steady); a picture shows it, with a rolling shutter
     in its rows. pwm_depth: how far their light swings from its mean, as a share of it.
     strobe_s: time between the flashes of a third diver's strobe between the nodes; 0: none.
@@ -126,6 +128,7 @@ class Scenario:
     magnetometer_off_rad: float = 0.0
     inertial: InertialGrade = "good"
     dead_lamps: tuple[str, ...] = ()
+    blink_slot_ns: int = 0
     pwm_hz: float = 0.0
     pwm_depth: float = 0.5
     strobe_s: float = 0.0
@@ -207,6 +210,12 @@ class Scenario:
         """Return the baseline of a node, metres; further nodes have A's and B's by turns."""
         return (self.baseline_a_m, self.baseline_b_m)[index % 2]
 
+    def blink(self, index: int) -> Blink | None:
+        """Return how a node's lamp blinks, None where it does not."""
+        if not self.blink_slot_ns:
+            return None
+        return Blink(code=index % len(DARK_SLOTS), lamp="left", slot_ns=self.blink_slot_ns)
+
 
 def more_nodes(count: int) -> tuple[str, ...]:
     """Return the names of the nodes beside a and b: c, d, ...; raise BuddylineError for a count out of range."""
@@ -232,6 +241,7 @@ _LOWEST: Final = {
     "miss_share": 0.0,
     "false_lights": 0,
     "other_lamps": 0,
+    "blink_slot_ns": 0,
     "pwm_hz": 0.0,
     "pwm_depth": 0.0,
     "strobe_s": 0.0,

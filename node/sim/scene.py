@@ -16,6 +16,8 @@ from buddyline.node.sim.scenario import Scenario
 from buddyline.node.sim.tags import SeenTag
 from buddyline.node.sim.team import TeamMotion
 from buddyline.node.sim.trajectory import NodesMotion, PairMotion, Placement
+from buddyline.protocol.blinking import lit
+from buddyline.protocol.clock import S_NS
 
 LAMP_RADIUS_M = 0.02
 PASSING_PERIOD_S = 12.0
@@ -165,9 +167,21 @@ class Scene:
         return LightSource(
             placement.position_ned_m + R_ned_camera @ rig.lights_m[side],
             R_ned_camera @ rig.aims[side],
-            0.0 if (index, side) in self._dead else float(rig.intensities[side]),
+            float(rig.intensities[side]) if self._is_lit(index, side, t_s) else 0.0,
             float(rig.beams_rad[side]),
         )
+
+    def _is_lit(self, index: int, side: int, t_s: float) -> bool:
+        if (index, side) in self._dead:
+            return False
+        scenario = self.scenario
+        blink = scenario.blink(index)
+        if blink is None:
+            return True
+        # All clocks but the first node's have an offset.
+        own_s = t_s * (1.0 + scenario.clock_drift) if index else t_s
+        offset_ns = scenario.clock_offset_ns if index else 0
+        return lit(blink, scenario.start_ns + offset_ns + round(own_s * S_NS))[0 if side == LEFT else 1]
 
     def _reflection(self, index: int, side: int, t_s: float) -> LightSource:
         """Return a light's mirror image in the surface; ripples move it and lengthen it."""

@@ -74,6 +74,7 @@ class World:
             tags=carried or UNSET,
             imu_m=_triple(self._sensors[index].unit.stated_lever_m),
             fixed=self._place(node, stamp_ns) if node in s.fixed_nodes else UNSET,
+            blink=s.blink(index) or UNSET,
         )
 
     def _place(self, node: str, stamp_ns: int) -> FixedPlace:

@@ -71,6 +71,11 @@ class Panel:
         return self._state.started
 
     @property
+    def shines(self) -> bool:
+        """Whether the dive lights are to be on."""
+        return self._state.lights
+
+    @property
     def leak(self) -> bool | None:
         """Whether water is in the housing; None without a probe."""
         return None if self._pins.leak is None else self._leak

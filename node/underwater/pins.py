@@ -86,6 +86,13 @@ class GpioPin:
                 device.close()
 
 
+def output(number: int, factory: Any = None) -> Any:
+    """Open a pin as an output. factory: gpiozero's own by default."""
+    from gpiozero import DigitalOutputDevice
+
+    return DigitalOutputDevice(number, pin_factory=factory)
+
+
 class PanelPins:
     """The pins that [panel] names; None for each of the others. factory: gpiozero's own by default."""
 
@@ -98,16 +105,14 @@ class PanelPins:
 
             return DigitalInputDevice(number, pull_up=pull_up, pin_factory=factory)
 
-        def output(number: int) -> Any:
-            from gpiozero import DigitalOutputDevice
-
-            return DigitalOutputDevice(number, pin_factory=factory)
+        def switch(number: int) -> Any:
+            return output(number, factory)
 
         self.button = pin("button", config.button_pin, partial(contact, pull_up=True))
         self.leak = pin("leak", config.leak_pin, partial(contact, pull_up=False))
-        self.lamp = pin("lamp", config.lamp_pin, output)
-        self.buzzer = pin("buzzer", config.buzzer_pin, output)
-        self.lights = pin("lights", config.lights_pin, output)
+        self.lamp = pin("lamp", config.lamp_pin, switch)
+        self.buzzer = pin("buzzer", config.buzzer_pin, switch)
+        self.lights = pin("lights", config.lights_pin, switch)
         self.all = [one for one in (self.button, self.leak, self.lamp, self.buzzer, self.lights) if one is not None]
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Final, Literal
 
 from buddyline.protocol.messages.fields import Count, Message, NodeId, NonNegative, Positive, StampNs
+from buddyline.protocol.messages.node import Blink
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 MAX_BLOBS: Final = 64
@@ -84,7 +85,8 @@ class Expect(Message, frozen=True, kw_only=True):
     """Where the solver's track expects the lights of the node `seen` in a later picture of the node `node`.
 
     stamp_ns: the instant of the prediction, on node's clock; usually that of node's next picture. It serves until
-    valid_ns after the stamp. lights: those that should be in the picture; the others are left out.
+    valid_ns after the stamp. lights: those that should be in the picture; the others are left out. blink: how a lamp of
+    `seen` blinks: while it is dark it is in no picture.
     """
 
     node: NodeId
@@ -92,6 +94,7 @@ class Expect(Message, frozen=True, kw_only=True):
     stamp_ns: StampNs
     valid_ns: Annotated[int, Meta(ge=1, le=10_000_000_000)]
     lights: Annotated[list[ExpectedLight], Meta(max_length=2)]
+    blink: Blink | UnsetType = UNSET
 
 
 class FoxgloveTime(Struct, frozen=True, kw_only=True):

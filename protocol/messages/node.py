@@ -76,6 +76,17 @@ class FixedPlace(Struct, frozen=True, kw_only=True):
         check_unit("q_xyzw", self.q_xyzw)
 
 
+class Blink(Struct, frozen=True, kw_only=True):
+    """How a node's lamp blinks, so that others know whose it is (protocol/blinking.py).
+
+    code: its number among the codes. lamp: which of the two is switched. slot_ns: the node's trigger period.
+    """
+
+    code: Annotated[int, Meta(ge=0, le=9)]
+    lamp: Literal["left", "right", "both"]
+    slot_ns: Annotated[int, Meta(ge=1, le=2**63 - 1)]
+
+
 class NodeInfo(Message, frozen=True, kw_only=True):
     """Calibration and identity of a node.
 
@@ -84,7 +95,8 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     are magnetic. tags: AR tags on the node, for comparison only. imu_m: place of the inertial unit in the camera
     frame. imu_delay_ns: stamp of an inertial sample minus its true time. role: "lights" has two lamps and no camera,
     "camera" a camera and no lamps (its light_left_m and light_right_m, or its camera, are then not used). fixed: for a
-    node that stands still. certificate: in PEM; its key signs the node's digests.
+    node that stands still. blink: for a node with a lamp that is switched by a code. certificate: in PEM; its key signs
+    the node's digests.
     """
 
     node: NodeId
@@ -107,6 +119,7 @@ class NodeInfo(Message, frozen=True, kw_only=True):
     imu_delay_ns: int | UnsetType = UNSET
     role: Role | UnsetType = UNSET
     fixed: FixedPlace | UnsetType = UNSET
+    blink: Blink | UnsetType = UNSET
     certificate: Annotated[str, Meta(max_length=8192)] | UnsetType = UNSET
 
     @property

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.observation import Observation
+from buddyline.solver_service.geometry.observation import Blinking, Observation
 from buddyline.solver_service.geometry.ragged import places, starts_of
 from buddyline.solver_service.geometry.rig import RigPair
 from buddyline.solver_service.geometry.rotation import Floats, Indices
+from numpy.typing import NDArray
 
 # As many as a Candidates message holds.
 _MAX_CANDIDATES: Final = 64
@@ -35,7 +36,8 @@ class CandidateBearings:
     the bearing in the bar frame, the place over the picture's width and height, the bearing's variance, rad^2 per axis,
     and the square of the radius of a disc of its area, rad^2. frames: (N, 3, 3) bearing and both tangents, px per rad
     over sigma_px, camera frame. sigma_px (N,). dt_s: (N,) after the instant that the pose is for, the mean of both
-    stamps. log_score, log_area: (N,).
+    stamps. log_score, log_area: (N,). log_side: (N, 2) what a code says for the other node's left and right lamp. dark:
+    (T, 4) which lamps are switched off, in the order of Quads.lights. Both are None where no lamp blinks.
     """
 
     triggers: int
@@ -50,6 +52,8 @@ class CandidateBearings:
     dt_s: Floats
     log_score: Floats
     log_area: Floats
+    log_side: Floats | None = None
+    dark: NDArray[np.bool_] | None = None
 
     @property
     def bearing(self) -> Floats:
@@ -98,6 +102,11 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
     table[6] = area_px / (math.pi * px2_per_sr)
     frames[:, 1:] /= sigma_px[:, None, None]
     elsewhere = np.array([view.elsewhere for view in views])
+    log_side, dark = None, None
+    if any(view.blinking is not None for view in views):
+        said = [view.blinking or Blinking(np.zeros((len(view.table), 2)), (False, False)) for view in views]
+        log_side = np.concatenate([each.log_ratio[:_MAX_CANDIDATES] for each in said])[usable]
+        dark = np.array([each.dark for each in said]).reshape(-1, 4)
     return CandidateBearings(
         triggers=len(observations),
         counts=counts.reshape(-1, 2),
@@ -111,6 +120,8 @@ def find_candidates(observations: Sequence[Observation], rigs: RigPair) -> Candi
         dt_s=seen[:, 5] + later_s.T.ravel()[image],
         log_score=_log_score(seen[:, 3], image, counts, elsewhere),
         log_area=np.log(area_px),
+        log_side=log_side,
+        dark=dark,
     )
 
 

@@ -28,16 +28,30 @@ CHECKS: Final = frozenset({"range", "twist", "attitude", "depth"})
 
 
 @dataclass(frozen=True, eq=False)
+class Blinking:
+    """What a code says of the candidates (N) of one picture.
+
+    log_ratio: (N, 2) that each is the other node's left or right lamp, over chance. dark: whether the left and the
+    right lamp are switched off in this picture.
+    """
+
+    log_ratio: Floats
+    dark: tuple[bool, bool]
+
+
+@dataclass(frozen=True, eq=False)
 class View:
     """What one node saw at one trigger: N candidates.
 
     table: (N, 6), one row a candidate, with the columns that the properties name. stamp_ns: of the frame. elsewhere:
-    how many more the whole picture held, where only parts were searched.
+    how many more the whole picture held, where only parts were searched. blinking: what a code by which the other
+    node's lamps blink says; None where they do not.
     """
 
     table: Floats
     stamp_ns: int
     elsewhere: int = 0
+    blinking: Blinking | None = None
 
     @staticmethod
     def of(pixels: Floats, sigma_px: Floats, score: Floats, area_px: Floats, dt_s: Floats, stamp_ns: int) -> View:

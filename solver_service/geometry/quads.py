@@ -102,6 +102,8 @@ def find_quads(
     # (2, 2, K): left and right, then in A's picture and in B's.
     lights = np.where(turned, ends[::-1], ends)
     log_score = candidates.log_score[lights]
+    if candidates.log_side is not None:
+        log_score += candidates.log_side[lights, np.array((0, 1))[:, None, None]]
     quads = Quads(
         trigger=pairs.trigger[ia],
         lights=lights.swapaxes(0, 1).reshape(4, -1),

@@ -34,6 +34,8 @@ from numpy.typing import NDArray
 _FITS_CHI2: Final = 16.0
 _STEPS: Final = 4
 # No gap tells a gross error of the pair: the covariance has its share of them.
+# Of which side each of four lights is.
+_SIDES: Final = np.array((0, 1, 0, 1))
 UNCHECKED: Final = 1.0 + GROSS_PROBABILITY * (GROSS_SCALE**2 - 1.0)
 
 
@@ -175,6 +177,10 @@ def _log_ratio(
     # Nine residuals and six unknowns leave three factors of a normal density.
     total += math.log(PITCH_SPREAD * DEPTH_SPREAD_M * MISSING_ODDS) - 1.5 * math.log(2.0 * math.pi)
     total += np.where(lights < 0, 0.0, seen.log_score[lights]).sum(1)
+    if seen.log_side is not None and seen.dark is not None:
+        total += np.where(lights < 0, 0.0, seen.log_side[lights, _SIDES]).sum(1)
+        # A lamp that is switched off is missing for certain.
+        total -= math.log(MISSING_ODDS) * ((lights < 0) & seen.dark[trigger]).sum(1)
     R_ned_a, R_ned_b = sensors.R_ned_camera[trigger].swapaxes(0, 1)
     turn = turn_of(T_a_b.R, R_ned_a, R_ned_b)
     u = T_a_b.t_m / range_m[:, None]

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.blinking import lit
+from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import Floats, rotation_log, skew
 from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
@@ -37,6 +39,8 @@ LOST_S: Final = 3.0
 LOST_M: Final = 1.5
 # A bar whose lights are further outside of a picture than this is not looked for in it.
 OUTSIDE_PX: Final = 60.0
+# How likely a lamp that is switched off by its code is in the picture after all: it was switched late.
+SHOWN_DARK: Final = 0.01
 # What iron near a compass, or acceleration, adds to an attitude's sigmas (roll, pitch, yaw) when a join is checked.
 IRON_RAD: Final = np.radians((1.0, 1.0, 8.0))
 # For so long after a pose made a node a member, its lights are not used: they are those of the pose.
@@ -67,13 +71,14 @@ class NetRow:
 class NetEstimate(NetBelief):
     """One estimate of the network: a belief that also takes lights, lets nodes join and leave, and gives rows.
 
-    dark: nodes without lamps. start_s: when a challenger began. evidence: log odds over clutter of all pictures so far.
-    detection: by observer and other node, how likely each of its lights is found.
+    dark: nodes without lamps. blinks: how lamps blink, by node. start_s: when a challenger began. evidence: log odds
+    over clutter of all pictures so far. detection: by observer and other node, how likely each of its lights is found.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
         super().__init__(intake)
         self.dark: set[int] = set()
+        self.blinks: dict[int, Blink] = {}
         self.start_s = -np.inf
         self.evidence = 0.0
         self.detection: dict[tuple[int, int], Floats] = {}
@@ -126,11 +131,12 @@ class NetEstimate(NetBelief):
                 continue
             within = [wide or in_picture(camera, pixel, EDGE_PX) for pixel in pixels]
             detection = self.detection.setdefault((sight.node, member.node), np.full(2, 0.8))
-            found = detection * np.where(within, 1.0, 0.02)
+            shines = self._lit(member.node, sight)
+            found = np.where(shines, detection * np.where(within, 1.0, 0.02), SHOWN_DARK)
             y, H = residuals(sight.bearings, sight.tangents, X[: len(dt_s)], D[: len(dt_s)])
             bars.append(weigh(y, H, P, sight.sigma_px, found, clutter))
             compared.append((other, which, y, H))
-            inside.append(within)
+            inside.append([there and on for there, on in zip(within, shines, strict=True)])
         if not bars:
             return
         shared = share(bars, sight.sigma_px)
@@ -145,6 +151,11 @@ class NetEstimate(NetBelief):
             np.clip(detection, 0.02, 0.97, out=detection)
         if shared.chosen:
             self._update(observer, sight, shared.chosen, compared)
+
+    def _lit(self, node: int, sight: Sight) -> tuple[bool, bool]:
+        """Return which of a node's lamps are lit in a picture."""
+        blink = self.blinks.get(node)
+        return (True, True) if blink is None else lit(blink, sight.stamp_ns)
 
     def _update(
         self,

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from buddyline.protocol.messages import Blink
 from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix
@@ -61,8 +62,13 @@ class NetFilter(TrackIntake):
         self._watches: dict[int, FixedWatch] = {}
         self._watched_s = -np.inf
 
-    def add_node(self, node: TrackNode, place: KnownPlace | None = None, *, shines: bool = True) -> int:
-        """Take a node into the network, and return its index. place: of a fixed node. shines: whether it has lamps."""
+    def add_node(
+        self, node: TrackNode, place: KnownPlace | None = None, *, shines: bool = True, blink: Blink | None = None
+    ) -> int:
+        """Take a node into the network, and return its index.
+
+        place: of a fixed node. shines: whether it has lamps. blink: how they blink.
+        """
         self.nodes.append(node)
         self.samples.append(Samples())
         self.turning.append(Turning())
@@ -78,6 +84,8 @@ class NetFilter(TrackIntake):
                 self.challengers = []
         if not shines:
             self.main.dark.add(index)
+        if blink is not None:
+            self.main.blinks[index] = blink
         return index
 
     def advance(self, to_ns: int, outputs_ns: Sequence[int] = ()) -> list[NetRow]:

@@ -22,6 +22,7 @@ _INFO = m.NodeInfo(
     trigger_period_ns=PERIOD_NS,
     role="full",
     fixed=m.FixedPlace(p_m=(0.0, 0.0, 3.0), q_xyzw=_UNIT),
+    blink=m.Blink(code=1, lamp="left", slot_ns=PERIOD_NS),
 )
 
 

@@ -6,8 +6,9 @@ from buddyline.node.detect import Detection, make_detector
 from buddyline.node.devices import Frame
 from buddyline.node.guide import WHOLE_EVERY_NS, Guide, expected_first
 from buddyline.node.pipeline import Pipeline
+from buddyline.protocol.blinking import lit
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Blob, Expect, ExpectedLight
+from buddyline.protocol.messages import Blink, Blob, Expect, ExpectedLight
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -73,6 +74,20 @@ def test_expected_lights_are_looked_for_where_they_are_expected():
         candidates = eye.look(LAMPS, *of_lamps())
         assert guided(candidates)
         assert finds(candidates, *LAMPS)
+
+
+def test_a_lamp_that_is_dark_by_its_code_is_not_lost():
+    eye = Eye()
+    blink = Blink(code=0, lamp="left", slot_ns=PERIOD_NS)
+    looks = []
+    for _ in range(20):
+        shown = lit(blink, (eye.k + 1) * PERIOD_NS)[0]
+        eye.guide.expect(replace(expect(eye.k + 1, *of_lamps()), blink=blink))
+        looks.append((eye.look(LAMPS if shown else LAMPS[1:]), shown))
+    # Once a second the whole picture is searched in any case.
+    assert sum(not guided(one) for one, _ in looks) <= 4
+    assert sum(not shown for _, shown in looks) == 6
+    assert all(finds(one, *(LAMPS if shown else LAMPS[1:])) for one, shown in looks)
 
 
 def test_candidates_of_a_region_are_those_of_the_whole_picture():

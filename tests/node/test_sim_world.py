@@ -12,6 +12,7 @@ from buddyline.node.sim.inertial import ACCEL_SIGMA_MPS2, FIELD_NED_T, GRADES, G
 from buddyline.node.sim.rig import R_BODY_CAMERA
 from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
 from buddyline.node.sim.world import World
+from buddyline.protocol.blinking import lit
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, Candidates
@@ -343,3 +344,21 @@ def test_what_cannot_be_simulated_is_refused_by_name(wrong, named):
 def test_an_unknown_node_is_refused():
     with pytest.raises(BuddylineError, match="'c'"):
         World(Scenario()).depth("c", 0)
+
+
+@pytest.mark.parametrize("offset_ns", [0, 40_000_000])
+def test_a_blinking_lamp_is_dark_by_its_own_nodes_clock(offset_ns):
+    slot_ns = S_NS // 10
+    world = World(
+        Scenario(start_ns=START_NS, blink_slot_ns=slot_ns, interruptions=False, clock_offset_ns=offset_ns, miss_share=0)
+    )
+    blink = world.info("b", START_NS, slot_ns).blink
+    seen = []
+    for k in range(1, 21):
+        # Middle of a's slots, on a's clock; b's slots are as much earlier as its clock is ahead.
+        stamp_ns = START_NS + k * slot_ns
+        lights = {one.name: one.visible for one in world.light_truth("a", stamp_ns, k).lights}
+        assert lights["right"]
+        assert lights["left"] == lit(blink, stamp_ns + offset_ns)[0]
+        seen.append(lights["left"])
+    assert seen.count(False) == 6

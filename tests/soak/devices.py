@@ -32,7 +32,7 @@ class RenderedBefore(World):
     """A world whose pictures are rendered once."""
 
     def __init__(self, config: NodeConfig) -> None:
-        super().__init__(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+        super().__init__(scenario_of(config))
         self._config = config
         start_ns, step_ns = config.simulation.start_ns, STRETCH_NS // PICTURES
         render = super().render
@@ -56,7 +56,7 @@ def open_camera(config: NodeConfig, clock: Clock) -> RepeatingCamera:
 
 
 def open_sensors(config: NodeConfig, clock: Clock) -> list[SimulatedSensor]:
-    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    world = World(scenario_of(config))
     start_ns = config.simulation.start_ns
 
     def sensor(name: str, rate_hz: int, sample: Callable[[str, int], Message]) -> SimulatedSensor:

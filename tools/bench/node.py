@@ -216,7 +216,7 @@ def _render(config: NodeConfig, path: str) -> NodeInfo:
     from buddyline.node.sim.world import World
 
     cv2.setNumThreads(1)
-    world = World(scenario_of(config.simulation, config.camera.width_px, config.camera.height_px))
+    world = World(scenario_of(config))
     start_ns = config.simulation.start_ns
     stamps_ns = [start_ns + round((1.0 + 1.7 * i) * S_NS) for i in range(PICTURES)]
     pictures = [cv2.cvtColor(world.render(config.node, stamp_ns), cv2.COLOR_BGR2GRAY) for stamp_ns in stamps_ns]
