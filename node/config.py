@@ -135,12 +135,14 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
 class RecordConfig(Config, frozen=True, kw_only=True):
     """[record]: the node's own log. Pictures: at most images_hz of them, JPEG of this quality.
 
+    encoder: "camera" for the JPEG encoder that Pis before 5 have beside their camera; it costs no processor time.
     min_free_mb: where less is free, the oldest pictures are deleted, those of earlier dives first; 0: never.
     """
 
     directory: str = "dives"
     images_hz: Annotated[float, Meta(ge=0)] = 1.0
     image_quality: Annotated[int, Meta(ge=1, le=100)] = 90
+    encoder: Literal["software", "camera"] = "software"
     min_free_mb: Annotated[int, Meta(ge=0)] = 200
 
 
@@ -370,6 +372,11 @@ class NodeConfig(Config, frozen=True, kw_only=True):
             blink = Blink(code=self.blink.code, lamp=self.blink.lamp, slot_ns=self.trigger_period_ns)
         return replace(info, role=role, fixed=info.fixed if self.fixed is None else self.fixed.place, blink=blink)
 
+    def check_encoder(self) -> None:
+        """Raise ConfigError for an encoder that the camera does not have."""
+        if self.record.encoder == "camera" and self.camera.name != "picamera2":
+            raise ConfigError(f"record.encoder = 'camera': camera {self.camera.name!r} has none, only 'picamera2' has")
+
     def check_fixed(self) -> None:
         """Raise ConfigError for a place that is none."""
         if self.fixed is None:
@@ -386,6 +393,7 @@ def load_node_config(path: Path | str) -> NodeConfig:
     try:
         config.check_pins()
         config.check_fixed()
+        config.check_encoder()
         config.power.check()
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -26,7 +27,8 @@ class Frame:
 
     stamp_ns: middle of exposure of the middle row, wall clock. row_time_ns: from one row to the next.
     exposure: what this very frame had, None where the camera does not tell. context: whether that was the scene's
-    exposure and not the lamps'; None where it is always the same.
+    exposure and not the lamps'; None where it is always the same. jpeg: of a picture to be recorded that the camera's
+    own encoder makes; it fails where the encoder does.
     """
 
     image: NDArray[np.uint8]
@@ -34,6 +36,7 @@ class Frame:
     row_time_ns: int = 0
     exposure: Exposure | None = None
     context: bool | None = None
+    jpeg: Future[bytes] | None = None
 
 
 class ExposureControl(Protocol):

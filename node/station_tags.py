@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from buddyline.node.config import StationTagsConfig
 from buddyline.node.devices import Frame
-from buddyline.node.images import RateLimiter
+from buddyline.node.picking import RateLimiter
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Mark
 

@@ -16,8 +16,9 @@ from typing import Any, Final
 import numpy as np
 from buddyline.node.capture.exposure import Exposure, ExposureRange, inverse_tone_curve, srgb_to_linear
 from buddyline.node.capture.planned import PlannedExposures
-from buddyline.node.config import CameraConfig, NodeConfig
+from buddyline.node.config import CameraConfig, NodeConfig, RecordConfig
 from buddyline.node.devices import Frame
+from buddyline.node.drivers.camera_jpeg import CameraJpegs
 from buddyline.node.drivers.health import DeviceHealth
 from buddyline.node.drivers.readout import (
     GLOBAL_SHUTTERS,
@@ -28,6 +29,7 @@ from buddyline.node.drivers.readout import (
     first_line_ns,
 )
 from buddyline.node.drivers.samples import AbsentError, DeviceError
+from buddyline.node.picking import RecordedFrames
 from buddyline.node.trigger import FollowerWatch, FrameChooser, PhaseLock, frames_per_trigger
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import NodeInfo
@@ -57,7 +59,8 @@ CAMERA_ERRORS: Final = (RuntimeError, OSError, ValueError, LookupError, Assertio
 class Picamera2Camera:
     """One camera.
 
-    Its pictures are BGR, or luminance alone. skipped: frames that were not given out, by reason.
+    Its pictures are BGR, or luminance alone. skipped: frames that were not given out, by reason. record: how pictures
+    are recorded; None where none are.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class Picamera2Camera:
         trigger_period_ns: int,
         clock: Clock,
         boottime: Callable[[], int] = boottime_ns,
+        record: RecordConfig | None = None,
     ) -> None:
         self.skipped: Counter[str] = Counter()
         self._config = config
@@ -76,6 +80,9 @@ class Picamera2Camera:
         self._boottime = boottime
         self._health = DeviceHealth("camera")
         self._camera: Any = None
+        self._record = record
+        self._recorded = RecordedFrames(record.images_hz if record and record.encoder == "camera" else 0.0)
+        self._jpegs: CameraJpegs | None = None
         self.exposure_control: PlannedExposures | None = None
         self._open()
 
@@ -113,10 +120,11 @@ class Picamera2Camera:
     def close(self) -> None:
         """Free the camera."""
         camera, self._camera = self._camera, None
+        jpegs, self._jpegs = self._jpegs, None
         if camera is None:
             return
         # libcamera can hang on a camera that was unplugged; the node must still end.
-        closing = threading.Thread(target=_close, args=(camera,), name="camera closing", daemon=True)
+        closing = threading.Thread(target=_close, args=(camera, jpegs), name="camera closing", daemon=True)
         closing.start()
         closing.join(CLOSE_S)
         if closing.is_alive():
@@ -136,6 +144,8 @@ class Picamera2Camera:
         try:
             self._camera = Picamera2()
             self._configure()
+            if self._record is not None and self._record.encoder == "camera":
+                self._jpegs = CameraJpegs(self._camera, self._record.image_quality)
             self._camera.start()
         except CAMERA_ERRORS as error:
             self.close()
@@ -272,14 +282,17 @@ class Picamera2Camera:
             if not self._chooser.is_nearest(steady_ns):
                 self.skipped["not_nearest"] += 1
                 return None
+            control = self.exposure_control
+            context = None if control is None else control.plan.is_context(exposure)
             image = self._copy(request)
+            jpeg = None
+            if self._jpegs is not None and self._recorded.pick(stamp_ns, context):
+                jpeg = self._jpegs.encode(request, metadata["SensorTimestamp"])
         finally:
             # Controls given to set_controls ride on the request that is released next.
             request.release()
         self._health.update(self._follow(steady_ns))
-        control = self.exposure_control
-        context = None if control is None else control.plan.is_context(exposure)
-        return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])), exposure, context)
+        return Frame(image, stamp_ns, round(readout.row_time_ns(image.shape[0])), exposure, context, jpeg)
 
     def _wait_request(self, stop: threading.Event) -> Any:
         camera, asked_ns = self._camera, self._boottime()
@@ -369,7 +382,9 @@ def _limits(duration_ns: int) -> tuple[int, int]:
     return duration_us, duration_us
 
 
-def _close(camera: Any) -> None:
+def _close(camera: Any, jpegs: CameraJpegs | None) -> None:
+    if jpegs is not None:
+        jpegs.close()
     try:
         camera.close()
     except CAMERA_ERRORS as error:
@@ -378,4 +393,4 @@ def _close(camera: Any) -> None:
 
 def open_camera(config: NodeConfig, clock: Clock) -> Picamera2Camera:
     """Open the camera; raise DeviceError where there is none."""
-    return Picamera2Camera(config.camera, config.trigger_period_ns, clock)
+    return Picamera2Camera(config.camera, config.trigger_period_ns, clock, record=config.record)

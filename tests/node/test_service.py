@@ -25,7 +25,8 @@ from buddyline.node.config import (
 )
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.samples import AbsentError
-from buddyline.node.images import Images, RateLimiter
+from buddyline.node.images import Images
+from buddyline.node.picking import RateLimiter
 from buddyline.node.service import NodeService
 from buddyline.node.time_base import NodeClock
 from buddyline.protocol.clock import MS_NS, S_NS

@@ -38,5 +38,6 @@ def bus(adapter: Adapter) -> Iterator[I2cBus]:
 @pytest.fixture
 def sensor(monkeypatch: pytest.MonkeyPatch) -> standin.Sensor:
     sensor = standin.Sensor(ManualClock(picamera2_rig.START_NS))
-    monkeypatch.setitem(sys.modules, "picamera2", standin.module(sensor))
+    for name, module in standin.modules(sensor).items():
+        monkeypatch.setitem(sys.modules, name, module)
     return sensor

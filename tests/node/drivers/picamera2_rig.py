@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from buddyline.node.config import CameraConfig
+from buddyline.node.config import CameraConfig, RecordConfig
 from buddyline.node.devices import Frame
 from buddyline.node.drivers.camera_picamera2 import Picamera2Camera
 from buddyline.protocol.clock import MS_NS, S_NS, trigger_index
@@ -31,8 +31,13 @@ class Wall:
         return stop.is_set()
 
 
-def make(sensor: standin.Sensor, config: CameraConfig | None = None, period_ns: int = PERIOD_NS):
-    return Picamera2Camera(config or CameraConfig(colour=False), period_ns, Wall(sensor), sensor.boottime_ns)
+def make(
+    sensor: standin.Sensor,
+    config: CameraConfig | None = None,
+    period_ns: int = PERIOD_NS,
+    record: RecordConfig | None = None,
+) -> Picamera2Camera:
+    return Picamera2Camera(config or CameraConfig(colour=False), period_ns, Wall(sensor), sensor.boottime_ns, record)
 
 
 def frames(camera: Picamera2Camera, n: int) -> list[Frame]:

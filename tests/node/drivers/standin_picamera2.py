@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from enum import Enum
 from types import ModuleType
 from typing import Any
 
@@ -58,6 +59,9 @@ class Sensor:
         self.set_wall: dict[int, int] = {}
         self.opened = 0
         self.closed = 0
+        self.has_encoder = True
+        self.encoder_error: Exception | None = None
+        self.encoders: list[MJPEGEncoder] = []
         self.wall_shift_ns = 0
 
     def boottime_ns(self) -> int:
@@ -77,15 +81,22 @@ class Request:
         self.buffer = buffer
         self._metadata = metadata
         self._references = 1
+        self.stream_map = {"main": object()}
 
     def get_metadata(self) -> dict[str, Any]:
         return dict(self._metadata)
+
+    def acquire(self) -> None:
+        if self._references == 0:
+            raise RuntimeError("CompletedRequest: acquiring lock with ref_count 0")
+        self._references += 1
 
     def release(self) -> None:
         self._references -= 1
         if self._references < 0:
             raise RuntimeError("CompletedRequest: lock now has negative ref_count")
-        self._camera._recycle(self.buffer)
+        if self._references == 0:
+            self._camera._recycle(self.buffer)
 
 
 class MappedArray:
@@ -100,6 +111,99 @@ class MappedArray:
 
     def __exit__(self, *_: object) -> None:
         self.array = None
+
+
+class Output:
+    """Of picamera2.outputs."""
+
+    def __init__(self, pts: Any = None) -> None:
+        self.recording = False
+
+    def start(self) -> None:
+        self.recording = True
+
+    def stop(self) -> None:
+        self.recording = False
+
+    def outputframe(self, frame, keyframe=True, timestamp=None, packet=None, audio=False) -> None:
+        raise NotImplementedError
+
+    def _add_stream(self, encoder_stream: Any, *args: Any, **kwargs: Any) -> None:
+        pass
+
+
+class Quality(Enum):
+    VERY_LOW = 0
+    LOW = 1
+    MEDIUM = 2
+    HIGH = 3
+    VERY_HIGH = 4
+
+
+class MJPEGEncoder:
+    """The V4L2 encoder: it holds each request until a test lets it finish or lose the oldest."""
+
+    def __init__(self, bitrate: int | None = None) -> None:
+        if not Picamera2.sensor.has_encoder:
+            raise RuntimeError("Hardware MJPEG not available on this platform")
+        Picamera2.sensor.encoders.append(self)
+        self.width = self.height = self.stride = 0
+        self.format = self.name = ""
+        self.framerate: float | None = None
+        self.bits_per_s = 0
+        self.running = False
+        self.firsttimestamp: int | None = None
+        self._output: Output | None = None
+        self._held: deque[tuple[Request, int]] = deque()
+
+    @property
+    def output(self) -> Output | None:
+        return self._output
+
+    @output.setter
+    def output(self, value: Output) -> None:
+        if not isinstance(value, Output):
+            raise RuntimeError("Must pass Output")
+        self._output = value
+
+    def start(self, quality: Quality | None = None) -> None:
+        megabits = {Quality.MEDIUM: 30, Quality.HIGH: 40, Quality.VERY_HIGH: 50}[quality or Quality.MEDIUM]
+        self.bits_per_s = int(megabits * 1e6 * self.width * self.height * self.framerate / (1920 * 1080 * 30))
+        if self.format not in ("RGB888", "YUV420") or self.stride < self.width or self.output is None:
+            raise RuntimeError("Unrecognised format")
+        self.running = True
+        self.output.start()
+
+    def encode(self, stream: Any, request: Request) -> None:
+        if not self.running:
+            return
+        if Picamera2.sensor.encoder_error is not None:
+            raise Picamera2.sensor.encoder_error
+        assert request.stream_map[stream]
+        request.acquire()
+        timestamp_us = int(request.get_metadata()["SensorTimestamp"] / 1000)
+        if self.firsttimestamp is None:
+            self.firsttimestamp = timestamp_us
+        self._held.append((request, timestamp_us - self.firsttimestamp))
+
+    def finish(self) -> None:
+        """Give out the oldest picture: made-up bytes, which name a grey level of the buffer as it is now."""
+        request, timestamp_us = self._held.popleft()
+        grey = int(request.buffer.flat[0])
+        request.release()
+        assert self.output is not None
+        self.output.outputframe(b"jpeg of %d" % grey, True, timestamp_us, None, False)
+
+    def lose(self) -> None:
+        """Give the oldest request back without its picture."""
+        self._held.popleft()[0].release()
+
+    def stop(self) -> None:
+        if not self.running:
+            raise RuntimeError("Encoder already stopped")
+        self.running = False
+        while self._held:
+            self.lose()
 
 
 class Job:
@@ -178,6 +282,7 @@ class Picamera2:
         self._config = camera_config
         width, height = camera_config["main"]["size"]
         stride = -(-width // max(self._sensor.padding, 1)) * max(self._sensor.padding, 1)
+        camera_config["main"]["stride"] = stride * (1 if camera_config["main"]["format"] == "YUV420" else 3)
         if camera_config["main"]["format"] == "YUV420":
             shape: tuple[int, ...] = (height * 3 // 2, stride)
         else:
@@ -292,6 +397,17 @@ class Picamera2:
         self._free.append(buffer)
         self._queued.append(self._pending)
         self._pending = {}
+
+
+def modules(sensor: Sensor) -> dict[str, ModuleType]:
+    """Return what `import picamera2` and the imports of its modules are to find."""
+    encoders, mjpeg, outputs = (
+        ModuleType(f"picamera2.{name}") for name in ("encoders", "encoders.mjpeg_encoder", "outputs")
+    )
+    encoders.Quality = Quality  # type: ignore[attr-defined]
+    mjpeg.MJPEGEncoder = MJPEGEncoder  # type: ignore[attr-defined]
+    outputs.Output = Output  # type: ignore[attr-defined]
+    return {made.__name__: made for made in (module(sensor), encoders, mjpeg, outputs)}
 
 
 def module(sensor: Sensor) -> ModuleType:
