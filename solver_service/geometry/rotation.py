@@ -114,6 +114,18 @@ def _one_exp(x: float, y: float, z: float) -> tuple[float, ...]:
     return 1.0 - yy - zz, xy - c, xz + b, xy + c, 1.0 - xx - zz, yz - a, xz - b, yz + a, 1.0 - xx - yy
 
 
+def left_jacobian(w_rad: Floats) -> Floats:
+    """Give J (3, 3) of a rotation vector (3,): exp(w + dw) = exp(J dw) exp(w), and J t is the way of a screw (w, t)."""
+    angle2 = float(w_rad @ w_rad)
+    half = max(0.5 * math.sqrt(angle2), _TINY)
+    sine = math.sin(half) / half
+    # (x - sin x) / x^3 loses its digits near 0.
+    second = 1.0 / 6.0 - angle2 / 120.0 if angle2 < 1e-4 else (1.0 - sine * math.cos(half)) / angle2
+    K = skew(w_rad)
+    J: Floats = _IDENTITY + (0.5 * sine * sine) * K + second * (K @ K)
+    return J
+
+
 def rotation_log(R: Floats) -> Floats:
     """Turn rotation matrices (..., 3, 3) into rotation vectors (..., 3), at most pi long."""
     if R.size > 9 * _FEW:

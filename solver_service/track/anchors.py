@@ -44,14 +44,14 @@ def depth_residual(state: State, shown_m: float, age_s: float, ports_m: Floats) 
     ports_m (2, 3): of the ports, camera frames. h = (r + R_B p_B - R_A p_A)_z - v_z age + offset.
     """
     (xa, ya, za), (xb, yb, zb) = (state.R @ ports_m[:, :, None])[:, :, 0].tolist()
-    x, y, z = (state.r_m - age_s * state.v_mps).tolist()
-    h = z + zb - za + state.depth_offset_m
+    (x, y, z), (u, v, w) = state.r_m.tolist(), (age_s * state.v_mps).tolist()
+    h = z - w + zb - za + state.depth_offset_m
     H = np.zeros((1, SIZE))
     H[0, R_.start + 2] = 1.0
     H[0, V_.start + 2] = -age_s
-    # Turning moves what stands at p by phi x p, of which this is the downward part.
-    H[0, PHI[0]] = y - ya, xa - x, 0.0
-    H[0, PHI[1]] = yb, -xb, 0.0
+    # Turning moves what stands at p by phi x p, of which this is the downward part; r turns with phi_B, v with phi_A.
+    H[0, PHI[0]] = -v - ya, xa + u, 0.0
+    H[0, PHI[1]] = y + yb, -x - xb, 0.0
     H[0, DEPTH_OFFSET] = 1.0
     return np.array((shown_m - h,)), H
 

@@ -18,7 +18,7 @@ from buddyline.solver_service.track.output import TrackRow, at_one_time, at_one_
 from buddyline.solver_service.track.pool import MAX_TENTATIVE, TrackPool
 from buddyline.solver_service.track.shaking import Shaking
 from buddyline.solver_service.track.start import CLOCK_S, state_from_fix
-from buddyline.solver_service.track.state import CLOCK, State
+from buddyline.solver_service.track.state import CLOCK, State, place_covariance
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TOGETHER_S
 from buddyline.solver_service.track.walking import Walking
 
@@ -241,7 +241,7 @@ class TrackFilter(TrackPool):
         main = self.main
         if main is not None and main.confirmed and t_s - main.light_s > LOST_S and self.restarts:
             range_m = float(np.linalg.norm(main.state.r_m))
-            sigma_m = math.sqrt(float(np.trace(main.covariance[:3, :3])))
+            sigma_m = math.sqrt(float(np.trace(place_covariance(main.state, main.covariance))))
             if sigma_m > LOST_SHARE * min(range_m, LOST_RANGE_M):
                 # It knows no more than a new start would.
                 main.end_s = main.light_s + 1.0

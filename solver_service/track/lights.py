@@ -26,9 +26,9 @@ def light_positions(
 
     Returns X (K, L, 3) and D (K, L, 3, NAV + 1): dX by the errors of COLUMNS. rates_radps (2, 3): turn rates.
     Seen by A:  X = R_A^T (r + R_B l)
-                dX = R_A^T (dr + dt dv - [R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
+                dX = R_A^T (dr + dt dv - [r + R_B l]x (phi_B - phi_A)) + R_A^T (v + R_B (w_B x l)) dclock
     Seen by B:  X = R_B^T d, d = R_A l - r
-                dX = R_B^T (-dr - dt dv - [d]x (phi_A - phi_B)) - R_B^T R_A (w_A x l) dclock
+                dX = R_B^T (-dr - dt dv - [r + d]x (phi_A - phi_B)) - R_B^T R_A (w_A x l) dclock
     With B's clock ahead by dclock more than believed, what is called B's state at t was true dclock earlier. The
     displacement that A's own unknown velocity adds is counted to r.
     """
@@ -52,7 +52,7 @@ def light_positions(
     D = np.zeros((*X.shape, NAV + 1))
     D[..., 0:3] = sign * toward
     D[..., 3:6] = D[..., 0:3] * ahead_s[:, None, None, None]
-    turn = toward @ skew(arms if observer == 0 else d)
+    turn = toward @ skew((arms if observer == 0 else d) + state.r_m)
     D[..., 6:9] = turn if observer == 0 else -turn
     D[..., 9:12] = -D[..., 6:9]
     clock = state.v_mps + swept if observer == 0 else -swept

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 # A position no better than this share of the range is not told.
 WORST_SHARE: Final = 0.2
+# a x b = _ACROSS a b, by its last two axes.
+_ACROSS: Final = -skew(np.eye(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,26 +58,43 @@ def at_one_time_jacobian(state: State, rates_radps: Floats) -> Floats:
     turned = 0.5 * (state.R @ rates_radps[..., None])[..., 0]
     J[..., PHI[0], NAV] = -turned[..., 0, :]
     J[..., PHI[1], NAV] = turned[..., 1, :]
-    # The errors are those of plus: r turns with phi_A, which the clock turns here.
-    across = skew(turned[..., 0, :])
-    J[..., R_, NAV] = 0.5 * state.v_mps + (across @ state.r_m[..., None])[..., 0]
-    J[..., V_, NAV] = (across @ state.v_mps[..., None])[..., 0]
+    # The errors are those of plus: r turns with phi_B and v with phi_A, which the clock turns here.
+    half = skew(0.5 * np.asarray(state.clock_s)[..., None] * state.v_mps)
+    J[..., R_, PHI[0]], J[..., R_, PHI[1]] = -half, half
+    J[..., R_, NAV] = 0.5 * state.v_mps - (skew(turned[..., 1, :]) @ state.r_m[..., None])[..., 0]
+    J[..., V_, NAV] = (skew(turned[..., 0, :]) @ state.v_mps[..., None])[..., 0]
     return J
 
 
 def pose_jacobian(now: State) -> Floats:
     """Give the errors (..., 12, NAV) of t_a_b, of the rotation, of v_a_b and of t_ned by those of a state at one time.
 
-    t = R_A^T r with r = exp(phi_A) r + dr, so dt = R_A^T dr whatever phi_A is, and w = R_A^T (phi_B - phi_A).
+    With psi = phi_B - phi_A, t = R_A^T r errs by dt = R_A^T (dr - [r]x psi), and w = R_A^T psi.
     """
     toward = np.swapaxes(now.R[..., 0, :, :], -1, -2)
     J = np.zeros((*toward.shape[:-2], 12, NAV))
     J[..., 0:3, R_] = toward
+    across = skew(now.r_m)
+    J[..., 0:3, PHI[0]], J[..., 0:3, PHI[1]] = toward @ across, -toward @ across
     J[..., 3:6, PHI[0]], J[..., 3:6, PHI[1]] = -toward, toward
     J[..., 6:9, V_] = toward
     J[..., 9:12, R_] = np.eye(3)
-    J[..., 9:12, PHI[0]] = -skew(now.r_m)
+    J[..., 9:12, PHI[1]] = -across
     return J
+
+
+def _bent(C: Floats) -> Floats:
+    """Give what a place's covariance (N, 3, 3) lacks because it is bent, by the pose's covariance (N, 6, 6).
+
+    The state's errors are a screw's (dt, w): of the second order the place errs by b = w x dt / 2 beside dt. Where one
+    node alone is seen, the other's place lies on an arc, far thinner than the arc is bent: without E[b b^T] the pose
+    would be many sigmas off. For normal errors E[w_j t_k w_m t_n] = W_jk W_mn + E_jm T_kn + W_jn W_mk; W is of (w, t).
+    """
+    of_t, of_w, both = C[:, :3, :3], C[:, 3:, 3:], C[:, 3:, :3]
+    fourth = np.einsum("ajk,amn->ajkmn", both, both) + np.einsum("ajm,akn->ajkmn", of_w, of_t)
+    fourth += np.einsum("ajn,amk->ajkmn", both, both)
+    bent: Floats = 0.25 * np.einsum("ijk,lmn,ajkmn->ail", _ACROSS, _ACROSS, fourth, optimize=True)
+    return bent
 
 
 def rows_of(
@@ -94,6 +113,7 @@ def rows_of(
     toward = np.swapaxes(now.R[:, 0], -1, -2)
     J = pose_jacobian(now) @ at_one_time_jacobian(states, rates_radps)
     whole = J @ P @ np.swapaxes(J, -1, -2)
+    whole[:, :3, :3] += _bent(whole[:, :6, :6])
     ranges_m = np.sqrt(inner(now.r_m, now.r_m))
     told = np.isfinite(whole).all(axis=(1, 2))
     told &= np.sqrt(np.trace(whole[:, :3, :3], axis1=1, axis2=2)) <= WORST_SHARE * ranges_m

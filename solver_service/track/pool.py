@@ -15,7 +15,7 @@ from buddyline.solver_service.track.intake import newest_before
 from buddyline.solver_service.track.lights import BLOCK, Sight
 from buddyline.solver_service.track.search import starts
 from buddyline.solver_service.track.start import CLOCK_S, constants_of
-from buddyline.solver_service.track.state import PHI, R_, State
+from buddyline.solver_service.track.state import PHI, R_, State, of_place, place_covariance
 from buddyline.solver_service.track.stepping import HOLD_S, TICK_S, TrackSteps
 from buddyline.solver_service.track.trail import Chosen
 
@@ -69,17 +69,24 @@ class TrackPool(TrackSteps):
         for _ in range(REPLAYS):
             state = self._rewound(estimate, estimate.start_s)
             learned = REPLAY_SIGMAS * np.sqrt(np.diag(estimate.covariance))
+            place = REPLAY_SIGMAS * np.sqrt(np.diag(place_covariance(estimate.state, estimate.covariance)))
             range_m = float(np.linalg.norm(state.r_m))
             untold, variances = constants_of(self.nodes, state.R, state.r_m, self.clock_sigma_s)
             # What was learned of the constants is learned anew: the same lights must not count twice.
             state = untold.moved(state.r_m, state.v_mps, state.R)
             P = np.diag(variances)
-            P[R_, R_] = np.diag(np.maximum(learned[R_], REPLAY_SHARE * range_m) ** 2)
+            P[R_, R_] = np.diag(np.maximum(place, REPLAY_SHARE * range_m) ** 2)
             level = REPLAY_RAD**2 * np.eye(3)
             P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
             P[PHI[1], PHI[1]] = level + np.diag(np.maximum(learned[PHI[1]], REPLAY_RAD) ** 2)
             again = Estimate(
-                estimate.start_s, state, P, estimate.start_s, given=estimate.used, used=estimate.used, searched=True
+                estimate.start_s,
+                state,
+                of_place(state, P),
+                estimate.start_s,
+                given=estimate.used,
+                used=estimate.used,
+                searched=True,
             )
             self._open(again)
             for t_s, sight in self._sights:

@@ -14,7 +14,7 @@ from buddyline.solver_service.track.anchors import attitude_covariance
 from buddyline.solver_service.track.inputs import AttitudeSeen, TrackNode
 from buddyline.solver_service.track.lights import Sight
 from buddyline.solver_service.track.start import constants_of
-from buddyline.solver_service.track.state import PHI, R_, State
+from buddyline.solver_service.track.state import PHI, R_, State, of_place
 
 NEAREST_M: Final = 0.5
 FURTHEST_M: Final = 20.0
@@ -60,5 +60,5 @@ def starts(
                 P[PHI[node], PHI[node]] = attitude_covariance(
                     attitudes[node].R_ned_body, attitudes[node].sigma_rad, 1.5, 1.5
                 )
-            found.append((state, P, (p, q)))
+            found.append((state, of_place(state, P), (p, q)))
     return found

@@ -191,7 +191,7 @@ def _unseen(path: Path, states: State, two: NDArray[np.intp], span_s: Floats, sh
     variances[:, V_] = shaken[:, 4:5]
     T = np.zeros((len(two), NAV, NAV))
     T[:] = np.eye(NAV)
-    T[:, R_, PHI[0]], T[:, V_, PHI[0]] = skew(states.r_m), skew(states.v_mps)
+    T[:, R_, PHI[1]], T[:, V_, PHI[0]] = skew(states.r_m), skew(states.v_mps)
     out = np.zeros((len(two), len(COLUMNS), len(COLUMNS)))
     out[:, :NAV, :NAV] = (T * variances[:, None, :]) @ np.swapaxes(T, -1, -2)
     return out

@@ -27,6 +27,7 @@ from buddyline.solver_service.track.state import (
     SIZE,
     V_,
     State,
+    of_place,
 )
 
 # What is believed before the dive tells more, 1 sd.
@@ -102,6 +103,7 @@ def broad_start(
     level = BROAD_TURN_RAD**2 * np.eye(3)
     P[PHI[0], PHI[0]] = P[PHI[0], PHI[1]] = P[PHI[1], PHI[0]] = level
     P[PHI[1], PHI[1]] = level + BROAD_TURN_RAD**2 * np.eye(3)
+    P = of_place(state, P)
     if known is not None:
         least = np.diag([LEAST_BROAD**2] * NAV)
         narrow = BROAD_SIGMAS**2 * known[:NAV, :NAV] + least
@@ -132,7 +134,7 @@ def state_from_fix(
 ) -> tuple[State, Floats] | None:
     """Start from a fix, with A's attitude by its message or else its accelerometer; None where neither tells.
 
-    R_B = R_A R_a_b, r = R_A t. In the state's errors: dr = R_A dt, phi_B = phi_A + R_A w.
+    R_B = R_A R_a_b, r = R_A t: r errs by R_A dt, and phi_B = phi_A + R_A w.
     """
     if attitude is not None:
         R_A = attitude.R_ned_body @ nodes[0].rig.R_body_camera
@@ -152,4 +154,4 @@ def state_from_fix(
     P[PHI[1], PHI[1]] = level + from_fix[3:, 3:]
     P[R_, PHI[1]] = from_fix[:3, 3:]
     P[PHI[1], R_] = from_fix[3:, :3]
-    return state, P
+    return state, of_place(state, P)

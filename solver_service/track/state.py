@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from buddyline.solver_service.geometry.rotation import Floats, rotation_exp, rotation_log, skew
+from buddyline.solver_service.geometry.rotation import Floats, left_jacobian, rotation_exp, rotation_log, skew
 
 # Where each error stands in the error state: R_ is the position r's, not a rotation R's, which is PHI. A's part comes
 # first where a quantity belongs to a node.
@@ -34,6 +34,8 @@ _SHAPES: Final = ((3,), (3,), (2, 3, 3), (2, 3), (3,), (2, 3), (2, 3), (2, 3), (
 _ENDS: Final = np.cumsum([math.prod(shape) for shape in _SHAPES])
 ROW: Final = int(_ENDS[-1])
 _THREE: Final = 3.0 * np.eye(3)
+_OF_PLACE: Final = np.r_[R_, PHI[0], PHI[1]]
+_PLACE: Final = np.ix_(_OF_PLACE, _OF_PLACE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +66,15 @@ class State:
     def plus(self, error: Floats) -> State:
         """Return the state that is off this one by an error (SIZE,).
 
-        R_A = exp(phi_A) R_A, R_B = exp(phi_A) exp(phi_B - phi_A) R_B, r = exp(phi_A) (r + dr), v and shove likewise:
-        turning all about the vertical is then an error in phi_A and phi_B alone, whatever r and v are, and changes
-        nothing that pictures show, however large it is (docs/track.md, consistency).
+        R_A = exp(phi_A) R_A, R_B = exp(phi_A) exp(psi) R_B with psi = phi_B - phi_A, v = exp(phi_A) (v + dv), shove
+        likewise, r = exp(phi_A) (exp(psi) r + J(psi) dr): A turns all, and B goes by the screw (psi, dr) against it.
+        Turning all about the vertical changes nothing that pictures show, and where one node alone is seen, what they
+        leave open stays on its circle, however large it is (docs/track.md, consistency).
         """
-        turn = rotation_exp(np.stack((error[PHI[0]], error[PHI[1]] - error[PHI[0]])))
+        psi = error[PHI[1]] - error[PHI[0]]
+        turn = rotation_exp(np.stack((error[PHI[0]], psi)))
         return State(
-            r_m=turn[0] @ (self.r_m + error[R_]),
+            r_m=turn[0] @ (turn[1] @ self.r_m + left_jacobian(psi) @ error[R_]),
             v_mps=turn[0] @ (self.v_mps + error[V_]),
             R=orthonormal(turn[0] @ np.stack((self.R[0], turn[1] @ self.R[1]))),
             shake_rad=self.shake_rad + error[12:18].reshape(2, 3),
@@ -89,8 +93,10 @@ class State:
         error = np.empty(SIZE)
         error[PHI[0]] = phi = rotation_log(self.R[0] @ other.R[0].T)
         back = rotation_exp(-phi)
-        error[PHI[1]] = phi + rotation_log(back @ self.R[1] @ other.R[1].T)
-        error[R_] = back @ self.r_m - other.r_m
+        turn = back @ self.R[1] @ other.R[1].T
+        psi = rotation_log(turn)
+        error[PHI[1]] = phi + psi
+        error[R_] = np.linalg.solve(left_jacobian(psi), back @ self.r_m - turn @ other.r_m)
         error[V_] = back @ self.v_mps - other.v_mps
         error[12:18] = (self.shake_rad - other.shake_rad).ravel()
         error[SHOVE] = back @ self.shove_mps - other.shove_mps
@@ -129,12 +135,29 @@ def orthonormal(R: Floats) -> Floats:
 def plain_of_invariant(state: State) -> Floats:
     """Give T (MOVING, MOVING): errors with plain r_true - r, v_true - v and shove likewise, from the state's own."""
     T = np.eye(MOVING)
-    T[R_, PHI[0]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = -skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
+    T[R_, PHI[1]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = -skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
     return T
 
 
 def invariant_of_plain(state: State) -> Floats:
     """Give the inverse of `plain_of_invariant`."""
     T = np.eye(MOVING)
-    T[R_, PHI[0]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
+    T[R_, PHI[1]], T[V_, PHI[0]], T[SHOVE, PHI[0]] = skew(np.array((state.r_m, state.v_mps, state.shove_mps)))
     return T
+
+
+def of_place(state: State, P: Floats) -> Floats:
+    """Give the covariance (SIZE, SIZE) whose first errors are of where A sees B, exp(-phi_A) r, in the state's own."""
+    across = skew(state.r_m)
+    out = P.copy()
+    out[R_] += across @ (P[PHI[1]] - P[PHI[0]])
+    out[:, R_] += (out[:, PHI[1]] - out[:, PHI[0]]) @ across.T
+    return out
+
+
+def place_covariance(state: State, P: Floats) -> Floats:
+    """Give the covariance (3, 3) of where A sees B, in level axes."""
+    across = skew(state.r_m)
+    J = np.concatenate((np.eye(3), across, -across), axis=1)
+    block: Floats = J @ P[_PLACE] @ J.T
+    return block

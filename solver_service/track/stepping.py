@@ -23,7 +23,19 @@ from buddyline.solver_service.track.lights import (
     residuals,
 )
 from buddyline.solver_service.track.smoother import Path
-from buddyline.solver_service.track.state import CLOCK, GYRO_BIAS, MOUNT, MOVING, NAV, PHI, R_, SIZE, V_, State
+from buddyline.solver_service.track.state import (
+    CLOCK,
+    GYRO_BIAS,
+    MOUNT,
+    MOVING,
+    NAV,
+    PHI,
+    R_,
+    SIZE,
+    V_,
+    State,
+    place_covariance,
+)
 from buddyline.solver_service.track.strapdown import (
     Increment,
     Noise,
@@ -237,7 +249,8 @@ class TrackSteps(TrackIntake):
         if estimate.confirmed:
             sight = _widened(sight, H, estimate.covariance)
         detection = estimate.detection[observer]
-        wide = estimate.covariance[:3, :3].trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
+        place = place_covariance(estimate.state, estimate.covariance)
+        wide = place.trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
         if wide:
             inside = [True, True]
         else:

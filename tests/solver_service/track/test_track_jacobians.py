@@ -11,7 +11,7 @@ from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track.anchors import attitude_residual, depth_residual
 from buddyline.solver_service.track.lights import BLOCK, COLUMNS, light_positions, residuals
-from buddyline.solver_service.track.output import at_one_time, at_one_time_jacobian, pose_jacobian
+from buddyline.solver_service.track.output import at_one_time, at_one_time_jacobian, pose_jacobian, rows_of
 from buddyline.solver_service.track.state import (
     CLOCK,
     DELAY,
@@ -19,10 +19,13 @@ from buddyline.solver_service.track.state import (
     MOVING,
     NAV,
     PHI,
+    R_,
     SHAKE,
     SIZE,
     State,
     invariant_of_plain,
+    of_place,
+    place_covariance,
     plain_of_invariant,
 )
 from buddyline.solver_service.track.strapdown import Increment, integrate, propagate
@@ -85,6 +88,19 @@ def test_a_turn_of_all_together_changes_nothing_that_pictures_show() -> None:
     for vector in ("r_m", "v_mps", "shove_mps"):
         assert two.R[0].T @ getattr(two, vector) == pytest.approx(one.R[0].T @ getattr(one, vector), abs=1e-9)
     assert two.R[0].T @ two.R[1] == pytest.approx(one.R[0].T @ one.R[1], abs=1e-9)
+
+
+@pytest.mark.parametrize("observer", [0, 1])
+def test_what_one_nodes_pictures_leave_open_stays_on_an_arc(observer: int) -> None:
+    """A lamp at the centre of the camera that is seen stays where it is seen, however far B is turned about it."""
+    state, still = a_state(4), np.zeros((2, 3))
+    about = state.r_m if observer == 0 else np.zeros(3)
+    psi = np.array((0.3, -0.2, 0.4))
+    error = np.zeros(SIZE)
+    error[PHI[1]], error[R_] = psi, -np.cross(psi, about)
+    seen, _ = light_positions(state, observer, np.zeros((1, 3)), still, np.zeros(1))
+    turned, _ = light_positions(state.plus(error), observer, np.zeros((1, 3)), still, np.zeros(1))
+    assert turned == pytest.approx(seen, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -192,6 +208,34 @@ def test_anchors() -> None:
     _, H = attitude_residual(state, 1, state.R[1])
     numeric = -differences(lambda error: attitude_residual(state.plus(error), 1, state.R[1])[0], range(SIZE))
     assert np.allclose(H, numeric, atol=1e-6)
+
+
+def test_a_places_covariance_there_and_back() -> None:
+    state = a_state(6)
+    A = np.random.default_rng(1).normal(0.0, 1.0, (SIZE, SIZE))
+    P = A @ A.T
+    own = of_place(state, P)
+    assert place_covariance(state, own) == pytest.approx(P[R_, R_], abs=1e-9)
+    assert own == pytest.approx(own.T, abs=1e-9)
+
+
+def test_a_rows_covariance_holds_how_the_arc_is_bent() -> None:
+    """By many states about one whose turn is poorly known: the place's second moment, beyond the first order."""
+    state, still = replace(a_state(2), clock_s=0.0), np.zeros((2, 3))
+    sigma = np.full(NAV, 1e-4)
+    sigma[PHI[1]] = 0.1
+    P = np.zeros((len(COLUMNS), len(COLUMNS)))
+    P[:NAV, :NAV] = np.diag(sigma**2)
+    batch = State.of_row(state.to_row()[None])
+    told = rows_of((0,), batch, P[None], still[None], np.array((2,)), np.zeros(1))[0]
+    assert told is not None
+    error = np.zeros((4000, SIZE))
+    error[:, :NAV] = np.random.default_rng(5).normal(0.0, 1.0, (4000, NAV)) * sigma
+    places = np.array([moved.R[0].T @ moved.r_m for moved in map(state.plus, error)]) - told.t_a_b_m
+    along = told.t_a_b_m / told.range_m
+    # The arc is thin along the line of sight, where B's turn about A moves it only by being bent.
+    assert along @ told.covariance[:3, :3] @ along == pytest.approx(np.mean((places @ along) ** 2), rel=0.2)
+    assert np.trace(told.covariance[:3, :3]) == pytest.approx(np.mean((places**2).sum(axis=1)), rel=0.1)
 
 
 def test_pose_covariance() -> None:
