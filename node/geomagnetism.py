@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
@@ -13,6 +14,10 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
+
+# Years of the first World Magnetic Model that pygeomag has, and of the newest.
+FIRST_MODEL: Final = 2010
+NEWEST_MODEL: Final = 2025
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +36,8 @@ class EarthField:
 def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> EarthField:
     """Return the World Magnetic Model's field at sea level.
 
-    After the newest model's five years it is extrapolated: the declination then errs by tenths of a degree a year.
+    Before the first and after the newest model's five years it is extrapolated: the declination then errs by tenths
+    of a degree a year.
     Raises BuddylineError if pygeomag is missing, or the position is out of range.
     """
     if not (-90 <= latitude_deg <= 90 and -180 <= longitude_deg <= 180):
@@ -40,8 +46,9 @@ def earth_field(latitude_deg: float, longitude_deg: float, stamp_ns: int) -> Ear
         from pygeomag import GeoMag
     except ModuleNotFoundError as error:
         raise BuddylineError("declination from a position needs pygeomag: make install EXTRAS=pi") from error
-    model = GeoMag()
     moment = datetime.fromtimestamp(stamp_ns // S_NS, UTC)
+    # Each model is of five years; the first is of 2010.
+    model = GeoMag(base_year=datetime(min(max(moment.year, FIRST_MODEL), NEWEST_MODEL), 1, 1, tzinfo=UTC))
     start = datetime(moment.year, 1, 1, tzinfo=UTC)
     length = datetime(moment.year + 1, 1, 1, tzinfo=UTC) - start
     field = model.calculate(

@@ -12,7 +12,7 @@ from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.tools.survey.averages import Floats, wrap
-from buddyline.tools.survey.lines import bearing_of, sights_apart, slopes_of
+from buddyline.tools.survey.lines import bearing_of, line_of, measures_of, sights_apart, slopes_of
 from buddyline.tools.survey.observations import Observations
 from buddyline.tools.survey.project import Known, Leg, Project
 from msgspec import UNSET
@@ -210,6 +210,9 @@ def assemble(
     turned = {(one.dive, ns) for one in project.turn for ns in (one.from_ns, one.to_ns)}
     for number, (leg, names) in enumerate(zip(legs, ends, strict=True)):
         start, end = of.at[names[0]], of.at[names[1]]
+        if not leg.from_node:
+            _add_vector(to, number, project, start, end)
+            continue
         share = project.settings.range_share if leg.from_node else 0.0
         sigma_m = math.sqrt(
             max(leg.distance_sigma_m**2 - (share * leg.distance_m) ** 2, (OWN_SHARE * leg.distance_sigma_m) ** 2)
@@ -249,6 +252,32 @@ def assemble(
                 at_m = 0.0 if math.isnan(value_m) else value_m
                 of.add(kind, of.at[name], -1, at_m, max(known_m, EXACT_M), what=f"fixed point {name}")  # type: ignore[arg-type]
     return of
+
+
+def _add_vector(to: Assembly, number: int, project: Project, start: int, end: int) -> None:
+    """Add an old survey's leg as the vector that it is read as, along it, aside and across its slope."""
+    of, leg, turn_rad = to.observations, to.legs[number], to.turns_rad[number]
+    line = line_of(leg, measures_of(leg, project, turn_rad, {}), turn_rad)
+    if line is None:
+        return
+    slope, azimuth = line.measures.slopes[0], line.measures.azimuth
+    (sine, cosine), (east, north) = sincos(slope[0]), sincos(azimuth[0])
+    length_m, sigma_m = line.measures.distance
+    axes = {
+        "length": ((cosine * east, cosine * north, sine), sigma_m),
+        "direction, aside": ((north, -east, 0.0), length_m * abs(cosine) * azimuth[1]),
+        "slope, across": ((-sine * east, -sine * north, cosine), length_m * slope[1]),
+    }
+    for what, (axis, own_m) in axes.items():
+        terms = [(3 * at + k, sign * one) for at, sign in ((end, 1.0), (start, -1.0)) for k, one in enumerate(axis)]
+        value_m = length_m if what == "length" else 0.0
+        row = of.add("number", -1, -1, value_m, max(own_m, EXACT_M), terms, leg=number, what=what)
+        of.rows.setdefault((number, "distance"), row)
+
+
+def sincos(angle: float) -> tuple[float, float]:
+    """Return sine and cosine."""
+    return math.sin(angle), math.cos(angle)
 
 
 def _add_rises(to: Assembly, tides: Sequence[int]) -> None:

@@ -40,14 +40,14 @@ STYLES: Final = {"svx": ("auto", "diving", "normal"), "th": ("auto", "diving")}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    does = parser.add_subparsers(dest="does", required=True, metavar="{legs,adjust,report,export,watch,tags}")
+    does = parser.add_subparsers(dest="does", required=True, metavar="{legs,import,adjust,report,export,watch,tags}")
 
     def add(text: str, runs: Callable[[argparse.Namespace], int], example: str) -> argparse.ArgumentParser:
         one = subcommand(does, example.split(maxsplit=1)[0], text, f"survey {example}")
         one.set_defaults(survey=runs)
         if runs not in (_watch, _tags):
             one.add_argument("project", metavar="PROJECT.toml", type=Path)
-        if runs not in (_watch, _tags, _legs):
+        if runs not in (_watch, _tags, _legs, _import):
             one.add_argument(
                 "--depth",
                 choices=("absolute", "readings"),
@@ -65,6 +65,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     legs.add_argument(
         "--marks", type=Path, metavar="TIMES.csv", help="columns: time, node, name, and optionally kind and note"
     )
+    imported = add(
+        "take in surveys of other programs: they are adjusted with the project's own legs",
+        _import,
+        "import cave.toml old/161.svx",
+    )
+    imported.add_argument("files", nargs="+", metavar="FILE", type=Path, help="Survex .svx, Therion .th, ...")
+    imported.add_argument("--name", metavar="NAME", help="before its stations' names; default: the file's")
     adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")
     adjust.add_argument("--json", action="store_true", help="print everything as one JSON object")
     report = add("write an HTML report", _report, "report cave.toml -o cave.html")
@@ -138,7 +145,9 @@ def _legs(args: argparse.Namespace) -> int:
         by_hand = of_project(marks, number, int(pairs[0].stamps_ns[0]))
         derived.add(pairs, project.settings, project.alarms, number, by_hand)
     for one_place in project.equate:
-        derived.equate(one_place.stations)
+        # Names with points are those of old surveys, which are joined when all is adjusted.
+        if len(ours := [name for name in one_place.stations if "." not in name]) > 1:
+            derived.equate(ours)
     gauges = adjust_gauges(derived.legs, project.alarms)
     stations = derived.stations(gauges.depths)
     for text in gauges.alarms:
@@ -164,17 +173,49 @@ def _legs(args: argparse.Namespace) -> int:
     return 0 if (derived.legs or derived.points) and not derived.faults else 1
 
 
+def _import(args: argparse.Namespace) -> int:
+    """Add old surveys to a project, new if there is none; return 1 where something in them was not read."""
+    from buddyline.tools.survey.old.joining import joined, name_of, read_project_files
+    from buddyline.tools.survey.project import About, OldFile, Project, add_old, load_project, new_project
+    from msgspec import structs
+
+    path: Path = args.project
+    if args.name and len(args.files) > 1:
+        raise BuddylineError("--name is for one file")
+    added = [OldFile(file=os.path.relpath(one, path.parent), name=args.name or name_of(one)) for one in args.files]
+    project = load_project(path) if path.exists() else Project(survey=About(name=path.stem))
+    whole = structs.replace(project, old=project.old + added)
+    olds = read_project_files(whole, path.parent)
+    joined(whole, olds)
+    if path.exists():
+        add_old(path, added)
+    else:
+        new_project(path, path.stem, [], added)
+    for one, old in zip(added, olds[len(project.old) :], strict=True):
+        splays = sum("splay" in shot.flags for shot in old.shots)
+        print(
+            f"{one.file} as {one.name}: {len(old.shots) - splays} shots, {splays} splays, "
+            f"{len(old.stations)} stations, {len(old.passages)} passages, {len(old.fixes)} fixed"
+        )
+        for said in old.left_out:
+            print(f"  left out: {said}")
+    return 1 if any(old.left_out for old in olds[len(project.old) :]) else 0
+
+
 def _sheet(args: argparse.Namespace) -> Sheet:
     """Return the project's survey, adjusted."""
     from buddyline.tools.survey.network import adjust
+    from buddyline.tools.survey.old.joining import joined, read_project_files
     from buddyline.tools.survey.project import AdjustSettings, load_project
     from buddyline.tools.survey.sheet import Sheet
     from msgspec.structs import replace
 
     project = load_project(args.project)
+    olds = read_project_files(project, args.project.parent)
+    project = joined(project, olds)
     if args.depth:
         project = replace(project, adjust=AdjustSettings(depth=args.depth))
-    return Sheet(project, adjust(project))
+    return Sheet(project, adjust(project), olds)
 
 
 def _adjust(args: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from buddyline.tools.survey.assembly import Fixed, assemble, depths_of
 from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
-from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, slopes_of
+from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, measures_of, slopes_of
 from buddyline.tools.survey.observations import Observations, Solution
 from buddyline.tools.survey.placing import place_all, step_m_of
 from buddyline.tools.survey.project import Leg, Project
@@ -134,7 +134,7 @@ class Survey:
     def place(self, ends: list[tuple[str, str]]) -> None:
         """Find first places of all stations by the shortest way of legs; leave out legs that hang on nothing."""
         project, grid, at = self.project, self.grid, self.first_m
-        self.turns_rad = [grid.turn_rad(leg_date(project, leg), at.get(leg.from_)) for leg in self.legs]
+        self.turns_rad = [grid.leg_turn_rad(leg, leg_date(project, leg), at.get(leg.from_)) for leg in self.legs]
         self.first_m, why, self.north_along = place_all(project, self.legs, ends, self.turns_rad, self._starts())
         self.left_out += [(leg, said) for leg, said in zip(self.legs, why, strict=True) if said]
         kept = [number for number, said in enumerate(why) if not said]
@@ -212,6 +212,8 @@ class Survey:
 
     def _measures(self, solution: Solution, number: int, up_m: dict[str, float]) -> Measures | None:
         rows, leg, (start, end) = solution.observations.rows, self.legs[number], self.ends[number]
+        if not leg.from_node:
+            return measures_of(leg, self.project, self.turns_rad[number], {})
         sigma = solution.model.sigma
         distance = rows[number, "distance"]
         distance_m = leg.distance_m / (1 + float(solution.terms[distance]))

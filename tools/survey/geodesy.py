@@ -96,13 +96,13 @@ def survey_date(project: Project) -> date | None:
     """Return the stated date, or the first leg's (UTC)."""
     if project.survey.date is not UNSET:
         return project.survey.date
-    moments = [leg.moment for leg in project.leg + project.point]
+    moments = [leg.moment for leg in project.leg + project.point if leg.start_ns]
     return min(moments).date() if moments else None
 
 
 def leg_date(project: Project, leg: Leg) -> date:
     """Return the date that the leg's dive states, or the leg's own (UTC)."""
-    dive = project.dive[leg.dive - 1] if leg.dive <= len(project.dive) else None
+    dive = project.dive[leg.dive - 1] if 1 <= leg.dive <= len(project.dive) else None
     return dive.date if dive is not None and dive.date is not UNSET else leg.moment.date()
 
 
@@ -139,10 +139,13 @@ def declination(project: Project) -> Declination | None:
     if place.declination_deg is not UNSET:
         source = place.declination_source or "stated in the project"
         return Declination(source, math.radians(place.declination_deg))
+    magnetic = [leg for leg in project.leg + project.point if leg.turn_deg is leg.declination_deg is UNSET]
+    if not magnetic and project.leg:
+        return Declination("stated with the old surveys", 0.0)
     where = _somewhere(project)
     if where is None:
         return None
-    dates = sorted({leg_date(project, leg) for leg in project.leg + project.point})
+    dates = sorted({leg_date(project, leg) for leg in magnetic})
     if not dates:
         return None
     when = f"{dates[0]}" if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
@@ -200,6 +203,14 @@ class Grid:
     def turn_rad(self, when: date, position_m: Floats | None = None) -> float:
         """Return grid azimuth minus magnetic azimuth."""
         return self.declination_rad(when, position_m) - self.convergence_rad(position_m)
+
+    def leg_turn_rad(self, leg: Leg, when: date, position_m: Floats | None = None) -> float:
+        """Return grid azimuth minus the azimuth that a leg's readings have: stated with them, or magnetic."""
+        if leg.turn_deg is not UNSET:
+            return math.radians(leg.turn_deg)
+        if leg.declination_deg is not UNSET:
+            return math.radians(leg.declination_deg) - self.convergence_rad(position_m)
+        return self.turn_rad(when, position_m)
 
     def _place(self, position_m: Floats | None) -> tuple[float, float] | None:
         return self.where if position_m is None else self.degrees(position_m) or self.where

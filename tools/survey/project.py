@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from datetime import UTC, date, datetime
 from itertools import count
 from pathlib import Path
@@ -127,6 +128,16 @@ class Equate(Config, frozen=True, kw_only=True):
     stations: Annotated[list[str], Meta(min_length=2)]
 
 
+class OldFile(Config, frozen=True, kw_only=True):
+    """[[old]]: a survey made with another program, read anew each time; relative to the project file.
+
+    name: before its stations' names; by default the file's.
+    """
+
+    file: str
+    name: str = ""
+
+
 class AdjustSettings(Config, frozen=True, kw_only=True):
     """[adjust]. depth: absolute takes each reading as its station's depth; readings lets each leg keep its own two.
 
@@ -174,8 +185,9 @@ class Leg(Config, frozen=True, kw_only=True):
     """[[leg]] and [[point]]: one shot from a station to a station or point, as read; angles magnetic, in degrees.
 
     azimuth_deg, inclination_deg: by the node at `from`, towards `to`; back_*: by the node at `to`, towards
-    `from`. *_sigma_*: 1 sd; *_noise_*: its part that is new in each leg, not the gauge's own. fixes_used, unused:
-    triggers, as ranges; unused: by reason.
+    `from`. turn_deg: from magnetic to grid north, where it was stated, declination_deg: to true north. *_sigma_*: 1
+    sd; *_noise_*: its part that is new in each leg, not the gauge's own. fixes_used, unused: triggers, as ranges;
+    unused: by reason. A leg of an old survey has no nodes.
     """
 
     from_: str = field(name="from")
@@ -205,6 +217,8 @@ class Leg(Config, frozen=True, kw_only=True):
     field_to_ut: float | UnsetType = UNSET
     dip_from_deg: float | UnsetType = UNSET
     dip_to_deg: float | UnsetType = UNSET
+    turn_deg: float | UnsetType = UNSET
+    declination_deg: float | UnsetType = UNSET
     heading_gap_deg: float | UnsetType = UNSET
     disturbed: list[str] = field(default_factory=list)
     fixes: int
@@ -248,6 +262,7 @@ class Project(Config, frozen=True, kw_only=True):
     place: Place = field(default_factory=Place)
     fix: list[FixedPoint] = field(default_factory=list)
     dive: list[DiveFiles] = field(default_factory=list)
+    old: list[OldFile] = field(default_factory=list)
     mark: list[HandMark] = field(default_factory=list)
     edit: list[Edit] = field(default_factory=list)
     equate: list[Equate] = field(default_factory=list)
@@ -286,7 +301,8 @@ def load_project(path: Path | str) -> Project:
             )
     names = {leg.name for leg in project.leg}
     for edit in project.edit:
-        if names and edit.leg not in names:
+        # The legs of old surveys are read later.
+        if names and edit.leg not in names and not project.old:
             raise ConfigError(f"{path}: edit of leg {edit.leg!r}: no such leg; known: {', '.join(sorted(names))}")
     return project
 
@@ -298,7 +314,18 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
     text = f"{upper}\n\n{MARKER}\n{_toml(derived)}"
     if text == old:
         return
-    if MARKER in old:
+    _write_again(path, text, old if MARKER in old else "")
+
+
+def add_old(path: Path, added: list[OldFile]) -> None:
+    """Add old surveys to the upper part; keep the file as it was as `NAME.1`, `NAME.2`, ..."""
+    old = path.read_text(encoding="utf-8")
+    upper, marker, lower = old.partition(MARKER)
+    _write_again(path, f"{upper.rstrip()}\n{_toml({'old': added})}\n{marker}{lower}".rstrip() + "\n", old)
+
+
+def _write_again(path: Path, text: str, old: str) -> None:
+    if old:
         numbered = (path.with_name(f"{path.name}.{number}") for number in count(1))
         write_new(next(kept for kept in numbered if not kept.exists()), old)
     fresh = path.with_name(f"{path.name}.new")
@@ -306,9 +333,10 @@ def write_derived(path: Path, derived: dict[str, list[Any]]) -> None:
     os.replace(fresh, path)
 
 
-def new_project(path: Path, name: str, logs: list[str]) -> None:
+def new_project(path: Path, name: str, logs: list[str], old: Sequence[OldFile] = ()) -> None:
     """Write a project file to fill in; raise BuddylineError if one exists."""
-    text = TEMPLATE.format(name=_toml_value(name), logs=_toml_value(logs))
+    text = TEMPLATE.format(name=_toml_value(name))
+    text += f"\n[[dive]]\nlogs = {_toml_value(logs)}\n" * bool(logs) + (_toml({"old": list(old)}) if old else "")
     write_new(path, text, hint="add the dive to it as another [[dive]]")
 
 
@@ -335,9 +363,6 @@ notes = ""
 # latitude_deg = 45.5
 # longitude_deg = 9.2
 # entrance = true
-
-[[dive]]
-logs = {logs}
 
 # [[mark]]            # stations, points and notes by hand
 # node = "b"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -12,11 +13,15 @@ from buddyline.tools.survey.assembly import Fixed
 from buddyline.tools.survey.geodesy import leg_date, survey_date
 from buddyline.tools.survey.lines import Line, bearing_of
 from buddyline.tools.survey.network import Adjusted
+from buddyline.tools.survey.old.joining import same_place
+from buddyline.tools.survey.old.model import OldSurvey
 from buddyline.tools.survey.project import Leg, Project
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 # Survex refuses, as a warning, sights that differ by three sd of their difference.
 SEEN_SIGMAS: Final = 2.5
+# After a survey's name, where an old survey has the same.
+OWN: Final = "dives"
 
 
 @dataclass(frozen=True)
@@ -63,10 +68,12 @@ def remark_on(leg: Leg) -> str:
 class Sheet:
     """An adjusted survey, ready to be written down."""
 
-    def __init__(self, project: Project, adjusted: Adjusted) -> None:
-        self.project, self.adjusted = project, adjusted
+    def __init__(self, project: Project, adjusted: Adjusted, olds: Sequence[OldSurvey] = ()) -> None:
+        self.project, self.adjusted, self.olds = project, adjusted, olds
         about = project.survey
-        self.name = about.name
+        theirs = {station.partition(".")[0] for old in olds for station in old.stations}
+        # A survey of the hierarchy has one name.
+        self.name = f"{about.name}_{OWN}" if about.name in theirs else about.name
         self.title = about.title or about.name
         self.team = about.team
         when = survey_date(project)
@@ -100,7 +107,9 @@ class Sheet:
     @property
     def instruments(self) -> dict[str, str]:
         """The stated instruments; for tape and compass, if not stated, the nodes' own."""
-        nodes = sorted({node for leg in self.project.leg for node in (leg.from_node, leg.to_node)})
+        nodes = sorted({node for leg in self.project.leg for node in (leg.from_node, leg.to_node) if node})
+        if not nodes:
+            return dict(self.project.survey.instruments)
         ours = {
             "tape": f"Buddyline optical range, nodes {' and '.join(nodes)}",
             "compass": "Buddyline nodes' own, as foresight and backsight",
@@ -131,6 +140,35 @@ class Sheet:
         return fixed
 
     @property
+    def own_fixed(self) -> Fixed:
+        """Fixed stations that no old survey has fixed, those of this survey's legs; by the names they have here."""
+        if not self.olds:
+            return self.fixed
+        same_as = same_place(self.project, self.olds)
+        theirs = {same_as(fix.station) for old in self.olds for fix in old.fixes}
+        ours = {name for reading in self.readings for name in (reading.leg.from_, reading.leg.to)}
+        return {self.local(name): at for name, at in self.fixed.items() if name in ours - theirs}
+
+    @staticmethod
+    def local(name: str) -> str:
+        """Return a station's name among this survey's own; a point stands before the names of old surveys."""
+        return name.replace(".", "_")
+
+    def renamed(self, reading: Reading) -> Reading:
+        """Return a reading with stations' names of this survey."""
+        leg = structs.replace(reading.leg, from_=self.local(reading.leg.from_), to=self.local(reading.leg.to))
+        return replace(reading, line=replace(reading.line, leg=leg)) if self.olds else reading
+
+    @property
+    def joints(self) -> list[list[str]]:
+        """Names of one place in this survey and in old ones, the latter with points."""
+        ours = {name for reading in self.readings for name in (reading.leg.from_, reading.leg.to)}
+        of_old = {name for old in self.olds for name in old.stations}
+        stated = [[name for name in one.stations if name in ours | of_old] for one in self.project.equate]
+        shared = [[name, self.local(name)] for name in sorted(ours) if "." in name and name in of_old]
+        return [same for same in [*stated, *shared] if len(same) > 1 and self.olds]
+
+    @property
     def entrances(self) -> list[str]:
         """Fixed stations that are entrances."""
         return [fix.station for fix in self.project.fix if fix.entrance]
@@ -141,7 +179,9 @@ class Sheet:
         looped = {number for loop in self.adjusted.loops for number in loop.legs}
         numbers = {id(leg): number for number, leg in enumerate(self.adjusted.survey.legs)}
         return [
-            self._reading(line, numbers[id(line.leg)], numbers[id(line.leg)] in looped) for line in self.adjusted.lines
+            self._reading(line, numbers[id(line.leg)], numbers[id(line.leg)] in looped)
+            for line in self.adjusted.lines
+            if line.leg.from_node
         ]
 
     def _reading(self, line: Line, number: int, looped: bool) -> Reading:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from buddyline.tools.survey.averages import Floats
+from buddyline.tools.survey.old.writing import quoted, svx_of, svx_system, th_of, therion_person
 from buddyline.tools.survey.sheet import Reading, Sheet
 
 
@@ -100,21 +101,10 @@ THERION: Final = Language("", "#", "length", " ", corrects=False, turns=True)
 THERION_INSTRUMENTS: Final = ("tape", "length", "compass", "backcompass", "clino", "depth")
 
 
-def quoted(text: str) -> str:
-    """Return text in quotes; quotes in it are replaced."""
-    return '"' + text.replace('"', "'").replace("\n", " ") + '"'
-
-
 def coordinate_system(sheet: Sheet) -> str:
     """Return the map grid as both languages name it; empty without one."""
     projection = sheet.adjusted.grid.projection
     return "" if projection is None else f"EPSG:{projection.epsg}"
-
-
-def therion_person(name: str) -> str:
-    """Return a name as Therion takes it: first names, a slash, surname; two words at most without the slash."""
-    words = name.replace("/", " ").split()
-    return quoted(" ".join(words) if len(words) < 3 else f"{' '.join(words[:-1])}/{words[-1]}")
 
 
 def corrected(reading: Reading) -> Reading:
@@ -183,7 +173,7 @@ def svx(sheet: Sheet, style: str = "auto") -> str:
         "*units tape depth metres",
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
-        *SURVEX.data(sheet, sheet.readings, by_clino),
+        *SURVEX.data(sheet, map(sheet.renamed, sheet.readings), by_clino),
     ]
     return _svx_file(sheet, body)
 
@@ -195,23 +185,25 @@ def svx_cartesian(sheet: Sheet) -> str:
         "*sd position 0.001 metres",
         "*data cartesian from to easting northing altitude ignoreall",
     ]
-    for line in sheet.adjusted.lines:
+    for line in (reading.line for reading in sheet.readings):
         for i, axis in enumerate(("dx", "dy", "dz")):
             body.append(f"*sd {axis} {math.sqrt(line.covariance[i, i]):.4f} metres")
         values = "\t".join(f"{value:.4f}" for value in line.vector_m)
-        body.append(f"{line.leg.from_}\t{line.leg.to}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
+        ends = "\t".join(map(sheet.local, (line.leg.from_, line.leg.to)))
+        body.append(f"{ends}\t{values}\t; n={line.leg.fixes} grade {line.leg.grade}")
     return _svx_file(sheet, body)
 
 
 def _svx_file(sheet: Sheet, body: list[str]) -> str:
-    fixed, grid = sheet.fixed, coordinate_system(sheet)
+    fixed, grid = sheet.own_fixed, coordinate_system(sheet)
     lines = [
         f"; {sheet.title}",
         f"; {sheet.why}",
         "; Buddyline; from is never swapped with to; sds are 1 sd",
         *([f"*cs {grid}", f"*cs out {grid}"] if grid else []),
         f"*begin {sheet.name}",
-        f"*export {' '.join(fixed)}",
+        # Where one survey states its exports, Survex expects them of all.
+        *([f"*export {' '.join(fixed)}"] if not sheet.olds else []),
         f"*title {quoted(sheet.title)}",
         *([f"*date {sheet.date}"] if sheet.date else []),
         *(f"*team {quoted(person)}" for person in sheet.team),
@@ -222,11 +214,26 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
         # Without correlations Survex takes standard deviations of both axes on the map, and of height.
         sd = f" {max(sigma_m[0], 0.001):.3f} {max(sigma_m[2], 0.001):.3f}" if sigma_m.any() else ""
         lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
-    lines += [f"*entrance {name}" for name in sorted(sheet.entrances)]
+    lines += [f"*entrance {name}" for name in sorted(sheet.entrances) if name in fixed]
     lines += [
         *(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out),
     ]
-    return "\n".join([*lines, *body, f"*end {sheet.name}", ""])
+    if sheet.olds and not sheet.readings:
+        return "\n".join([*lines[: lines.index(f"*begin {sheet.name}")], *_svx_olds(sheet, grid), ""])
+    return "\n".join([*lines, *body, f"*end {sheet.name}", *_svx_olds(sheet, grid), ""])
+
+
+def _svx_olds(sheet: Sheet, grid: str) -> Iterator[str]:
+    """Yield the old surveys as they were read, each in a block of its own, and what joins them to this one."""
+    name_of: dict[str, str] = {}
+    for number, old in enumerate(sheet.olds):
+        written = svx_of(old, grid)
+        if not grid and not number:
+            yield from svx_system(old)
+        yield from ["*begin", *written.lines, "*end"]
+        name_of |= {station: written.name(station) for station in old.stations}
+    for same in sheet.joints:
+        yield f"*equate {' '.join(name_of.get(name, f'{sheet.name}.{sheet.local(name)}') for name in same)}"
 
 
 def th(sheet: Sheet, style: str = "auto") -> str:
@@ -236,7 +243,9 @@ def th(sheet: Sheet, style: str = "auto") -> str:
     each leg's standard deviations by axis, without their correlations, which bends loops of readings by decimetres.
     diving: as read.
     """
-    readings = [_adjusted(sheet, one) if style == "auto" and one.looped else one for one in sheet.readings]
+    readings = [
+        sheet.renamed(_adjusted(sheet, one) if style == "auto" and one.looped else one) for one in sheet.readings
+    ]
     grid = coordinate_system(sheet)
     rows = [
         *([f"date {sheet.date}"] if sheet.date else []),
@@ -248,12 +257,23 @@ def th(sheet: Sheet, style: str = "auto") -> str:
         ),
         *(f"# {note}" for note in sheet.notes),
         *([f"cs {grid}"] if grid else []),
-        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}{_therion_sd(sd)}" for name, (p, sd) in sheet.fixed.items()),
-        *(f'station {name} "" entrance' for name in sheet.entrances),
+        *(f"fix {name} {p[0]:.4f} {p[1]:.4f} {p[2]:.4f}{_therion_sd(sd)}" for name, (p, sd) in sheet.own_fixed.items()),
+        *(f'station {name} "" entrance' for name in sheet.entrances if name in sheet.own_fixed),
         "units length depth metres",
         "units compass clino degrees",
         "calibrate depth 0 -1",
         *THERION.data(sheet, readings, lambda reading: reading.by_clino),
     ]
     head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
-    return "\n".join([*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey", ""])
+    body = [*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey"]
+    return "\n".join([*(body if readings or not sheet.olds else head[:2]), *_th_olds(sheet, grid), ""])
+
+
+def _th_olds(sheet: Sheet, grid: str) -> Iterator[str]:
+    name_of: dict[str, str] = {}
+    for old in sheet.olds:
+        written = th_of(old, grid)
+        yield from written.lines
+        name_of |= {station: written.name(station) for station in old.stations}
+    for same in sheet.joints:
+        yield f"equate {' '.join(name_of.get(name, f'{sheet.local(name)}@{sheet.name}') for name in same)}"

@@ -1,0 +1,189 @@
+"""Old surveys in a project: their shots as legs of the one adjustment, their fixed points in the project's grid."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.config import ConfigError
+from buddyline.tools.survey.geodesy import utm_epsg
+from buddyline.tools.survey.old.model import LEAST_M, OldShot, OldSurvey, StationName
+from buddyline.tools.survey.old.readers import read_old
+from buddyline.tools.survey.old.systems import crs_of, map_system, moved
+from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project
+from msgspec import UNSET, UnsetType, structs
+
+# 1 sd of an angle that nothing tells, degrees.
+ANY_DEG: Final = 180.0
+
+
+def read_project_files(project: Project, folder: Path) -> list[OldSurvey]:
+    """Read a project's old surveys, each with its name before its stations; raise BuddylineError."""
+    found: list[OldSurvey] = []
+    names: set[str] = set()
+    for one in project.old:
+        name = one.name or name_of(Path(one.file))
+        if not STATION_NAME.match(name):
+            raise ConfigError(f"old.name {name!r} of {one.file}: is not 1 to 12 of A-Z a-z 0-9 _ -")
+        if name in names:
+            raise ConfigError(f"old.name {name!r}: two old surveys have it; name one of them otherwise")
+        names.add(name)
+        found.append(named(read_old(folder / one.file), name))
+    return found
+
+
+def name_of(path: Path) -> str:
+    """Return a survey's name by its file's."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in path.stem)[:12]
+
+
+def named(survey: OldSurvey, name: str) -> OldSurvey:
+    """Return a survey with all stations below one survey of this name; as it is where they are already."""
+    stations = [end for shot in survey.shots for end in (shot.start, shot.end) if end]
+    if all(one.startswith(f"{name}.") for one in [*stations, *(fix.station for fix in survey.fixes)]):
+        return survey
+
+    def below(station: StationName) -> StationName:
+        return f"{name}.{station}" if station else ""
+
+    return OldSurvey(
+        [replace(s, start=below(s.start), end=below(s.end), survey=(name, *s.survey)) for s in survey.shots],
+        [
+            replace(
+                one,
+                survey=(name, *one.survey),
+                sections=tuple(replace(section, station=below(section.station)) for section in one.sections),
+            )
+            for one in survey.passages
+        ],
+        [tuple(map(below, same)) for same in survey.equates],
+        [replace(fix, station=below(fix.station)) for fix in survey.fixes],
+        [below(one) for one in survey.entrances],
+        {(name, *path): notes for path, notes in survey.surveys.items()},
+        {below(station): note for station, note in survey.station_notes.items()},
+        survey.system,
+        survey.left_out,
+    )
+
+
+def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
+    """Return a project with its old surveys' legs and fixed points; raise ConfigError naming what does not fit."""
+    if not olds:
+        return project
+    same_as = same_place(project, olds)
+    stations = {name for leg in project.leg for name in (leg.from_, leg.to)}
+    stations |= {name for old in olds for name in old.stations}
+    for one in project.equate:
+        for name in one.stations:
+            if name not in stations:
+                raise ConfigError(f"equate of {name!r}: no leg and no old survey has this station")
+    legs = [
+        structs.replace(leg, from_=same_as(leg.from_), to=same_as(leg.to))
+        for leg in [*project.leg, *(leg for old in olds for leg in legs_of(old))]
+    ]
+    known = {name for leg in legs for name in (leg.from_, leg.to)}
+    place = project.place
+    system = next((name for old in olds if (name := map_system(old))), "")
+    if system and place.epsg is UNSET and place.utm_zone is UNSET:
+        code = crs_of(system).to_epsg()
+        if code is not None:
+            place = structs.replace(place, epsg=code)
+    wanted = system
+    if place.utm_zone is not UNSET:
+        wanted = f"EPSG:{utm_epsg(place.utm_zone)}"
+    elif place.epsg is not UNSET:
+        wanted = f"EPSG:{place.epsg}"
+    fixes: dict[str, FixedPoint] = {
+        same_as(fix.station): structs.replace(fix, station=same_as(fix.station)) for fix in project.fix
+    }
+    for old in olds:
+        for fix in old.fixes:
+            station = same_as(fix.station)
+            if station not in known or station in fixes:
+                continue
+            east_m, north_m = moved(fix, wanted) if wanted else fix.position[:2]
+            fixes[station] = FixedPoint(
+                station=station,
+                east_m=east_m,
+                north_m=north_m,
+                altitude_m=fix.position[2],
+                sigma_m=max(fix.sigmas_m[:2]),
+                altitude_sigma_m=fix.sigmas_m[2],
+                entrance=fix.station in old.entrances,
+            )
+    names = {leg.name for leg in legs}
+    for edit in project.edit:
+        if edit.leg not in names:
+            raise ConfigError(f"edit of leg {edit.leg!r}: no such leg, nor in the old surveys")
+    points = [structs.replace(leg, from_=same_as(leg.from_)) for leg in project.point]
+    return structs.replace(project, leg=legs, point=points, fix=list(fixes.values()), place=place)
+
+
+def same_place(project: Project, olds: Sequence[OldSurvey]) -> Callable[[StationName], StationName]:
+    """Return the name that stands for a station, of those that the project and old surveys say are one place."""
+    stated = [tuple(one.stations) for one in project.equate]
+    return _merged([*stated, *(same for old in olds for same in old.equates)])
+
+
+def _merged(equates: Iterable[tuple[StationName, ...]]) -> Callable[[StationName], StationName]:
+    """Return the name that stands for each station, the first that was stated of each place."""
+    parent: dict[StationName, StationName] = {}
+
+    def root(name: StationName) -> StationName:
+        while name in parent:
+            name = parent[name]
+        return name
+
+    for first, *others in equates:
+        for other in others:
+            one, two = root(first), root(other)
+            if one != two:
+                parent[two] = one
+    return root
+
+
+def legs_of(survey: OldSurvey) -> list[Leg]:
+    """Return a survey's shots between stations as legs; splays to nameless ends and unmeasured ones are none."""
+    return [_leg(shot) for shot in survey.shots if shot.start and shot.end and shot.style != "nosurvey"]
+
+
+def _leg(shot: OldShot) -> Leg:
+    distance_m, azimuth_deg, slope_deg = shot.polar
+    along_m, aside_m, across_m = shot.polar_sigmas
+    distance_m = max(distance_m, LEAST_M)
+    # As angles; of a plumbed leg the azimuth's sd is large, and its effect on the map the stated one.
+    run_m = distance_m * abs(math.cos(math.radians(slope_deg)))
+    start_ns = 0
+    if shot.when is not None:
+        start_ns = int(datetime(shot.when.year, shot.when.month, shot.when.day, 12, tzinfo=UTC).timestamp()) * S_NS
+    turn: float | UnsetType = UNSET
+    declination: float | UnsetType = UNSET
+    north = shot.north
+    if north.kind == "grid":
+        turn = north.value_deg
+    elif north.kind == "true" or shot.when is None:
+        declination = north.value_deg
+    return Leg(
+        from_=shot.start,
+        to=shot.end,
+        from_node="",
+        to_node="",
+        dive=0,
+        start_ns=max(start_ns, 0),
+        end_ns=max(start_ns, 0),
+        distance_m=distance_m,
+        distance_sigma_m=along_m,
+        azimuth_deg=azimuth_deg,
+        azimuth_sigma_deg=math.degrees(aside_m / run_m) if run_m else ANY_DEG,
+        inclination_deg=slope_deg,
+        inclination_sigma_deg=math.degrees(across_m / distance_m),
+        turn_deg=turn,
+        declination_deg=declination,
+        fixes=0,
+        note=f"{shot.place} {shot.note}".strip(),
+    )
