@@ -33,7 +33,9 @@ class NetTracker:
     def __init__(self, streams: Mapping[str, NodeStream], settings: TrackSettings) -> None:
         self._streams = streams
         self._period_ns = round(S_NS / min(settings.rate_hz, MOST_HZ))
+        self._mode: TrackMode = "smooth" if "smooth" in settings.modes else "filter"
         self._past: list[str] = []
+        self._left: list[Message] = []
         self._filter: NetFilter | None = None
         self.forget()
 
@@ -41,6 +43,8 @@ class NetTracker:
         """Start anew: a clock was set, or a rig was changed."""
         if self._filter is not None:
             self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
+            # What has not been smoothed yet is told now.
+            self._left += self._rest(self._filter)
         self._filter = None
         self._infos: dict[str, NodeInfo] = {}
         self._nodes: list[str] = []
@@ -92,19 +96,33 @@ class NetTracker:
             except (ArithmeticError, ValueError) as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
-                return []
+                return self._told([])
 
     def finish(self) -> list[Message]:
         """Take what is left, at the end of the dive."""
         if self._filter is None:
-            return []
+            return self._told([])
         with np.errstate(all="ignore"):
             try:
-                return self._take([], max(self._settled_ns.values(), default=0) + S_NS)
+                messages = self._take([], max(self._settled_ns.values(), default=0) + S_NS)
+                return messages + (self._rest(self._filter) if self._filter is not None else [])
             except (ArithmeticError, ValueError) as error:
                 self._note([f"values were out of numeric range ({error}): the network started anew"])
                 self.forget()
+                return self._told([])
+
+    def _rest(self, track: NetFilter) -> list[Message]:
+        """Return what is still to be smoothed; nothing where absurd values have spoiled it."""
+        with np.errstate(all="ignore"):
+            try:
+                return [self._message(row) for row in track.finish()]
+            except (ArithmeticError, ValueError):
                 return []
+
+    def _told(self, messages: list[Message]) -> list[Message]:
+        """Return messages, behind those of a network that has ended."""
+        left, self._left = self._left, []
+        return left + messages
 
     def _frontier_ns(self) -> int:
         """Return up to when everything has come: outcomes, and samples of the sensors that have not stopped.
@@ -121,20 +139,20 @@ class NetTracker:
     def _take(self, fixes: Sequence[RelativePose], to_ns: int) -> list[Message]:
         self._meet(to_ns)
         if self._filter is None:
-            return []
+            return self._told([])
         track = self._filter
         for fix in fixes:
             if fix.node_a in self._nodes and fix.node_b in self._nodes:
                 track.add_pair_fix(self._nodes.index(fix.node_a), self._nodes.index(fix.node_b), fix_of(fix))
         if to_ns <= self._taken_ns:
-            return []
+            return self._told([])
         for index, node in enumerate(self._nodes):
             self._feed(track, index, self._streams[node], self._taken_ns + 1, to_ns)
         told_ns = min(to_ns, max(self._settled_ns.values(), default=to_ns))
         due = range(-(-(self._told_ns + 1) // self._period_ns), told_ns // self._period_ns + 1)
         self._taken_ns, self._told_ns = to_ns, told_ns
         rows = track.advance(to_ns, [k * self._period_ns for k in due])
-        return [self._message(row) for row in rows]
+        return self._told([self._message(row) for row in rows])
 
     def _meet(self, to_ns: int) -> None:
         """Take nodes into the network whose calibration has come; start anew where one has changed."""
@@ -156,7 +174,7 @@ class NetTracker:
         for node in new:
             info, rig = known[node]
             if self._filter is None:
-                self._filter = NetFilter()
+                self._filter = NetFilter(smooths=self._mode == "smooth")
                 self._taken_ns = self._told_ns = self._first_ns - S_NS
             self._infos[node] = info
             self._nodes.append(node)
@@ -196,7 +214,7 @@ class NetTracker:
             R = rotation_exp(np.array([0.0, 0.0, first - own])) @ R
         return AttitudeSeen(message.stamp_ns, R, np.array(message.sigma_rad))
 
-    def _message(self, row: NetRow, mode: TrackMode = "filter") -> NodePose:
+    def _message(self, row: NetRow) -> NodePose:
         node = self._nodes[row.node]
         px, py, pz = (self._zero_m + row.p_m).tolist()
         vx, vy, vz = row.v_mps.tolist()
@@ -212,7 +230,7 @@ class NetTracker:
             v_mps=(vx, vy, vz),
             covariance=row.covariance.ravel().tolist(),
             fixed=self._infos[node].fixed is not UNSET,
-            mode=mode,
+            mode=self._mode,
             age_s=row.age_s,
         )
 

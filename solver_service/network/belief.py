@@ -27,6 +27,7 @@ from buddyline.solver_service.network.state import (
     blocks,
     lone,
 )
+from buddyline.solver_service.network.trail import Chosen, Grown, Learned, NetTrail
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.inputs import AttitudeSeen, TrackNode
 from buddyline.solver_service.track.intake import TrackIntake, newest_before
@@ -78,7 +79,7 @@ class NetBelief:
     """The state and covariance of all members, moved on by inertial samples and updated by the nodes' own sensors.
 
     intake: what all nodes have told. places: of the fixed nodes, by index. members, state, covariance, rates_radps,
-    shaking and t_s: as they are now.
+    shaking and t_s: as they are now. trail: what led there, None where nothing is smoothed.
     """
 
     def __init__(self, intake: TrackIntake) -> None:
@@ -90,6 +91,7 @@ class NetBelief:
         self.rates_radps: Floats = np.zeros((0, 3))
         self.shaking = NetShaking.of_none()
         self.t_s = -np.inf
+        self.trail: NetTrail | None = None
 
     @property
     def nodes(self) -> Sequence[TrackNode]:
@@ -126,8 +128,11 @@ class NetBelief:
         own[P_, P_] = place.sigma_m**2 * np.eye(3) + place.sigma_rad**2 * cross @ cross.T
         self._add(Member(node, t_s, confirmed=True, light_s=-np.inf), state, own)
 
-    def _add(self, member: Member, state: NetState, own: Floats, across: Floats | None = None) -> None:
-        """Add a member with its covariance (BLOCK, BLOCK), and that with the errors so far (N, BLOCK)."""
+    def _add(self, member: Member, state: NetState, own: Floats, by: Floats | None = None) -> None:
+        """Add a member with its covariance (BLOCK, BLOCK). by (BLOCK, N): its errors by those so far."""
+        across = None if by is None else self.covariance @ by.T
+        if self.trail is not None:
+            self.trail.events.append(Grown(np.zeros((BLOCK, len(self.covariance))) if by is None else by))
         if self.state is None:
             self.state, self.covariance = state, np.array(((DATUM_M**2,),))
             # The net's clock is the first member's.
@@ -152,6 +157,7 @@ class NetBelief:
         was_anchor = self.anchor == index
         self.members = [self.members[i] for i in kept]
         if not self.members:
+            self._note_chosen([])
             self.state, self.covariance, self.rates_radps = None, np.zeros((0, 0)), np.zeros((0, 3))
             self.shaking = NetShaking.of_none()
             return
@@ -159,10 +165,15 @@ class NetBelief:
             # The frame moves with another node from now on.
             self._anchor(kept[0])
         chosen = blocks(kept)
+        self._note_chosen(chosen)
         self.state = self.state.chosen(kept)
         self.covariance = self.covariance[np.ix_(chosen, chosen)]
         self.rates_radps = self.rates_radps[kept]
         self.shaking = self.shaking.chosen(kept)
+
+    def _note_chosen(self, chosen: list[int]) -> None:
+        if self.trail is not None:
+            self.trail.events.append(Chosen(tuple(chosen), len(self.covariance)))
 
     def _anchor(self, index: int) -> None:
         if self.state is None:
@@ -171,6 +182,8 @@ class NetBelief:
         p, v = self.state.p_m[index], self.state.v_mps[index]
         move = Move(np.broadcast_to(np.eye(BLOCK), (n, BLOCK, BLOCK)), np.zeros((n, BLOCK, BLOCK)), index, p, v)
         self.state = replace(self.state, p_m=self.state.p_m - p, v_mps=self.state.v_mps - v)
+        if self.trail is not None:
+            self.trail.moved(move)
         self.covariance = move.covariance(self.covariance)
 
     # Motion
@@ -229,12 +242,17 @@ class NetBelief:
         """Bring the network to t_s, by ticks where that is long, and take what sensors say there."""
         while t_s - self.t_s > 1.5 * TICK_S:
             self.step(self.t_s + TICK_S)
-        if t_s - self.t_s < TOGETHER_S:
-            return
+        if t_s - self.t_s >= TOGETHER_S:
+            self._go(t_s)
+
+    def _go(self, t_s: float) -> None:
+        """Bring the network to t_s in one step, and take what sensors say there."""
         self.state, move, self.rates_radps, without, drawn = self._moved(t_s)
         self.shaking = self.shaking.moved(move.F[:, :MOVING, :MOVING], drawn)
         for member, now in zip(self.members, without, strict=True):
             member.without = now
+        if self.trail is not None:
+            self.trail.moved(move)
         self.covariance = move.covariance(self.covariance)
         self.t_s = t_s
         for index, member in enumerate(self.members):
@@ -249,6 +267,8 @@ class NetBelief:
         assert self.state is not None
         before = self.covariance
         error, self.covariance, _, S_inverse = anchors.kalman(before, H, y, noise)
+        if self.trail is not None:
+            self.trail.events.append(Learned(H, before @ H.T @ S_inverse, S_inverse, y))
         if teaches:
             self.shaking = self.shaking.taught(y, S_inverse, H, before)
         self.state = self.state.plus(error)

@@ -15,7 +15,8 @@ from buddyline.solver_service.geometry.rotation import Floats, rotation_log, ske
 from buddyline.solver_service.network.belief import Member, NetBelief
 from buddyline.solver_service.network.exclusive import share
 from buddyline.solver_service.network.sights import columns, light_positions
-from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, block, lone
+from buddyline.solver_service.network.state import BLOCK, P_, PHI, V_, NetState, block, lone
+from buddyline.solver_service.network.trail import Present, Told
 from buddyline.solver_service.track import anchors
 from buddyline.solver_service.track.association import weigh
 from buddyline.solver_service.track.inputs import FixSeen
@@ -88,6 +89,7 @@ class NetEstimate(NetBelief):
         other = copy.copy(self)
         other.members = [replace(member) for member in self.members]
         other.detection = {pair: of.copy() for pair, of in self.detection.items()}
+        other.trail = None if self.trail is None else self.trail.copied()
         return other
 
     def remove(self, index: int) -> None:
@@ -226,15 +228,15 @@ class NetEstimate(NetBelief):
         by_fix[P_, :3], by_fix[P_, 3:], by_fix[PHI, 3:] = R_i, skew(p) @ R_i, R_i
         by_member = np.zeros((BLOCK, len(self.covariance)))
         by_member[P_, block(index)][:, P_] = by_member[PHI, block(index)][:, PHI] = np.eye(3)
-        across = self.covariance @ by_member.T
-        own += by_fix @ (fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)) @ by_fix.T + by_member @ across
+        own += by_fix @ (fix.covariance + np.diag([1e-4] * 3 + [1e-5] * 3)) @ by_fix.T
+        own += by_member @ self.covariance @ by_member.T
         seen = newest_before(self.intake.attitudes[node], t_s + HOLD_S)
         if seen is not None and t_s - seen[0] < 1.0:
             y = rotation_log(self.intake.level_camera(node, seen[1]) @ R.T)
             noise = self._attitude_noise(replace(seen[1], sigma_rad=np.hypot(seen[1].sigma_rad, IRON_RAD)), 1.0, 1.0)
             if float(y @ np.linalg.solve(noise + own[PHI, PHI], y)) > CONTRADICTS:
                 return
-        self._add(Member(node, t_s, confirmed=False, light_s=t_s, skip_s=t_s + SKIP_S), state, own, across)
+        self._add(Member(node, t_s, confirmed=False, light_s=t_s, skip_s=t_s + SKIP_S), state, own, by_member)
 
     def gap(self, t_s: float, fix: PairFix, one: int, two: int) -> tuple[Floats, float]:
         """Give how far a pose between two members is off (6,), m and rad, and its chi^2."""
@@ -261,18 +263,50 @@ class NetEstimate(NetBelief):
             return []
         while t_s - self.t_s > 1.5 * TICK_S:
             self.step(self.t_s + TICK_S)
+        if self.trail is not None:
+            # The smoother needs the state at this very time.
+            if t_s - self.t_s > 1e-6:
+                self._go(t_s)
+            self.trail.events.append(Told.of(t_s, stamp_ns, self._present(t_s), self.state, self.covariance))
+            return []
         state, P = self.state, self.covariance
         if t_s - self.t_s > 1e-6:
             state, move, *_ = self._moved(t_s)
             P = move.covariance(P)
+        own = np.stack([P[block(index), block(index)][:9, :9] for index in range(len(self.members))])
+        return self._rows_of(stamp_ns, self._present(t_s), state, own)
+
+    def smoothed(self, since_s: float, until_s: float) -> list[NetRow]:
+        """Give the rows that were passed after since_s, until until_s, by all that came up to now.
+
+        A member that is confirmed now was right before.
+        """
+        assert self.trail is not None
+        sure = {(member.node, member.since_s) for member in self.members if member.confirmed}
+        rows: list[list[NetRow]] = []
+        for told, state, own in self.trail.smoothed(len(self.covariance)):
+            sure |= {(one.node, one.since_s) for one in told.members if one.confirmed}
+            if since_s < told.t_s <= until_s:
+                present = [replace(one, confirmed=(one.node, one.since_s) in sure) for one in told.members]
+                rows.append(self._rows_of(told.stamp_ns, present, state, own))
+        return [row for of_time in reversed(rows) for row in of_time]
+
+    def _present(self, t_s: float) -> list[Present]:
+        return [
+            Present(one.node, one.since_s, one.confirmed, max(t_s - max(one.light_s, one.since_s), 0.0))
+            for one in self.members
+        ]
+
+    def _rows_of(self, stamp_ns: int, members: Sequence[Present], state: NetState, own: Floats) -> list[NetRow]:
+        """Give the confirmed members whose places are known well; own (n, 9, 9): covariances in the state's errors."""
         rows = []
-        for index, member in enumerate(self.members):
+        for index, member in enumerate(members):
             if not member.confirmed:
                 continue
             J = self.plain(state, index)
-            own = J @ P[block(index), block(index)][:9, :9] @ J.T
+            plain = J @ own[index] @ J.T
             told_m = max(TOLD_M, TOLD_SHARE * float(np.linalg.norm(state.p_m[index])))
-            if not math.sqrt(max(float(np.trace(own[:3, :3])), 0.0)) < told_m:
+            if not math.sqrt(max(float(np.trace(plain[:3, :3])), 0.0)) < told_m:
                 continue
             which = np.r_[P_, PHI]
             rows.append(
@@ -282,8 +316,8 @@ class NetEstimate(NetBelief):
                     p_m=state.p_m[index],
                     R=state.R[index],
                     v_mps=state.v_mps[index],
-                    covariance=own[np.ix_(which, which)],
-                    age_s=max(t_s - max(member.light_s, member.since_s), 0.0),
+                    covariance=plain[np.ix_(which, which)],
+                    age_s=member.age_s,
                 )
             )
         return rows

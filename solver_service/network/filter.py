@@ -18,6 +18,7 @@ from buddyline.solver_service.geometry.rotation import rotation_log, skew
 from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import CONTRADICTS, NetEstimate, NetRow, PairFix
 from buddyline.solver_service.network.fixed import FixedWatch
+from buddyline.solver_service.network.trail import NetTrail
 from buddyline.solver_service.track.inputs import FixSeen, TrackNode
 from buddyline.solver_service.track.intake import CHECK_EVERY_S, TrackIntake, newest_before
 from buddyline.solver_service.track.lights import Sight
@@ -43,18 +44,28 @@ AGAIN_S: Final = 1.0
 # A pair is reported after so many poses in a row that contradict the network.
 CONTRADICTIONS: Final = 10
 MEMORY_S: Final = 30.0
+# Rows are smoothed by what comes in this time after them at least, and in twice this time at most.
+LATER_S: Final = 10.0
 # Rows come after all else of their time.
 ROW: Final = 1 << 20
 
 
 class NetFilter(TrackIntake):
-    """The network of nodes. Samples and events may be added in any order before `advance` passes them."""
+    """The network of nodes. Samples and events may be added in any order before `advance` passes them.
+
+    smooths: rows come later, by all that was seen in the LATER_S after each, or up to the end.
+    """
 
     nodes: list[TrackNode]
 
-    def __init__(self) -> None:
+    def __init__(self, *, smooths: bool = False) -> None:
         super().__init__([])
         self.main = NetEstimate(self)
+        self.smooths = smooths
+        if smooths:
+            self.main.trail = NetTrail()
+        # Up to when rows have been smoothed.
+        self._smoothed_s = -np.inf
         self.challengers: list[NetEstimate] = []
         self._fixes: dict[tuple[int, int], list[tuple[float, PairFix]]] = {}
         self._challenged_s: dict[tuple[int, int], float] = {}
@@ -101,12 +112,34 @@ class NetFilter(TrackIntake):
         while self._events and self._events[0][0] <= end_s:
             t_s, _, _, what = heapq.heappop(self._events)
             if isinstance(what, int):
-                rows += self.main.rows(t_s, what)
+                rows += self._rows(t_s, what)
             elif isinstance(what, PairFix):
                 self._take_fix(t_s, what)
             elif isinstance(what, Sight):
                 self._take_sight(t_s, what)
         self._forget_before(end_s - MEMORY_S)
+        return rows
+
+    def finish(self) -> list[NetRow]:
+        """Return the rows that have not been smoothed yet, at the end of the dive."""
+        return self._smooth(np.inf) if self.smooths else []
+
+    def _rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
+        if not self.smooths:
+            return self.main.rows(t_s, stamp_ns)
+        for estimate in [self.main, *self.challengers]:
+            estimate.rows(t_s, stamp_ns)
+        if self._smoothed_s == -np.inf:
+            self._smoothed_s = t_s - TOGETHER_S
+        return self._smooth(t_s - LATER_S) if t_s - self._smoothed_s >= 2.0 * LATER_S else []
+
+    def _smooth(self, until_s: float) -> list[NetRow]:
+        """Return the rows until then that have not been smoothed yet."""
+        rows = self.main.smoothed(self._smoothed_s, until_s)
+        self._smoothed_s = until_s
+        for estimate in [self.main, *self.challengers]:
+            if estimate.trail is not None:
+                estimate.trail.forget_before(until_s)
         return rows
 
     def add_pair_fix(self, node: int, other: int, fix: FixSeen) -> None:

@@ -100,6 +100,16 @@ class Move:
             own[V_] -= ref[V_] + v_cross @ turn
         return moved
 
+    def backward(self, M: Floats) -> Floats:
+        """Return F^T M, for a matrix (N, M)."""
+        if self.anchor is not None:
+            whole: Floats = self.onward(np.eye(len(M))).T @ M
+            return whole
+        n = len(self.F)
+        moved = M.copy()
+        moved[1:] = (np.swapaxes(self.F, 1, 2) @ M[1:].reshape(n, BLOCK, -1)).reshape(n * BLOCK, -1)
+        return moved
+
     def covariance(self, P: Floats) -> Floats:
         """Return F P F^T + Q."""
         n = len(self.F)
