@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose
+from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose, Track
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.derive import Derived, ranges
@@ -105,6 +105,44 @@ def test_a_point_is_measured_from_the_other_nodes_station(messages):
     station = adjusted.positions[leg.to]
     assert np.linalg.norm(adjusted.points[0].position_m - station.position_m) < 0.3
     assert adjusted.points[0].ellipse[0] > 0.02
+
+
+def test_a_station_that_is_swum_past_is_measured_by_the_track():
+    course = world.line(np.random.default_rng(2), 2)
+    messages = world.dive(course, np.random.default_rng(7), rest_s=8.0, swim_s=50.0)
+    first, second = derived(messages).legs
+    at_ns = (first.end_ns + second.start_ns) // 2
+    pose = next(m for m in messages if isinstance(m, RelativePose) and m.stamp_ns > first.start_ns)
+    # As if a were still at station 0; where the track has no row there, nothing is made up.
+    row = Track(
+        node_a="a",
+        node_b="b",
+        stamp_ns=at_ns + 5 * 10**7,
+        t_a_b_m=pose.t_a_b_m,
+        q_a_b_xyzw=pose.q_a_b_xyzw,
+        covariance=pose.covariance,
+        v_a_b_mps=(0.0, 0.0, 0.0),
+        v_covariance=[0.0] * 9,
+        mode="smooth",
+        lights=4,
+        age_s=0.0,
+        range_m=1.0,
+    )
+    mark = Mark(node="a", stamp_ns=at_ns, name="M", note="flake")
+    found = derived([*messages, row, mark])
+    assert not found.faults
+    assert "M" not in found.numbered
+    leg = found.legs[2]
+    assert (leg.from_, leg.from_node, leg.to, leg.note) == ("1", "b", "M", "swum past flake")
+    assert abs(leg.distance_m - first.distance_m) < 0.15
+    assert abs((leg.azimuth_deg - first.back_azimuth_deg + 180) % 360 - 180) < 5.0
+    assert abs(leg.depth_to_m - first.depth_from_m) < 0.2
+    assert 0.2 < leg.distance_sigma_m < 0.25
+    for wrong, why in (([mark], "no track"), ([row, replace(mark, node="b")], "where node a stood")):
+        found = derived([*messages, *wrong])
+        assert len(found.legs) == 2
+        assert found.faults == 1
+        assert why in found.problems[0].text
 
 
 def test_a_point_without_fixes_is_reported(messages):
@@ -453,6 +491,11 @@ def test_a_mark_by_hand_takes_precedence_and_equate_joins_stations(messages):
     found = Derived()
     found.add(of_messages([*messages, wrong]), SurveySettings(), AlarmSettings(), by_hand=[right])
     assert found.legs[2].to == "T12"
+    assert not found.problems
+    # Of two in the log the later one counts, and that is said.
+    later = derived([*messages, wrong, replace(right, stamp_ns=wrong.stamp_ns + S_NS)])
+    assert later.legs[2].to == "T12"
+    assert "is at T21 and at T12; T12 counts" in later.problems[0].text
     found.equate(["T12", found.legs[0].from_])
     assert found.legs[0].from_ == "T12"
     assert "T12" in {station.name for station in found.stations({})}

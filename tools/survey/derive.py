@@ -31,6 +31,8 @@ from msgspec.structs import replace
 # A mark belongs to the nearest rest, but not to one further away than this.
 MARK_NEAR_NS: Final = 20_000_000_000
 LEAST_POINT_FIXES: Final = 3
+# The track's row nearest to a mark is no further from it than this.
+TRACK_NEAR_NS: Final = 150_000_000
 
 
 class Derived:
@@ -70,11 +72,19 @@ class Derived:
             self.turns += chain.turns
             chains.append(chain)
         nodes = {node for chain in chains for node in chain.readings.nodes}
+        placed = {id(mark) for chain in chains for mark in chain.placed}
+        passing = {
+            id(mark): [chain.passed(mark) for chain in chains if mark.node in chain.readings.nodes]
+            for mark in marks
+            if mark.kind == "station" and mark.tag is UNSET and id(mark) not in placed and STATION_NAME.match(mark.name)
+        }
+        passed = [leg for found in passing.values() for leg in found if isinstance(leg, Leg)]
+        self.legs += passed
         marked = {name for chain in chains for stations in chain.named for name in stations.values()}
+        marked |= {leg.to for leg in passed}
         for leg in self.legs:
             for name in {leg.from_, leg.to} - marked:
                 self.numbered.setdefault(name, leg.dive)
-        placed = {id(mark) for chain in chains for mark in chain.placed}
         points = [mark for mark in marks if mark.kind == "point" and mark.node in nodes]
         for mark in marks:
             at = time_text(mark.stamp_ns)
@@ -92,9 +102,11 @@ class Derived:
                     continue
                 if mark.note and mark.note not in self.notes[mark.name]:
                     self.notes[mark.name].append(mark.note)
-                if id(mark) not in placed and not points and mark.tag is UNSET:
+                why = passing.get(id(mark), [])
+                used = points or any(isinstance(one, Leg) for one in why) or mark.name in {leg.from_ for leg in passed}
+                if why and not used:
                     self.faults += 1
-                    self.add_problem(f"mark {mark.name} at {at}: no rest near it")
+                    self.add_problem(f"mark {mark.name} at {at}: no rest near it; in passing: {why[0]}")
         for mark in points:
             name = mark.name or f"p{len(self.points) + 1}"
             # Of several nodes that saw the point, the first with enough fixes.
@@ -206,6 +218,12 @@ class _Chain:
             if mark.kind != "station" or mark.node not in self.readings.nodes or not STATION_NAME.match(mark.name):
                 continue
             if (at := rest_of(mark, self.found)) is not None:
+                before = named[at].get(mark.node, mark.name)
+                if before != mark.name and id(mark) not in corrected:
+                    when = time_text(self.found[at].start_ns)
+                    out.add_problem(
+                        f"rest at {when}: node {mark.node} is at {before} and at {mark.name}; {mark.name} counts"
+                    )
                 named[at][mark.node] = mark.name
                 self.placed.append(mark)
                 earlier = out.numbered.get(mark.name, self.dive)
@@ -228,6 +246,21 @@ class _Chain:
             return f"{int(near.sum())} fixes within {self.settings.point_s:g} s of its mark"
         shot = shoot(self.readings, self.seen, near, self.settings)
         return replace(self._leg(shot, {other: station, mark.node: name}, other), note=mark.note)
+
+    def passed(self, mark: Mark) -> Leg | str:
+        """Return the leg from the other node's station to a place that was swum past, or why there is none."""
+        other = next(node for node in self.readings.nodes if node != mark.node)
+        station, track = self._standing_at(mark.stamp_ns, other), self.readings.track
+        if station is None or station == mark.name:
+            return f"where node {other} stood is not known"
+        off_ns = np.abs(track.stamps_ns - mark.stamp_ns) if track is not None else np.array([TRACK_NEAR_NS + 1])
+        if track is None or off_ns.min() > TRACK_NEAR_NS:
+            return "no track at this time"
+        held_m = math.hypot(self.settings.centering_m, self.settings.passing_m) / math.sqrt(2)
+        settings = replace(self.settings, centering_m=held_m)
+        shot = shoot(track, sights(track, settings), np.arange(len(off_ns)) == off_ns.argmin(), settings)
+        leg = self._leg(shot, {other: station, mark.node: mark.name}, other)
+        return replace(leg, fixes=0, fixes_used="", note=" ".join(filter(None, ("swum past", mark.note))))
 
     def _standing_at(self, stamp_ns: int, node: str) -> str | None:
         """Return a node's station: that of the rests before and after, or its last mark's if there are none."""

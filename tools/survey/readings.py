@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,6 +19,7 @@ from buddyline.protocol.messages import (
     NodeInfo,
     Rejected,
     RelativePose,
+    Track,
 )
 from buddyline.tools.dives import open_each
 from buddyline.tools.evaluation.rotation import multiply, normalized
@@ -28,13 +29,15 @@ from msgspec import UNSET
 
 # An attitude is interpolated between neighbours no further apart than this.
 ATTITUDE_GAP_NS: Final = 500_000_000
+# Of the track one row in this time is kept.
+TRACK_NS: Final = 100_000_000
 # The message fields that the survey reads of each sensor, and their lengths.
 COLUMNS: Final[dict[type[Message], dict[str, int]]] = {
     Attitude: {"q_ned_body_xyzw": 4, "sigma_rad": 3},
     Depth: {"depth_m": 1, "sigma_m": 1},
     Imu: {"accel_mps2": 3, "gyro_radps": 3, "mag_t": 3},
 }
-TOPICS: Final = ("pose", "rejected", "info", "attitude", "depth", "imu", "mark", "candidates")
+TOPICS: Final = ("pose", "rejected", "info", "attitude", "depth", "imu", "mark", "candidates", "track")
 
 
 class Series:
@@ -94,17 +97,18 @@ class NodeReadings:
 class PairReadings:
     """One dive of a pair a, b. t_a_b_m: (n, 3), q_a_b: (n, 4), covariance: (n, 6, 6), in the order of time.
 
-    marks: of all nodes of the dive.
+    marks: of all nodes of the dive. track: the same of the track's rows, where the log has one; their triggers are 0.
     """
 
     pair: tuple[NodeReadings, NodeReadings]
     stamps_ns: Ints
-    triggers: Ints
     t_a_b_m: Floats
     q_a_b: Floats
     covariance: Floats
+    triggers: Ints
     rejected: list[Rejected]
     marks: list[Mark]
+    track: PairReadings | None = None
 
     @property
     def nodes(self) -> tuple[str, str]:
@@ -123,6 +127,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
     infos: dict[str, NodeInfo] = {}
     samples: dict[tuple[type[Message], str], dict[int, Message]] = {}
     pictures: dict[str, dict[int, Candidates]] = {}
+    tracks: dict[tuple[str, str], dict[int, Track]] = {}
     for message in messages:
         if isinstance(message, RelativePose | Rejected):
             outcomes.setdefault((message.node_a, message.node_b), {}).setdefault(message.trigger, message)
@@ -130,6 +135,8 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
             infos.setdefault(message.node, message)
         elif isinstance(message, Mark):
             marks[message] = None
+        elif isinstance(message, Track):
+            tracks.setdefault((message.node_a, message.node_b), {}).setdefault(message.stamp_ns // TRACK_NS, message)
         elif isinstance(message, Candidates):
             pictures.setdefault(message.node, {}).setdefault(message.trigger, message)
         elif isinstance(message, Attitude | Depth | Imu):
@@ -144,27 +151,32 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
         poses = {trigger: one for trigger, one in of_pair.items() if isinstance(one, RelativePose)}
         for node in pair:
             marks |= dict.fromkeys(find_blinks(pictures.get(node, {}).values(), poses))
+    in_order = sorted(marks, key=lambda mark: mark.stamp_ns)
     found = []
     for (a, b), of_pair in outcomes.items():
         in_time = sorted(of_pair.values(), key=lambda outcome: outcome.stamp_ns)
         fixes = [outcome for outcome in in_time if isinstance(outcome, RelativePose)]
+        rows = sorted(tracks.get((a, b), {}).values(), key=lambda row: row.stamp_ns)
         if not fixes:
             continue
-        found.append(
-            PairReadings(
-                (sensors(a), sensors(b)),
-                np.array([fix.stamp_ns for fix in fixes], dtype=np.int64),
-                np.array([fix.trigger for fix in fixes], dtype=np.int64),
-                np.array([fix.t_a_b_m for fix in fixes]),
-                normalized(np.array([fix.q_a_b_xyzw for fix in fixes])),
-                np.array([fix.covariance for fix in fixes]).reshape(-1, 6, 6),
-                [outcome for outcome in in_time if isinstance(outcome, Rejected)],
-                sorted(marks, key=lambda mark: mark.stamp_ns),
-            )
-        )
+        nodes = sensors(a), sensors(b)
+        triggers = np.array([fix.trigger for fix in fixes], dtype=np.int64)
+        rejected = [outcome for outcome in in_time if isinstance(outcome, Rejected)]
+        track = PairReadings(nodes, *_columns(rows), np.zeros(len(rows), np.int64), [], []) if rows else None
+        found.append(PairReadings(nodes, *_columns(fixes), triggers, rejected, in_order, track))
     if not found:
         raise BuddylineError(f"{name}: holds no poses; solve the dive first (buddyline solve)")
     return sorted(found, key=lambda readings: int(readings.stamps_ns[0]))
+
+
+def _columns(poses: Sequence[RelativePose | Track]) -> tuple[Ints, Floats, Floats, Floats]:
+    """Return stamps_ns, t_a_b_m, q_a_b and covariance of poses or of the track's rows."""
+    return (
+        np.array([pose.stamp_ns for pose in poses], dtype=np.int64),
+        np.array([pose.t_a_b_m for pose in poses]),
+        normalized(np.array([pose.q_a_b_xyzw for pose in poses])),
+        np.array([pose.covariance for pose in poses]).reshape(-1, 6, 6),
+    )
 
 
 def of_logs(paths: list[str]) -> list[PairReadings]:

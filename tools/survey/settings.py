@@ -16,7 +16,8 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     (leapfrog), or node `first` stays. first: the node at the first station (default: the pair's first).
     rest_s, rest_fixes: the minimum for a leg. rest_speed_mps: below it the pair counts as resting.
     turn_radps, jolt_mps2: gyroscope and accelerometer above which a node is handled, not held.
-    centering_m: 1 sd, how well a node is held at its station, each axis. range_share: 1 sd, error of the ranges'
+    centering_m: 1 sd, how well a node is held at its station, each axis. passing_m: how near to a station a node that
+    swims past it is, as it is marked. range_share: 1 sd, error of the ranges'
     scale by calibration. compass_floor_deg, depth_floor_m: 1 sd, what averaging over a rest does not reduce.
     compass_common_deg: 1 sd, an error that all azimuths share (declination, mount): it turns the survey as a whole.
     disturbed_deg: 1 sd of a compass in a disturbed field, used where there is no other compass.
@@ -33,6 +34,7 @@ class SurveySettings(Config, frozen=True, kw_only=True):
     turn_radps: Positive = 0.6
     jolt_mps2: Positive = 1.5
     centering_m: NonNegative = 0.01
+    passing_m: NonNegative = 0.2
     range_share: NonNegative = 0.0015
     compass_floor_deg: NonNegative = 0.3
     tilt_floor_deg: NonNegative = 0.2

@@ -22,6 +22,9 @@ from buddyline.tools.survey.settings import SurveySettings
 from buddyline.tools.survey.sights import Sights
 from numpy.typing import NDArray
 
+# Sensors are averaged over this time on either side of a single fix.
+BESIDE_NS = 500_000_000
+
 
 @dataclass(frozen=True)
 class End:
@@ -82,10 +85,13 @@ def shoot(
     gaps = seen.heading_gap_rad[index]
     gaps = gaps[~np.isnan(gaps)]
 
+    beside_ns = BESIDE_NS if len(index) == 1 else 0
+    span_ns = start_ns - beside_ns, end_ns + beside_ns
+
     def end(i: int, node: NodeReadings) -> End:
         azimuth, inclination = _sight(seen, i, index, settings)
-        depth = _depth(node, seen.below_port_m[i, index], start_ns, end_ns, settings)
-        return End(node.info.node, azimuth, inclination, depth, field_of(node, start_ns, end_ns))
+        depth = _depth(node, seen.below_port_m[i, index], *span_ns, settings)
+        return End(node.info.node, azimuth, inclination, depth, field_of(node, *span_ns))
 
     return Shot(
         start_ns=start_ns,
