@@ -341,6 +341,117 @@ def test_bad_th_is_refused_by_file_line_and_value(tmp_path, text, said):
     assert said in str(refused.value)
 
 
+# Compass has feet, its own corrections and backsights, and names that are no names elsewhere.
+DAT = """\
+Old Cave
+SURVEY NAME: A
+SURVEY DATE: 10 13 1986  COMMENT:low water
+SURVEY TEAM:
+Ann Diver, Bo Fin
+DECLINATION: 4.00  FORMAT: DDDDLRUDLADadBF  CORRECTIONS: 1.00 0.50 0.10
+
+FROM TO LENGTH BEARING INC LEFT UP DOWN RIGHT AZM2 INC2 FLAGS COMMENTS
+
+A1 A2 32.90 45.00 -10.00 1.00 2.00 3.00 4.00 226.00 10.50 wide
+A2 B! 20.00 -999.00 5.00 -9.90 -9.90 -9.90 -9.90 100.00 -999.00 #|PL#
+A2 X 20.00 10.00 5.00 1.00 1.00 1.00 1.00 -999.00 -999.00 #|X#
+"""
+MAK = """\
+/ two files in one
+@420000.0,5260000.0,50.0,0,0.0;
+&WGS 1984;
+$33;
+#cave.dat,
+A1[m,420000.0,5260000.0,50.0];
+"""
+TXT = """\
+FIX
+1.0\t10\t20\t30
+TRIP
+DATE 2008-01-01
+DECLINATION\t2.00
+DATA
+1.0\t1.1\t90.00\t-5.00\t4.000\t>
+1.0\t\t180.00\t1.00\t2.000\t<
+"""
+CSV = """\
+from;to;distance (ft);azimuth_deg;inclination_deg;left;right;up;down;flags;date
+1;2;10,0;90;-5;1;2;;;duplicate;2020-02-03
+2;-;3;180;0;;;;;;
+"""
+
+
+def test_compass_data_are_read_in_metres_with_corrections_taken_in(tmp_path):
+    old = read(tmp_path, DAT.replace("\n", "\r\n") + "\f\r\n\x1a", "cave.dat")
+    first, second = old.shots
+    assert first.tape_m == pytest.approx(33.0 * 0.3048)
+    assert (first.compass_deg, first.clino_deg, first.back_deg, first.back_clino_deg) == (46.0, -9.5, 227.0, 11.0)
+    assert (first.north.value_deg, first.when.isoformat(), first.note) == (4.0, "1986-10-13", "wide")
+    assert (second.end, second.compass_deg, second.back_deg) == ("B!", None, 101.0)
+    assert second.flags == {"surface", "duplicate"}
+    assert old.passages[0].sections[0].right_m == pytest.approx(4 * 0.3048)
+    assert old.left_out == ["cave.dat:12: A2 X, which the file excludes"]
+    assert old.surveys[()].team == ["Ann Diver", "Bo Fin"]
+
+
+@CAVERN
+def test_compass_data_go_out_to_survex(tmp_path):
+    # Of a .dat file Survex 1.4.4 reads neither corrections nor backsights.
+    plain = DAT.replace("1.00 0.50 0.10", "0.00 0.00 0.00").replace("DDDDLRUDLADadBF", "DDDDLRUDLAD")
+    plain = plain.replace("226.00 10.50 ", "").replace("-999.00 5.00", "280.00 5.00").replace("100.00 -999.00 ", "")
+    (tmp_path / "cave.dat").write_text(plain)
+    done = subprocess.run(
+        ["cavern", "-q", "cave.dat"], cwd=tmp_path, capture_output=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.returncode == 0
+    expected = {name: at for name, at in places(tmp_path / "cave.3d").items() if name != "x"}
+    assert_same(in_survex(tmp_path, read_old(tmp_path / "cave.dat")), expected, fixed=False)
+
+
+def test_a_compass_project_has_place_and_fixed_points(tmp_path):
+    (tmp_path / "cave.dat").write_text(DAT)
+    old = read(tmp_path, MAK, "cave.mak")
+    assert old.fixes[0].position == (420000.0, 5260000.0, 50.0)
+    assert map_system(old) == "UTM33N"
+    assert joined(Project(), [named(old, "cave")]).place.epsg == 32633
+
+
+def test_tables_and_pockettopo_are_read(tmp_path):
+    old = read(tmp_path, CSV, "cave.csv")
+    first, splay = old.shots
+    assert (first.tape_m, first.when.isoformat(), first.flags) == (pytest.approx(3.048), "2020-02-03", {"duplicate"})
+    assert (splay.end, splay.flags) == ("", {"splay"})
+    old = read(tmp_path, TXT, "cave.txt")
+    assert (old.shots[0].compass_deg, old.shots[0].north.value_deg, old.shots[0].extend) == (90.0, 2.0, "right")
+    assert old.shots[1].flags == {"splay"}
+    assert old.fixes[0].position == (10.0, 20.0, 30.0)
+    assert read(tmp_path, "# TopoDroid\n1@a,2@a,3.5,90.1,-5\n", "droid.csv").shots[0].polar == (
+        3.5,
+        90.1,
+        pytest.approx(-5),
+    )
+
+
+BAD_TABLES = {
+    "dat number": (DAT.replace("32.90", "long"), "cave.dat", "cave.dat:10: LENGTH: 'long' is not a number"),
+    "dat date": (DAT.replace("10 13 1986", "13 10 1986"), "cave.dat", "cave.dat:3: SURVEY DATE: '13 10 1986'"),
+    "dat columns": (DAT.replace("226.00 10.50 wide", ""), "cave.dat", "cave.dat:10: "),
+    "dat heading": ("nothing\n", "cave.dat", "cave.dat:1: 'nothing' begins no survey"),
+    "mak file": ("#none.dat;\n", "cave.mak", "cave.mak:1: 'none.dat': no such file"),
+    "csv columns": ("a,b,c\n1,2,3\n", "cave.csv", "cave.csv:1: 'a,b,c' names no columns"),
+    "csv number": (CSV.replace("10,0", "ten"), "cave.csv", "cave.csv:2: tape: 'ten' is not a number"),
+    "csv date": (CSV.replace("2020-02-03", "3.2.20"), "cave.csv", "cave.csv:2: date: '3.2.20'"),
+    "txt": (TXT.replace("-5.00", "minus"), "cave.txt", "cave.txt:7: DATA: 'minus'"),
+}
+
+
+@pytest.mark.parametrize(("text", "name", "said"), BAD_TABLES.values(), ids=BAD_TABLES)
+def test_bad_tables_are_refused_by_file_line_and_value(tmp_path, text, name, said):
+    with pytest.raises(BuddylineError) as refused:
+        read(tmp_path, text, name)
+    assert said in str(refused.value)
+
+
 def run(*words):
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)

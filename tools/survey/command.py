@@ -70,7 +70,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         _import,
         "import cave.toml old/161.svx",
     )
-    imported.add_argument("files", nargs="+", metavar="FILE", type=Path, help="Survex .svx, Therion .th, ...")
+    imported.add_argument(
+        "files",
+        nargs="+",
+        metavar="FILE",
+        type=Path,
+        help="Survex .svx, Therion .th, Compass .dat or .mak, a table .csv, PocketTopo .txt",
+    )
     imported.add_argument("--name", metavar="NAME", help="before its stations' names; default: the file's")
     adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")
     adjust.add_argument("--json", action="store_true", help="print everything as one JSON object")

@@ -16,6 +16,10 @@ Reader: TypeAlias = Callable[[OldSurvey, Path, SurveyPath], None]
 READERS: Final[Mapping[str, tuple[str, str, str]]] = {
     ".svx": ("svx", "read_svx", "Survex"),
     ".th": ("therion", "read_th", "Therion"),
+    ".dat": ("compass", "read_dat", "Compass"),
+    ".mak": ("compass", "read_mak", "Compass"),
+    ".csv": ("columns", "read_csv", "a table"),
+    ".txt": ("columns", "read_pockettopo", "PocketTopo"),
 }
 
 
