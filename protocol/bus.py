@@ -76,8 +76,17 @@ class Publisher(ABC):
             return False
         return not self._closed and self._cap.passes() and self._send(payload)
 
+    def repeat(self, payload: bytes) -> bool:
+        """Send again what an earlier publisher of this key has sent.
+
+        Subscribers with history drop it if they have it, those without in any case.
+        """
+        if not self.topic.repeated:
+            raise ValueError(f"topic {self.topic.name} is not repeated")
+        return not self._closed and self._send(payload, again=True)
+
     @abstractmethod
-    def _send(self, payload: bytes) -> bool: ...
+    def _send(self, payload: bytes, *, again: bool = False) -> bool: ...
 
     @abstractmethod
     def close(self) -> None:
@@ -191,6 +200,10 @@ class Bus(ABC):
 
     def link_problem(self) -> str:
         """Return what a slow link leaves out, for people; "" if nothing."""
+        return ""
+
+    def flood_problem(self) -> str:
+        """Return who sends more than this process takes, for people; "" if nobody."""
         return ""
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Parts of both buses: a bounded queue with its own thread, a rate cap, and a latch for the first thread that dies."""
+"""Parts of both buses: a bounded queue with its own thread, a rate cap, a memory of what has come, a failure latch."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from buddyline.protocol.clock import S_NS, Clock
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 CLOSE_S: Final = 1.0
+# Of each key, the messages of a minute at 30 Hz.
+MAX_KNOWN: Final = 2048
+MAX_KNOWN_KEYS: Final = 512
 
 log = logging.getLogger(__name__)
 
@@ -151,6 +154,26 @@ class Delivery(Generic[T]):
         if not queue.items:
             del self._queues[name]
         return item
+
+
+class Repeats:
+    """Knows the newest messages of each key, by their bytes, to tell one that is sent again."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[str, OrderedDict[int, None]] = OrderedDict()
+
+    def is_new(self, key: str, payload: bytes, *, again: bool) -> bool:
+        """Note a message; return whether to deliver it. again: its publisher says that it is sent again."""
+        known = self._known.setdefault(key, OrderedDict())
+        number = hash(payload)
+        if again and number in known:
+            return False
+        known[number] = None
+        if len(known) > MAX_KNOWN:
+            known.popitem(last=False)
+        if len(self._known) > MAX_KNOWN_KEYS:
+            self._known.popitem(last=False)
+        return True
 
 
 class RateCap:

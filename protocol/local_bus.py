@@ -20,7 +20,7 @@ from buddyline.protocol.bus import (
     queue_of,
 )
 from buddyline.protocol.clock import Clock, SystemClock
-from buddyline.protocol.delivery import Delivery, RateCap
+from buddyline.protocol.delivery import Delivery, RateCap, Repeats
 from buddyline.protocol.topics import Topic
 
 
@@ -78,14 +78,14 @@ class LocalPublisher(Publisher):
         self.cache: deque[bytes] = deque(maxlen=cache_depth(topic, network.cache_s))
         self._network = network
 
-    def _send(self, payload: bytes) -> bool:
+    def _send(self, payload: bytes, *, again: bool = False) -> bool:
         with self._network.lock:
             self.cache.append(payload)
             if self.topic.retained:
                 self._network.newest[self.key] = self.topic, payload
             for subscription in self._network.subscriptions:
                 if subscription.takes(self.key):
-                    subscription.offer(self, payload)
+                    subscription.offer(self, payload, again=again)
         return True
 
     def close(self) -> None:
@@ -101,11 +101,15 @@ class LocalSubscription:
 
     missed = 0
 
-    def __init__(self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received]) -> None:
+    def __init__(
+        self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received], *, history: bool
+    ) -> None:
         self.joined = False
+        self._history = history
         self._key_exprs = key_exprs
         self._network = network
         self._delivery = delivery
+        self._repeats = Repeats()
 
     @property
     def dropped(self) -> int:
@@ -116,8 +120,12 @@ class LocalSubscription:
         """Return whether the subscription matches key."""
         return any(key_matches(key_expr, key) for key_expr in self._key_exprs)
 
-    def offer(self, publisher: LocalPublisher, payload: bytes) -> None:
-        """Queue a message of publisher."""
+    def offer(self, publisher: LocalPublisher, payload: bytes, *, again: bool = False) -> None:
+        """Queue a message of publisher; again: unless it is known."""
+        if publisher.topic.repeated:
+            is_new = self._repeats.is_new(publisher.key, payload, again=again)
+            if not is_new or (again and not self._history):
+                return
         now_ns = self._network.clock.now_ns()
         received = Received(publisher.key, payload, now_ns, publisher.topic.encoding)
         self._delivery.offer(received, len(payload), queue_of(publisher.key, payload, now_ns) if self.joined else "")
@@ -176,7 +184,7 @@ class LocalBus(Bus):
     ) -> Subscription:
         """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         delivery = Delivery(f"bus {' '.join(each_of(keys))}", handle, capacity, self._failures)
-        subscription = LocalSubscription(self._network, each_of(keys), delivery)
+        subscription = LocalSubscription(self._network, each_of(keys), delivery, history=history)
         with self._network.lock:
             if history:
                 publishers = [p for p in self._network.publishers if subscription.takes(p.key)]

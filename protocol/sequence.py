@@ -117,6 +117,12 @@ class SampleSequence(Generic[S]):
         self._pass(publisher, number, sample)
         return None
 
+    def skip(self, source: PublisherId, number: int) -> None:
+        """Leave out a sample that the receiver does not want: it is neither delivered nor missing."""
+        publisher = self._sender(source, _Sender(0, known=False))
+        if not publisher.open and number >= publisher.due:
+            publisher.due = number + 1
+
     def accept_copy(self, source: PublisherId, number: int, sample: S) -> None:
         """Deliver a copy that has come by another way, if it is the next; its original comes too."""
         publisher = self._publishers.get(source.owner, {}).get(source)

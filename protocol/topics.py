@@ -24,8 +24,10 @@ class Topic:
     template: its key, with {node}, {a} and {b}, or {net} and {node}. schema: the message's type. rate_hz: nominal; 0
     for messages sent on change. latest_only: a late subscriber gets only the newest message (of other topics, what it
     missed). express: sent at once, not in batches. stale_s: age from which it is stale (0: never). retained: the hub
-    keeps the newest message of each key, also after its sender is gone. solved: a result of the solver, which `solve`
-    computes again from a stored dive. max_bytes: of a payload; a larger one is not sent, and no hub passes it on.
+    keeps the newest message of each key, also after its sender is gone. repeated: a publisher that takes another's
+    place sends that one's last messages again, and subscribers drop those that they have. solved: a result of the
+    solver, which `solve` computes again from a stored dive. max_bytes: of a payload; a larger one is not sent, and no
+    hub passes it on.
 
     On a slow link. shed: the order in which it does without the topic: 1 first, 4 last, 0 never. keep_hz: up to this
     rate it is sent anyway. prompt: what waits goes together with these messages; they are also sent as datagrams,
@@ -41,6 +43,7 @@ class Topic:
     latest_only: bool = False
     stale_s: float = 0.0
     retained: bool = False
+    repeated: bool = False
     solved: bool = False
     max_bytes: int = 64 * 1024
     shed: int = 0
@@ -174,6 +177,7 @@ POSE: Final = Topic(
     express=True,
     stale_s=1.0,
     retained=True,
+    repeated=True,
     solved=True,
 )
 # After POSE, because topic_of returns the first topic of a schema.
@@ -186,6 +190,7 @@ REJECTED: Final = Topic(
     "interactive_high",
     express=True,
     retained=True,
+    repeated=True,
     solved=True,
 )
 TRACK: Final = Topic(

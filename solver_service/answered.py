@@ -81,15 +81,28 @@ class AnsweredPair:
 
     def __init__(self, said: Iterable[Outcome] = (), *, taken_over: bool = False) -> None:
         self._taken_over = taken_over
+        said = list(said)
         in_order = [one for one in said if is_in_order(one)]
         self._up_to: int | None = max((one.trigger for one in in_order), default=None)
         self.up_to_ns = max((one.stamp_ns for one in in_order), default=0)
+        # An outcome that came `late` says nothing of other triggers.
+        self._late = {one.trigger for one in said if not is_in_order(one)}
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
+
+    def answers(self, trigger: int) -> bool:
+        """Return whether a trigger's outcome was published before."""
+        return trigger in self._late or (self._up_to is not None and trigger <= self._up_to)
+
+    def give_up(self, trigger: int) -> None:
+        """Note a trigger that was answered without its frames; they may still come."""
+        self._late.add(trigger)
 
     def is_due(self, outcome: Outcome) -> bool:
         """Return whether an outcome is to be published; if not, withhold it."""
         if self._up_to is not None and outcome.trigger <= self._up_to:
             self._withheld.append(outcome)
+            return False
+        if outcome.trigger in self._late:
             return False
         self._withheld.clear()
         return True

@@ -1,4 +1,4 @@
-"""The last outcomes that a live solver has published, in a small file that outlives a kill of solver and hub."""
+"""What a live solver has received and said, in small files that outlive a kill of solver and hub."""
 
 from __future__ import annotations
 
@@ -7,27 +7,51 @@ import logging
 import os
 import re
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from buddyline.protocol.messages import Message, Rejected
+from buddyline.protocol.bus import CACHE_S
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode
+from buddyline.protocol.envelope import Envelope, open_envelope
+from buddyline.protocol.errors import MessageError
+from buddyline.protocol.messages import Candidates, Message
 from buddyline.protocol.statusfile import runtime_directory
+from buddyline.protocol.topics import key_of
 from buddyline.solver_service.answered import Outcome, is_in_order
 
 log = logging.getLogger(__name__)
 
-# From this size on only the last line of each pair is kept.
-MOST_BYTES: Final = 256 * 1024
+# From this size on a file becomes the one before, and a new one begins with the last outcome of each pair.
+MOST_BYTES: Final = 4 * 1024 * 1024
+# A frame's line begins with it.
+FRAME: Final = b"frame"
+# Its last word shows that the line is whole.
+END: Final = b"."
+FRAME_WORDS: Final = 4
 # The file of another solver that shared the work, and has written nothing for so long, is no longer needed.
 KEPT_S: Final = 600.0
-# A line: both nodes, trigger, time, and a word that shows that the line is whole.
-END: Final = "."
-WORDS: Final = 5
+
+
+@dataclass
+class Noted:
+    """What earlier solvers at this hub have received and said.
+
+    said: outcomes, in their order. recent: those of the last minute, as they were published. frames: node, trigger and
+    stamp of the frames of the last minute.
+    """
+
+    said: list[Outcome] = field(default_factory=list)
+    recent: list[Envelope] = field(default_factory=list)
+    frames: list[tuple[str, int, int]] = field(default_factory=list)
 
 
 class Journal:
-    """One line for each outcome: whose, of which trigger, when. A write error is logged once, and the solver goes on.
+    """One line for each outcome, with its key and payload, and one for each frame, with its node, trigger and stamp.
+
+    A write error is logged once, and the solver goes on.
 
     A line is in the system's hands as soon as it is written, so it outlives the process; a power cut ends the dive for
     nodes and solver alike. instance: of solvers that share the work, each has its own file, and reads those of all.
@@ -48,44 +72,54 @@ class Journal:
         name = re.sub(r"[^A-Za-z0-9]+", "-", f"{endpoint} {namespace}").strip("-")
         return None if directory is None else cls(directory / f"solver-{name}.answered", instance)
 
-    def read(self) -> list[Outcome]:
-        """Return the last outcome of each pair; a line that was cut off is left out."""
-        found: dict[tuple[str, str], Outcome] = {}
+    def read(self, now_ns: int) -> Noted:
+        """Return what is noted; a line that was cut off is left out. now_ns: wall clock."""
+        past = Noted()
         for line in self._lines():
-            words = line.decode("ascii", "replace").split()
-            if len(words) != WORDS or words[-1] != END or not all(word.isdecimal() for word in words[2:4]):
+            key, _, payload = line.partition(b" ")
+            if key == FRAME:
+                words = payload.split()
+                if len(words) == FRAME_WORDS and words[-1] == END and all(word.isdigit() for word in words[1:3]):
+                    frame = words[0].decode("ascii", "replace"), int(words[1]), int(words[2])
+                    past.frames += [frame] * (abs(now_ns - frame[2]) < CACHE_S * S_NS)
                 continue
-            node_a, node_b, trigger, stamp_ns = words[0], words[1], int(words[2]), int(words[3])
-            if (node_a, node_b) in found and found[node_a, node_b].stamp_ns > stamp_ns and self.path != self._common:
+            try:
+                noted = open_envelope(key.decode("ascii", "replace"), payload)
+            except MessageError:
                 continue
-            # Of an outcome that was published, only its trigger and its time count.
-            found[node_a, node_b] = Rejected(
-                node_a=node_a, node_b=node_b, stamp_ns=stamp_ns, trigger=trigger, reason="ambiguous"
-            )
-            self._last[node_a, node_b] = line + b"\n"
-        return list(found.values())
+            if isinstance(noted.message, Outcome):
+                past.said.append(noted.message)
+                past.recent += [noted] * (abs(now_ns - noted.stamp_ns) < CACHE_S * S_NS)
+                if is_in_order(noted.message):
+                    self._last[noted.message.node_a, noted.message.node_b] = line + b"\n"
+        if self.path != self._common:
+            past.said.sort(key=lambda one: one.stamp_ns)
+            past.recent.sort(key=lambda one: one.stamp_ns)
+        return past
 
-    def _lines(self) -> list[bytes]:
-        """Return the lines of this file; of a shared journal those of all solvers, whose old files are removed."""
-        lines: list[bytes] = []
-        of_all = [*self._common.parent.glob(f"{self._common.name}.*")] if self.path != self._common else []
-        for path in [self._common, *of_all]:
+    def _lines(self) -> Iterator[bytes]:
+        """Yield the lines of this journal; of a shared one those of all solvers, whose old files are removed."""
+        is_shared = self.path != self._common
+        of_all = sorted(self._common.parent.glob(f"{self._common.name}.*"), key=_is_current) if is_shared else []
+        for path in [_before(self._common), self._common, *of_all]:
             with contextlib.suppress(OSError):
-                lines += path.read_bytes().splitlines()
-                if path not in (self._common, self.path) and time.time() - path.stat().st_mtime > KEPT_S:
+                yield from path.read_bytes().splitlines()
+                if path in of_all and path != self.path and time.time() - path.stat().st_mtime > KEPT_S:
                     path.unlink()
-        return lines
 
     def add(self, messages: Iterable[Message]) -> None:
-        """Note the outcomes among messages that were published."""
-        lines = []
-        for message in messages:
-            if isinstance(message, Outcome) and is_in_order(message):
-                pair = message.node_a, message.node_b
-                self._last[pair] = _line(message)
-                lines.append(self._last[pair])
+        """Note the outcomes among messages that are about to be published."""
+        outcomes = [message for message in messages if isinstance(message, Outcome)]
+        lines = [_line(key_of(message), encode(message)) for message in outcomes]
         if lines:
             self._write(b"".join(lines))
+        for message, line in zip(outcomes, lines, strict=True):
+            if is_in_order(message):
+                self._last[message.node_a, message.node_b] = line
+
+    def add_frame(self, frame: Candidates) -> None:
+        """Note a frame that has been received: its trigger will have an outcome, also if its node ends too."""
+        self._write(b"%s %s %d %d %s\n" % (FRAME, frame.node.encode(), frame.trigger, frame.stamp_ns, END))
 
     def close(self) -> None:
         """Close the file."""
@@ -95,11 +129,11 @@ class Journal:
 
     def _write(self, text: bytes) -> None:
         try:
-            if self._file is None or self._bytes + len(text) > MOST_BYTES:
-                self._begin()
-            else:
-                os.write(self._file, text)
-                self._bytes += len(text)
+            if self._file is None:
+                self._file = self._open()
+            if self._bytes + len(text) > MOST_BYTES:
+                self._file = self._begin()
+            self._bytes += os.write(self._file, text)
         except OSError as error:
             if not self._failed:
                 log.warning("solver: journal %s cannot be written: %s", self.path, error.strerror)
@@ -107,17 +141,32 @@ class Journal:
         else:
             self._failed = False
 
-    def _begin(self) -> None:
-        """Put the last line of each pair into a new file, which takes the old one's place at once."""
-        self.close()
+    def _open(self) -> int:
+        """Go on with the file; the solver before may have been killed within a line."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        file = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
-        text = b"".join(self._last.values())
-        os.write(file, text)
-        fresh.replace(self.path)
-        self._file, self._bytes = file, len(text)
+        file = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        self._bytes = os.fstat(file).st_size
+        if self._bytes:
+            self._bytes += os.write(file, b"\n")
+        return file
+
+    def _begin(self) -> int:
+        """Begin a new file with the last outcome of each pair; the old one takes the place of the one before."""
+        self.close()
+        self.path.replace(_before(self.path))
+        file = self._open()
+        self._bytes += os.write(file, b"".join(self._last.values()))
+        return file
 
 
-def _line(outcome: Outcome) -> bytes:
-    return f"{outcome.node_a} {outcome.node_b} {outcome.trigger} {outcome.stamp_ns} {END}\n".encode()
+def _before(path: Path) -> Path:
+    """Return the name of the file that was full."""
+    return path.with_name(f"{path.name}~")
+
+
+def _is_current(path: Path) -> bool:
+    return not path.name.endswith("~")
+
+
+def _line(key: str, payload: bytes) -> bytes:
+    return key.encode() + b" " + payload + b"\n"

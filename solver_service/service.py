@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import Clock, SystemClock
-from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Candidates, Message
+from buddyline.protocol.messages import Candidates, Message, Rejected
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
 from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, NET_POSE, POSE, REJECTED, Topic, key_of
-from buddyline.solver_service.answered import THIS_DIVE_NS, Answered, Outcome
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answered, Outcome, is_in_order
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
-from buddyline.solver_service.journal import Journal
+from buddyline.solver_service.journal import Journal, Noted
 from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
 from buddyline.solver_service.shared_work import SharedWork
 
@@ -35,6 +36,8 @@ TICK_S: Final = 0.25
 TICKS_A_STATUS: Final = 4
 MAX_ALIVE_NAME: Final = 64
 WAIT_S: Final = 1.0
+# Within this time the nodes have connected again, sent what was missed, and the solver has waited for all.
+OWED_S: Final = 10.0
 
 
 class SolverService(Service):
@@ -72,6 +75,9 @@ class SolverService(Service):
         self._joined_ns: int | None = None
         self._attached_ns = 0
         self._player = False
+        # Triggers of which an earlier solver had a frame, and that have no outcome yet; with the frame's stamp.
+        self._owed: dict[tuple[PairId, int], int] = {}
+        self._owed_until_s = 0.0
 
     def start(self) -> None:
         """Start all threads."""
@@ -118,6 +124,8 @@ class SolverService(Service):
             results = self.core.advance(self.clock.now_ns())
             self._declare()
             self._publish(results)
+            if self._owed and time.monotonic() > self._owed_until_s:
+                self._give_up_owed()
         if self._news or status_due:
             self.report()
 
@@ -145,9 +153,10 @@ class SolverService(Service):
             self._shown = work.declare(bus, self._shown)
         if not begin:
             return
-        said = self._said_before(bus)
+        past, said = self._read_past(bus)
         for task in begin:
             with self._turn():
+                self._repeat([one for one in past.recent if one.ids == task])
                 found = work.begin(task, said, self.clock.now_ns())
                 self._declare()
                 self._publish(found)
@@ -173,12 +182,16 @@ class SolverService(Service):
         """Subscribe to the nodes on this bus, and publish on it from now on."""
         self._bus = bus
         self.problems = ["no two nodes yet"]
+        past = Noted()
         if self._work is None:
-            self._answered.know(self._said_before(bus))
+            past, said = self._read_past(bus)
+            self._answered.know(said)
         else:
             bus.subscribe((POSE.key_any(), REJECTED.key_any()), self._hear, history=False)
             log.info("solver: shares the work of this hub as %s", self._work.sharing.instance)
         self._declare()
+        self._repeat(past.recent)
+        self._expect_again(past)
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
         bus.subscribe(tuple(topic.key_any() for topic in SOLVED_FROM), self.receive, capacity=32768)
@@ -219,7 +232,9 @@ class SolverService(Service):
             now_ns = self.clock.now_ns()
             refused, self._refused = self._refused, ""
             self._news = False
-            problems = ([refused] if refused else []) + (self._work.problems if self._work is not None else [])
+            flood = self._bus.flood_problem() if self._bus is not None else ""
+            problems = [one for one in (refused, flood) if one]
+            problems += self._work.problems if self._work is not None else []
             statuses = self.core.report(now_ns, now_ns, self.refusals.count, problems)
             if not statuses:
                 if self._work is not None:
@@ -238,6 +253,8 @@ class SolverService(Service):
             self._joined_ns = 0
         elif self._answered.is_over(self.core.pairs_of(frame.node), frame.stamp_ns, self.clock.now_ns()):
             return
+        if self._journal is not None and self._work is None:
+            self._journal.add_frame(frame)
         self._handle(frame)
         if new and self._is_of_now(frame):
             pairs = self.core.pairs_of(frame.node)
@@ -262,31 +279,69 @@ class SolverService(Service):
         if self._bus is None:
             return
         for of_net in self.core.net_poses:
-            if NET_POSE.key(*of_net) not in self._publishers:
-                self._publishers[NET_POSE.key(*of_net)] = self._bus.publisher(NET_POSE, *of_net)
+            self._publisher_of(NET_POSE, *of_net)
         for pair in self.core.pairs.keys() - self._declared:
             log.info("solver: pair %s, %s", *pair)
             self._declared.add(pair)
             named: list[tuple[Topic, tuple[str, ...]]] = [(topic, pair) for topic in PUBLISHED]
             named += [(topic, (node,)) for topic in PUBLISHED_FOR_NODES for node in pair]
             for topic, ids in named:
-                if topic.key(*ids) not in self._publishers:
-                    self._publishers[topic.key(*ids)] = self._bus.publisher(topic, *ids)
+                self._publisher_of(topic, *ids)
+
+    def _publisher_of(self, topic: Topic, *ids: str) -> None:
+        """Declare a publisher, unless there is one."""
+        if self._bus is not None and topic.key(*ids) not in self._publishers:
+            self._publishers[topic.key(*ids)] = self._bus.publisher(topic, *ids)
 
     def _publish(self, messages: Iterable[Message]) -> None:
         if self._work is not None and not self._work.may_speak:
             return
         unsaid = self._answered.unsaid(messages)
-        # Noted first: a solver that is killed in between leaves a trigger without an outcome, not with two.
+        # Noted first: if this solver is killed in between, the next one publishes what is noted.
         if self._journal is not None:
             self._journal.add(unsaid)
         for message in unsaid:
             self._publishers[key_of(message)].put(message)
+            if isinstance(message, Outcome):
+                self._owed.pop(((message.node_a, message.node_b), message.trigger), None)
         self.core.saw_published(unsaid, self.clock.now_ns())
 
-    def _said_before(self, bus: Bus) -> list[Outcome]:
-        """Return the last outcomes of each pair, of all solvers so far: as the hub holds them, else the journals."""
-        return _newest_of(_held_by(bus), self._journal.read() if self._journal is not None else [])
+    def _repeat(self, published: Iterable[Envelope]) -> None:
+        """Publish an earlier solver's last outcomes again, for those who have missed them: it answers nobody now."""
+        for one in published:
+            self._publisher_of(one.topic, *one.ids)
+            self._publishers[one.key].repeat(one.payload)
+
+    def _expect_again(self, past: Noted) -> None:
+        """Note of which triggers an earlier solver has received a frame and said nothing.
+
+        Their nodes have the frames in their caches, unless they have ended too.
+        """
+        pairs = {(one.node_a, one.node_b) for one in past.said}
+        for node, trigger, stamp_ns in past.frames:
+            for pair in pairs:
+                if node in pair and not self._answered.pair(pair).answers(trigger):
+                    self._owed[pair, trigger] = stamp_ns
+        self._owed_until_s = time.monotonic() + OWED_S
+
+    def _give_up_owed(self) -> None:
+        """Answer the triggers whose frames have not come again."""
+        owed, self._owed = self._owed, {}
+        detail = "its frames were lost with the solver and node that had them"
+        outcomes = [
+            Rejected(node_a=a, node_b=b, stamp_ns=stamp_ns, trigger=trigger, reason="late", detail=detail)
+            for ((a, b), trigger), stamp_ns in sorted(owed.items())
+        ]
+        for outcome in outcomes:
+            self._publisher_of(REJECTED, outcome.node_a, outcome.node_b)
+        self._publish(outcomes)
+        for pair, trigger in owed:
+            self._answered.pair(pair).give_up(trigger)
+
+    def _read_past(self, bus: Bus) -> tuple[Noted, list[Outcome]]:
+        """Return what the journals know, and the outcomes of all solvers so far."""
+        past = self._journal.read(self.clock.now_ns()) if self._journal is not None else Noted()
+        return past, _said_of(_held_by(bus), past.said)
 
 
 def _pulse(work: SharedWork, stop: threading.Event) -> None:
@@ -294,11 +349,27 @@ def _pulse(work: SharedWork, stop: threading.Event) -> None:
         work.pulse()
 
 
-def _newest_of(held: Iterable[Outcome], kept: Iterable[Outcome]) -> list[Outcome]:
-    """Return what the hub holds, and for pairs of which it holds nothing what the journal has."""
-    known = list(held)
-    pairs = {(one.node_a, one.node_b) for one in known}
-    return known + [one for one in kept if (one.node_a, one.node_b) not in pairs]
+def _said_of(held: Iterable[Outcome], noted: Iterable[Outcome]) -> list[Outcome]:
+    """Return each pair's last outcomes by the journal, or as the hub holds them if the journal does not know those."""
+    by_journal, by_hub = _by_pair(noted), _by_pair(held)
+    said: list[Outcome] = []
+    for pair in {**by_journal, **by_hub}:
+        of_journal, of_hub = by_journal.get(pair, []), by_hub.get(pair, [])
+        known = {(one.trigger, one.stamp_ns) for one in of_journal}
+        if of_hub and not any((one.trigger, one.stamp_ns) in known for one in of_hub):
+            said += of_hub
+        else:
+            # What the journal has beyond the hub was published too, and is published again.
+            said += [one for one in of_journal if is_in_order(one)][-1:]
+            said += [one for one in of_journal if not is_in_order(one)]
+    return said
+
+
+def _by_pair(outcomes: Iterable[Outcome]) -> dict[PairId, list[Outcome]]:
+    found: dict[PairId, list[Outcome]] = {}
+    for one in outcomes:
+        found.setdefault((one.node_a, one.node_b), []).append(one)
+    return found
 
 
 def _held_by(bus: Bus) -> list[Outcome]:

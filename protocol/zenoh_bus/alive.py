@@ -34,7 +34,7 @@ class ZenohWatch:
         self._intake.close()
         self._delivery.close()
 
-    def _accept(self, sample: zenoh.Sample) -> None:
+    def _accept(self, sample: zenoh.Sample) -> bool:
         token = str(sample.key_expr).removeprefix(f"{ALIVE}/")
         name, _, process = token.rpartition("/")
         processes = self._processes.setdefault(name, set())
@@ -47,3 +47,4 @@ class ZenohWatch:
             del self._processes[name]
         if before != bool(processes):
             self._delivery.offer((name, bool(processes)))
+        return True

@@ -25,20 +25,18 @@ from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.delivery import Delivery, RateCap
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT
 from buddyline.protocol.link_budget import LinkBudget
-from buddyline.protocol.security import Tls
+from buddyline.protocol.rate_limit import RateLimit
+from buddyline.protocol.security import PLAYER, Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
 from buddyline.protocol.zenoh_bus.answers import AnswerDesk, ask
 from buddyline.protocol.zenoh_bus.link import Link
 from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
-from buddyline.protocol.zenoh_bus.subscription import QUERY_S, ZenohSubscription
+from buddyline.protocol.zenoh_bus.subscription import AGAIN, COPY, QUERY_S, ZenohSubscription
 from buddyline.protocol.zenoh_bus.watchdog import Watchdog
 
 HEARTBEAT_S: Final = 2.0
-# Marks a copy, whose original comes by the reliable connection.
-COPY: Final = b"copy"
-
 _PRIORITIES: Final = {
     "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
     "data_high": zenoh.Priority.DATA_HIGH,
@@ -98,7 +96,7 @@ class ZenohPublisher(Publisher):
         self._lock = threading.Lock()
         self._publisher = declare()
 
-    def _send(self, payload: bytes) -> bool:
+    def _send(self, payload: bytes, *, again: bool = False) -> bool:
         if not self._budget.admits(self.topic, len(payload), time.monotonic()):
             return False
         with self._lock:
@@ -107,7 +105,7 @@ class ZenohPublisher(Publisher):
             self._publisher = self._publisher or self._declare()
             if self._publisher is None:
                 return False
-            self._publisher.put(payload)
+            self._publisher.put(payload, attachment=AGAIN if again else None)
             self._last = payload
             if self.topic.prompt:
                 self._hurry(payload, zenoh.SourceInfo(self._publisher.id, self._count))
@@ -143,6 +141,10 @@ class ZenohBus(Bus):
         self._cache_s = cache_s
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._answers: list[AnswerDesk] = []
+        self._limits: list[RateLimit] = []
+        # Processes that play stored dives, which may be faster than live ones.
+        self._players: set[str] = set()
+        session.liveliness().declare_subscriber(f"{ALIVE}/{PLAYER}/*", self._note_player, history=True)
         self._asking = zenoh.CancellationToken()
         self._budget = LinkBudget()
         self._link = Link(session, self._budget)
@@ -195,11 +197,13 @@ class ZenohBus(Bus):
         """Pass every message on these keys to handle, one at a time; see protocol.bus.Bus.subscribe."""
         key_exprs = each_of(keys)
         delivery = Delivery(f"bus {' '.join(key_exprs)}", handle, capacity, self._failures)
+        limit = RateLimit(is_off=lambda: bool(self._players))
         subscription = ZenohSubscription(
-            self._session, key_exprs, delivery, history=history, clock=self.clock, failures=self._failures
+            self._session, key_exprs, delivery, limit, history=history, clock=self.clock, failures=self._failures
         )
         with self._lock:
             self._subscriptions.append(subscription)
+            self._limits.append(limit)
         return subscription
 
     def newest(self, topic: Topic) -> list[Received]:
@@ -270,6 +274,16 @@ class ZenohBus(Bus):
     def link_problem(self) -> str:
         """Return what the link leaves out, for people; "" if nothing."""
         return self._budget.words(time.monotonic())
+
+    def flood_problem(self) -> str:
+        """Return who sends more than this process takes, for people; "" if nobody."""
+        return max((limit.problem() for limit in list(self._limits)), key=len, default="")
+
+    def _note_player(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._players.add(str(sample.key_expr))
+        else:
+            self._players.discard(str(sample.key_expr))
 
     def _leave(self) -> None:
         atexit.unregister(self.close)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from typing import Final, TypeAlias
 
@@ -10,6 +11,8 @@ import zenoh
 from buddyline.protocol.delivery import CLOSE_S, FailureLatch
 
 INTAKE: Final = 2048
+# Short beside the time in which a flood of 100,000 samples a second fills the ring.
+FLOOD_PAUSE_S: Final = 0.005
 
 RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
 
@@ -17,14 +20,15 @@ RingSubscriber: TypeAlias = zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]
 class Intake:
     """A thread that takes samples out of Zenoh at once, so that Zenoh's ring buffer does not overflow.
 
-    name: part of the thread's name. accept: is called with each sample, and must not wait.
+    name: part of the thread's name. accept: is called with each sample, and must not wait; it returns False for one too
+    many. Then the thread lets samples gather for a moment.
     """
 
     def __init__(
         self,
         name: str,
         subscriber: RingSubscriber,
-        accept: Callable[[zenoh.Sample], None],
+        accept: Callable[[zenoh.Sample], bool],
         failures: FailureLatch,
     ) -> None:
         self._subscriber = subscriber
@@ -48,9 +52,15 @@ class Intake:
         try:
             while True:
                 try:
-                    sample = self._samples.recv()
+                    sample: zenoh.Sample | None = self._samples.recv()
                 except zenoh.ZError:
                     return
-                self._accept(sample)
+                is_flood = False
+                while sample is not None:
+                    is_flood |= not self._accept(sample)
+                    sample = self._samples.try_recv()
+                if is_flood:
+                    # The interpreter changes threads every 5 ms where none waits: the others would crawl.
+                    time.sleep(FLOOD_PAUSE_S)
         except Exception as error:
             self._failures.report(self._thread.name, error)

@@ -9,12 +9,17 @@ from typing import Final
 import zenoh
 from buddyline.protocol.bus import Received, held_order, queue_of
 from buddyline.protocol.clock import Clock
-from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch
+from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch, Repeats
+from buddyline.protocol.rate_limit import RateLimit
 from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from buddyline.protocol.topics import parse_key
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
 from buddyline.protocol.zenoh_bus.session import RETRY_S
 
+# Attachments of a sample. Of a copy the original comes by the reliable connection; what is sent again was sent by an
+# earlier publisher of its key.
+COPY: Final = b"copy"
+AGAIN: Final = b"again"
 QUERY_S: Final = 2.0
 # Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all.
 MAX_OWNER_GAPS: Final = 8
@@ -36,6 +41,7 @@ class ZenohSubscription:
         session: zenoh.Session,
         key_exprs: Sequence[str],
         delivery: Delivery[Received],
+        limit: RateLimit,
         *,
         history: bool,
         clock: Clock,
@@ -43,18 +49,20 @@ class ZenohSubscription:
     ) -> None:
         self._session = session
         self._delivery = delivery
+        self._limit = limit
         self._history = history
         self._clock = clock
         self._failures = failures
         self._lock = threading.Lock()
         self._joined = False
         self._sequence = SampleSequence(self._deliver)
+        self._repeats = Repeats()
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
-        subscribers = [(key_expr, self._accept, self._declare(key_expr)) for key_expr in key_exprs]
+        subscribers = [(key_expr, self._take, self._declare(key_expr)) for key_expr in key_exprs]
         if history:
             beside = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
-            subscribers += [(selector, self._accept_heartbeat, self._declare(selector)) for selector in beside]
+            subscribers += [(selector, self._take_heartbeat, self._declare(selector)) for selector in beside]
             held = [sample for selector in beside for sample in self._query(selector)]
             for sample in sorted(held, key=_number):
                 self._sequence.begin(_source(sample), _number(sample))
@@ -70,8 +78,8 @@ class ZenohSubscription:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped because the handler was too slow."""
-        return self._delivery.dropped
+        """Number of messages dropped because the handler was too slow, or that were more than their topic's rate."""
+        return self._delivery.dropped + sum(self._limit.dropped.values())
 
     @property
     def missed(self) -> int:
@@ -89,6 +97,22 @@ class ZenohSubscription:
         for thread in threads:
             thread.join(CLOSE_S)
 
+    def _take(self, sample: zenoh.Sample) -> bool:
+        """Accept a sample that has come just now; return False if there are too many of its key."""
+        if self._limit.admits(str(sample.key_expr), len(sample.payload)):
+            self._accept(sample)
+            return True
+        if sample.source_info is not None:
+            with self._lock:
+                self._sequence.skip(_source(sample), _number(sample))
+        return False
+
+    def _take_heartbeat(self, sample: zenoh.Sample) -> bool:
+        if self._limit.admits(str(sample.key_expr), len(sample.payload)):
+            self._accept_heartbeat(sample)
+            return True
+        return False
+
     def _accept(self, sample: zenoh.Sample) -> None:
         """Deliver a sample, or hold it until the publisher's missing earlier samples are fetched."""
         if sample.kind != zenoh.SampleKind.PUT:
@@ -98,7 +122,7 @@ class ZenohSubscription:
             return
         source = _source(sample)
         with self._lock:
-            if sample.attachment is not None:
+            if _attachment(sample) == COPY:
                 self._sequence.accept_copy(source, _number(sample), sample)
                 return
             gap = self._sequence.accept(
@@ -175,8 +199,15 @@ class ZenohSubscription:
                 yield reply.ok
 
     def _deliver(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        parsed = parse_key(key)
+        if parsed is not None and parsed[0].repeated:
+            again = _attachment(sample) == AGAIN
+            is_new = self._repeats.is_new(key, bytes(sample.payload), again=again)
+            if not is_new or (again and not self._history):
+                return
         received = Received(
-            key=str(sample.key_expr),
+            key=key,
             payload=bytes(sample.payload),
             receive_ns=self._clock.now_ns(),
             encoding=str(sample.encoding),
@@ -188,6 +219,10 @@ class ZenohSubscription:
 def _source(sample: zenoh.Sample) -> PublisherId:
     key, info = str(sample.key_expr), sample.source_info
     return PublisherId(key, "", 0) if info is None else PublisherId(key, str(info.source_id.zid), info.source_id.eid)
+
+
+def _attachment(sample: zenoh.Sample) -> bytes:
+    return b"" if sample.attachment is None else sample.attachment.to_bytes()
 
 
 def _newest_only(key: str) -> bool:

@@ -38,6 +38,8 @@ class Chaos:
     def __init__(self, system: System, namespace: str) -> None:
         self._system = system
         self._namespace = namespace
+        # When the solver ended, and when it was started again.
+        self.away_ns: list[tuple[int, int]] = []
 
     def spawn(self, name: str) -> None:
         """Start a process, and wait for nothing: there may be no hub."""
@@ -45,8 +47,9 @@ class Chaos:
 
     def kill(self, name: str) -> Undo:
         """Kill with SIGKILL."""
+        ended_ns = time.time_ns()
         self._system.kill(name)
-        return lambda: self.spawn(name)
+        return self._spawner(name, ended_ns)
 
     def stop(self, name: str) -> Undo:
         """Stop it where it stands, for longer or shorter than the leases."""
@@ -55,8 +58,18 @@ class Chaos:
 
     def end(self, name: str) -> Undo:
         """End it in order."""
+        # From then on it takes nothing more.
+        ended_ns = time.time_ns()
         self._system.processes.pop(name).end()
-        return lambda: self.spawn(name)
+        return self._spawner(name, ended_ns)
+
+    def _spawner(self, name: str, ended_ns: int) -> Undo:
+        def spawn() -> None:
+            self.spawn(name)
+            if name == "solver":
+                self.away_ns.append((ended_ns, time.time_ns()))
+
+        return spawn
 
     def cut(self, name: str) -> Undo:
         """Pull its cable; where it has none, stop it."""
@@ -117,16 +130,29 @@ def doubled(observer: Observer) -> list[str]:
     return [f"{trigger}: {'; '.join(words)}" for trigger, words in sorted(by_trigger.items()) if len(words) > 1]
 
 
-def unanswered(observer: Observer) -> list[str]:
-    """Return a line for each trigger without an outcome: its frames, when they were received, and how old."""
+def unreached(observer: Observer, away_ns: list[tuple[int, int]]) -> set[int]:
+    """Return the triggers whose frames all came while there was no solver: their nodes may have ended before it came.
+
+    away_ns: when a solver ended, and when the next one was started; it is there with its first outcome.
+    """
+    back_ns = sorted(receive_ns for _, receive_ns in observer.outcomes)
+    spans = [(from_ns, next((at_ns for at_ns in back_ns if at_ns > to_ns), to_ns)) for from_ns, to_ns in away_ns]
+    reached = {
+        frame.trigger
+        for frame, receive_ns in observer.frames
+        if not any(from_ns <= receive_ns <= to_ns for from_ns, to_ns in spans)
+    }
+    return {frame.trigger for frame, _ in observer.frames} - reached
+
+
+def unanswered(observer: Observer) -> dict[int, str]:
+    """Return the triggers without an outcome, with their frames, when they were received, and how old."""
     answered = {outcome.trigger for outcome, _ in observer.outcomes}
     by_trigger: dict[int, list[str]] = defaultdict(list)
     for frame, receive_ns in observer.frames:
         at_s, age_s = receive_ns / S_NS % 10_000, (receive_ns - frame.stamp_ns) / S_NS
         by_trigger[frame.trigger].append(f"{frame.node} {frame.boot} {frame.seq} at {at_s:.3f} s, {age_s:.2f} s old")
-    return [
-        f"{trigger}: {'; '.join(words)}" for trigger, words in sorted(by_trigger.items()) if trigger not in answered
-    ]
+    return {trigger: "; ".join(words) for trigger, words in sorted(by_trigger.items()) if trigger not in answered}
 
 
 def main() -> int:
@@ -151,16 +177,21 @@ def main() -> int:
         observer.wait_for_match(0, RECOVER_S)
         faults, recovered_s = chaos.do(args.seconds, rng)
         tally: Tally = system.finish()
-        for line in [*doubled(observer), "without an outcome:", *unanswered(observer)]:
+        without, away = unanswered(observer), unreached(observer, chaos.away_ns)
+        for line in [*doubled(observer), "without an outcome:"]:
             print(line, file=sys.stderr)
+        for trigger, words in without.items():
+            print(trigger, "(no solver then)" if trigger in away else "", words, file=sys.stderr)
     found = {
         "rounds": len(recovered_s),
         "faults": dict(sorted(faults.items())),
         "recovery_s": {"median": median(recovered_s), "worst": max(recovered_s)} if recovered_s else {},
         **vars(tally),
+        "without_outcome_though_reached": len(without.keys() - away),
     }
     print(json.dumps(found, indent=2))
-    return 1 if faults["not recovered"] or tally.outcomes_doubled or tally.duplicated or tally.disordered else 0
+    broken = faults["not recovered"], tally.outcomes_doubled, tally.duplicated, tally.disordered, without.keys() - away
+    return 1 if any(broken) else 0
 
 
 if __name__ == "__main__":

@@ -297,6 +297,10 @@ class Capture:
         """Return no retained message."""
         return []
 
+    def flood_problem(self) -> str:
+        """Say that nobody floods it."""
+        return ""
+
     def put(self, message: Message) -> bool:
         encode(message)
         self.published.append(message)

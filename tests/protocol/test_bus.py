@@ -8,7 +8,7 @@ import time
 import pytest
 from buddyline.protocol import topics
 from buddyline.protocol.clock import ManualClock
-from buddyline.protocol.codec import decode, payload_stamp_ns
+from buddyline.protocol.codec import decode, encode, payload_stamp_ns
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import key_matches
 from buddyline.protocol.messages import CompressedImage, Depth, FoxgloveTime, NodeStatus, Rejected
@@ -145,6 +145,35 @@ def test_without_history_only_new_messages_come(client: Connect) -> None:
         time.sleep(0.002)
     assert min(triggers(inbox)) >= 10
     assert subscription.missed == 0
+
+
+def test_what_is_sent_again_comes_to_those_who_have_missed_it(client: Connect) -> None:
+    """A publisher that takes another's place says its last messages again."""
+    first, second, known, without = client(), client(), Inbox(), Inbox()
+    viewer = client()
+    viewer.subscribe("buddyline/pair/a/b/rejected", known)
+    viewer.subscribe("buddyline/pair/a/b/rejected", without, history=False)
+    publisher = first.publisher(topics.REJECTED, "a", "b")
+    for trigger in (1, 2, 4):
+        publisher.put(rejected(trigger))
+    known.wait_for(3)
+    first.close()
+    publisher = second.publisher(topics.REJECTED, "a", "b")
+    for trigger in (1, 2, 3, 4):
+        assert publisher.repeat(encode(rejected(trigger)))
+    publisher.put(rejected(5))
+    known.wait_for(5)
+    # What is said anew, as in a dive that is played twice, is not said again.
+    publisher.put(rejected(4))
+    known.wait_for(6)
+    assert triggers(known) == [1, 2, 4, 3, 5, 4]
+    late = Inbox()
+    client().subscribe("buddyline/pair/a/b/rejected", late)
+    late.wait_for(6)
+    assert sorted(triggers(late)) == [1, 2, 3, 4, 4, 5]
+    assert 3 not in triggers(without)
+    with pytest.raises(ValueError, match="depth is not repeated"):
+        second.publisher(topics.DEPTH, "a").repeat(b"{}")
 
 
 def test_only_the_subscribed_keys_come(client: Connect) -> None:

@@ -233,6 +233,28 @@ def test_nothing_is_lost_when_the_hub_is_killed_and_comes_back() -> None:
         solver.close()
 
 
+def test_what_is_sent_again_while_there_is_no_hub_comes_to_those_who_have_missed_it() -> None:
+    """It is then fetched from the publisher's cache."""
+    endpoint, inbox = free_endpoint(), Inbox()
+    with hub_process(endpoint) as hub:
+        viewer, first, second = (run_client(endpoint) for _ in range(3))
+        viewer.subscribe("buddyline/pair/*/*/rejected", inbox)
+        publisher, successor = (bus.publisher(topics.REJECTED, "a", "b") for bus in (first, second))
+        for number in (1, 2):
+            publisher.put_bytes(b"%d" % number)
+        inbox.wait_for(2)
+        hub.kill()
+        hub.wait(PATIENCE_S)
+        first.close()
+        for number in (1, 2, 3):
+            successor.repeat(b"%d" % number)
+        successor.put_bytes(b"4")
+    with hub_process(endpoint):
+        assert numbers(inbox, 4) == [1, 2, 3, 4]
+        second.close()
+        viewer.close()
+
+
 def test_an_outage_longer_than_the_cache_is_counted() -> None:
     endpoint, inbox = free_endpoint(), Inbox()
     with hub_process(endpoint) as hub:

@@ -6,9 +6,10 @@ import pytest
 from buddyline.protocol.bus import Received
 from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.codec import decode, encode
-from buddyline.protocol.local_bus import LocalNetwork
+from buddyline.protocol.local_bus import LocalNetwork, LocalPublisher
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import key_of, parse_key
+from buddyline.solver_service import service as service_module
 from buddyline.solver_service.answered import Answered, AnsweredPair
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
@@ -153,3 +154,53 @@ def test_what_a_link_held_up_is_not_answered_again(player):
         with service._lock:
             service._publish(service.core.flush())
     assert bool(outcomes) is player
+
+
+def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkeypatch):
+    """Its last outcomes went into a hub that was dying; of one trigger it had one frame, whose node is gone too."""
+    messages, _ = dive_messages(seconds=4.0, sensors=False, period_ns=2 * PERIOD_NS)
+    frames = [one for one in messages if isinstance(one, Candidates)]
+    last = max(frames, key=lambda frame: frame.stamp_ns)
+    clock = ManualClock(last.stamp_ns + S_NS)
+    network, outcomes, deaf = LocalNetwork(clock), [], False
+    send = LocalPublisher._send
+
+    def send_unless_deaf(publisher, payload, **how):
+        return deaf or send(publisher, payload, **how)
+
+    monkeypatch.setattr(LocalPublisher, "_send", send_unless_deaf)
+    config = SolverConfig(nodes=["a", "b"], journal=str(tmp_path / "answered"))
+
+    def solver(bus):
+        service = SolverService(config, clock=clock)
+        service.attach(bus)
+        return service
+
+    with network.connect() as viewer:
+        viewer.subscribe(("buddyline/pair/*/*/pose", "buddyline/pair/*/*/rejected"), outcomes.append, capacity=10_000)
+        with network.connect() as bus:
+            service = solver(bus)
+            for i, message in enumerate(messages):
+                deaf = i > len(messages) // 2
+                clock.set_ns(clock.now_ns() + 1)
+                if message is not last:
+                    service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+            assert service.core.pending
+            heard = len(outcomes)
+        deaf = False
+        monkeypatch.setattr(service_module, "OWED_S", 0.0)
+        for _ in range(3):
+            with network.connect() as bus:
+                service = solver(bus)
+                service.tick(status_due=False)
+                # They come after all: nothing is answered again.
+                for message in messages:
+                    clock.set_ns(clock.now_ns() + 1)
+                    service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
+                with service._lock:
+                    service._publish(service.core.flush())
+        until(lambda: payload_trigger(outcomes[-1]) == last.trigger)
+    assert 0 < heard < len(outcomes) - 5
+    counts = Counter(payload_trigger(one) for one in outcomes)
+    assert set(counts) == {frame.trigger for frame in frames}
+    assert set(counts.values()) == {1}

@@ -1,31 +1,58 @@
-"""What a live solver has answered outlives a kill of solver and hub."""
+"""What a live solver has received and answered outlives a kill of solver and hub."""
 
-from buddyline.protocol.messages import Rejected
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import encode
+from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.solver_service import journal
 from buddyline.solver_service.answered import Answered
 from buddyline.solver_service.journal import Journal
+from buddyline.solver_service.service import _said_of
+
+NOW_NS = 10**18
 
 
-def outcome(trigger, pair=("a", "b"), reason="ambiguous"):
-    return Rejected(node_a=pair[0], node_b=pair[1], stamp_ns=trigger * 10**8, trigger=trigger, reason=reason)
+def outcome(trigger, pair=("a", "b"), reason="ambiguous", ago_s=100):
+    return Rejected(
+        node_a=pair[0], node_b=pair[1], stamp_ns=NOW_NS - ago_s * S_NS + trigger, trigger=trigger, reason=reason
+    )
+
+
+def frame(trigger, ago_s=1):
+    stamp_ns = NOW_NS - ago_s * S_NS
+    return Candidates(
+        node="a", stamp_ns=stamp_ns, trigger=trigger, seq=trigger, boot="x", width_px=640, height_px=480, blobs=[]
+    )
 
 
 def kept(path):
-    return {(one.node_a, one.node_b): one.trigger for one in Journal(path).read()}
+    return {(one.node_a, one.node_b): one.trigger for one in _said_of([], Journal(path).read(NOW_NS).said)}
 
 
 def test_the_last_outcome_of_each_pair_is_read_back(tmp_path):
     path = tmp_path / "deep" / "solver.answered"
     first = Journal(path)
-    assert first.read() == []
+    assert first.read(NOW_NS).said == []
     first.add([outcome(3), outcome(4), outcome(9, ("a", "c"))])
-    first.add([outcome(2, reason="late")])
     assert kept(path) == {("a", "b"): 4, ("a", "c"): 9}
     # The next solver has read it, and goes on for one pair alone.
     second = Journal(path)
-    second.read()
+    second.read(NOW_NS)
     second.add([outcome(5)])
     assert kept(path) == {("a", "b"): 5, ("a", "c"): 9}
+
+
+def test_outcomes_of_the_last_minute_and_frames_are_read_back_as_they_were(tmp_path):
+    path = tmp_path / "solver.answered"
+    one = Journal(path)
+    said = [outcome(1, ago_s=70), outcome(2, ago_s=50), outcome(3, reason="late", ago_s=1)]
+    one.add(said[:2])
+    for each in (frame(2), frame(1, ago_s=70), frame(3)):
+        one.add_frame(each)
+    one.add(said[2:])
+    past = Journal(path).read(NOW_NS)
+    assert past.said == said
+    assert [one.payload for one in past.recent] == [encode(one) for one in said[1:]]
+    assert past.frames == [("a", k, frame(k).stamp_ns) for k in (2, 3)]
 
 
 def test_a_line_that_was_cut_off_is_left_out(tmp_path):
@@ -38,21 +65,33 @@ def test_a_line_that_was_cut_off_is_left_out(tmp_path):
 
 
 def test_it_stays_small(tmp_path, monkeypatch):
-    monkeypatch.setattr(journal, "MOST_BYTES", 1000)
+    monkeypatch.setattr(journal, "MOST_BYTES", 2000)
     path = tmp_path / "solver.answered"
     one = Journal(path)
+    one.add([outcome(7, ("a", "c"))])
     for trigger in range(100):
         one.add([outcome(trigger)])
-        assert path.stat().st_size <= 1000
-    assert kept(path) == {("a", "b"): 99}
-    assert [file.name for file in tmp_path.iterdir()] == ["solver.answered"]
+        one.add_frame(frame(trigger))
+        assert path.stat().st_size <= 2000
+    assert kept(path) == {("a", "b"): 99, ("a", "c"): 7}
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["solver.answered", "solver.answered~"]
+    # What was noted last is still there.
+    assert [trigger for _, trigger, _ in Journal(path).read(NOW_NS).frames][-5:] == [95, 96, 97, 98, 99]
 
 
 def test_what_it_says_is_not_answered_again(tmp_path):
     path = tmp_path / "solver.answered"
-    Journal(path).add([outcome(7)])
-    answered = Answered(Journal(path).read())
-    assert [one.trigger for one in answered.unsaid([outcome(6), outcome(7), outcome(8)])] == [8]
+    Journal(path).add([outcome(7), outcome(9, reason="late")])
+    answered = Answered(_said_of([], Journal(path).read(NOW_NS).said))
+    said = [outcome(6), outcome(7), outcome(8), outcome(9, reason="late"), outcome(9)]
+    assert answered.unsaid(said) == [said[2]]
+
+
+def test_the_journal_goes_on_from_what_the_hub_holds_unless_that_is_another_solvers():
+    noted = [outcome(5), outcome(6), outcome(7)]
+    assert _said_of([outcome(6), outcome(4)], noted) == [outcome(7)]
+    assert _said_of([outcome(9), outcome(8)], noted) == [outcome(9), outcome(8)]
+    assert _said_of([outcome(9, ("a", "c"))], noted) == [outcome(7), outcome(9, ("a", "c"))]
 
 
 def test_a_place_that_cannot_be_written_is_said_once(tmp_path, caplog):

@@ -1,0 +1,134 @@
+"""How much of each key a receiver takes: many times what its topic's table says, and no more.
+
+A client at full speed sends a hundred thousand messages a second. To decode them, or only to queue them, would take the
+processor from all others on the machine. A stored dive is played faster than it was: the limit is off meanwhile.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Final
+
+from buddyline.protocol.bus import MAX_TRIGGER_HZ
+from buddyline.protocol.sequence import owner_of
+from buddyline.protocol.topics import Topic, parse_key
+
+# Over the topic's nominal rate: drivers and configurations may be faster.
+MARGIN: Final = 4.0
+# What a link held up comes at once.
+BURST_S: Final = 10.0
+# Sixteen times what 30 frames a second take; of larger messages, one a second.
+MOST_BYTES_PER_S: Final = 1_000_000.0
+# Keys that are no topic's.
+OTHER_HZ: Final = 100.0
+# Keys of an owner, and owners, that have a limit of their own.
+MAX_KEYS: Final = 128
+MAX_OWNERS: Final = 256
+# So long after the last message that was left out its owner is named; the first so many are.
+SAID_S: Final = 5.0
+MAX_SAID: Final = 4
+
+
+def most_hz(topic: Topic | None) -> float:
+    """Return how many messages a second are taken of a key of this topic; None: of a key that is no topic's."""
+    return OTHER_HZ if topic is None else MARGIN * max(topic.rate_hz, MAX_TRIGGER_HZ)
+
+
+def most_bytes_per_s(topic: Topic | None) -> float:
+    """Return how many bytes a second are taken of a key of this topic."""
+    return max(MOST_BYTES_PER_S, 0.0 if topic is None else topic.max_bytes)
+
+
+class _Bucket:
+    """What may still come of one key now."""
+
+    __slots__ = ("bytes", "bytes_per_s", "hz", "messages", "since_s")
+
+    def __init__(self, topic: Topic | None, now_s: float) -> None:
+        self.hz, self.bytes_per_s = most_hz(topic), most_bytes_per_s(topic)
+        self.messages, self.bytes, self.since_s = self.hz * BURST_S, self.bytes_per_s * BURST_S, now_s
+
+    def takes(self, size_bytes: int, now_s: float) -> bool:
+        """Return whether there is room for a message; if so, take it."""
+        passed_s, self.since_s = now_s - self.since_s, now_s
+        self.messages = min(self.messages + passed_s * self.hz, BURST_S * self.hz)
+        self.bytes = min(self.bytes + passed_s * self.bytes_per_s, BURST_S * self.bytes_per_s)
+        if self.messages < 1.0 or self.bytes < size_bytes:
+            return False
+        self.messages -= 1.0
+        self.bytes -= size_bytes
+        return True
+
+
+class _Owner:
+    """What may still come of the keys of one owner, and what was left out."""
+
+    def __init__(self) -> None:
+        self.buckets: dict[str, _Bucket] = {}
+        self.dropped = 0
+        self.dropped_s = 0.0
+
+
+class RateLimit:
+    """Admits what comes on each key, up to its rate; counts the rest by owner. Safe to use from several threads.
+
+    now_s: a clock that nobody sets. is_off: whether everything is admitted.
+    """
+
+    def __init__(
+        self, now_s: Callable[[], float] = time.monotonic, *, is_off: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._now_s = now_s
+        self._is_off = is_off
+        # The one that has been silent longest is first.
+        self._owners: OrderedDict[str, _Owner] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def admits(self, key: str, size_bytes: int) -> bool:
+        """Return whether to take a message of this size on this key."""
+        if self._is_off():
+            return True
+        now_s, name = self._now_s(), owner_of(key)
+        with self._lock:
+            owner = self._owners.get(name)
+            if owner is None:
+                owner = self._owners[name] = _Owner()
+                if len(self._owners) > MAX_OWNERS:
+                    self._owners.popitem(last=False)
+            else:
+                self._owners.move_to_end(name)
+            bucket = owner.buckets.get(key) or self._add(owner, key, now_s)
+            if bucket.takes(size_bytes, now_s):
+                return True
+            owner.dropped += 1
+            owner.dropped_s = now_s
+            return False
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """How many messages of each owner were left out."""
+        with self._lock:
+            return {name: owner.dropped for name, owner in self._owners.items() if owner.dropped}
+
+    def problem(self) -> str:
+        """Return who sends too much now, for people; "" if nobody."""
+        now_s = self._now_s()
+        with self._lock:
+            words = [
+                f"{name} sends too much: {owner.dropped} messages left out"
+                for name, owner in sorted(self._owners.items())
+                if owner.dropped and now_s - owner.dropped_s < SAID_S
+            ]
+        return "; ".join(words[:MAX_SAID])
+
+    def _add(self, owner: _Owner, key: str, now_s: float) -> _Bucket:
+        parsed = parse_key(key)
+        if parsed is None or len(owner.buckets) >= MAX_KEYS:
+            # All such keys of an owner share one.
+            key, parsed = "", None
+        if key not in owner.buckets:
+            owner.buckets[key] = _Bucket(None if parsed is None else parsed[0], now_s)
+        return owner.buckets[key]

@@ -1,0 +1,109 @@
+"""How much a receiver takes of each key, and what a client at full speed costs it."""
+
+from __future__ import annotations
+
+import zenoh
+from buddyline.protocol import rate_limit, topics
+from buddyline.protocol.codec import payload_stamp_ns
+from buddyline.protocol.rate_limit import BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
+from buddyline.protocol.security import PLAYER
+from buddyline.protocol.zenoh_bus import open_hub
+from buddyline.protocol.zenoh_bus.session import config_of
+from buddyline.protocol.zenoh_bus.settings import client_settings
+
+from tests.processes import free_endpoint, until
+from tests.protocol.inbox import Inbox
+from tests.protocol.test_bus_zenoh import run_client
+
+
+class Clock:
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def admitted(limit: RateLimit, key: str, count: int, size_bytes: int = 100) -> int:
+    return sum(limit.admits(key, size_bytes) for _ in range(count))
+
+
+def test_each_topic_may_come_several_times_as_fast_as_its_table_says() -> None:
+    clock = Clock()
+    limit = RateLimit(clock)
+    for topic in topics.TOPICS:
+        key = topic.key(*("abc"[: len(topic.id_fields)]))
+        for _ in range(200):
+            clock.now_s += 0.1
+            admitted(limit, key, max(round(MARGIN * topic.rate_hz / 10), 1), topic.max_bytes // 64)
+    assert limit.dropped == {}
+    assert limit.problem() == ""
+
+
+def test_what_is_more_is_left_out_and_its_owner_named_for_a_while() -> None:
+    clock = Clock()
+    limit = RateLimit(clock)
+    key, hz = topics.IMU.key("c"), most_hz(topics.IMU)
+    assert admitted(limit, key, 100_000) == BURST_S * hz
+    clock.now_s += 1.0
+    assert admitted(limit, key, 100_000) == hz
+    left_out = round(200_000 - (BURST_S + 1) * hz)
+    assert limit.dropped == {"buddyline/node/c": left_out}
+    assert limit.problem() == f"buddyline/node/c sends too much: {left_out} messages left out"
+    # Other keys, its own too, have what is theirs.
+    assert admitted(limit, topics.CANDIDATES.key("c"), 100) == 100
+    assert admitted(limit, topics.IMU.key("a"), 100) == 100
+    clock.now_s += rate_limit.SAID_S
+    assert limit.problem() == ""
+
+
+def test_bytes_count_too() -> None:
+    limit, key = RateLimit(Clock()), topics.CANDIDATES.key("c")
+    assert admitted(limit, key, 1000, 65536) == int(BURST_S * MOST_BYTES_PER_S / 65536)
+
+
+def test_keys_that_an_owner_invents_share_one_limit_and_take_nothing_from_others() -> None:
+    limit = RateLimit(Clock())
+    for number in range(100_000):
+        limit.admits(f"buddyline/node/c/x{number}", 1)
+        limit.admits(f"buddyline/pair/c/x{number}/pose", 1)
+    taken = rate_limit.OTHER_HZ * BURST_S
+    assert limit.dropped["buddyline/node/c"] == 100_000 - taken
+    assert limit.dropped["buddyline/pair/c"] == 100_000 - taken - rate_limit.MAX_KEYS
+    assert admitted(limit, topics.CANDIDATES.key("a"), 100) == 100
+
+
+def test_owners_that_are_invented_are_forgotten() -> None:
+    limit = RateLimit(Clock())
+    for number in range(10 * rate_limit.MAX_OWNERS):
+        limit.admits(topics.IMU.key(f"x{number}"), 1)
+    assert len(limit._owners) == rate_limit.MAX_OWNERS
+
+
+def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood() -> None:
+    endpoint, inbox, count = free_endpoint(), Inbox(), 2 * round(BURST_S * most_hz(topics.DEPTH))
+    own = topics.DEPTH.key("c")
+    with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
+        subscription = receiver.subscribe(topics.EVERYTHING, inbox, capacity=100_000)
+        publisher = node.publisher(topics.CANDIDATES, "a")
+        with zenoh.open(config_of(client_settings(endpoint, None))) as client:
+
+            def flood() -> int:
+                for _ in range(100):
+                    client.put(own, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+                return subscription.dropped
+
+            until(flood, 0.0)
+            assert len(inbox.payloads(own)) <= count
+            assert "buddyline/node/c sends too much" in receiver.flood_problem()
+            node.declare_alive(PLAYER)
+            until(lambda: receiver._players)  # type: ignore[attr-defined]
+            dropped = subscription.dropped
+            for number in range(count):
+                publisher.put_bytes(b'{"stamp_ns":%d}' % number)
+                if number % 100 == 99:
+                    # More than its cache holds must not be on the way.
+                    inbox.wait_until(lambda due=number + 1: len(inbox.payloads(publisher.key)) == due)  # type: ignore[misc]
+            assert [payload_stamp_ns(payload) for payload in inbox.payloads(publisher.key)] == list(range(count))
+            assert subscription.dropped == dropped
+            node.withdraw_alive(PLAYER)
+            until(lambda: not receiver._players)  # type: ignore[attr-defined]
