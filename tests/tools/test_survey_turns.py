@@ -8,6 +8,7 @@ import pytest
 from buddyline.protocol.config import ConfigError
 from buddyline.tools.survey.averages import wrap
 from buddyline.tools.survey.derive import Derived
+from buddyline.tools.survey.magnetism import Field, iron_rad
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import AdjustSettings, Known, Place, Turn
 from buddyline.tools.survey.readings import of_messages
@@ -98,6 +99,19 @@ def test_gyroscopes_that_feel_no_turn_are_named_and_not_the_compasses(seed):
         assert blunder.cause.startswith("gyroscope")
         assert blunder.cause not in blunder.others
         assert "180 deg" not in blunder.text
+
+
+def test_iron_turns_a_compass_as_much_as_its_field_tells():
+    rng = np.random.default_rng(1)
+    usual = Field(48e-6, math.radians(60.0))
+    undisturbed = usual.norm_t * np.array([math.cos(usual.dip_rad), 0.0, math.sin(usual.dip_rad)])
+    turned, told = [], []
+    for north, east, down in undisturbed + rng.normal(0, 1.5e-6, (2000, 3)):
+        level = math.hypot(north, east)
+        turned.append(math.atan2(east, north))
+        told.append(iron_rad(Field(math.hypot(level, down), math.atan2(down, level)), usual))
+    assert np.mean(np.square(told)) == pytest.approx(np.mean(np.square(turned)), rel=0.1)
+    assert iron_rad(usual, usual) == iron_rad(None, usual) == iron_rad(usual, None) == 0.0
 
 
 def test_a_known_azimuth_gives_north_without_any_compass():

@@ -17,7 +17,7 @@ from buddyline.tools.survey import alarms
 from buddyline.tools.survey.averages import Mean
 from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.gauges import StationDepth
-from buddyline.tools.survey.magnetism import usual_field
+from buddyline.tools.survey.magnetism import iron_rad, usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg, Problem, Station, Turn
 from buddyline.tools.survey.readings import PairReadings
 from buddyline.tools.survey.rests import Rest, rests
@@ -274,7 +274,7 @@ class _Chain:
 
     def _leg(self, shot: Shot, station: dict[str, str], rear: str) -> Leg:
         bad = alarms.disturbed(shot, self.usual, self.limits)
-        leg = replace(one_leg(shot, station, rear), dive=self.dive, disturbed=bad)
+        leg = replace(one_leg(shot, station, rear, self.usual), dive=self.dive, disturbed=bad)
         leg = replace(leg, alarms=alarms.of_leg(leg, shot, self.usual, self.limits))
         return replace(leg, grade=alarms.grade(leg))
 
@@ -302,13 +302,17 @@ def doubt_of(problem: str, stations: Mapping[str, str], *, after_lost: bool) -> 
     return [f"stations: {text}" for text in said]
 
 
-def one_leg(shot: Shot, station: dict[str, str], rear: str) -> Leg:
-    """Return a shot as a leg from the rear node's station; station: by node."""
+def one_leg(shot: Shot, station: dict[str, str], rear: str, usual: alarms.UsualFields) -> Leg:
+    """Return a shot as a leg from the rear node's station; station: by node. usual: fields, which tell of iron."""
     fields: dict[str, Any] = {}
     ends = sorted(shot.ends, key=lambda end: end.node != rear)
     for end, at, prefix, name in zip(ends, ("from_", "to"), ("", "back_"), ("from", "to"), strict=True):
         fields |= {at: station[end.node], f"{name}_node": end.node}
-        for angle, what in ((end.azimuth, "azimuth"), (end.inclination, "inclination")):
+        azimuth = end.azimuth
+        if azimuth is not None:
+            iron = iron_rad(end.field, usual.get(end.node))
+            azimuth = Mean(azimuth.value, math.hypot(azimuth.sigma, iron), azimuth.count, azimuth.noise)
+        for angle, what in ((azimuth, "azimuth"), (end.inclination, "inclination")):
             fields |= _rounded(angle, 3, math.degrees(1), f"{prefix}{what}_deg", f"{prefix}{what}_sigma_deg")
         fields |= _rounded(end.depth, 4, 1.0, *(f"depth_{name}_{part}" for part in ("m", "sigma_m", "noise_m")))
         if end.field is not None:

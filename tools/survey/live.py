@@ -155,7 +155,7 @@ class LiveLegs:
                 found, words = {"rest": text}, ""
             else:
                 standing, doubts = standings[id(one)]
-                leg = one_leg(one.shot, standing.station, standing.rear)
+                leg = one_leg(one.shot, standing.station, standing.rear, usual)
                 measured.append(leg)
                 which = f"leg {leg.name}"
                 texts = [*alarms.of_leg(leg, one.shot, usual, self._limits), *doubts]

@@ -55,6 +55,19 @@ def off_usual(field: Field | None, usual: Field | None, limits: AlarmSettings) -
     return max(abs(share) / limits.field_share, abs(turn_deg) / limits.dip_deg)
 
 
+def iron_rad(field: Field | None, usual: Field | None) -> float:
+    """Return by how much iron turns a compass whose field is not the usual one, 1 sd; 0 if a field is not known.
+
+    The iron's field has an unknown direction. Strength and dip show two of its components; the third, level and across
+    the usual field, turns the compass, and is as large as those two are (rms).
+    """
+    if field is None or usual is None:
+        return 0.0
+    along_t, down_t = field.norm_t - usual.norm_t, usual.norm_t * (field.dip_rad - usual.dip_rad)
+    across_t, level_t = math.hypot(along_t, down_t) / math.sqrt(2), usual.norm_t * math.cos(usual.dip_rad)
+    return math.atan2(across_t, max(level_t, 0.0))
+
+
 def field_alarm(field: Field | None, usual: Field | None, limits: AlarmSettings) -> str:
     """Return the difference of a field from the usual one in words; empty if it is small or not known."""
     if field is None or usual is None:
