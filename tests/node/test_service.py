@@ -34,9 +34,11 @@ from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.messages import NodeStatus
 from buddyline.tools.dives import Dive
+from msgspec.structs import replace
 
 from tests.disks import small_disk
 from tests.processes import PATIENCE_S, REPOSITORY, Process, free_endpoint, until
+from tests.tagged import CAMERA, frame
 
 CONFIG = """
 node = "a"
@@ -334,6 +336,40 @@ def test_a_node_without_its_camera_at_the_start_runs_says_so_and_takes_it_later(
     with DiveLogReader(service.recorder.path) as reader:
         infos = [record.open().message for record in reader.records(lambda key: key.endswith("/info"))]
     assert [info.row_time_ns for info in infos] == [0, 37_000]
+
+
+class TagCamera(NewCamera):
+    """A camera before whose scene pictures a diver holds a station's tag."""
+
+    def __init__(self, clock):
+        super().__init__()
+        self.stamp_ns, self.rng = clock.now_ns(), np.random.default_rng(3)
+
+    def next_frame(self, stop):
+        if stop.wait(0.02):
+            return None
+        self.stamp_ns += S_NS
+        return frame(self.rng, self.stamp_ns, {117: 0.6})
+
+
+def test_a_node_that_is_shown_a_tag_marks_itself(tmp_path):
+    pi = load_node_config(REPOSITORY / "node/examples/pi.toml")
+    config = NodeConfig(
+        node="a",
+        connect=free_endpoint(),
+        calibration=replace(pi.calibration, camera=CAMERA),
+        record=RecordConfig(directory=str(tmp_path)),
+    )
+    service = NodeService(config, camera=lambda config, clock: TagCamera(clock))
+    service.open()
+    try:
+        service.start()
+        until(lambda: service.outlet.sent["mark"] > 0)
+    finally:
+        assert service.close() == 0
+    with DiveLogReader(service.recorder.path) as reader:
+        marks = [record.open().message for record in reader.records(lambda key: key.endswith("/mark"))]
+    assert {(mark.node, mark.kind, mark.name, mark.tag) for mark in marks} == {("a", "station", "T117", 117)}
 
 
 @pytest.mark.skipif(shutil.which("chronyd") is None, reason="chrony is not on this machine")
