@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.service import start_logging
 
 
@@ -13,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("--config", required=True, metavar="FILE.toml", help="this node's configuration")
     parser.add_argument("--connect", metavar="ENDPOINT", help="the hub, as tcp/host:7447; replaces the configured one")
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this time")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.service import start_logging
 
 
@@ -17,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--share", action="store_true", help="divide the pairs among all solvers of this hub that are started so"
     )
-    parser.add_argument("--seconds", type=float, metavar="S", help="stop after this time")
+    parser.add_argument("--seconds", type=above_zero, metavar="S", help="stop after this time")
 
 
 def run(args: argparse.Namespace) -> int:

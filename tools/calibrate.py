@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.newfile import check_new, write_new
-from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     import numpy as np

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Final
 from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario, more_nodes
 from buddyline.protocol.codec import encode
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.service import Service
 from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
-from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.messages import Message

@@ -11,10 +11,10 @@ from buddyline.protocol.config import Config, load_config
 from buddyline.protocol.endpoint import DEFAULT_ENDPOINT, is_loopback
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeId
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.security import HUB, Tls, check_identity
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.tools.option_values import above_zero
 from msgspec import field
 from msgspec.structs import replace
 

@@ -249,3 +249,12 @@ def test_a_number_that_must_be_above_zero_is_named(words, capsys):
         main([*words])
     assert ended.value.code == 2
     assert f"{words[-1]}: give a number above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["solver", "node", "hub"])
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan", "soon"])
+def test_a_service_that_is_to_run_for_no_time_is_refused(command, seconds, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--seconds", seconds])
+    assert ended.value.code == 2
+    assert f"{seconds}: give a number above 0" in capsys.readouterr().err

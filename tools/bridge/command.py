@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol import topics
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
-from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol import topics
+from buddyline.protocol.options import above_zero
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient, follow
-from buddyline.tools.option_values import above_zero
 from buddyline.tools.pairs import add_pair_argument
 
 if TYPE_CHECKING:

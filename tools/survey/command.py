@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.security import SURVEYOR
 from buddyline.tools.arguments import subcommand
 from buddyline.tools.client import add_client_arguments
-from buddyline.tools.option_values import above_zero
 
 if TYPE_CHECKING:
     from buddyline.tools.survey.network import Adjusted

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
+from buddyline.protocol.options import above_zero
 from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
-from buddyline.tools.option_values import above_zero
 from buddyline.tools.survey.marks import KINDS, stamp_ns_of, time_of
 from buddyline.tools.survey.project import STATION_NAME
 
