@@ -140,6 +140,7 @@ def tune(parser: argparse.ArgumentParser) -> None:
     _method(parser)
     parser.add_argument("--environment", default="auto", choices=PRESETS, help="of the paper's method: where to start")
     parser.add_argument("--fit", action="store_true", help="fit the score, and print it; the pictures show no lamp")
+    parser.add_argument("--fit-sigma", action="store_true", help="fit sigma to simulated pictures, and print it")
     parser.add_argument("--note", default="", help="with --fit: what the pictures are, for the record")
     parser.add_argument("--pictures", type=int, default=24, metavar="N", help="at most, evenly spread; default: 24")
     parser.add_argument(

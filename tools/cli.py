@@ -180,7 +180,12 @@ COMMANDS: Final = (
     Command(
         "tune",
         "propose detector values for a site, and show the pictures they were judged on",
-        ("tune dive.mcap", "tune pictures/ --draw judged/", "tune --fit without_lamps/ > score.toml"),
+        (
+            "tune dive.mcap",
+            "tune pictures/ --draw judged/",
+            "tune --fit without_lamps/ > score.toml",
+            "tune --fit-sigma > sigma.toml",
+        ),
     ),
     Command(
         "solve",

@@ -7,7 +7,6 @@ resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are 
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,44 +17,15 @@ import cv2
 import numpy as np
 from buddyline.node.detect.score import NAMES, probability
 from buddyline.node.detect.source import SourceDetector
-from buddyline.protocol.clock import MS_NS
+from buddyline.tools.fit_scenes import HELD_OUT, SEEDS, VIEWS, FitPicture, views
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from buddyline.node.capture.exposure import Exposure
-    from buddyline.node.sim.world import World
+    pass
 
 Floats = NDArray[np.float64]
 
-SEEDS: Final = range(1000, 1050)
-HELD_OUT: Final = range(2000, 2012)
-"""Seeds of the scenes: to fit, and to say how well it fits. Each makes a scene in every water."""
-VIEWS: Final = 6
-SECONDS: Final = 60.0
-CLEAN_SHARE: Final = 0.65
-"""Share of the scenes without decoys."""
-FAR: Final = (0.6, 1.4)
-"""Greatest range of a scene, as a share of the water's own: lamps that only just show count as well."""
-DARK_SHARE: Final = 0.2
-"""Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
-STOPS: Final = (0.0, 0.0, 1.0, -1.0, -2.0, -3.0)
-LAMPS_SHARE, LAMPS_MS = 0.5, (0.015, 0.25)
-"""Half of the scenes are exposed relative to the scene's exposure, half for lamps, as a node does nearly always: so
-many ms, evenly on a logarithmic scale."""
-OTHER_LAMPS: Final = (0, 0, 1, 2, 4, 8)
-SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
-GREY_SHARE: Final = 0.15
-DECOYS: Final = (
-    ("shells",),
-    ("shells", "slabs"),
-    ("bubbles",),
-    ("shells", "lasers", "slabs"),
-    ("bubbles", "clock"),
-    ("shells", "bubbles", "slabs", "lasers", "clock"),
-    ("walls",),
-    ("walls", "slabs", "clock"),
-)
 NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
 """A candidate counts as a lamp within 3 px or 1 % of the width, the greater."""
 BESIDE_RADII: Final = 1.5
@@ -115,54 +85,13 @@ def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterat
     for i, seed in enumerate(seeds):
         for k, environment in enumerate(ENVIRONMENTS):
             progress.show(done + i * len(ENVIRONMENTS) + k, f"{environment}, seed {seed}")
-            yield from _scene(environment, seed)
+            for view in views(environment, seed):
+                yield from _labelled(view)
 
 
-def _scene(environment: str, seed: int) -> Iterator[Sample]:
-    from buddyline.node.sim.scenario import WATERS, Scenario
-    from buddyline.node.sim.world import World
-
-    rng = np.random.default_rng(seed * 10 + sum(environment.encode()))
-    width_px, height_px = SIZES[rng.integers(len(SIZES))]
-    dark = rng.random() < DARK_SHARE
-    far_m = WATERS[environment].range_max_m * rng.uniform(*FAR)
-    scenario = Scenario(
-        environment=environment,  # type: ignore[arg-type]
-        seed=seed,
-        width_px=width_px,
-        height_px=height_px,
-        range_max_m=float(far_m),
-        decoys=() if rng.random() < CLEAN_SHARE else DECOYS[rng.integers(len(DECOYS))],
-        other_lamps=int(rng.choice(OTHER_LAMPS)),
-        dead_lamps=("a.left", "a.right", "b.left", "b.right") if dark else (),
-    )
-    world = World(scenario)
-    exposure = _exposure(world, rng)
-    grey = rng.random() < GREY_SHARE
-    detector = SourceDetector({}, None)
-    for k in range(VIEWS):
-        node = (scenario.node_a, scenario.node_b)[k % 2]
-        stamp_ns = round(1e9 * (1.0 + SECONDS * rng.random()))
-        picture = world.render(node, stamp_ns, exposure)
-        yield from _labelled(detector, picture[:, :, 1].copy() if grey else picture, world, node, stamp_ns)
-
-
-def _exposure(world: World, rng: np.random.Generator) -> Exposure | None:
-    """Return an exposure for lamps, or one that is longer or shorter than the scene's; None for the scene's own."""
-    from buddyline.node.capture.exposure import Exposure
-    from buddyline.node.sim.sensor import scene_exposure
-
-    lamps_ms = math.exp(rng.uniform(*np.log(LAMPS_MS)))
-    stops = float(rng.choice(STOPS))
-    if rng.random() < LAMPS_SHARE:
-        return Exposure(round(lamps_ms * MS_NS))
-    return Exposure(round(scene_exposure(world.scenario.water).amount * 2.0**stops * MS_NS)) if stops else None
-
-
-def _labelled(
-    detector: SourceDetector, picture: NDArray[np.uint8], world: World, node: str, stamp_ns: int
-) -> Iterator[Sample]:
+def _labelled(view: FitPicture) -> Iterator[Sample]:
     """Yield a picture's candidates, without those beside a lamp and those of a lamp that is hidden."""
+    detector, picture, world, node, stamp_ns = view
     seen = detector.examine(picture)
     if seen is None:
         return

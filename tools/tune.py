@@ -4,6 +4,8 @@ The values are judged by the dive's light truth, if it has any. Otherwise the li
 replace it, and the proposed values are the strictest ones that keep these candidates.
 
 With `--fit` the pictures show no lamp, and the detector's score is fitted to them and to simulated ones (fit_score.py).
+`--fit-sigma` fits the sigma of what the detector finds to simulated pictures, and to dives with light truth
+(fit_sigma.py).
 """
 
 from __future__ import annotations
@@ -20,13 +22,14 @@ from typing import Any, Final, TypeAlias
 import cv2
 import numpy as np
 from buddyline.node.detect import Detector, make_detector, values_of
-from buddyline.node.detect.detection import is_likely
+from buddyline.node.detect.detection import focal_of, is_likely
+from buddyline.node.detect.source import SourceDetector
 from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
 from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, LightTruth
 from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
-from buddyline.tools import fit_score, losses
+from buddyline.tools import fit_score, fit_sigma, losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.measure.pictures import spread
@@ -55,6 +58,7 @@ COST_OF_FALSE: Final = 0.01
 ROUNDS: Final = 2
 MASK_BGR: Final = (255, 160, 60)
 BY_TRUTH: Final = "truth"
+EVERY: Final = 1_000_000
 NO_LIGHTS: Final = np.empty((0, 2))
 
 
@@ -88,6 +92,8 @@ class Judged:
 def run(args: argparse.Namespace) -> int:
     """Propose values; return 0."""
     cv2.setNumThreads(1)
+    if args.fit_sigma:
+        return fit_sigma.run(args.inputs, _located(args.inputs))
     if args.fit:
         return fit_score.run(args.inputs, (pixels for _, pixels in _readable(_files(args.inputs))), args.note)
     if not args.inputs:
@@ -122,6 +128,20 @@ def run(args: argparse.Namespace) -> int:
     else:
         sys.stdout.write(_text(report, proposed, before, after))
     return 0
+
+
+def _located(dives: Iterable[str]) -> Iterator[fit_sigma.Errors]:
+    """Yield the located lights of dives. The truth of NAME.mcap is in it, or in NAME.truth.mcap beside it."""
+    for dive in dives:
+        beside = Path(dive).with_suffix(".truth.mcap")
+        pictures, by = load_pictures([dive], str(beside) if beside.exists() else None, EVERY)
+        if by != BY_TRUTH:
+            raise BuddylineError(f"{dive}: --fit-sigma needs the true places of the lights, in it or in {beside.name}")
+        detectors: dict[float, SourceDetector] = {}
+        for picture in pictures:
+            focal_px = picture.focal_px or focal_of(picture.pixels.shape[1])
+            detector = detectors.setdefault(focal_px, SourceDetector({}, focal_px))
+            yield from fit_sigma.located(detector, picture.pixels, focal_px, picture.lights_px, fit_sigma.DIVES)
 
 
 def _true_lights(pictures: Sequence[Picture], by: str) -> list[Points] | None:

@@ -24,6 +24,7 @@ import numpy as np
 from buddyline.node.detect.detection import CLIPPED, FOCAL_PX
 from buddyline.node.detect.lights import HALF, VEIL, Lights
 from buddyline.node.detect.rings import RAY_UV, RAYS, Floats, geometric_radii, luminance, sample_rings, weakest_channel
+from buddyline.node.detect.sigma import Doubt, direct_px2, fitted, long_px2
 from numpy.typing import NDArray
 
 _RINGS = 16
@@ -46,14 +47,7 @@ _INFLATION: Final = 8.0
 # lean.
 _CORE_SHARE, _LEAN_SD = 0.3, 3.0
 
-# The other terms of sigma, fitted by maximum likelihood to the same pictures: those of this project at the scene's
-# exposure and down to 6 stops below it, as they are, as JPEG, and through a Bayer mosaic.
-_FLOOR_PX: Final = 0.004
-# Scale of the least squares' own sigma, beside the root of the model's misfit; and the power by which it grows with the
-# light's halo, as its outline's radius at 0.3 of its height over that at half: glow follows the model less than a core.
-_MISFIT_SCALE, _HALO_POWER = 0.45, 2.2
-# Px per unit of elongation above the first value: a long core is partly hidden, or two lights merge in it.
-_LONG_FROM, _LONG_PX = 1.2, 1.6
+# The sizes of sigma's other terms are in sigma.toml.
 # Radii are at least this: what shows on no ray has the radius 0.
 _LEAST_PX: Final = 0.3
 # For a light that shows only its scattered glow: share of the glow's radius.
@@ -65,11 +59,16 @@ _OUTSIDE_FROM, _OUTSIDE_SHARE = 0.3, 0.5
 
 @dataclass(slots=True, eq=False)
 class Centres:
-    """Sources of N lights: centre_px (N, 2), sigma_px (N,) per axis, lean (N, 2) of the glow, towards the beam."""
+    """Sources of N lights: centre_px (N, 2), sigma_px (N,) per axis, lean (N, 2) of the glow, towards the beam.
+
+    doubt: what sigma is made of, where the model of glow and core holds (N,).
+    """
 
     centre_px: Floats
     sigma_px: Floats
     lean: Floats
+    doubt: Doubt
+    holds: NDArray[np.bool_]
 
 
 def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) -> Centres:
@@ -80,20 +79,22 @@ def locate_sources(image: NDArray[np.uint8], lights: Lights, focal_px: float) ->
     equations = _Equations(image, lights, growth)
     glow_px = np.maximum(lights.radii_px[:, HALF], _LEAST_PX)
     halo = np.maximum(lights.radii_px[:, HALF + 1], _LEAST_PX) / glow_px
-    step_px, lean, variance_px2 = equations.solve(prior_px2, start_px - guess_px, halo)
+    step_px, lean, model_px2, growth_px2 = equations.solve(prior_px2, start_px - guess_px)
+    doubt = Doubt(model_px2, growth_px2, halo, focal_px / FOCAL_PX, lights.core_elongation)
+    sizes = fitted()
     # Where the model does not hold, the result is the region's centre with the prior's uncertainty.
     moved = guess_px + step_px - start_px
     square = moved * moved
     moved_px2 = square[:, 0] + square[:, 1]
     holds = equations.solvable & (moved_px2 <= (radius_px + 3.0) ** 2)
     direct = 1.0 - lights.scattered
-    own_px2 = _FLOOR_PX**2 + direct * variance_px2 + lights.scattered * (_SCATTERED_SHARE * glow_px) ** 2
-    variance_px2 = np.where(holds, own_px2, prior_px2)
-    variance_px2 += (_LONG_PX * np.maximum(lights.core_elongation - _LONG_FROM, 0.0)) ** 2
+    scattered_px2 = lights.scattered * (_SCATTERED_SHARE * glow_px) ** 2
+    variance_px2 = np.where(holds, direct * direct_px2(doubt, sizes) + scattered_px2, prior_px2)
+    variance_px2 += sizes["floor_px"] ** 2 + long_px2(doubt, sizes)
     centre_px = start_px + (holds * direct)[:, None] * moved
     if lights.border_px.any():
         variance_px2 += _outside_px(_to_border(centre_px, image), *lights.border_px.T) ** 2
-    return Centres(centre_px, np.sqrt(variance_px2), lean * holds[:, None])
+    return Centres(centre_px, np.sqrt(variance_px2), lean * holds[:, None], doubt, holds)
 
 
 def _to_border(centre_px: Floats, image: NDArray[np.uint8]) -> Floats:
@@ -175,15 +176,14 @@ class _Equations:
         np.divide(used, noise * noise + _MODEL_NOISE**2, out=weight)
         np.multiply(weight, self._y, out=self._weighted[:, :, 1])
 
-    def solve(self, prior_px2: Floats, prior_px: Floats, halo: Floats) -> tuple[Floats, Floats, Floats]:
-        """Solve for the step to the source (N, 2), the lean (N, 2) and the step's variance (N,) per axis.
+    def solve(self, prior_px2: Floats, prior_px: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Solve for the step to the source (N, 2), the lean (N, 2), and two parts of the step's variance (N,) per axis.
 
         The prior on the step has the mean prior_px (N, 2) and the variance prior_px2 (N,); the prior on the lean has
         the mean 0. The equations are solved twice: samples that the first solution does not explain (an obstacle,
-        another light) have less weight in the second. The variance is that of the least squares times the misfit and
-        a fitted scale. The misfit is the mean squared residual of the first solution over the variance that was
-        assumed: noise, JPEG and other lights show in it. The uncertainty of the growth is added. halo: (N,), see
-        _HALO_POWER.
+        another light) have less weight in the second. The first part of the variance is that of the least squares times
+        the misfit, which is the mean squared residual of the first solution over the variance that was assumed: noise,
+        JPEG and other lights show in it. The second part is from the uncertainty of the growth.
         """
         prior = np.repeat(_PRIOR[None], len(prior_px2), axis=0)
         information = 1.0 / prior_px2
@@ -204,9 +204,9 @@ class _Equations:
         self._weighted /= robust[:, :, None]
         x, _ = self._least_squares(rows, prior)
         apart = x[2, :, :2, 0] - x[1, :, :2, 0]
-        variance = (_MISFIT_SCALE * halo**_HALO_POWER) ** 2 * misfit * (x[0, :, 0, 1] + x[0, :, 1, 2])
-        variance += 0.25 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
-        return x[0, :, :2, 0], x[0, :, 2:, 0], 0.5 * variance
+        model_px2 = 0.5 * misfit * (x[0, :, 0, 1] + x[0, :, 1, 2])
+        growth_px2 = 0.125 * (apart[:, 0] ** 2 + apart[:, 1] ** 2)
+        return x[0, :, :2, 0], x[0, :, 2:, 0], model_px2, growth_px2
 
     def _rows(self) -> Floats:
         """Return the factors of the rings' sums, (3, N, 5, M): the products ss, sw, ww, then s, w.

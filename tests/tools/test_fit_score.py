@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from buddyline.node.detect.score import NAMES, fitted, probability
-from buddyline.tools import fit_score
+from buddyline.tools import fit_scenes, fit_score
 from buddyline.tools.cli import main
 from buddyline.tools.fit_score import Sample
 from buddyline.tools.progress import Progress
@@ -39,8 +39,8 @@ def test_the_shipped_score_is_a_probability_in_fresh_waters():
 def test_the_command_writes_weights_with_their_provenance(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(fit_score, "SEEDS", range(1, 2))
     monkeypatch.setattr(fit_score, "HELD_OUT", range(2, 3))
-    monkeypatch.setattr(fit_score, "VIEWS", 2)
-    monkeypatch.setattr(fit_score, "SIZES", ((410, 308),))
+    monkeypatch.setattr(fit_scenes, "VIEWS", 2)
+    monkeypatch.setattr(fit_scenes, "SIZES", ((410, 308),))
     picture = np.random.default_rng(1).integers(0, 255, (40, 60), np.uint8)
     cv2.imwrite(str(tmp_path / "stones.png"), cv2.resize(picture, None, fx=4, fy=4))
     assert main(["tune", "--fit", str(tmp_path), "--note", 'stones, "dry"']) == 0
