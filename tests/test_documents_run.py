@@ -115,6 +115,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "about.toml").write_text(about[1])
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "161.svx").write_text("*begin 161\n1 2 10.23 106 -02\n2 3 6.77 098 -04\n*end 161\n")
+    shutil.copytree(REPOSITORY / "examples" / "datums", tmp_path / "examples" / "datums")
     shutil.copytree(REPOSITORY / "node" / "examples", tmp_path / "node" / "examples")
     return tmp_path
 

@@ -29,9 +29,9 @@ def plan(adjusted: Adjusted, title: str) -> Figure:
     spots = [(LINE_COLOUR, list(adjusted.positions.values())), (POINT_COLOUR, adjusted.points)]
     places = [(float(p.position_m[0]), float(p.position_m[1])) for _, positions in spots for p in positions]
     figure, axis = _page(places, f"{title}: plan, {adjusted.grid.north} north up", "east, m", "north, m")
-    for line in adjusted.lines:
-        ends_m = zip(stations[line.leg.from_][:2], stations[line.leg.to][:2], strict=True)
-        axis.plot(*ends_m, color=ALARM_COLOUR if line.leg.alarms else LINE_COLOUR, linewidth=1.2)
+    for leg, names in adjusted.survey.stations_legs:
+        ends_m = zip(*(stations[name][:2] for name in names), strict=True)
+        axis.plot(*ends_m, color=ALARM_COLOUR if leg.alarms else LINE_COLOUR, linewidth=1.2)
     for colour, positions in spots:
         for position in positions:
             at = float(position.position_m[0]), float(position.position_m[1])

@@ -92,7 +92,7 @@ class DepthReading:
     @property
     def what(self) -> str:
         """Its name in words."""
-        return f"gauge of {self.gauge[1]}"
+        return f"gauge of {self.gauge[1]}" if self.gauge[1] else f"depth of {self.station}"
 
 
 def readings_of(legs: Sequence[Leg]) -> list[DepthReading]:
@@ -102,10 +102,14 @@ def readings_of(legs: Sequence[Leg]) -> list[DepthReading]:
     for leg, middle_s in zip(legs, middles_s, strict=True):
         first_s[leg.dive] = min(first_s.get(leg.dive, math.inf), middle_s)
     found = []
+    tabled: set[tuple[str, float]] = set()
     for number, (leg, middle_s) in enumerate(zip(legs, middles_s, strict=True)):
         ends = (leg.from_, leg.from_node), (leg.to, leg.to_node)
         for end, ((station, node), depth) in enumerate(zip(ends, depths_of(leg), strict=True)):
-            if depth is not None:
+            # Tables repeat the one depth of a station beside each of its distances.
+            again = not node and depth is not None and (station, depth[0]) in tabled
+            if depth is not None and not again:
+                tabled |= set() if node else {(station, depth[0])}
                 gauge, time_s = (leg.dive, node), middle_s - first_s[leg.dive]
                 found.append(DepthReading(number, end, station, gauge, time_s, *depth))
     return found
@@ -126,6 +130,8 @@ class _GaugeTerms:
 
     def terms(self, one: DepthReading, sign: float) -> list[tuple[int, float]]:
         """Return zero, drift, level and tide of one reading."""
+        if not one.gauge[1]:
+            return []
         zero, drift, level, tide = self._columns.get(one.gauge) or self._unknowns(one.gauge)
         terms = [(zero, sign), (drift, sign * one.time_s / DRIFT_S)]
         terms += [(level, sign)] if level is not None else []
@@ -210,7 +216,7 @@ def assemble(
     turned = {(one.dive, ns) for one in project.turn for ns in (one.from_ns, one.to_ns)}
     for number, (leg, names) in enumerate(zip(legs, ends, strict=True)):
         start, end = of.at[names[0]], of.at[names[1]]
-        if not leg.from_node:
+        if not leg.from_node and leg.azimuth_deg is not UNSET:
             _add_vector(to, number, project, start, end)
             continue
         share = project.settings.range_share if leg.from_node else 0.0

@@ -212,7 +212,7 @@ class Survey:
 
     def _measures(self, solution: Solution, number: int, up_m: dict[str, float]) -> Measures | None:
         rows, leg, (start, end) = solution.observations.rows, self.legs[number], self.ends[number]
-        if not leg.from_node:
+        if not leg.from_node and leg.azimuth_deg is not UNSET:
             return measures_of(leg, self.project, self.turns_rad[number], {})
         sigma = solution.model.sigma
         distance = rows[number, "distance"]

@@ -141,7 +141,7 @@ def adjust(project: Project) -> Adjusted:
     solution = survey.adjust()
     covariances = solution.station_covariances
     if project.adjust.datum == "free" and not project.fix:
-        covariances = free_covariances(solution)
+        covariances = free_covariances(solution, turned=survey.north_along is not None)
     origin_m = survey.origin_m
     at = solution.observations.at
     of_points = {ends[1]: leg.to for leg, ends in zip(survey.legs, survey.ends, strict=True) if " " in ends[1]}
@@ -161,18 +161,23 @@ def adjust(project: Project) -> Adjusted:
     )
 
 
-def free_covariances(solution: Solution) -> Floats:
+def free_covariances(solution: Solution, *, turned: bool = False) -> Floats:
     """Return the stations' covariances (s, 3, 3) relative to all stations' mean (inner constraints; Baarda 1973).
 
     S = I - H (H^T H)^-1 H^T takes off what a shift of the whole map, H, explains; heights keep their water level.
+    turned: and what a turn about the mean explains, where nothing tells a direction.
     """
     count = solution.model.stations
-    H = np.zeros((len(solution.x), 2))
+    H = np.zeros((len(solution.x), 3 if turned else 2))
     H[0 : 3 * count : 3, 0] = H[1 : 3 * count : 3, 1] = 1 / math.sqrt(count)
+    if turned:
+        away_m = solution.position_m[:, :2] - solution.position_m[:, :2].mean(axis=0)
+        H[0 : 3 * count : 3, 2], H[1 : 3 * count : 3, 2] = away_m[:, 1], -away_m[:, 0]
+        H[:, 2] /= np.linalg.norm(H[:, 2])
     ZH = solution.normal.solve(H)
     block = (H.T @ ZH)[None]
-    h = H[: 3 * count].reshape(count, 3, 2)
-    across = h @ ZH[: 3 * count].reshape(count, 3, 2).transpose(0, 2, 1)
+    h = H[: 3 * count].reshape(count, 3, H.shape[1])
+    across = h @ ZH[: 3 * count].reshape(count, 3, H.shape[1]).transpose(0, 2, 1)
     return np.asarray(
         solution.station_covariances - across - across.transpose(0, 2, 1) + h @ block @ h.transpose(0, 2, 1)
     )

@@ -28,8 +28,8 @@ def summary(sheet: Sheet) -> list[str]:
     """Return the summary: lengths, loops, blunders and alarms, a line each."""
     project, adjusted = sheet.project, sheet.adjusted
     lines = [
-        f"{sheet.title}: {len(adjusted.lines)} legs, {adjusted.length_m:.1f} m, {len(adjusted.positions)} stations, "
-        f"{len(adjusted.points)} points",
+        f"{sheet.title}: {len(adjusted.survey.stations_legs)} legs, {adjusted.length_m:.1f} m, "
+        f"{len(adjusted.positions)} stations, {len(adjusted.points)} points",
         sheet.why,
     ]
     for loop in adjusted.loops:

@@ -14,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.survey.connected import station_depths
 from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.geodesy import leg_date
+from buddyline.tools.survey.observations import CHECKED
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
 from buddyline.tools.survey.survex import corrected
@@ -64,6 +65,36 @@ def legs_csv(sheet: Sheet) -> str:
         rows.append(row | {"detectable_m": f"{shown_m:.3f}" if math.isfinite(shown_m) else ""})
     fields = [name for name in Leg.__struct_encode_fields__ if name not in ("unused", "alarms", "disturbed")]
     return _csv([*fields, "disturbed", "alarms", "used", "why_not", "residual_chi2", "detectable_m"], rows)
+
+
+def residuals_csv(sheet: Sheet) -> str:
+    """Return every observation's residual: what it is of, its value less the adjusted one, and how well it is checked.
+
+    In metres and degrees, as the unit says. redundancy: share of an error that shows; w: residual over its own sd,
+    empty where nothing checks it.
+    """
+    solution = sheet.adjusted.solution
+    of, model, r = solution.observations, solution.model, solution.redundancies
+    rows = []
+    for row, what in enumerate(of.what):
+        leg = int(model.leg[row])
+        angle = bool(model.is_angle[row])
+        scale = math.degrees(1) if angle else 1.0
+        sigma = scale * float(solution.weights[row]) ** -0.5
+        residual = scale * float(solution.misfit[row])
+        w = residual / (sigma * math.sqrt(r[row])) if r[row] > CHECKED else None
+        rows.append(
+            {
+                "leg": sheet.adjusted.survey.legs[leg].name if leg >= 0 else "",
+                "observation": what,
+                "unit": "deg" if angle else "",
+                "residual": f"{residual:z.4f}",
+                "sigma": f"{sigma:.4f}",
+                "redundancy": f"{r[row]:.3f}",
+                "w": "" if w is None else f"{w:z.2f}",
+            }
+        )
+    return _csv(("leg", "observation", "unit", "residual", "sigma", "redundancy", "w"), rows)
 
 
 def _station_rows(sheet: Sheet) -> list[dict[str, Any]]:

@@ -24,6 +24,8 @@ COLUMNS: Final = {
     **dict.fromkeys(("depth from", "fromdepth", "depth in"), "fromdepth"),
     **dict.fromkeys(("depth to", "todepth", "depth out"), "todepth"),
     **{name: name for name in ("left", "right", "up", "down", "flags", "date", "note", "declination", "survey")},
+    **dict.fromkeys(("sd", "sigma", "distance sigma", "distance sd"), "sigma"),
+    **dict.fromkeys(("depth sd", "depth sigma"), "depthsigma"),
     **dict.fromkeys(("comment", "comments", "remark"), "note"),
 }
 FEET: Final = frozenset(("ft", "feet", "foot"))
@@ -51,7 +53,8 @@ def read_csv(survey: OldSurvey, path: Path, prefix: SurveyPath) -> None:
         names = [*TOPODROID, *[""] * (len(first) - len(TOPODROID))]
     else:
         raise head.error(f"{head.text.strip()!r} names no columns from, to, distance, azimuth, inclination")
-    if missing := {"from", "to", "tape", "compass"} - set(names):
+    depths = {"fromdepth", "todepth"} <= set(names)
+    if missing := ({"from", "to", "tape"} | (set() if depths else {"compass"})) - set(names):
         raise head.error(f"no column for {', '.join(sorted(missing))}")
     for line in lines:
         row = dict(zip(names, _cells(line, gap), strict=False))
@@ -86,8 +89,17 @@ def _shot(
         raise line.error(f"{line.text.strip()!r} has no station to begin at")
     tape, compass, clino, back = (value(name) for name in ("tape", "compass", "clino", "back"))
     depths = value("fromdepth"), value("todepth")
-    if tape is None or (compass is None and back is None and abs(clino or 0.0) < 90):
-        raise line.error(f"{line.text.strip()!r}: {'no distance' if tape is None else 'no azimuth'}")
+    if tape is None:
+        raise line.error(f"{line.text.strip()!r}: no distance")
+    own = {what: value(name) for what, name in (("tape", "sigma"), ("depth", "depthsigma"))}
+    sigmas = {what: sigma for what, sigma in own.items() if sigma is not None}
+    if any(sigma <= 0 for sigma in sigmas.values()):
+        raise line.error(f"{line.text.strip()!r}: a standard deviation is above zero")
+    if compass is back is None and abs(clino or 0.0) < 90:
+        if depths[0] is None or depths[1] is None or not end:
+            raise line.error(f"{line.text.strip()!r}: no azimuth, and for a distance alone no depths of both ends")
+        _distance(survey, (start, end, path), tape, (depths[0], depths[1]), sigmas, line)
+        return
     flags = frozenset(word for word in re.split(r"[\s|;]+", row.get("flags", "").lower()) if word)
     by_depth = depths[0] is not None and depths[1] is not None and clino is None
     survey.shots.append(
@@ -105,6 +117,7 @@ def _shot(
             flags=flags if end else flags | {"splay"},
             when=_date(row.get("date", ""), line),
             north=North("grid", value("declination") or 0.0),
+            sigmas=sigmas,
             note=row.get("note", ""),
             place=line.place,
             text=line.text.strip(),
@@ -113,6 +126,21 @@ def _shot(
     sides = [value(name) for name in ("left", "right", "up", "down")]
     if any(side is not None for side in sides):
         survey.passages.append(Passage(path, (CrossSection(start, *sides),)))
+
+
+def _distance(
+    survey: OldSurvey,
+    ends: tuple[str, str, SurveyPath],
+    tape_m: float,
+    depths_m: tuple[float, float],
+    sigmas: dict[str, float],
+    line: SourceLine,
+) -> None:
+    """Add a distance without a direction."""
+    if tape_m <= abs(depths_m[1] - depths_m[0]):
+        raise line.error(f"distance: {tape_m:g} m is less than the difference of depth")
+    shot = OldShot(*ends, "distance", tape_m=tape_m, depths_m=depths_m, sigmas=sigmas, place=line.place)
+    survey.shots.append(shot)
 
 
 def _date(word: str, line: SourceLine) -> date | None:

@@ -15,7 +15,7 @@ from buddyline.tools.survey.geodesy import utm_epsg
 from buddyline.tools.survey.old.model import LEAST_M, OldShot, OldSurvey, StationName
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import crs_of, map_system, moved
-from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project
+from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project, Station
 from msgspec import UNSET, UnsetType, structs
 
 # 1 sd of an angle that nothing tells, degrees.
@@ -121,7 +121,16 @@ def joined(project: Project, olds: Sequence[OldSurvey]) -> Project:
         if edit.leg not in names:
             raise ConfigError(f"edit of leg {edit.leg!r}: no such leg, nor in the old surveys")
     points = [structs.replace(leg, from_=same_as(leg.from_)) for leg in project.point]
-    return structs.replace(project, leg=legs, point=points, fix=list(fixes.values()), place=place)
+    stated = {station.name for station in project.station}
+    depths = [
+        structs.replace(one, name=same_as(one.name))
+        for old in olds
+        for one in depths_of(old)
+        if same_as(one.name) not in stated
+    ]
+    return structs.replace(
+        project, leg=legs, point=points, fix=list(fixes.values()), place=place, station=project.station + depths
+    )
 
 
 def same_place(project: Project, olds: Sequence[OldSurvey]) -> Callable[[StationName], StationName]:
@@ -152,7 +161,39 @@ def legs_of(survey: OldSurvey) -> list[Leg]:
     return [_leg(shot) for shot in survey.shots if shot.start and shot.end and shot.style != "nosurvey"]
 
 
+def depths_of(survey: OldSurvey) -> list[Station]:
+    """Return the stations whose depths are read with distances alone."""
+    found: dict[StationName, Station] = {}
+    for shot in survey.shots:
+        if shot.depths_m is not None:
+            for name, depth_m in zip((shot.start, shot.end), shot.depths_m, strict=True):
+                found.setdefault(
+                    name, Station(name=name, depth_m=depth_m, depth_sigma_m=shot.sigma("depth"), readings=1)
+                )
+    return list(found.values())
+
+
 def _leg(shot: OldShot) -> Leg:
+    if shot.depths_m is not None:
+        sigma_m = shot.sigma("depth")
+        return Leg(
+            from_=shot.start,
+            to=shot.end,
+            from_node="",
+            to_node="",
+            dive=0,
+            start_ns=0,
+            end_ns=0,
+            distance_m=shot.tape_m,
+            distance_sigma_m=shot.sigma("tape"),
+            depth_from_m=shot.depths_m[0],
+            depth_from_sigma_m=sigma_m,
+            depth_to_m=shot.depths_m[1],
+            depth_to_sigma_m=sigma_m,
+            turn_deg=0.0,
+            fixes=0,
+            note=shot.place,
+        )
     distance_m, azimuth_deg, slope_deg = shot.polar
     along_m, aside_m, across_m = shot.polar_sigmas
     distance_m = max(distance_m, LEAST_M)

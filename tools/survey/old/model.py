@@ -16,7 +16,7 @@ from buddyline.tools.survey.averages import wrap
 # A station's full name: the surveys around it and its own name, with points between; "" has no name (splays).
 StationName: TypeAlias = str
 SurveyPath: TypeAlias = tuple[str, ...]
-Style: TypeAlias = Literal["normal", "diving", "cartesian", "cylpolar", "nosurvey"]
+Style: TypeAlias = Literal["normal", "diving", "cartesian", "cylpolar", "nosurvey", "distance"]
 
 # 1 sd of what no file states, metres and degrees: BCRA grade 5 as Survex has it, its default.
 SIGMAS: Final[Mapping[str, float]] = {
@@ -42,6 +42,7 @@ class North:
 @dataclass(frozen=True)
 class OldShot:
     """One shot as read. None: not read. rise_m: by depth gauges, up. vector_m: of cartesian style, east, north, up.
+    depths_m: of both ends, of distance style, which has a tape alone.
 
     clino_word: up, down or level, where no angle was read. when: first day. text: the line of its file.
     sigmas: 1 sd by quantity, those of SIGMAS if not here. extend: of the extended elevation: left, right, ignore, ...
@@ -59,6 +60,7 @@ class OldShot:
     clino_word: Literal["", "up", "down", "level"] = ""
     rise_m: float | None = None
     vector_m: tuple[float, float, float] | None = None
+    depths_m: tuple[float, float] | None = None
     flags: frozenset[str] = frozenset()
     when: date | None = None
     north: North = field(default_factory=North)

@@ -99,7 +99,7 @@ def _columns(shot: OldShot) -> dict[str, str]:
     """Return a shot's readings by column, those of both languages; backsights only where there are any."""
     if shot.vector_m is not None:
         return {name: _number(value, 4) for name, value in zip(("dx", "dy", "dz"), shot.vector_m, strict=True)}
-    if shot.style == "nosurvey":
+    if shot.style in ("nosurvey", "distance"):
         return {}
     row = {"tape": _number(shot.tape_m, 4), "compass": _angle(shot.compass_deg)}
     row |= {} if shot.back_deg is None else {"backcompass": _angle(shot.back_deg)}
@@ -109,6 +109,11 @@ def _columns(shot: OldShot) -> dict[str, str]:
     if shot.clino_word or shot.clino_deg is not None or shot.back_clino_deg is None:
         row["clino"] = shot.clino_word or _number(shot.clino_deg, 4)
     return row | ({} if shot.back_clino_deg is None else {"backclino": _number(shot.back_clino_deg, 4)})
+
+
+def _style(shot: OldShot) -> str:
+    """Return a shot's style in both languages, which have no distances alone."""
+    return "nosurvey" if shot.style == "distance" else shot.style
 
 
 def _angle(angle_deg: float | None) -> str:
@@ -191,10 +196,10 @@ def _svx_block(survey: OldSurvey, block: _Block, names: _Names, turn_deg: float)
         }
         if shot.when is not None:
             now["*date"] = f"{shot.when:%Y.%m.%d}"
-        if shot.style not in ("cartesian", "nosurvey"):
+        if shot.style not in ("cartesian", "nosurvey", "distance"):
             now |= _svx_north(shot, state, turn_deg)
         row = _columns(shot)
-        now[f"*data {' '.join([shot.style, 'from', 'to', *row])}"] = ""
+        now[f"*data {' '.join([_style(shot), 'from', 'to', *row])}"] = ""
         for name, value in now.items():
             if state.get(name) != value:
                 yield f"{name} {value}".rstrip()
@@ -254,7 +259,13 @@ def _svx_passages(block: _Block, names: _Names) -> Iterator[str]:
 def remark_of(shot: OldShot) -> str:
     """Return what was read, where it was, and what else was said of it."""
     other = sorted(shot.flags - {"surface", "duplicate", "splay", "wall"})
-    words = [shot.place, *other, *([f"extend {shot.extend}"] if shot.extend else []), shot.note]
+    words = [
+        shot.place,
+        f"{shot.tape_m:.4f} m" if shot.style == "distance" else "",
+        *other,
+        *([f"extend {shot.extend}"] if shot.extend else []),
+        shot.note,
+    ]
     return " ".join(word for word in words if word)
 
 
@@ -335,13 +346,13 @@ def _th_rows(block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
         }
         if shot.when is not None:
             now["date"] = f"{shot.when:%Y.%m.%d}"
-        if shot.style != "nosurvey" and shot.north.kind != "model":
+        if shot.style not in ("nosurvey", "distance") and shot.north.kind != "model":
             # Therion itself turns from true north to the grid's.
             value_deg = shot.north.value_deg + (turn_deg if shot.north.kind == "grid" else 0.0)
             if value_deg or turn_deg or "declination" in state:
                 now["declination"] = f"{value_deg + 0.0:.4f} degrees"
         row = _columns(shot)
-        now[f"data {' '.join([shot.style, 'from', 'to', *row])}"] = ""
+        now[f"data {' '.join([_style(shot), 'from', 'to', *row])}"] = ""
         for name, value in now.items():
             if state.get(name) != value:
                 yield f"{name} {value}".rstrip()
