@@ -57,7 +57,7 @@ INFO_AHEAD_S: Final = 0.3
 
 
 class SolverFollower:
-    """Follows a solver's outcomes on the bus, so that a fast playback does not outrun it."""
+    """Follows a solver's outcomes on the bus, so that playback neither outruns it nor leaves before it is done."""
 
     def __init__(self, bus: Bus, nodes: Iterable[str]) -> None:
         self._changed = threading.Condition()
@@ -82,22 +82,33 @@ class SolverFollower:
                 self._heard_s = time.monotonic()
             self._changed.notify_all()
 
-    def wait_to_send(self, node: str, stamp_ns: int, stop: threading.Event) -> None:
+    def wait_to_send(self, stamp_ns: int, stop: threading.Event) -> None:
         """Wait until the solver's outcomes are close to stamp_ns, of the next frame; no wait without a solver."""
         with self._changed:
             if self._resolved_ns < 0:
                 # Everything before the first frame counts as resolved.
                 self._resolved_ns = stamp_ns
             silent = min(self._sent_ns.values(), default=-1) < stamp_ns - AHEAD_NS
-            ahead_ns = AHEAD_OF_SILENT_NS if silent else AHEAD_NS
-            while (
-                self._solvers
-                and self._resolved_ns < stamp_ns - ahead_ns
-                and time.monotonic() - self._heard_s < SOLVER_SILENT_S
-                and not stop.is_set()
-            ):
-                self._changed.wait(0.1)
+            self._wait_for(stamp_ns - (AHEAD_OF_SILENT_NS if silent else AHEAD_NS), stop)
+
+    def take_sent(self, node: str, stamp_ns: int) -> None:
+        """Take the stamp of a frame that was sent."""
+        with self._changed:
             self._sent_ns[node] = stamp_ns
+
+    def wait_for_last(self, stop: threading.Event) -> None:
+        """Wait until the solver has given the outcome of all nodes' last frames; no wait without a solver."""
+        with self._changed:
+            self._wait_for(min(self._sent_ns.values(), default=-1), stop)
+
+    def _wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
+        while (
+            self._solvers
+            and self._resolved_ns < stamp_ns
+            and time.monotonic() - self._heard_s < SOLVER_SILENT_S
+            and not stop.is_set()
+        ):
+            self._changed.wait(0.1)
 
 
 class Player:
@@ -110,7 +121,7 @@ class Player:
         self._clock = clock
         self._stop = stop
         self._publishers: dict[str, Publisher] = {}
-        self._follower = SolverFollower(bus, nodes) if speed == 0 else None
+        self._follower = SolverFollower(bus, nodes)
         self._image_due_ns: dict[str, int] = {}
         self._first_ns: int | None = None
         self._began_ns = 0
@@ -139,14 +150,21 @@ class Player:
             return
         if envelope.topic is IMAGE and not self._image_is_due(envelope.key):
             return
-        if self._follower is not None and envelope.topic is CANDIDATES:
-            self._follower.wait_to_send(envelope.node, time_ns, self._stop)
+        if envelope.topic is CANDIDATES:
+            if self._speed == 0:
+                self._follower.wait_to_send(time_ns, self._stop)
+            self._follower.take_sent(envelope.node, time_ns)
         publisher = self._publishers[envelope.key]
         if shift_triggers:
             publisher.put(_shifted(envelope.message, shift_triggers, period_ns))
         else:
             publisher.put_bytes(envelope.payload)
         self.sent += 1
+
+    def finish(self) -> None:
+        """Stay until a solver is done with the dive: subscribers may still fetch lost samples from this process."""
+        self._follower.wait_for_last(self._stop)
+        self._stop.wait(1.0)
 
     def _image_is_due(self, key: str) -> bool:
         if self._clock.now_ns() < self._image_due_ns.get(key, 0):
@@ -194,8 +212,7 @@ def run(args: argparse.Namespace) -> int:
                         player.send(envelope, lap * laps_triggers, period_ns)
                         progress.show((envelope.time_ns - start_ns) / S_NS)
                 lap += 1
-            # Subscribers may still fetch lost samples from this process.
-            client.stop.wait(1.0)
+            player.finish()
             log.info("play: %d messages sent, %d bad", player.sent, dive.refused)
 
         return client.run(play)

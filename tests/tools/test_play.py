@@ -17,7 +17,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.play import Player, _selected, _span
 from msgspec.structs import replace
 
-from tests.processes import PATIENCE_S
+from tests.processes import PATIENCE_S, until
 from tests.solver_service.conftest import PERIOD_NS, START_NS, dive_messages
 from tests.tools.evaluated import track
 
@@ -161,3 +161,26 @@ def test_fast_playback_without_a_solver_does_not_wait(log, monkeypatch):
 def test_a_part_outside_the_dive_is_refused(log, start_s, end_s):
     with Dive([log]) as dive, pytest.raises(BuddylineError, match="the dive goes from 0 to"):
         _span(dive, start_s, end_s)
+
+
+def test_playback_stays_until_the_solver_has_answered_the_last_frames(log, monkeypatch):
+    monkeypatch.setattr(play, "SOLVER_SILENT_S", math.inf)
+    network, stop = LocalNetwork(), threading.Event()
+    with Dive([log]) as dive, network.connect() as bus, network.connect() as solver:
+        player = Player(bus, dive.nodes("candidates"), math.inf, ManualClock(5), stop)
+        player.declare(dive.keys)
+        solver.declare_alive("solver/test")
+        until(lambda: player._follower._solvers)
+        frames = list(dive.messages(CANDIDATES.name))
+        for frame in frames:
+            player.send(frame)
+        staying = threading.Thread(target=player.finish)
+        staying.start()
+        staying.join(1.2)
+        assert staying.is_alive()
+        last = frames[-1].message
+        solver.publisher(REJECTED, "a", "b").put(
+            Rejected(node_a="a", node_b="b", stamp_ns=last.stamp_ns, trigger=last.trigger, reason="unmatched")
+        )
+        staying.join(PATIENCE_S)
+        assert not staying.is_alive()
