@@ -50,17 +50,21 @@ class Intake:
 
     def _run(self) -> None:
         try:
-            while True:
-                try:
-                    sample: zenoh.Sample | None = self._samples.recv()
-                except zenoh.ZError:
-                    return
+            while (sample := self._next(wait=True)) is not None:
                 is_flood = False
                 while sample is not None:
                     is_flood |= not self._accept(sample)
-                    sample = self._samples.try_recv()
+                    # Without a wait for what is there: it would give the interpreter to a busy thread for milliseconds.
+                    sample = self._next(wait=False)
                 if is_flood:
                     # The interpreter changes threads every 5 ms where none waits: the others would crawl.
                     time.sleep(FLOOD_PAUSE_S)
         except Exception as error:
             self._failures.report(self._thread.name, error)
+
+    def _next(self, *, wait: bool) -> zenoh.Sample | None:
+        """Return the next sample; None at the end, and without a wait also where there is none yet."""
+        try:
+            return self._samples.recv() if wait else self._samples.try_recv()
+        except zenoh.ZError:
+            return None

@@ -172,3 +172,26 @@ def test_another_process_of_the_same_name_is_alive(client: Connect) -> None:
 def test_an_alive_name_that_cannot_be_a_key_is_refused(client: Connect, name: str) -> None:
     with pytest.raises(ValueError, match="alive name"):
         client().declare_alive(name)
+
+
+def test_a_bus_closes_while_messages_come(client: Connect) -> None:
+    """It is no failure of a thread that takes them."""
+    node = client()
+    publisher, ended = node.publisher(topics.DEPTH, "a"), threading.Event()
+
+    def publish() -> None:
+        while not ended.wait(0.0):
+            publisher.put_bytes(b"{}")
+
+    device = threading.Thread(target=publish, daemon=True)
+    device.start()
+    try:
+        for _ in range(15):
+            bus, inbox = client(), Inbox()
+            bus.subscribe(topics.EVERYTHING, inbox, history=False)
+            inbox.wait_for(1)
+            bus.close()
+            assert bus.failure is None
+    finally:
+        ended.set()
+        device.join(PATIENCE_S)
