@@ -80,6 +80,7 @@ def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_pat
         assert not any(key.startswith("buddyline/node/b/") for key in reader.keys)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not THIRD_BAR.exists(), reason="the shared sample dives are not here")
 def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):
     done = buddyline("solve", THIRD_BAR, "-o", tmp_path / "out.mcap")

@@ -67,6 +67,7 @@ def beyond(lights):
     return np.mean([light.square > 11.83 for light in lights])
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_sigma_says(found):
     assert 0.7 < np.mean([light.square for light in found]) / 2 < 1.3
 

@@ -138,6 +138,7 @@ def finds_both(found):
     return all(any(np.hypot(d.blob.u_px - u, d.blob.v_px - v) < 3.0 for d in found) for u, v in LAMPS)
 
 
+@pytest.mark.slow
 def test_the_whole_picture_is_searched_once_a_second():
     eye = Eye()
     looks = [eye.look(LAMPS, *of_lamps()) for _ in range(40)]

@@ -13,7 +13,9 @@ GATE = 4.5
 
 
 @pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
-@pytest.mark.parametrize(("count", "triggers"), [(9, 200), (14, 25)], ids=["few", "many"])
+@pytest.mark.parametrize(
+    ("count", "triggers"), [(9, 200), pytest.param(14, 25, marks=pytest.mark.slow)], ids=["few", "many"]
+)
 def test_every_combination_within_both_gates_is_found(rigs, count, triggers):
     rng = np.random.default_rng(1)
     passing = 0

@@ -25,6 +25,7 @@ def test_the_fit_finds_the_weights_that_made_the_lamps():
     assert fit_score.calibration_error(samples, fitted_weights + np.array([2.0, 0.0, 0.0])) > 0.1
 
 
+@pytest.mark.slow
 def test_the_shipped_score_is_a_probability_in_fresh_waters():
     samples = list(fit_score.simulated((3001, 3002), Progress("test", 1, io.StringIO())))
     assert fit_score.calibration_error(samples, fitted()) < 0.1

@@ -45,6 +45,7 @@ def test_the_places_are_found_through_a_third_node(dive, tmp_path):
     assert load_node_config(config).fixed.net == "main"
 
 
+@pytest.mark.slow
 def test_a_node_that_moves_is_no_fixed_node(dive, capsys):
     assert main(["net", "init", str(dive[0]), "--still", "a", "--still", "b"]) == 2
     assert "node b: does not stand still" in capsys.readouterr().err

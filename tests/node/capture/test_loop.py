@@ -194,6 +194,7 @@ def strangers(node_lamp, stranger):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("told", "guided"), [(0, False), (1, False), (0, True)])
 def test_a_strangers_bright_lamp_does_not_hide_the_other_nodes(told, guided):
     """It is 10,000 times as bright. Context frames show the other, or the solver says which one it is."""

@@ -25,6 +25,7 @@ def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> Dive:
     return replace(make(seed, setting), fixes=make(seed, replace(setting, dead=())).fixes)
 
 
+@pytest.mark.slow
 def test_the_live_track_is_honest_from_its_start_on() -> None:
     judged = []
     for seed, lamp in enumerate(LAMPS):

@@ -53,6 +53,7 @@ def test_a_dead_lamp_is_named_offline():
     assert "left lamp of b has not been seen for" in status_problem(0, 10.0, "b.left", mode="smooth")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 3, pytest.param(1, marks=SLOW), pytest.param(2, marks=SLOW)])
 def test_lamps_that_work_are_not_named(seed):
     assert "lamp of" not in status_problem(seed, 15.0)

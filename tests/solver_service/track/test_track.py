@@ -125,6 +125,7 @@ def bare_of(dive: Dive) -> tuple[NodeRecord, NodeRecord]:
     return a, b
 
 
+@pytest.mark.slow
 def test_without_inertial_units(dive: Dive) -> None:
     bare = bare_of(dive)
     for records in ((bare[0], bare[1]), (dive.records[0], bare[1]), (bare[0], dive.records[1])):
@@ -134,6 +135,7 @@ def test_without_inertial_units(dive: Dive) -> None:
         assert judged.nees < 2.5
 
 
+@pytest.mark.slow
 def test_compasses_that_wander_within_seconds_give_no_wrong_track() -> None:
     """Where each node sees one lamp for seconds, lateral place, heading and range are told by attitudes alone."""
     dive = make(301, Setting(seconds=40.0, near_m=4.0, far_m=8.0))
