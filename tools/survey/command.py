@@ -30,6 +30,11 @@ FORMATS: Final = {
     "stations": ".stations.csv",
     "residuals": ".residuals.csv",
     "geojson": ".geojson",
+    "kml": ".kml",
+    "dxf": ".dxf",
+    "gpkg": ".gpkg",
+    "control": ".control.csv",
+    "scalebars": ".scalebars.csv",
     "svg": ".svg",
     "profile": ".profile.svg",
     "pdf": ".pdf",
@@ -262,7 +267,7 @@ def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
     """Return a survey in one of FORMATS."""
     from buddyline.tools.draw import figures
     from buddyline.tools.draw.survey import plan, profile
-    from buddyline.tools.survey import survex, tables
+    from buddyline.tools.survey import maps, survex, tables
 
     adjusted, title = sheet.adjusted, sheet.title
     writers: dict[str, Callable[[], str | bytes]] = {
@@ -274,6 +279,11 @@ def exported(sheet: Sheet, kind: str, style: str = "auto") -> str | bytes:
         "stations": lambda: tables.stations_csv(sheet),
         "residuals": lambda: tables.residuals_csv(sheet),
         "geojson": lambda: tables.geojson(sheet),
+        "kml": lambda: maps.kml(sheet),
+        "dxf": lambda: maps.dxf(sheet),
+        "gpkg": lambda: maps.geopackage(sheet),
+        "control": lambda: maps.control_csv(sheet),
+        "scalebars": lambda: maps.scale_bars_csv(sheet),
         "svg": lambda: figures.svg(plan(adjusted, title)),
         "profile": lambda: figures.svg(profile(adjusted, title)),
         "pdf": lambda: figures.pdf([plan(adjusted, title), profile(adjusted, title)]),

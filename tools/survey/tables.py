@@ -124,8 +124,8 @@ def stations_csv(sheet: Sheet) -> str:
     )
 
 
-def geojson(sheet: Sheet) -> str:
-    """Return stations, points and legs as GeoJSON (RFC 7946: WGS 84, longitude first, altitude third)."""
+def map_features(sheet: Sheet) -> list[dict[str, Any]]:
+    """Return stations, points and legs as features of GeoJSON: WGS 84, longitude first, altitude third."""
     if not sheet.north_known:
         raise BuddylineError("a map needs a declination: give [place] in the project")
     features: list[dict[str, Any]] = []
@@ -145,10 +145,15 @@ def geojson(sheet: Sheet) -> str:
             at[row["name"]] = where
         digits = {name: STATION_DIGITS[name] for name in MAP_PROPERTIES}
         add("Point", where, {name: row[name] if n is None else round(row[name], n) for name, n in digits.items()})
-    for line in sheet.adjusted.lines:
-        leg = line.leg
+    for leg, names in sheet.adjusted.survey.stations_legs:
         properties = {"name": leg.name, "kind": "leg", "distance_m": leg.distance_m, "grade": leg.grade}
-        add("LineString", [at[leg.from_], at[leg.to]], properties | {"alarms": leg.alarms})
+        add("LineString", [at[name] for name in names], properties | {"alarms": leg.alarms})
+    return features
+
+
+def geojson(sheet: Sheet) -> str:
+    """Return stations, points and legs as GeoJSON (RFC 7946)."""
+    features = map_features(sheet)
     description = f"{sheet.title}; {sheet.date}; {sheet.why}"
     collection = {"type": "FeatureCollection", "name": sheet.name, "description": description, "features": features}
     return json.dumps(collection, indent=1, allow_nan=False)

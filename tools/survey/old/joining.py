@@ -158,7 +158,7 @@ def _merged(equates: Iterable[tuple[StationName, ...]]) -> Callable[[StationName
 
 def legs_of(survey: OldSurvey) -> list[Leg]:
     """Return a survey's shots between stations as legs; splays to nameless ends and unmeasured ones are none."""
-    return [_leg(shot) for shot in survey.shots if shot.start and shot.end and shot.style != "nosurvey"]
+    return [leg_of(shot) for shot in survey.shots if shot.start and shot.end and shot.style != "nosurvey"]
 
 
 def depths_of(survey: OldSurvey) -> list[Station]:
@@ -173,7 +173,8 @@ def depths_of(survey: OldSurvey) -> list[Station]:
     return list(found.values())
 
 
-def _leg(shot: OldShot) -> Leg:
+def leg_of(shot: OldShot) -> Leg:
+    """Return a shot as a leg of the adjustment."""
     if shot.depths_m is not None:
         sigma_m = shot.sigma("depth")
         return Leg(
