@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from buddyline.solver_service.geometry.trigger import TriggerReadings, read_trig
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
+from buddyline.solver_service.resting import LOOKS, Resting, look_apart
 from buddyline.solver_service.results import view_of
 from msgspec import UNSET
 
@@ -49,6 +51,11 @@ class Matched:
     rig_b: Rig
     sensed_a: Sensed
     sensed_b: Sensed
+
+    @cached_property
+    def apart(self) -> bool:
+        """Whether by their attitudes the nodes look apart, in a trigger that need not be solved."""
+        return self.trigger % LOOKS != 0 and look_apart((self.sensed_a, self.sensed_b), (self.rig_a, self.rig_b))
 
     @property
     def dark(self) -> bool:
@@ -83,6 +90,7 @@ class PairSolver:
         self._headings = HeadingOffset()
         self._rarity = Rarity()
         self._followers = LampFollower(), LampFollower()
+        self._resting = Resting()
 
     def solve(self, matched: Sequence[Matched]) -> list[Fix | NoFix]:
         """Return one result for each trigger.
@@ -99,6 +107,7 @@ class PairSolver:
         self._prior.reset()
         self._headings.reset()
         self._rarity.reset()
+        self._resting.forget()
         for follower in self._followers:
             follower.forget()
 
@@ -107,14 +116,34 @@ class PairSolver:
         return self._headings.predict(stamp_ns)
 
     def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
+        # What is read does not depend on which triggers are read with it.
+        may_rest = "attitude" in self.settings.checks
+        wanted = [one for one in batch if not (may_rest and one.apart)]
         try:
-            readings = self._read(batch)
+            readings = self._read(wanted) if wanted else None
         except (ArithmeticError, ValueError) as error:
             if len(batch) == 1:
                 return [self._out_of_range(batch[0], error)]
             # One trigger has absurd but finite values, such as 1e300, which make a matrix singular: solve one by one.
             return [fix for one in batch for fix in self._solve_batch([one])]
-        return [self._decide(one, readings, place) for place, one in enumerate(batch)]
+        places = {id(one): place for place, one in enumerate(wanted)}
+        found = []
+        for one in batch:
+            if id(one) in places and readings is not None:
+                found.append(self._decide(one, readings, places[id(one)]))
+            elif self._resting.rests(one.stamp_ns):
+                found.append(NoFix("out_of_view", "by both attitudes the cameras look apart"))
+            else:
+                found.append(self._look(one))
+        return found
+
+    def _look(self, one: Matched) -> Fix | NoFix:
+        """Solve one trigger by itself."""
+        try:
+            readings = self._read([one])
+        except (ArithmeticError, ValueError) as error:
+            return self._out_of_range(one, error)
+        return self._decide(one, readings, 0)
 
     def _read(self, batch: Sequence[Matched]) -> TriggerReadings:
         observations = [
@@ -145,6 +174,7 @@ class PairSolver:
             if not matched.dark:
                 self._rarity.take(found)
             self._headings.take(stamp_ns, found)
+            self._resting.take(stamp_ns, found)
             if isinstance(found, Fix):
                 self._remember(matched, found)
         except (ArithmeticError, ValueError) as error:

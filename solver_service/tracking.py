@@ -28,6 +28,7 @@ from buddyline.protocol.messages import (
 from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
+from buddyline.solver_service.resting import LOOKS
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
@@ -82,6 +83,9 @@ class PairTracker:
         self._settled_ns = -1
         self._oriented = False
         self._clock: tuple[float, float] | None = None
+        # Whether there was a pose; whether the nodes look apart and never had one; the triggers of then, with stamps.
+        self._posed = self._rests = False
+        self._unseen: dict[int, int] = {}
 
     @property
     def problems(self) -> list[str]:
@@ -161,6 +165,14 @@ class PairTracker:
             self._first_ns = self._told_ns = min(stamps_ns)
             self._taken_ns = self._first_ns - S_NS
         self._settled_ns = max(self._settled_ns, *stamps_ns)
+        for one in outcomes:
+            self._posed |= isinstance(one, RelativePose)
+            if isinstance(one, Rejected) and not self._posed:
+                apart = one.reason == "out_of_view"
+                # One in LOOKS triggers is solved also of nodes that look apart.
+                self._rests = apart or (self._rests and one.trigger % LOOKS == 0)
+                if self._rests:
+                    self._unseen[one.trigger] = one.stamp_ns
         fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if self._filter is not None:
             for fix in fixes:
@@ -223,6 +235,7 @@ class PairTracker:
             if self._filter is not None:
                 feed(self._filter, node, piece)
         self._taken_ns = to_ns
+        self._unseen = {trigger: ns for trigger, ns in self._unseen.items() if ns > to_ns - S_NS}
         return self._live(to_ns)
 
     def _live(self, to_ns: int) -> list[Message]:
@@ -272,7 +285,12 @@ class PairTracker:
         stamps_ns, values = stream.imu.between(start_ns, end_ns)
         return NodeRecord(
             node=self._nodes[node],
-            frames=[frame_of(frame) for frame in map(view_of, stream.frames.between(start_ns, end_ns))],
+            # In pictures of nodes that look apart the track would only find wrong starts.
+            frames=[
+                frame_of(view_of(frame))
+                for frame in stream.frames.between(start_ns, end_ns)
+                if frame.trigger not in self._unseen
+            ],
             imu_stamps_ns=stamps_ns,
             accel_mps2=values[:, :3],
             gyro_radps=values[:, 3:],

@@ -31,6 +31,7 @@ Reason: TypeAlias = Literal[
     "duplicate",
     "heading",
     "other_lights",
+    "out_of_view",
 ]
 TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -90,6 +91,15 @@ class Camera:
             _, px2_per_sr = self.frames(grid)
             angle = float(np.nansum(self.area_px2 / (columns * rows) / px2_per_sr))
         return angle if 0.0 < angle < 13.0 else 1.0
+
+    @cached_property
+    def half_view_rad(self) -> float:
+        """The widest angle of the picture from the optical axis; pi where the model does not reach its corners."""
+        right, below = self.width_px - 0.5, self.height_px - 0.5
+        corners = np.array([(u, v) for u in (-0.5, right) for v in (-0.5, below)])
+        with np.errstate(all="ignore"):
+            ahead = float(self.frames(corners)[0][:, 0, 2].min())
+        return math.acos(min(max(ahead, -1.0), 1.0)) if math.isfinite(ahead) else math.pi
 
     def _pinhole_frames(self, distorted: Floats) -> tuple[Floats, Floats]:
         frames = np.empty((len(distorted), 3, 3))

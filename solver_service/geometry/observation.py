@@ -20,6 +20,7 @@ Reason: TypeAlias = Literal[
     "depth",
     "heading",
     "other_lights",
+    "out_of_view",
     "out_of_range",
     "ambiguous",
     "degenerate",

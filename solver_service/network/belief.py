@@ -34,13 +34,13 @@ from buddyline.solver_service.track.intake import TrackIntake, newest_before
 from buddyline.solver_service.track.stepping import (
     ATTITUDE_EVERY_S,
     HOLD_S,
-    MAX_DELAY_S,
     TICK_S,
     TOGETHER_S,
     WITHOUT_RAD,
     WITHOUT_RADPS,
+    increment,
 )
-from buddyline.solver_service.track.strapdown import Increment, Noise, integrate
+from buddyline.solver_service.track.strapdown import Noise
 
 # With fixed nodes the heading of an attitude gets this factor: it does not count.
 FREE_HEADING: Final = 1e6
@@ -188,19 +188,6 @@ class NetBelief:
 
     # Motion
 
-    def _increment(self, state: NetState, index: int, from_s: float, to_s: float) -> Increment:
-        samples = self.intake.samples[self.members[index].node]
-        shift = min(max(float(state.delay_s[index]), -MAX_DELAY_S), MAX_DELAY_S)
-        known_s = to_s + HOLD_S
-        grid, values, told, _ = samples.between(from_s + shift, to_s + shift, known_s)
-        without = not told.any() and not samples.near(to_s + shift, known_s)
-        if without:
-            values = np.zeros_like(values)
-        slow = [samples.slow_rate(each_s, known_s) for each_s in (from_s + shift, to_s + shift)]
-        ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
-        part = integrate(as_first_of_pair(state, index), 0, grid, values[:, :3], values[:, 3:], told, np.stack(ends))
-        return replace(part, without=True) if without else part
-
     def _noise_of(self, node: int, t_s: float) -> Noise:
         noise = self.intake.samples[node].noise(t_s)
         stated = self.intake.turning[node].stated(t_s)
@@ -219,7 +206,8 @@ class NetBelief:
         for i, member in enumerate(self.members):
             if member.node in self.places:
                 continue
-            part = self._increment(state, i, self.t_s, to_s)
+            samples = self.intake.samples[member.node]
+            part = increment(samples, as_first_of_pair(state, i), 0, self.t_s, to_s)
             noise = self._noise_of(member.node, to_s)
             after, F[i], Q[i], drawn[i] = moved_member(state, i, part, noise, shaking[i], to_s - self.t_s)
             if part.without != member.without:

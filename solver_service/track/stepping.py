@@ -22,6 +22,7 @@ from buddyline.solver_service.track.lights import (
     pixel_of,
     residuals,
 )
+from buddyline.solver_service.track.samples import Samples
 from buddyline.solver_service.track.smoother import Path
 from buddyline.solver_service.track.state import (
     CLOCK,
@@ -89,6 +90,20 @@ class PassGuide:
     look: Look
 
 
+def increment(samples: Samples, state: State, node: int, from_s: float, to_s: float) -> Increment:
+    """Integrate the samples of one node of a pair's state from one time to the next, by its own clock's delay."""
+    shift = min(max(float(state.delay_s[node]), -MAX_DELAY_S), MAX_DELAY_S)
+    known_s = to_s + HOLD_S
+    grid, values, told, fast = samples.between(from_s + shift, to_s + shift, known_s)
+    without = not told.any() and not samples.near(to_s + shift, known_s)
+    if without:
+        values = np.zeros_like(values)
+    slow = [samples.slow_rate(each_s, known_s) for each_s in (from_s + shift, to_s + shift)]
+    ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
+    part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends), fast)
+    return replace(part, without=True) if without else part
+
+
 class TrackSteps(TrackIntake):
     """Moves estimates by what has come in. unrest: how much of the guessed motion's noise is taken.
 
@@ -106,21 +121,8 @@ class TrackSteps(TrackIntake):
 
     def increments(self, estimate: Estimate, t_s: float) -> tuple[Increment, Increment]:
         """Integrate both nodes from the estimate's time to t_s."""
-        state = estimate.state
-        parts = []
-        for node in (0, 1):
-            shift = min(max(float(state.delay_s[node]), -MAX_DELAY_S), MAX_DELAY_S)
-            grid, values, told, fast = self.samples[node].between(estimate.t_s + shift, t_s + shift, t_s + HOLD_S)
-            without = not told.any() and not self.samples[node].near(t_s + shift, t_s + HOLD_S)
-            if without:
-                values = np.zeros_like(values)
-            slow = [
-                self.samples[node].slow_rate(each_s, t_s + HOLD_S) for each_s in (estimate.t_s + shift, t_s + shift)
-            ]
-            ends = [values[i, 3:] if each is None else each for i, each in zip((0, -1), slow, strict=True)]
-            part = integrate(state, node, grid, values[:, :3], values[:, 3:], told, np.stack(ends), fast)
-            parts.append(replace(part, without=True) if without else part)
-        return parts[0], parts[1]
+        a, b = (increment(self.samples[node], estimate.state, node, estimate.t_s, t_s) for node in (0, 1))
+        return a, b
 
     def _with_sudden(self, variances: Floats, parts: tuple[Increment, Increment]) -> Floats:
         """Give the variances (3,) of shaking with what the shares take off a camera's own sudden turns."""
