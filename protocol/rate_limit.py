@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from buddyline.protocol.bus import MAX_TRIGGER_HZ
@@ -27,8 +27,12 @@ OTHER_HZ: Final = 100.0
 # Keys of an owner, and owners, that have a limit of their own.
 MAX_KEYS: Final = 128
 MAX_OWNERS: Final = 256
+# What makes a flood, from look to look; and so many owners are still heard beside one.
+FLOOD_MESSAGES: Final = 500
+FLOOD_BYTES: Final = 500_000
+MAX_HEARD: Final = 32
 # So long after the last message that was left out its owner is named; the first so many are.
-SAID_S: Final = 5.0
+SAID_S: Final = 15.0
 MAX_SAID: Final = 4
 
 
@@ -69,7 +73,15 @@ class _Owner:
     def __init__(self) -> None:
         self.buckets: dict[str, _Bucket] = {}
         self.dropped = 0
+        self.dropped_bytes = 0
         self.dropped_s = 0.0
+        self.at_look = 0, 0
+
+    def is_flood(self) -> bool:
+        """Return whether much was left out since the last look."""
+        messages, size = self.at_look
+        self.at_look = self.dropped, self.dropped_bytes
+        return self.dropped - messages >= FLOOD_MESSAGES or self.dropped_bytes - size >= FLOOD_BYTES
 
 
 class RateLimit:
@@ -104,8 +116,27 @@ class RateLimit:
             if bucket.takes(size_bytes, now_s):
                 return True
             owner.dropped += 1
+            owner.dropped_bytes += size_bytes
             owner.dropped_s = now_s
             return False
+
+    def flooding(self) -> set[str]:
+        """Return the owners of whom much was left out since the last call."""
+        with self._lock:
+            return {name for name, owner in self._owners.items() if owner.is_flood()}
+
+    def owners(self) -> list[str]:
+        """Return the owners that have been heard last."""
+        with self._lock:
+            return list(self._owners)[-MAX_HEARD:]
+
+    def empty(self, names: Iterable[str]) -> None:
+        """Let nothing come at once of these owners' keys."""
+        now_s = self._now_s()
+        with self._lock:
+            for name in names:
+                for bucket in self._owners[name].buckets.values() if name in self._owners else ():
+                    bucket.messages, bucket.bytes, bucket.since_s = 0.0, 0.0, now_s
 
     @property
     def dropped(self) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 import zenoh
@@ -14,6 +14,7 @@ from buddyline.protocol.rate_limit import RateLimit
 from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from buddyline.protocol.topics import parse_key
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
+from buddyline.protocol.zenoh_bus.narrowing import Narrowing
 from buddyline.protocol.zenoh_bus.session import RETRY_S
 
 # Attachments of a sample. Of a copy the original comes by the reliable connection; what is sent again was sent by an
@@ -68,9 +69,16 @@ class ZenohSubscription:
                 self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
+        wanted = [(key_expr, accept) for key_expr, accept, _ in subscribers]
+        self._narrowing = Narrowing(wanted, self._intake, limit, failures)
         # What was held goes first, in its own order.
         self._joined = True
-        self._intakes = [Intake(key_expr, subscriber, accept, failures) for key_expr, accept, subscriber in subscribers]
+        self._narrowing.begin(
+            [Intake(key_expr, subscriber, accept, failures) for key_expr, accept, subscriber in subscribers]
+        )
+
+    def _intake(self, key_expr: str, accept: Callable[[zenoh.Sample], bool]) -> Intake:
+        return Intake(key_expr, self._declare(key_expr), accept, self._failures)
 
     def _declare(self, key_expr: str) -> RingSubscriber:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)
@@ -89,8 +97,7 @@ class ZenohSubscription:
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end the threads."""
         self._stop.set()
-        for intake in self._intakes:
-            intake.close()
+        self._narrowing.close()
         self._delivery.close()
         with self._lock:
             threads = list(self._fetching)
@@ -102,6 +109,7 @@ class ZenohSubscription:
         if self._limit.admits(str(sample.key_expr), len(sample.payload)):
             self._accept(sample)
             return True
+        self._narrowing.watch()
         if sample.source_info is not None:
             with self._lock:
                 self._sequence.skip(_source(sample), _number(sample))
@@ -111,6 +119,7 @@ class ZenohSubscription:
         if self._limit.admits(str(sample.key_expr), len(sample.payload)):
             self._accept_heartbeat(sample)
             return True
+        self._narrowing.watch()
         return False
 
     def _accept(self, sample: zenoh.Sample) -> None:

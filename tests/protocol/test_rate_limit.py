@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import pytest
 import zenoh
 from buddyline.protocol import rate_limit, topics
 from buddyline.protocol.codec import payload_stamp_ns
 from buddyline.protocol.rate_limit import BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
 from buddyline.protocol.security import PLAYER
-from buddyline.protocol.zenoh_bus import open_hub
+from buddyline.protocol.zenoh_bus import narrowing, open_hub
+from buddyline.protocol.zenoh_bus.narrowing import Narrowing, narrowed
 from buddyline.protocol.zenoh_bus.session import config_of
 from buddyline.protocol.zenoh_bus.settings import client_settings
 
@@ -107,3 +111,62 @@ def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood()
             assert subscription.dropped == dropped
             node.withdraw_alive(PLAYER)
             until(lambda: not receiver._players)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("key_expr", "left"),
+    [
+        ("buddyline/**", ["buddyline/node/a/**", "buddyline/pair/a/**"]),
+        ("buddyline/**/@adv/pub/**", ["buddyline/node/a/**/@adv/pub/**", "buddyline/pair/a/**/@adv/pub/**"]),
+        ("buddyline/node/*/imu", ["buddyline/node/a/imu"]),
+        ("buddyline/pair/*/*/pose/@adv/pub/**", ["buddyline/pair/a/*/pose/@adv/pub/**"]),
+        ("buddyline/net/*/*", []),
+        ("buddyline/node/c/expect", ["buddyline/node/c/expect"]),
+    ],
+)
+def test_a_subscription_without_some_owners(key_expr: str, left: list[str]) -> None:
+    assert narrowed(key_expr, ["buddyline/node/a", "buddyline/pair/a", "other"]) == left
+
+
+def test_who_floods_is_shut_out_for_a_time_and_the_others_lose_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(narrowing, "SHUT_OUT_S", 0.5)
+    monkeypatch.setattr(narrowing, "LOOK_S", 0.05)
+    changes: list[bool] = []
+    change = Narrowing._change
+
+    def noted(of: Narrowing, owners: Sequence[str] | None) -> None:
+        change(of, owners)
+        changes.append(owners is None)
+
+    monkeypatch.setattr(Narrowing, "_change", noted)
+    endpoint, inbox = free_endpoint(), Inbox()
+    own, numbers = topics.DEPTH.key("c"), iter(range(100_000))
+    with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
+        receiver.subscribe(topics.EVERYTHING, inbox, capacity=100_000)
+        publisher = node.publisher(topics.CANDIDATES, "a")
+
+        def say() -> None:
+            publisher.put_bytes(b'{"stamp_ns":%d}' % next(numbers))
+
+        say()
+        inbox.wait_for(1)
+        with zenoh.open(config_of(client_settings(endpoint, None))) as client:
+
+            def flood() -> list[bool]:
+                say()
+                for _ in range(200):
+                    client.put(own, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+                return changes
+
+            until(flood, 0.0)
+            assert not changes[0]
+        until(lambda: say() or len(changes) > 1, 0.01)
+        assert changes[1]
+        say()
+        said = next(numbers)
+        inbox.wait_until(lambda: len(inbox.payloads(publisher.key)) == said)
+        assert [payload_stamp_ns(payload) for payload in inbox.payloads(publisher.key)] == list(range(said))
+        # Who was shut out, and newcomers, are heard again.
+        for name in "cd":
+            known = node.publisher(topics.CANDIDATES, name)
+            until(lambda known=known: known.put_bytes(b"{}") and inbox.payloads(known.key), 0.05)
