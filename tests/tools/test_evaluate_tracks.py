@@ -82,6 +82,31 @@ def test_truth_at_five_a_second_is_known_between_to_a_millimetre():
         assert np.linalg.norm(turn) < 2 * within_m
 
 
+def test_a_covariance_is_judged_where_truth_is_known_and_not_between_sparse_truths():
+    """A track that is true between the truths too, with a sigma far below what interpolation misses there."""
+    tracks = []
+    for k in range(1, 180):
+        t_m, q_xyzw = swum(k * PERIOD_NS)
+        tracks.append(replace(track(k, t_m, sigma_m=1e-5), q_a_b_xyzw=q_xyzw))
+    sparse = TruthTrack([truth_of_swell(k * S_NS // 5) for k in range(20)])
+    dense = TruthTrack([truth_of_swell(k * PERIOD_NS) for k in range(200)])
+    (of_sparse,), (of_dense,) = tracks_figures(tracks, [], sparse), tracks_figures(tracks, [], dense)
+    assert of_sparse.samples == of_dense.samples == of_dense.nees6.count == 179
+    assert of_sparse.nees6.count == 17
+    assert of_sparse.nees6.mean == pytest.approx(0.0, abs=0.1)
+    assert of_dense.nees6.mean == pytest.approx(0.0, abs=0.1)
+    assert of_sparse.worst_m > 10e-5
+
+
+def test_truth_is_close_beside_a_sample_and_between_dense_ones():
+    history = TruthTrack([truth_of_swell(stamp) for stamp in (0, S_NS // 25, S_NS // 5, 2 * S_NS // 5)])
+    assert history.is_close(S_NS // 50)
+    assert history.is_close(S_NS // 5 - 4_000_000)
+    assert not history.is_close(S_NS // 10)
+    assert not history.is_close(S_NS)
+    assert not TruthTrack([]).is_close(0)
+
+
 def test_a_gap_in_the_truth_is_not_bridged():
     stamps_ns = [0, S_NS // 5, 2 * S_NS // 5, 2 * S_NS, 11 * S_NS // 5, 12 * S_NS // 5]
     broken = TruthTrack([truth_of_swell(stamp) for stamp in stamps_ns])

@@ -24,6 +24,10 @@ from msgspec.structs import replace
 MAX_GAP_NS: Final = 500_000_000
 # The greatest distance in time at which a single truth is still used: the clocks of one dive may differ by this.
 NEAREST_NS: Final = 20_000_000
+# Between samples at most this far apart, and so near to any one, interpolation is as good as a sample. Farther away it
+# misses what fins shake, several sigmas of a track that has inertial units.
+DENSE_NS: Final = 50_000_000
+CLOSE_NS: Final = 5_000_000
 
 
 def inverted(truth: Truth) -> Truth:
@@ -72,6 +76,13 @@ class PoseHistory:
         if best is None or abs(self.stamps_ns[best] - stamp_ns) > NEAREST_NS:
             return None
         return self.t_m[best], self.q_xyzw[best]
+
+    def is_close(self, stamp_ns: int) -> bool:
+        """Return whether `at` is as good as a sample: beside one, or between two that follow each other quickly."""
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        near = self.stamps_ns[max(after - 1, 0) : after + 1]
+        dense = len(near) == 2 and near[1] - near[0] <= DENSE_NS
+        return dense or any(abs(one - stamp_ns) <= CLOSE_NS for one in near)
 
     def _joined(self, after: int) -> bool:
         """Tell whether a sample and the one before it are near enough to interpolate, and not of one stamp."""
@@ -132,3 +143,7 @@ class TruthTrack:
     def interpolated(self, stamp_ns: int) -> tuple[Floats, Floats] | None:
         """Return the true t_a_b_m (3,) and q_a_b_xyzw (4,) by time only."""
         return self._track.at(stamp_ns)
+
+    def is_close(self, stamp_ns: int) -> bool:
+        """Return whether what is interpolated there is as good as a sample of the truth."""
+        return self._track.is_close(stamp_ns)
