@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
-    if args.format == "trc" or (args.what == "net" and args.format != "c3d"):
+    if args.format == "trc" or (args.what == "net" and args.format not in ("c3d", "colmap", "metashape")):
         return _export_network(args)
     if args.node is not None:
         raise BuddylineError("--node: only with --what net")

@@ -25,6 +25,10 @@ FORMATS: Final = (
     ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
     ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "export_c3d", "frames"),
     ExportFormat(
+        "colmap", "a folder with all nodes' pictures and cameras, as COLMAP's text", "export_colmap", "pictures"
+    ),
+    ExportFormat("metashape", "the same with cameras.xml for Metashape", "export_metashape", "pictures"),
+    ExportFormat(
         "parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet", "rows"
     ),
     ExportFormat(
