@@ -17,8 +17,9 @@ DICTIONARY: Final = cv2.aruco.DICT_APRILTAG_36h11
 NUMBERS: Final = range(100, 587)
 # Where all pictures have one exposure, so many of them are looked at in a second.
 RATE_HZ: Final = 0.5
-# A tag is read when two pictures in succession, no further apart than this, show it: not while a diver swims past it.
-AGAIN_NS: Final = 6 * S_NS
+# A tag is read when so many pictures within this time show it, and no other one: not while a diver swims past it.
+LOOKS: Final = 3
+WITHIN_NS: Final = 9 * S_NS
 # Of two tags in a picture the nearer one counts, if the other one is this many times as far.
 CLEARLY: Final = 1.5
 # A larger picture is halved: near tags have pixels enough.
@@ -44,22 +45,24 @@ class StationTags:
         parameters.adaptiveThreshConstant = CONTRAST_LEVELS
         self._detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
         self._limit = RateLimiter(RATE_HZ)
-        self._last: tuple[int, int] | None = None
+        self._seen_ns: list[int] = []
+        self._number = -1
 
     def read(self, frame: Frame) -> Mark | None:
-        """Return the node's station where this picture and the one looked at before show one tag from near."""
+        """Return the node's station where this picture and earlier ones show one tag from near."""
         due = self._limit.allow(frame.stamp_ns) if frame.context is None else frame.context
         if not self._config.side_m or not due:
             return None
-        before, self._last = self._last, None
         found = sorted(self._distances_m(frame))
         if not found or found[0][0] > self._config.within_m:
             return None
-        if len(found) > 1 and found[1][0] < CLEARLY * found[0][0]:
-            return None
         away_m, number = found[0]
-        self._last = number, frame.stamp_ns
-        if before is None or before[0] != number or not 0 < frame.stamp_ns - before[1] <= AGAIN_NS:
+        if number != self._number:
+            self._number, self._seen_ns = number, []
+        if len(found) > 1 and found[1][0] < CLEARLY * away_m:
+            return None
+        self._seen_ns = [one for one in self._seen_ns if abs(frame.stamp_ns - one) < WITHIN_NS] + [frame.stamp_ns]
+        if len(self._seen_ns) < LOOKS:
             return None
         return Mark(
             node=self._node,

@@ -56,11 +56,11 @@ def looks(course, tags, rng, forgotten):
         arriving = [(1 - rear, end)] + ([(rear, start)] if number == 0 else [])
         for node, station in arriving:
             # Before tying off the diver holds the camera before the marker for some seconds.
-            count = int(rng.integers(3, 6)) if rng.random() >= forgotten else 0
+            count = int(rng.integers(4, 7)) if rng.random() >= forgotten else 0
             look(node, rest_s - rng.uniform(12, 15), count, tags[station], 0.4, 0.9)
         if number:
             passed_s = rest_s - 3.0 - SWIM_S - PAUSE_S + rng.uniform(10, 16)
-            look(1 - rear, passed_s, int(rng.choice([0, 1, 2], p=[0.4, 0.5, 0.1])), tags[start], 0.5, 1.4)
+            look(1 - rear, passed_s, int(rng.choice(4, p=[0.4, 0.45, 0.1, 0.05])), tags[start], 0.5, 1.4)
             if rng.random() < 0.3:
                 look(rear, passed_s, 3, tags[start], 0.4, 1.2)
     return [sorted(one, key=lambda seen: seen[0]) for one in seen]

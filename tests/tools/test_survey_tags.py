@@ -10,6 +10,7 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Mark
 from buddyline.tools.cli import main
 from buddyline.tools.draw.tag_sheet import A4_MM, tag_sheet
+from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.derive import Derived
 from buddyline.tools.survey.readings import of_messages
 from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
@@ -48,6 +49,28 @@ def test_a_tag_names_the_rest_that_follows(messages):
     swum_past = derived([*messages, Mark(node="a", stamp_ns=legs[1].end_ns + S_NS, name="T105", tag=105)])
     assert not swum_past.faults
     assert not swum_past.problems
+
+
+def test_a_tag_of_the_other_node_s_station_is_not_used():
+    def at(line, *names, tagged=""):
+        return Stop(np.array(line, float), {"a": 10.0, "b": 10.0}, dict(names), frozenset(tagged))
+
+    # a swims past b, reads its tag there, and no other one.
+    stops = [
+        at((5, 0, 0), ("a", "T100"), ("b", "T101"), tagged="ab"),
+        at((-4, 2, 0), ("a", "T101"), tagged="a"),
+        at((4, 3, 0), ("b", "T103"), tagged="b"),
+    ]
+    standings = find_standings(stops, "leapfrog", "a")
+    assert [(one.station["a"], one.station["b"]) for one in standings] == [
+        ("T100", "T101"),
+        ("0", "T101"),
+        ("0", "T103"),
+    ]
+    assert ["tag T101 of the other node's station" in one.problem for one in standings] == [False, True, False]
+    # b has left the station by then, and says so: a has come to it.
+    moved = find_standings([stops[0], at((5, 5, 0), ("a", "T101"), ("b", "T102"), tagged="ab")], "leapfrog", "a")
+    assert moved[1].station == {"a": "T101", "b": "T102"}
 
 
 def test_a_tag_read_at_both_ends_of_a_leg_is_said(messages):

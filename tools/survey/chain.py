@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from buddyline.tools.survey.averages import Floats
@@ -17,11 +17,15 @@ Procedure = Literal["leapfrog", "stay"]
 
 @dataclass(frozen=True, eq=False)
 class Stop:
-    """The chain's input from one rest. By node: depth_m, None without a gauge; named, stations by marks."""
+    """The chain's input from one rest. By node: depth_m, None without a gauge; named, stations by marks.
+
+    tagged: the nodes whose names are of tags that they have read.
+    """
 
     line_m: Floats
     depth_m: dict[str, float | None]
     named: dict[str, str] = field(default_factory=dict)
+    tagged: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,10 @@ def find_standings(stops: list[Stop], procedure: Procedure, first: str, taken: I
     station: dict[str, str] = {}
     marked: set[str] = set()
     result: list[Standing] = []
-    for k, stop in enumerate(stops):
-        problem = ""
+    for k, whole in enumerate(stops):
+        stop, misread = _without_the_others_tag(whole, station)
         in_use |= set(stop.named.values())
-        moved = set(nodes)
+        moved, problem = set(nodes), ""
         if k:
             guessed = _guessed(stops[k - 1], stop, procedure, first, arrived)
             for node, name in stop.named.items():
@@ -60,6 +64,7 @@ def find_standings(stops: list[Stop], procedure: Procedure, first: str, taken: I
                     result = [_renamed(standing, station[node], name) for standing in result]
                     station[node] = name
             moved, problem = _moved(stops[k - 1], stop, station, guessed)
+        problem = problem or misread
         marked |= set(stop.named.values())
         for node in sorted(nodes, key=lambda one: arrived[one]):
             if node in moved:
@@ -70,6 +75,21 @@ def find_standings(stops: list[Stop], procedure: Procedure, first: str, taken: I
             problem = f"both nodes at station {station[nodes[0]]}: one of the marks is wrong"
         result.append(Standing(dict(station), _rear(arrived, first), problem))
     return result
+
+
+def _without_the_others_tag(stop: Stop, station: dict[str, str]) -> tuple[Stop, str]:
+    """Return a stop without the name of a tag that was read at the other node's station, in passing, and words on it.
+
+    station: of each node before, where the other node still is.
+    """
+    for node in sorted(stop.tagged):
+        name = stop.named[node]
+        for other, at in station.items():
+            if other != node and at == name and stop.named.get(other, name) == name:
+                named = {one: given for one, given in stop.named.items() if one != node}
+                words = f"node {node} has read tag {name} of the other node's station; mark its own"
+                return replace(stop, named=named, tagged=stop.tagged - {node}), words
+    return stop, ""
 
 
 def _rear(arrived: dict[str, int], first: str) -> str:

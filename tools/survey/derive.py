@@ -184,10 +184,17 @@ class _Chain:
         self.usual = {
             node: usual_field([shot.ends[i].field for shot in shots]) for i, node in enumerate(readings.nodes)
         }
+        # By rest, the nodes that have their names by a tag.
+        self.tagged: list[set[str]] = [set() for _ in self.found]
         self.named = self._named(out, corrected)
         stops = [
-            Stop(rest.line_m, {end.node: end.depth.value if end.depth else None for end in shot.ends}, stations)
-            for rest, shot, stations in zip(self.found, shots, self.named, strict=True)
+            Stop(
+                rest.line_m,
+                {end.node: end.depth.value if end.depth else None for end in shot.ends},
+                stations,
+                frozenset(tagged),
+            )
+            for rest, shot, stations, tagged in zip(self.found, shots, self.named, self.tagged, strict=True)
         ]
         first = settings.first if settings.first in readings.nodes else readings.nodes[0]
         taken = {name for leg in out.legs for name in (leg.from_, leg.to)}
@@ -225,6 +232,7 @@ class _Chain:
                         f"rest at {when}: node {mark.node} is at {before} and at {mark.name}; {mark.name} counts"
                     )
                 named[at][mark.node] = mark.name
+                self.tagged[at] = self.tagged[at] - {mark.node} | ({mark.node} if mark.tag is not UNSET else set())
                 self.placed.append(mark)
                 earlier = out.numbered.get(mark.name, self.dive)
                 if earlier != self.dive and mark.name not in joined:

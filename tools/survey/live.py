@@ -194,13 +194,20 @@ class LiveLegs:
     def _standings(self, pair: _Pair, legs: list[_JudgedRest]) -> dict[int, tuple[Standing, list[str]]]:
         """Return each leg's stations, and what is doubtful about them, by the id of its rest."""
         named: list[dict[str, str]] = [{} for _ in legs]
+        tagged: list[set[str]] = [set() for _ in legs]
         for mark in sorted(self._marks, key=lambda one: one.tag is UNSET):
             at = rest_of(mark, [one.rest for one in legs])
             if at is not None and mark.node in pair.nodes:
                 named[at][mark.node] = mark.name
+                tagged[at] = tagged[at] - {mark.node} | ({mark.node} if mark.tag is not UNSET else set())
         stops = [
-            Stop(one.rest.line_m, {end.node: end.depth.value if end.depth else None for end in one.shot.ends}, stations)
-            for one, stations in zip(legs, named, strict=True)
+            Stop(
+                one.rest.line_m,
+                {end.node: end.depth.value if end.depth else None for end in one.shot.ends},
+                stations,
+                frozenset(read),
+            )
+            for one, stations, read in zip(legs, named, tagged, strict=True)
             if one.shot is not None
         ]
         first = self._settings.first if self._settings.first in pair.nodes else pair.nodes[0]
