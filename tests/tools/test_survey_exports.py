@@ -15,6 +15,8 @@ from buddyline.tools.survey import report, survex, tables
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import Edit, FixedPoint, Place
 from buddyline.tools.survey.sheet import Sheet
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 from msgspec.structs import replace
 
 from tests.processes import PATIENCE_S
@@ -284,3 +286,28 @@ def test_drawings_and_report_hold_every_station():
     assert "misclosure" in page
     assert "ALARM: leg 3-4" in page
     assert "://" not in page
+
+
+def test_no_name_stands_on_another_and_the_plan_has_north_and_a_scale():
+    course = world.loop(np.random.default_rng(6), 30)
+    # A cluster of side shots: their names want the same place.
+    course.stations_m = np.vstack(
+        [course.stations_m, course.stations_m[4] + np.random.default_rng(1).normal(0, 0.3, (12, 3))]
+    )
+    course.names += [f"cluster_{k}" for k in range(12)]
+    course.legs += [(4, 30 + k, 0) for k in range(12)]
+    adjusted = adjust(world.project_of(world.readings_of(course, np.random.default_rng(2))))
+    for figure in (plan(adjusted, "Demo"), profile(adjusted, "Demo")):
+        (axis,) = figure.axes
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        named = [one for one in axis.texts if one.get_text() in adjusted.positions]
+        for one in named:
+            one.update_positions(canvas.get_renderer())
+        # The text alone, without the line that leads to it.
+        boxes = [Text.get_window_extent(one) for one in named]
+        assert len(boxes) == len(adjusted.positions)
+        assert not [1 for i, one in enumerate(boxes) for other in boxes[:i] if one.overlaps(other)]
+    texts = {one.get_text() for one in plan(adjusted, "Demo").axes[0].texts}
+    assert "N" in texts
+    assert any(text.endswith(" m") for text in texts)

@@ -432,7 +432,44 @@ def test_tables_and_pockettopo_are_read(tmp_path):
     )
 
 
+SRV = """\
+; the common part of Walls
+#units feet decl=3.5 order=dav typeab=c typevb=c lrud=F:LRUD
+#date 1990-09-09
+#prefix top
+#fix A1 100m 200m 300m
+A1 A2 32.81 45/46 -10/-11 <1,2,--,4>
+A2 A3 16i6 N45E 5
+A2 - 10 180 0
+#units rect
+A3 B:A4 3m 4m 5m #s /S
+#[
+nonsense
+#]
+"""
+
+
+def test_walls_data_are_read(tmp_path):
+    old = read(tmp_path, SRV, "cave.srv")
+    first, second, splay, last = old.shots
+    assert (first.start, first.tape_m) == ("top.A1", pytest.approx(32.81 * 0.3048))
+    # Corrected backsights read as foresights do.
+    assert (first.back_deg, first.back_clino_deg, first.north.value_deg) == (46 + 180, 11.0, 3.5)
+    assert (second.tape_m, second.compass_deg) == (pytest.approx(16.5 * 0.3048), 45.0)
+    assert splay.flags == {"splay", "wall"}
+    assert (last.vector_m, last.end, last.flags) == ((3.0, 4.0, 5.0), "B.A4", {"surface"})
+    assert old.fixes[0].position == pytest.approx((100.0, 200.0, 300.0))
+    assert old.passages[0].sections[0].up_m is None
+    assert old.passages[0].sections[0].down_m == pytest.approx(4 * 0.3048)
+    assert first.when.isoformat() == "1990-09-09"
+
+
 BAD_TABLES = {
+    "srv number": ("A B ten 0 0\n", "cave.srv", "cave.srv:1: distance: 'ten' is not a number"),
+    "srv few": ("A B 10\n", "cave.srv", "cave.srv:1: 'A B 10' ends before its A; order DAV"),
+    "srv units": ("#units inca=2\n", "cave.srv", "cave.srv:1: #units inca=2: this correction is not read here"),
+    "srv option": ("#units furlongs\n", "cave.srv", "cave.srv:1: #units furlongs: no such option"),
+    "srv date": ("#date 1990-13-01\n", "cave.srv", "cave.srv:1: #date '1990-13-01'"),
     "dat number": (DAT.replace("32.90", "long"), "cave.dat", "cave.dat:10: LENGTH: 'long' is not a number"),
     "dat date": (DAT.replace("10 13 1986", "13 10 1986"), "cave.dat", "cave.dat:3: SURVEY DATE: '13 10 1986'"),
     "dat columns": (DAT.replace("226.00 10.50 wide", ""), "cave.dat", "cave.dat:10: "),

@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="FILE",
         type=Path,
-        help="Survex .svx, Therion .th, Compass .dat or .mak, a table .csv, PocketTopo .txt",
+        help="Survex .svx, Therion .th, Compass .dat or .mak, Walls .srv, a table .csv, PocketTopo .txt",
     )
     imported.add_argument("--name", metavar="NAME", help="before its stations' names; default: the file's")
     adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")

@@ -18,6 +18,7 @@ READERS: Final[Mapping[str, tuple[str, str, str]]] = {
     ".th": ("therion", "read_th", "Therion"),
     ".dat": ("compass", "read_dat", "Compass"),
     ".mak": ("compass", "read_mak", "Compass"),
+    ".srv": ("walls", "read_srv", "Walls"),
     ".csv": ("columns", "read_csv", "a table"),
     ".txt": ("columns", "read_pockettopo", "PocketTopo"),
 }
