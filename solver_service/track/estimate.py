@@ -24,8 +24,9 @@ class Estimate:
 
     The filter: rates_radps (2, 3): the turn rates at t_s. shaking: how much the units are shaken in their mounts, as
     learned from the lights' residuals; shaken (3, MOVING, MOVING): the parts of the covariance that come from it.
-    walking: how much the units' biases walk, learned if learns_walk, once the track is confirmed and the clocks'
-    offset known. without: which nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what
+    walking: how much the units' biases walk, or the nodes themselves, learned if learns_walk, once the track is
+    confirmed and the clocks' offset known; follows_walk: since then. wide: whether the place was poorly known at the
+    last picture. without: which nodes have no inertial unit now. turning_off: of each, the lasting part (3,) of what
     its attitudes are off their prediction, in sigmas. by_shares (SIZE, 4): how the state would be moved by a share of 1
     of the samples' fast parts; shares: what the lights tell of them (vibration.py). attitude_s, depth_s: when attitudes
     and depths were last used.
@@ -65,6 +66,8 @@ class Estimate:
     shaken: Floats = field(default_factory=lambda: np.zeros((3, MOVING, MOVING)))
     walking: Walking = field(default_factory=Walking)
     learns_walk: bool = True
+    follows_walk: bool = False
+    wide: bool = False
     surprise: float = 0.0
     fit: float = 0.0
     told: int = 0

@@ -35,11 +35,13 @@ from buddyline.solver_service.track.state import (
     SIZE,
     V_,
     State,
+    invariant_of_plain,
     place_covariance,
 )
 from buddyline.solver_service.track.strapdown import (
     Increment,
     Noise,
+    guessed_noise,
     integrate,
     moved_by_shares,
     predicted,
@@ -60,6 +62,9 @@ EDGE_PX: Final = 2.0
 # How much the biases walk is learned only while the clocks' offset is known better than this, 1 sd: an unknown offset
 # looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
+# Without units it is not either while the place is known worse than to this share of the range: what is not linear
+# looks like a walk, too.
+WIDE_SHARE: Final = 0.02
 MAX_DELAY_S: Final = 0.03
 # How fast a node without an inertial unit turns, and how far off its attitude may be, 1 sd.
 WITHOUT_RADPS: Final = 0.25
@@ -72,9 +77,6 @@ STARTLED: Final = 11.3
 LASTING: Final = 0.6
 SUMMED: Final = 1.0 / (1.0 - LASTING**2)
 MOST_GAP_RATE: Final = 4.0
-# How fast an attitude's slow error walks, as a share of its stated sigma: an error with a period of 2 s changes by
-# 0.7 of its sigma in half a second.
-WANDER_PER_ROOT_S: Final = 1.0
 _STILL: Final = np.eye(MOVING)
 
 
@@ -131,17 +133,18 @@ class TrackSteps(TrackIntake):
         return widened
 
     def _noises(self, estimate: Estimate, t_s: float) -> tuple[Noise, Noise]:
-        gyro, accel = estimate.walking.densities
-        a, b = (replace(self._noise(node, t_s), gyro_bias_radps=gyro, accel_bias_mps2=accel) for node in (0, 1))
-        return a, b
-
-    def _noise(self, node: int, t_s: float) -> Noise:
-        noise = self.samples[node].noise(t_s).scaled(self.unrest)
-        stated = self.turning[node].stated(t_s)
-        if stated is None:
-            return noise
-        tilt, heading = (WANDER_PER_ROOT_S * sigma for sigma in stated)
-        return replace(noise, gap_tilt_rad=tilt, gap_heading_rad=heading)
+        gyro, accel, push, rate, wander = estimate.walking.densities.tolist()
+        noises = []
+        for node in (0, 1):
+            noise = self.samples[node].noise(t_s).scaled(self.unrest)
+            noise = replace(noise, gyro_bias_radps=gyro, accel_bias_mps2=accel)
+            if estimate.without[node]:
+                noise = replace(noise, gap_accel_mps=push, gap_rate_radps=rate)
+                stated = self.turning[node].stated(t_s)
+                if stated is not None:
+                    noise = replace(noise, gap_tilt_rad=wander * stated[0], gap_heading_rad=wander * stated[1])
+            noises.append(noise)
+        return noises[0], noises[1]
 
     def _move(self, estimate: Estimate, t_s: float) -> tuple[Floats, Floats, Floats]:
         span_s = t_s - estimate.t_s
@@ -158,8 +161,9 @@ class TrackSteps(TrackIntake):
             by_shares = estimate.by_shares.copy()
             by_shares[:MOVING] = F @ estimate.by_shares + moved_by_shares(after, parts)
             estimate.by_shares = by_shares
-        if estimate.confirmed and estimate.learns_walk and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
-            estimate.walking = estimate.walking.stepped(F, walk, (not parts[0].without, not parts[1].without))
+        if self._follows_walk(estimate):
+            guessed = self._guessed(after, parts, (a, b), noises, span_s)
+            estimate.walking = estimate.walking.stepped(F, walk, (not parts[0].without, not parts[1].without), guessed)
         for node, part in enumerate(parts):
             if part.without != estimate.without[node]:
                 # The unit has stopped, or come back: its constants and what stands in their place are told anew.
@@ -170,6 +174,31 @@ class TrackSteps(TrackIntake):
         estimate.state, estimate.t_s = after, t_s
         estimate.rates_radps = np.stack((parts[0].rate_radps, parts[1].rate_radps))
         return F, Q, walk
+
+    @staticmethod
+    def _follows_walk(estimate: Estimate) -> bool:
+        """Whether derivatives by the walks are carried along: from when they are first learned on, without a break."""
+        if estimate.confirmed and estimate.learns_walk and estimate.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
+            estimate.follows_walk = True
+        return estimate.follows_walk
+
+    @staticmethod
+    def _guessed(
+        after: State,
+        parts: tuple[Increment, Increment],
+        noises: tuple[Noise, Noise],
+        taken: tuple[Noise, Noise],
+        span_s: float,
+    ) -> Floats | None:
+        """Give what the learned walks of nodes without units add in a step; of a sudden turn, nothing is learned."""
+        if not (parts[0].without or parts[1].without):
+            return None
+        guessed = guessed_noise(parts, noises, span_s)
+        if taken != noises:
+            guessed[1] = 0.0
+        T = invariant_of_plain(after)
+        guessed[:, :MOVING, :MOVING] = T @ guessed[:, :MOVING, :MOVING] @ T.T
+        return guessed
 
     def _startled(self, estimate: Estimate, after: State, F: Floats, node: int, noise: Noise, to_s: float) -> Noise:
         """Return the noise of a step to to_s; more of it where a node without a unit turns otherwise than it did.
@@ -252,7 +281,8 @@ class TrackSteps(TrackIntake):
             sight = _widened(sight, H, estimate.covariance)
         detection = estimate.detection[observer]
         place = place_covariance(estimate.state, estimate.covariance)
-        wide = place.trace() > (0.1 * float(np.linalg.norm(estimate.state.r_m))) ** 2
+        share = math.sqrt(place.trace()) / float(np.linalg.norm(estimate.state.r_m))
+        wide, estimate.wide = share > 0.1, share > WIDE_SHARE
         if wide:
             inside = [True, True]
         else:
@@ -351,8 +381,10 @@ class TrackSteps(TrackIntake):
             if teaches:
                 estimate.shares = estimate.shares.taught(y, S_inverse, moved)
             estimate.by_shares = estimate.by_shares - before @ H.T @ (S_inverse @ moved)
-        if estimate.confirmed and estimate.learns_walk and before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2:
-            estimate.walking = estimate.walking.taught(y, S_inverse, H, before @ H.T @ S_inverse)
+        if estimate.follows_walk:
+            gain = before @ H.T @ S_inverse
+            learns = before[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 and not (estimate.wide and any(estimate.without))
+            estimate.walking = estimate.walking.taught(y, S_inverse, H, gain, learns=learns)
         # Depth and attitudes remove little of what shaking adds: to follow that would not be worth its time.
         if teaches:
             moving = H[:, :MOVING]

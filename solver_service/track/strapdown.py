@@ -34,6 +34,7 @@ Bools: TypeAlias = NDArray[np.bool_]
 # The specific force of a node that does not accelerate, level axes.
 _AT_REST_MPS2: Final = np.array((0.0, 0.0, -9.80665))
 _IDENTITY: Final[Floats] = np.eye(3)
+_CONSTANT: Final = np.arange(SIZE) >= MOVING
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +44,8 @@ class Noise:
     gyro_rad, accel_mps: of the samples. gap_gyro_rad, gap_accel_mps: of the motion that no sample tells;
     gap_rate_radps, gap_tilt_rad, gap_heading_rad: without a unit, of the turn rate, which stands in place of the
     gyro's bias, and of the attitude filter's own error, which stands in place of the mount (by its stated sigmas,
-    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk; a pair's track has learned ones
-    (walking.py), the network these.
+    where it states any). gyro_bias_radps, accel_bias_mps2: of the biases' walk. A pair's track has learned walks, of
+    the biases and without units (walking.py), the network these.
     """
 
     gyro_rad: float
@@ -260,19 +261,18 @@ def process_noise(
     walk = np.zeros(SIZE)
     force = 0.0
     for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
-        force += noise.accel_mps**2 * span_s + noise.gap_accel_mps**2 * part.gap_s
-        if part.without:
-            turn = noise.gap_rate_radps**2 * span_s**3 / 3.0
-            walk[GYRO_BIAS[node]] = noise.gap_rate_radps**2 * span_s
-            walk[MOUNT[node]] = np.array((noise.gap_tilt_rad, noise.gap_tilt_rad, noise.gap_heading_rad)) ** 2 * span_s
-        else:
-            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s
-            walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
-        Q[PHI[node], PHI[node]] = turn * _IDENTITY
+        force += noise.accel_mps**2 * span_s
         walk[ACCEL_BIAS[node]] = noise.accel_bias_mps2**2 * span_s
-    Q[V_, V_] = force * _IDENTITY
-    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * _IDENTITY
-    Q[R_, R_] = span_s * span_s / 3.0 * force * _IDENTITY
+        if not part.without:
+            force += noise.gap_accel_mps**2 * part.gap_s
+            turn = noise.gyro_rad**2 * span_s + noise.gap_gyro_rad**2 * part.gap_s
+            Q[PHI[node], PHI[node]] = turn * _IDENTITY
+            walk[GYRO_BIAS[node]] = noise.gyro_bias_radps**2 * span_s
+    _accelerated(Q, force, span_s)
+    if a.without or b.without:
+        whole = guessed_noise(parts, noises, span_s).sum(axis=0)
+        Q += whole[:MOVING, :MOVING]
+        walk += np.diag(whole) * _CONSTANT
     shaken = shaking_noise(after.R, shaking, span_s)
     for k, without in enumerate((a.without, b.without, a.without and b.without)):
         if without:
@@ -280,6 +280,30 @@ def process_noise(
     T = invariant_of_plain(after)
     shaken = T @ shaken @ T.T
     return T @ Q @ T.T + shaken.sum(axis=0), walk[MOVING:], shaken
+
+
+def guessed_noise(parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], span_s: float) -> Floats:
+    """Give what a step adds to the plain errors' covariance where nodes have no unit, (3, SIZE, SIZE): by their
+    acceleration, by their turn rates' walk, and by that of their attitudes' slow error."""
+    guessed = np.zeros((3, SIZE, SIZE))
+    force = 0.0
+    for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):
+        if part.without:
+            force += noise.gap_accel_mps**2 * part.gap_s
+            rate = noise.gap_rate_radps**2 * _IDENTITY
+            guessed[1, PHI[node], PHI[node]] = span_s**3 / 3.0 * rate
+            guessed[1, GYRO_BIAS[node], GYRO_BIAS[node]] = span_s * rate
+            tilt, heading = noise.gap_tilt_rad**2, noise.gap_heading_rad**2
+            guessed[2, MOUNT[node], MOUNT[node]] = span_s * np.diag((tilt, tilt, heading))
+    _accelerated(guessed[0], force, span_s)
+    return guessed
+
+
+def _accelerated(Q: Floats, force: float, span_s: float) -> None:
+    """Enter what a velocity's walk, of a variance (m/s)^2 by the step's end, adds to a covariance."""
+    Q[V_, V_] = force * _IDENTITY
+    Q[R_, V_] = Q[V_, R_] = 0.5 * span_s * force * _IDENTITY
+    Q[R_, R_] = span_s * span_s / 3.0 * force * _IDENTITY
 
 
 def predicted(P: Floats, F: Floats, Q: Floats, walk: Floats) -> Floats:

@@ -1,7 +1,8 @@
-"""How much the inertial units' biases walk, learned from the residuals.
+"""How much the inertial units' biases walk, and without units the nodes themselves, learned from the residuals.
 
 Good units' biases walk a sixth as far as those of poor ones, or less. If the assumed walk is too small, tilt, mount and
-north-east-down seem better known than they are; if it is too large, what the units tell is wasted. A walk shows only
+north-east-down seem better known than they are; if it is too large, what the units tell is wasted. Without a unit the
+same is true of a diver's acceleration and turning, and of how fast an attitude's slow error changes. A walk shows only
 over seconds, in how the residuals' means change. So the likelihood's whole slope is followed: its part by the
 covariance, and its part by the state.
 """
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -18,60 +19,80 @@ from buddyline.solver_service.geometry.rotation import Floats
 from buddyline.solver_service.track.shaking import LONGEST_STEP, MOST_CHI2
 from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, SIZE
 
-# Densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s, before anything is learned: those
-# of poor units, which fins shake and water cools. With steadier biases to begin with, the offset of clocks that are far
-# apart may not be found. 1 sd is a factor of e, by FIRST_INFORMATION.
-FIRST: Final = np.array((5e-4, 8e-3))
-FIRST_INFORMATION: Final = 0.25
-LEAST: Final = 2.0 * np.log(0.1 * FIRST)
+# Densities per root s before anything is learned. Of the gyros' (rad/s) and the accelerometers' (m/s^2) biases: those
+# of poor units, which fins shake and water cools; with steadier biases to begin with, the offset of clocks that are far
+# apart may not be found. Without units: of the velocity (m/s), of the turn rate (rad/s), and of the attitudes' slow
+# error, as a share of their stated sigma: an error with a period of 2 s changes by 0.7 of its sigma in half a second.
+# By FIRST_INFORMATION, 1 sd of a bias's walk is a factor of e; the others count as much as seconds of pictures tell, so
+# that a dive's first motion is not taken for all of it.
+FIRST: Final = np.array((5e-4, 8e-3, 0.3, 0.15, 1.0))
+FIRST_INFORMATION: Final = np.diag((0.25, 0.25, 30.0, 30.0, 30.0))
+# A calm diver swims off, or looks away, and no unit says so: a node without one is never taken to be calmer than this,
+# and its turning never than at first. With a slower rate tracks were wrong while a node that was calm looked away.
+LEAST: Final = 2.0 * np.log(np.array((0.1, 0.1, 0.35, 1.0, 0.4)) * FIRST)
 MOST: Final = 2.0 * np.log(10.0 * FIRST)
-WALKS: Final = 2
+WALKS: Final = len(FIRST)
+OF_UNITS: Final = slice(0, 2)
+OF_NODES: Final = slice(2, WALKS)
 _IDENTITY: Final = np.eye(SIZE)
 _BIASES: Final = (GYRO_BIAS, ACCEL_BIAS)
 
 
 @dataclass(frozen=True, eq=False)
 class Walking:
-    """The logs (2,) of both walks' variances per s, of gyros and accelerometers, and their information (2, 2).
+    """The logs (WALKS,) of the walks' variances per s, as FIRST has them, and their information (WALKS, WALKS).
 
-    spread (2, SIZE, SIZE), moved (SIZE, 2): derivatives of the track's covariance and state by the logs.
+    followed: which of them walk now: those of units, of nodes without one, or all. spread (K, SIZE, SIZE), moved
+    (SIZE, K): derivatives of the track's covariance and state by the logs that are followed.
     """
 
     logs: Floats = field(default_factory=lambda: 2.0 * np.log(FIRST))
-    information: Floats = field(default_factory=lambda: FIRST_INFORMATION * np.eye(WALKS))
-    spread: Floats = field(default_factory=lambda: np.zeros((WALKS, SIZE, SIZE)))
-    moved: Floats = field(default_factory=lambda: np.zeros((SIZE, WALKS)))
+    information: Floats = field(default_factory=FIRST_INFORMATION.copy)
+    followed: slice = field(default_factory=lambda: OF_UNITS)
+    spread: Floats = field(default_factory=lambda: np.zeros((2, SIZE, SIZE)))
+    moved: Floats = field(default_factory=lambda: np.zeros((SIZE, 2)))
 
     @property
-    def densities(self) -> tuple[float, float]:
-        """Densities of the gyros' (rad/s) and the accelerometers' (m/s^2) biases, per root s."""
-        gyro, accel = np.exp(0.5 * self.logs).tolist()
-        return gyro, accel
+    def densities(self) -> Floats:
+        """Densities per root s, as FIRST has them."""
+        return np.asarray(np.exp(0.5 * self.logs))
 
-    def stepped(self, F: Floats, walk: Floats, walking: tuple[bool, bool]) -> Walking:
+    def following(self, walking: tuple[bool, bool]) -> Walking:
+        """Follow what walks where these nodes have a unit; begin with that anew if it is not what was followed."""
+        followed = OF_UNITS if all(walking) else slice(0, WALKS) if any(walking) else OF_NODES
+        if followed == self.followed:
+            return self
+        count = followed.stop - followed.start
+        return Walking(self.logs, self.information, followed, np.zeros((count, SIZE, SIZE)), np.zeros((SIZE, count)))
+
+    def stepped(self, F: Floats, walk: Floats, walking: tuple[bool, bool], guessed: Floats | None = None) -> Walking:
         """Go on by a step with the transition's rows F (MOVING, SIZE).
 
         walk (SIZE - MOVING,): the variances that the step adds to the constants. walking: which nodes have a unit.
+        guessed (3, SIZE, SIZE): what the step adds by each walk of the nodes that have none.
         """
-        spread, moved = self.spread.copy(), self.moved.copy()
-        across = F @ self.spread
+        now = self.following(walking)
+        spread, moved = now.spread.copy(), now.moved.copy()
+        across = F @ now.spread
         spread[:, :MOVING, :MOVING] = across @ F.T
         spread[:, :MOVING, MOVING:] = across[:, :, MOVING:]
         spread[:, MOVING:, :MOVING] = np.swapaxes(across[:, :, MOVING:], 1, 2)
-        moved[:MOVING] = F @ self.moved
+        moved[:MOVING] = F @ now.moved
         for k, biases in enumerate(_BIASES):
             for walks, of_node in zip(walking, biases, strict=True):
                 if walks:
                     at = range(of_node.start, of_node.stop)
                     spread[k, at, at] += walk[of_node.start - MOVING : of_node.stop - MOVING]
-        return Walking(self.logs, self.information, spread, moved)
+        if guessed is not None:
+            spread[-len(guessed) :] += guessed
+        return replace(now, spread=spread, moved=moved)
 
-    def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> Walking:
+    def taught(self, y: Floats, S_inverse: Floats, H: Floats, gain: Floats, *, learns: bool = True) -> Walking:
         """Go on by an update with residuals y (m,), H (m, SIZE) and the filter's gain (SIZE, m), by Fisher's scoring.
 
         With D = dP / dlog, G = H D H^T, u = dx / dlog and z = S^-1 y the likelihood's slope is
         (z^T G z - tr(S^-1 G)) / 2 + z^T H u, its information tr(S^-1 G S^-1 G) / 2 + u^T H^T S^-1 H u. After the
-        update u = (I - K H)(u + D H^T z), D = (I - K H) D (I - K H)^T.
+        update u = (I - K H)(u + D H^T z), D = (I - K H) D (I - K H)^T. learns: whether the logs change.
         """
         z = S_inverse @ y
         chi2 = float(y @ z)
@@ -79,18 +100,25 @@ class Walking:
         across = self.spread @ H.T
         D = H @ across
         W = S_inverse @ D
-        y_moved = H @ self.moved
-        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2)) + y_moved.T @ z
-        fisher = 0.5 * (W.reshape(WALKS, -1) @ np.swapaxes(W, 1, 2).reshape(WALKS, -1).T)
-        information = self.information + fisher + y_moved.T @ S_inverse @ y_moved
-        step = np.minimum(np.maximum(np.linalg.solve(information, slope), -LONGEST_STEP), LONGEST_STEP)
         rest = _IDENTITY - gain @ H
         moved = rest @ (self.moved + (across @ z).T)
         less = gain @ np.swapaxes(across, 1, 2)
         spread = self.spread - less - np.swapaxes(less, 1, 2) + gain @ D @ gain.T
         # Rounding must not make it asymmetric: that part would grow.
         spread = 0.5 * (spread + np.swapaxes(spread, 1, 2))
-        return Walking(np.minimum(np.maximum(self.logs + step, LEAST), MOST), information, spread, moved)
+        if not learns:
+            return replace(self, spread=spread, moved=moved)
+        y_moved = H @ self.moved
+        slope = 0.5 * (D @ z @ z - np.trace(W, axis1=1, axis2=2)) + y_moved.T @ z
+        fisher = 0.5 * (W.reshape(len(W), -1) @ np.swapaxes(W, 1, 2).reshape(len(W), -1).T)
+        at = self.followed, self.followed
+        information = self.information.copy()
+        information[at] += fisher + y_moved.T @ S_inverse @ y_moved
+        step = np.zeros(WALKS)
+        step[self.followed] = np.linalg.solve(information[at], slope)
+        step = np.minimum(np.maximum(step, -LONGEST_STEP), LONGEST_STEP)
+        logs = np.minimum(np.maximum(self.logs + step, LEAST), MOST)
+        return replace(self, logs=logs, information=information, spread=spread, moved=moved)
 
 
 def joint(all_told: Sequence[Walking]) -> Walking:

@@ -92,9 +92,10 @@ def test_a_walk_is_learned_only_once_the_clock_is_known(monkeypatch: pytest.Monk
     learned: list[Floats] = []
     taught = Walking.taught
 
-    def noted(walking: Walking, y: Floats, S_inverse: Floats, H: Floats, gain: Floats) -> Walking:
-        learned.append(y)
-        return taught(walking, y, S_inverse, H, gain)
+    def noted(walking: Walking, y: Floats, S_inverse: Floats, H: Floats, gain: Floats, *, learns: bool) -> Walking:
+        if learns:
+            learned.append(y)
+        return taught(walking, y, S_inverse, H, gain, learns=learns)
 
     monkeypatch.setattr(Walking, "taught", noted)
     unknown = 0
