@@ -24,7 +24,7 @@ from buddyline.solver_service.geometry.trigger import TriggerReadings, read_trig
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
-from buddyline.solver_service.resting import LOOKS, Resting, look_apart
+from buddyline.solver_service.resting import LOOK_APART, LOOKS, Resting, look_apart
 from buddyline.solver_service.results import view_of
 from msgspec import UNSET
 
@@ -132,7 +132,7 @@ class PairSolver:
             if id(one) in places and readings is not None:
                 found.append(self._decide(one, readings, places[id(one)]))
             elif self._resting.rests(one.stamp_ns):
-                found.append(NoFix("out_of_view", "by both attitudes the cameras look apart"))
+                found.append(NoFix("too_few_candidates", LOOK_APART))
             else:
                 found.append(self._look(one))
         return found

@@ -19,6 +19,8 @@ from buddyline.solver_service.geometry.rotation import quat_to_matrix
 
 REST_NS: Final = 5 * S_NS
 LOOKS: Final = 5
+# The detail of the triggers that are not solved; their reason is `too_few_candidates`.
+LOOK_APART: Final = "by both attitudes the cameras look apart"
 # What iron may add to both compasses together, and how many of their own sigmas count.
 IRON_RAD: Final = math.radians(30.0)
 SIGMAS: Final = 4.0

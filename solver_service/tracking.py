@@ -28,7 +28,7 @@ from buddyline.protocol.messages import (
 from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
-from buddyline.solver_service.resting import LOOKS
+from buddyline.solver_service.resting import LOOK_APART, LOOKS
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
@@ -168,7 +168,7 @@ class PairTracker:
         for one in outcomes:
             self._posed |= isinstance(one, RelativePose)
             if isinstance(one, Rejected) and not self._posed:
-                apart = one.reason == "out_of_view"
+                apart = one.detail == LOOK_APART
                 # One in LOOKS triggers is solved also of nodes that look apart.
                 self._rests = apart or (self._rests and one.trigger % LOOKS == 0)
                 if self._rests:

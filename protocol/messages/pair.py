@@ -31,7 +31,6 @@ Reason: TypeAlias = Literal[
     "duplicate",
     "heading",
     "other_lights",
-    "out_of_view",
 ]
 TrackMode: TypeAlias = Literal["filter", "lag", "smooth"]
 

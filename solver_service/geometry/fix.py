@@ -63,4 +63,4 @@ class NoFix:
     @property
     def silent(self) -> bool:
         """Whether the trigger says nothing of the lamps."""
-        return self.reason in ("too_few_candidates", "degenerate", "out_of_range", "out_of_view")
+        return self.reason in ("too_few_candidates", "degenerate", "out_of_range")

@@ -20,7 +20,6 @@ Reason: TypeAlias = Literal[
     "depth",
     "heading",
     "other_lights",
-    "out_of_view",
     "out_of_range",
     "ambiguous",
     "degenerate",

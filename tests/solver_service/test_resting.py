@@ -15,7 +15,7 @@ from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import NoFix
 from buddyline.solver_service.geometry.observation import Sensed
-from buddyline.solver_service.resting import LOOKS, REST_NS, Resting, look_apart
+from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS, Resting, look_apart
 
 from tests.solver_service.scenes import IDEAL
 
@@ -57,7 +57,7 @@ def outcomes(messages: list[Message], together: int) -> dict[tuple[str, str, int
         found += core.handle_many(messages[start : start + together])
     found += core.flush()
     return {
-        (one.node_a, one.node_b, one.trigger): one.reason if isinstance(one, Rejected) else "solved"
+        (one.node_a, one.node_b, one.trigger): one.detail if isinstance(one, Rejected) else "solved"
         for one in found
         if isinstance(one, RelativePose | Rejected)
     }
@@ -77,8 +77,8 @@ def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers() -> None:
         pair: Counter(why for (a, b, _), why in told.items() if (a, b) == pair) for pair in (("a", "b"), ("a", "c"))
     }
     assert counts["a", "b"]["solved"] > 60
-    assert counts["a", "b"]["out_of_view"] == 0
-    assert 16 <= counts["a", "c"]["out_of_view"] <= 24
-    resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == "out_of_view"]
+    assert counts["a", "b"][LOOK_APART] == 0
+    assert 16 <= counts["a", "c"][LOOK_APART] <= 24
+    resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == LOOK_APART]
     assert all(trigger % LOOKS for trigger in resting)
     assert min(resting) * plan.period_ns > START_NS + REST_NS

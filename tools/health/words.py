@@ -39,7 +39,6 @@ REASONS: Final[dict[str, tuple[str, str]]] = {
         "what is seen is another diver's bar",
         "turn the nodes toward each other; keep steel away from the compass",
     ),
-    "out_of_view": ("the nodes do not look at each other", "turn the nodes toward each other"),
     "out_of_range": ("the distance is outside what is possible", "other lamps may be in view: switch them off"),
     "ambiguous": ("more than one arrangement fits", "other lamps may be in view: switch them off, or move apart"),
     "degenerate": ("the nodes stand so that no pose follows", "move one node a little aside or turn it"),
