@@ -52,6 +52,8 @@ AHEAD_NS: Final = 1_500_000_000
 AHEAD_OF_SILENT_NS: Final = 2_200_000_000
 # A solver without outcomes for this time waits for something that the dive does not have.
 SOLVER_SILENT_S: Final = 5.0
+# After the last message: longer than a publisher's heartbeat (2 s), which tells subscribers that they have missed it.
+LINGER_S: Final = 4.0
 # The calibration is sent this long before the frames, which have a higher priority on the bus.
 INFO_AHEAD_S: Final = 0.3
 
@@ -164,7 +166,7 @@ class Player:
     def finish(self) -> None:
         """Stay until a solver is done with the dive: subscribers may still fetch lost samples from this process."""
         self._follower.wait_for_last(self._stop)
-        self._stop.wait(1.0)
+        self._stop.wait(LINGER_S)
 
     def _image_is_due(self, key: str) -> bool:
         if self._clock.now_ns() < self._image_due_ns.get(key, 0):

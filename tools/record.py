@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
             bus.close()
             # The bus has taken its question back.
             filling.join()
-            recording.dropped = subscription.dropped
+            recording.dropped = subscription.dropped + subscription.missed
 
         status = client.run(record)
     recording.report(args.output)

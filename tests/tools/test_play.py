@@ -12,6 +12,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Candidates, Imu, NodeInfo, Rejected
 from buddyline.protocol.topics import CANDIDATES, EVERYTHING, REJECTED, parse_key
+from buddyline.protocol.zenoh_bus.bus import HEARTBEAT_S
 from buddyline.tools import play
 from buddyline.tools.dives import Dive
 from buddyline.tools.play import Player, _selected, _span
@@ -165,6 +166,7 @@ def test_a_part_outside_the_dive_is_refused(log, start_s, end_s):
 
 def test_playback_stays_until_the_solver_has_answered_the_last_frames(log, monkeypatch):
     monkeypatch.setattr(play, "SOLVER_SILENT_S", math.inf)
+    monkeypatch.setattr(play, "LINGER_S", 0.0)
     network, stop = LocalNetwork(), threading.Event()
     with Dive([log]) as dive, network.connect() as bus, network.connect() as solver:
         player = Player(bus, dive.nodes("candidates"), math.inf, ManualClock(5), stop)
@@ -184,3 +186,7 @@ def test_playback_stays_until_the_solver_has_answered_the_last_frames(log, monke
         )
         staying.join(PATIENCE_S)
         assert not staying.is_alive()
+
+
+def test_playback_stays_longer_than_until_the_next_heartbeat():
+    assert play.LINGER_S > HEARTBEAT_S
