@@ -40,8 +40,8 @@ LEAST_EARLIER_S: Final = 0.15
 # An offset is believed where its sigma is below this; it differs from the assumed one where it is so many sigmas off.
 TOLD_CLOCK_S: Final = 0.008
 TOLD_SIGMAS: Final = 6.0
-# Offsets that are tried where tracks fall to pieces; a pass finds one up to 0.3 s from each. Pieces are tracks whose
-# offsets differ by so many s, and so many sigmas.
+# Offsets that are tried where there is more than one track; a pass finds one up to 0.3 s from each. Pieces are tracks
+# whose offsets differ by so many s, and so many sigmas.
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
@@ -236,11 +236,11 @@ def _first_pass(
 ) -> tuple[TrackFilter, list[Estimate], int]:
     """Give a filter that has passed over a dive, its tracks, and how far B's clock was believed ahead.
 
-    tries_s: other offsets to try where the tracks of this one fall to pieces; the one that explains most is taken.
+    tries_s: other offsets to try where this one gives more than one track; the one that explains most is taken.
     """
     best = _rounds(records, fixes, clock_ns)
     for try_s in tries_s:
-        if not in_pieces(best[1]):
+        if len(best[1]) < 2:
             break
         other = _rounds(records, fixes, clock_ns + round(try_s * 1e9))
         best = max(best, other, key=lambda found: sum(part.evidence for part in found[1]))

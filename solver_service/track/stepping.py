@@ -48,7 +48,7 @@ from buddyline.solver_service.track.strapdown import (
     process_noise,
     propagate,
 )
-from buddyline.solver_service.track.trail import Look, Step
+from buddyline.solver_service.track.trail import Chosen, Look, Step
 
 # How far past an event samples may lie and still count for it: the unit's delay, and one sample to interpolate to.
 HOLD_S: Final = 0.05
@@ -298,6 +298,8 @@ class TrackSteps(TrackIntake):
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+        # What another estimate chose may be behind the camera by this one.
+        found = replace(found, chosen=_in_front(found.chosen, y))
         estimate.evidence += found.evidence
         estimate.evidence_by[observer] += found.evidence
         if any(inside) and not wide:
@@ -337,10 +339,11 @@ class TrackSteps(TrackIntake):
 
         The picture's own part is taken out of the smoothed estimate: P' = P + K H P, K = P H^T (R - H P H^T)^-1.
         """
-        path, step, chosen = guide.path, guide.step, guide.look.chosen
+        path, step = guide.path, guide.step
         after_s = guide.look.t_s - float(path.t_s[step])
         _, y, H = self._compared(sight, path.state(step), path.rates_radps[step], after_s)
         P = path.covariance(step)
+        chosen = _in_front(guide.look.chosen, y)
         if chosen:
             H_used = np.concatenate([H[k, light] for k, light, _ in chosen])
             y_used = np.concatenate([y[k, light] for k, light, _ in chosen])
@@ -463,6 +466,11 @@ class TrackSteps(TrackIntake):
         shaking = self._with_sudden(estimate.shaking.variances, parts)
         Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)
+
+
+def _in_front(chosen: Chosen, y: Floats) -> Chosen:
+    """Return those candidates of lights that the residuals y (K, 2, 2) have in front of the camera."""
+    return tuple(one for one in chosen if np.isfinite(y[one[0], one[1]]).all())
 
 
 def _widened(sight: Sight, H: Floats, P: Floats) -> Sight:

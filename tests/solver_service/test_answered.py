@@ -186,6 +186,7 @@ def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkey
                 if message is not last:
                     service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))
             assert service.core.pending
+            until(lambda: outcomes)
             heard = len(outcomes)
         deaf = False
         monkeypatch.setattr(service_module, "OWED_S", 0.0)

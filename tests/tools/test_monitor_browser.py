@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from tests.processes import until
 from tests.tools.browsed import (
     PATIENCE_MS,
     SCREENSHOTS,
@@ -65,6 +66,20 @@ def processes() -> Iterator[Processes]:
     started.end()
 
 
+def box_of(part: Any) -> dict[str, float]:
+    """Return where a part of the page is. What is drawn anew between two looks has no place for a moment."""
+    found: list[dict[str, float] | None] = []
+
+    def looked() -> bool:
+        found.append(part.bounding_box())
+        return found[-1] is not None
+
+    until(looked)
+    box = found[-1]
+    assert box is not None
+    return box
+
+
 def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Processes, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port = free_port()
@@ -90,8 +105,7 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         # Everything is there at once: nothing has to be scrolled.
         assert seen.page.evaluate("document.documentElement.scrollHeight") <= 800
         for part in ("#figures", "#scene", "#cam0 svg", "#cam1 svg", "#health", ".plot:nth-child(3) canvas"):
-            seen.page.locator(part).first.wait_for()
-            box = seen.page.locator(part).first.bounding_box()
+            box = box_of(seen.page.locator(part).first)
             assert box["height"] > 40, part
             assert box["y"] + box["height"] <= 800, part
         seen.screenshot("well")
