@@ -18,8 +18,9 @@ from buddyline.protocol.topics import Topic, parse_key
 
 # Over the topic's nominal rate: drivers and configurations may be faster.
 MARGIN: Final = 4.0
-# What a link held up comes at once.
-BURST_S: Final = 10.0
+# What a link held up for a minute, or a program that plays a dive quickly, comes at once; of bytes less, for memory.
+BURST_S: Final = 60.0
+BYTES_BURST_S: Final = 10.0
 # Sixteen times what 30 frames a second take; of larger messages, one a second.
 MOST_BYTES_PER_S: Final = 1_000_000.0
 # Keys that are no topic's.
@@ -53,13 +54,13 @@ class _Bucket:
 
     def __init__(self, topic: Topic | None, now_s: float) -> None:
         self.hz, self.bytes_per_s = most_hz(topic), most_bytes_per_s(topic)
-        self.messages, self.bytes, self.since_s = self.hz * BURST_S, self.bytes_per_s * BURST_S, now_s
+        self.messages, self.bytes, self.since_s = self.hz * BURST_S, self.bytes_per_s * BYTES_BURST_S, now_s
 
     def takes(self, size_bytes: int, now_s: float) -> bool:
         """Return whether there is room for a message; if so, take it."""
         passed_s, self.since_s = now_s - self.since_s, now_s
         self.messages = min(self.messages + passed_s * self.hz, BURST_S * self.hz)
-        self.bytes = min(self.bytes + passed_s * self.bytes_per_s, BURST_S * self.bytes_per_s)
+        self.bytes = min(self.bytes + passed_s * self.bytes_per_s, BYTES_BURST_S * self.bytes_per_s)
         if self.messages < 1.0 or self.bytes < size_bytes:
             return False
         self.messages -= 1.0

@@ -8,7 +8,7 @@ import pytest
 import zenoh
 from buddyline.protocol import rate_limit, topics
 from buddyline.protocol.codec import payload_stamp_ns
-from buddyline.protocol.rate_limit import BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
+from buddyline.protocol.rate_limit import BURST_S, BYTES_BURST_S, MARGIN, MOST_BYTES_PER_S, RateLimit, most_hz
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.zenoh_bus import narrowing, open_hub
 from buddyline.protocol.zenoh_bus.narrowing import Narrowing, narrowed
@@ -62,7 +62,7 @@ def test_what_is_more_is_left_out_and_its_owner_named_for_a_while() -> None:
 
 def test_bytes_count_too() -> None:
     limit, key = RateLimit(Clock()), topics.CANDIDATES.key("c")
-    assert admitted(limit, key, 1000, 65536) == int(BURST_S * MOST_BYTES_PER_S / 65536)
+    assert admitted(limit, key, 1000, 65536) == int(BYTES_BURST_S * MOST_BYTES_PER_S / 65536)
 
 
 def test_keys_that_an_owner_invents_share_one_limit_and_take_nothing_from_others() -> None:
