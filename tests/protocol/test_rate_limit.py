@@ -83,8 +83,10 @@ def test_owners_that_are_invented_are_forgotten() -> None:
     assert len(limit._owners) == rate_limit.MAX_OWNERS
 
 
-def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood() -> None:
-    endpoint, inbox, count = free_endpoint(), Inbox(), 2 * round(BURST_S * most_hz(topics.DEPTH))
+def test_a_flood_is_left_out_before_it_is_queued_and_a_stored_dive_is_no_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rate_limit, "BURST_S", 5.0)
+    monkeypatch.setattr(narrowing, "SHUT_OUT_S", 0.5)
+    endpoint, inbox, count = free_endpoint(), Inbox(), 2 * round(5.0 * most_hz(topics.DEPTH))
     own = topics.DEPTH.key("c")
     with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
         subscription = receiver.subscribe(topics.EVERYTHING, inbox, capacity=100_000)
