@@ -22,7 +22,7 @@ WINDOW_NS: Final = 1050 * MS_NS
 # A lamp that has been in no picture for this long is a new one when it comes back.
 LOST_NS: Final = 450 * MS_NS
 # Lengths as shares of the picture's width: how far a candidate may be from where it is looked for; how far the camera's
-# turning moves all candidates from one picture to the next; how near to each other two such moves are one.
+# turning moves all candidates from one picture to the next; how near two such moves must be to count as the same.
 GATE: Final = 0.03
 TURNED: Final = 0.1
 ALIKE: Final = 0.008
@@ -129,9 +129,9 @@ class LampFollower:
 
 
 def _common_move(away: Floats, width_px: int) -> Floats:
-    """Give by how much most lamps are off where they were foreseen (2,), px; away (N, K, 2): each candidate from each.
+    """Give by how much most lamps are off their foreseen places (2,), px: a camera that begins to turn moves all alike.
 
-    A camera that begins to turn moves all of them alike.
+    away (N, K, 2): each candidate's offset from each lamp's foreseen place.
     """
     moves = away[np.abs(away).max(-1) < TURNED * width_px]
     if len(moves) < 2:

@@ -1,8 +1,8 @@
 """Which triggers of a pair are not solved: those of nodes that, by their attitudes, do not look at each other.
 
-In a team many pairs are out of each other's view: nearly half, of two groups that face each other. Without poses for
-REST_NS, such a pair rests: only one in LOOKS of its triggers is solved. A pose, or one that only a compass contradicts,
-wakes it. So a compass that is off costs the first poses only.
+In a team many pairs are out of each other's view: nearly half of all, where two groups face each other. Without poses
+for REST_NS, such a pair rests: only one in LOOKS of its triggers is solved. A pose, or one that only a compass
+contradicts, wakes it. So a compass that is off costs the first poses only.
 """
 
 from __future__ import annotations

@@ -258,7 +258,10 @@ class NetEstimate(NetBelief):
     # Rows
 
     def rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
-        """Give the confirmed members at a time at or after the last picture's."""
+        """Give the confirmed members at a time at or after the last picture's.
+
+        With a trail nothing is given yet: it is noted for `smoothed`.
+        """
         if self.state is None or t_s < self.t_s - TOGETHER_S:
             return []
         while t_s - self.t_s > 1.5 * TICK_S:

@@ -101,7 +101,7 @@ class Move:
         return moved
 
     def backward(self, M: Floats) -> Floats:
-        """Return F^T M, for a matrix (N, M)."""
+        """Return F^T M, for a matrix M (N, K)."""
         if self.anchor is not None:
             whole: Floats = self.onward(np.eye(len(M))).T @ M
             return whole

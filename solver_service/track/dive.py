@@ -40,8 +40,8 @@ LEAST_EARLIER_S: Final = 0.15
 # An offset is believed where its sigma is below this; it differs from the assumed one where it is so many sigmas off.
 TOLD_CLOCK_S: Final = 0.008
 TOLD_SIGMAS: Final = 6.0
-# Offsets that are tried where there is more than one track; a pass finds one up to 0.3 s from each. Pieces are tracks
-# whose offsets differ by so many s, and so many sigmas.
+# Offsets that are tried where a first pass gives more than one track; a pass finds one up to 0.3 s from each. There is
+# no result if the best pass is in pieces: tracks whose offsets differ by more than so many s, and so many sigmas.
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
@@ -248,7 +248,7 @@ def _first_pass(
 
 
 def in_pieces(parts: Sequence[Estimate]) -> bool:
-    """Whether a dive's tracks disagree on the clocks' offset: it is further off than a pass can find."""
+    """Whether a dive's tracks disagree on the clocks' offset: it is further off than was tried."""
     told = [(part.state.clock_s, float(part.covariance[CLOCK, CLOCK])) for part in parts]
     return any(
         abs(one_s - other_s) > max(PIECES_S, PIECES_SIGMAS * math.sqrt(one_variance + other_variance))

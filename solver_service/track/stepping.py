@@ -62,7 +62,7 @@ EDGE_PX: Final = 2.0
 # How much the biases walk is learned only while the clocks' offset is known better than this, 1 sd: an unknown offset
 # looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
-# Without units it is not either while the place is known worse than to this share of the range: what is not linear
+# Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
 # looks like a walk, too.
 WIDE_SHARE: Final = 0.02
 MAX_DELAY_S: Final = 0.03

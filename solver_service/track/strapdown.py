@@ -283,8 +283,10 @@ def process_noise(
 
 
 def guessed_noise(parts: tuple[Increment, Increment], noises: tuple[Noise, Noise], span_s: float) -> Floats:
-    """Give what a step adds to the plain errors' covariance where nodes have no unit, (3, SIZE, SIZE): by their
-    acceleration, by their turn rates' walk, and by that of their attitudes' slow error."""
+    """Give what a step adds to the plain errors' covariance where nodes have no unit, (3, SIZE, SIZE).
+
+    By their acceleration, by their turn rates' walk, and by that of their attitudes' slow error.
+    """
     guessed = np.zeros((3, SIZE, SIZE))
     force = 0.0
     for node, (part, noise) in enumerate(zip(parts, noises, strict=True)):

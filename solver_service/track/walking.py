@@ -27,8 +27,9 @@ from buddyline.solver_service.track.state import ACCEL_BIAS, GYRO_BIAS, MOVING, 
 # that a dive's first motion is not taken for all of it.
 FIRST: Final = np.array((5e-4, 8e-3, 0.3, 0.15, 1.0))
 FIRST_INFORMATION: Final = np.diag((0.25, 0.25, 30.0, 30.0, 30.0))
-# A calm diver swims off, or looks away, and no unit says so: a node without one is never taken to be calmer than this,
-# and its turning never than at first. With a slower rate tracks were wrong while a node that was calm looked away.
+# A calm diver may swim off or look away, and without a unit nothing tells it at once: so no walk is taken below this
+# share of its first value, that of the turn rate not below the value itself. With less, tracks were wrong while a node
+# that had been calm looked away.
 LEAST: Final = 2.0 * np.log(np.array((0.1, 0.1, 0.35, 1.0, 0.4)) * FIRST)
 MOST: Final = 2.0 * np.log(10.0 * FIRST)
 WALKS: Final = len(FIRST)
@@ -58,7 +59,7 @@ class Walking:
         return np.asarray(np.exp(0.5 * self.logs))
 
     def following(self, walking: tuple[bool, bool]) -> Walking:
-        """Follow what walks where these nodes have a unit; begin with that anew if it is not what was followed."""
+        """Follow the walks that there are if these nodes have a unit; where others were followed, begin at 0."""
         followed = OF_UNITS if all(walking) else slice(0, WALKS) if any(walking) else OF_NODES
         if followed == self.followed:
             return self
