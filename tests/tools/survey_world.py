@@ -381,3 +381,13 @@ def coordinates(file):
             name = row.partition("[")[2].partition("]")[0].partition("@")[0].rpartition(".")[2]
             found[name] = np.array([float(word) for word in row.split()[1:4]])
     return found
+
+
+def renamed(message, **names):
+    """Return a message of other nodes: names of the old ones to the new."""
+    fields = {
+        field: names.get(value, value)
+        for field in ("node", "node_a", "node_b")
+        if (value := getattr(message, field, None))
+    }
+    return replace(message, **fields)

@@ -48,7 +48,7 @@ def nees(seed, seconds=60.0, passing_m=0.0):
     """
     messages, world = swim(seed, seconds)
     rng = np.random.default_rng(seed)
-    # Nothing is a rest here: marks within 20 s of one are its.
+    # No rest is long enough here: a mark within 20 s of a rest would belong to it.
     settings, start_ns = SurveySettings(passing_m=passing_m, rest_s=60.0), world.scenario.start_ns
     marks = [Mark(node="a", stamp_ns=start_ns, name="S")]
     truth_m = {}

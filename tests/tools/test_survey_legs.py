@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Depth, Imu, Mark, Rejected, RelativePose, Track
+from buddyline.protocol.messages import Imu, Mark, Rejected, RelativePose, Track
 from buddyline.tools.survey.averages import effective_count, inliers, mean_of_slow, mean_of_white, unwrapped, wrap
 from buddyline.tools.survey.chain import Stop, find_standings
 from buddyline.tools.survey.derive import Derived, ranges
-from buddyline.tools.survey.live import OVER_NS, LiveLegs
 from buddyline.tools.survey.network import adjust
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.readings import of_messages
@@ -270,91 +269,6 @@ def test_a_disturbed_field_is_noticed_and_its_compass_not_used():
     assert np.linalg.norm((adjusted.positions["5"].position_m - adjusted.positions["0"].position_m - end)[:2]) < 1.0
 
 
-def judged(messages):
-    """What is said of each leg while it is measured, at node a and without late words, and what afterwards."""
-    live = LiveLegs(SurveySettings(), AlarmSettings())
-    said = [mark for message in messages for mark in live.handle(message)]
-    assert [mark.note for mark in said if mark.node == "a"] == [mark.note for mark in said if mark.node == "b"]
-    found = []
-    for leg in derived(messages).legs:
-        meanwhile = [mark for mark in said if mark.node == "a" and abs(mark.leg_ns - leg.start_ns) < 3 * S_NS]
-        for mark in meanwhile:
-            assert mark.earlier or mark.stamp_ns <= leg.end_ns + OVER_NS + S_NS
-            assert mark.note.startswith(f"leg {leg.name} of ") is mark.earlier
-        found.append((leg, meanwhile))
-    return found
-
-
-def test_each_leg_is_judged_at_its_tenth_second():
-    rng = np.random.default_rng(11)
-    course = world.line(rng, 6)
-
-    def disturb(index, number):
-        return 20.0 if (index, number) == (0, 6) else 0.0
-
-    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=12.0, swim_s=3.0, disturb=disturb)
-    verdicts = judged(messages)
-    assert len(verdicts) == 6
-    for leg, said in verdicts:
-        # A leg begins with the first fix that it keeps, one or two triggers after the rest's first.
-        assert -S_NS <= said[0].stamp_ns - leg.start_ns - 10 * S_NS <= 3 * S_NS
-        assert {mark.name for mark in said if mark.kind == "alarm"} == {text.partition(":")[0] for text in leg.alarms}
-    kinds = [said[0].kind for _, said in verdicts]
-    assert kinds[:5] == ["leg"] * 5
-    assert {mark.name for mark in verdicts[5][1]} >= {"sights", "field"}
-    assert "m, 1" in verdicts[0][1][0].note
-
-
-def test_a_station_that_is_seen_again_is_recognized_while_the_nodes_are_there():
-    rng = np.random.default_rng(5)
-    course = world.loop(rng, 4)
-    course.marks.clear()
-    *others, (leg, said) = judged(world.dive(course, rng, rest_s=10.5, swim_s=1.0))
-    # Nobody has said that the last station is the first: it is asked, and keeps its number.
-    assert leg.name == "3-4"
-    assert "station 4 may be 0: " in said[0].note
-    assert " sd: if it is, mark it" in said[0].note
-    assert not any("may be" in mark.note for _, said in others for mark in said)
-
-
-def test_an_alarm_of_an_earlier_leg_says_which():
-    rng = np.random.default_rng(11)
-    course = world.line(rng, 5)
-
-    def disturb(index, number):
-        return 20.0 if (index, number) == (0, 0) else 0.0
-
-    # The usual field is known only later: then the first leg's alarm comes.
-    messages = world.dive(course, rng, world.Flaws(compass_deg=0.5), rest_s=10.5, swim_s=1.0, disturb=disturb)
-    tag = Mark(node="b", stamp_ns=world.START_NS, name="T100", tag=100)
-    (leg, said), *others = judged([messages[0], tag, *messages[1:]])
-    assert leg.name == "0-T100"
-    late = [mark for mark in said if mark.earlier]
-    assert "field" in {mark.name for mark in late}
-    assert all(mark.stamp_ns - mark.leg_ns > 20 * S_NS for mark in late)
-    assert not any(mark.earlier for _, said in others for mark in said)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_every_alarm_is_said_in_the_water_and_few_others():
-    false = sound = alarmed = 0
-    for seed in range(5):
-        rng = np.random.default_rng([seed, 9])
-        course = world.line(rng, 10)
-        flaws = world.Flaws(compass_deg=(1.0, 1.5)[seed % 2], disturbed_share=(0.0, 0.1)[seed % 2])
-        for leg, said in judged(
-            world.dive(course, rng, flaws, float(rng.uniform(10.5, 16)), float(rng.uniform(3, 10)))
-        ):
-            signalled = any(mark.kind == "alarm" for mark in said)
-            assert signalled or not leg.alarms, leg.name
-            alarmed += bool(leg.alarms)
-            sound += not leg.alarms
-            false += signalled and not leg.alarms
-    assert alarmed > 10
-    assert false <= 0.02 * sound
-
-
 def stop(line, a=10.0, b=10.0):
     return Stop(np.array(line, dtype=float), {"a": a, "b": b})
 
@@ -429,19 +343,9 @@ def test_a_leg_is_named_by_its_ends():
     assert "from" in Leg.__struct_encode_fields__
 
 
-def renamed(message, **names):
-    """Return a message of other nodes: names of the old ones to the new."""
-    fields = {
-        field: names.get(value, value)
-        for field in ("node", "node_a", "node_b")
-        if (value := getattr(message, field, None))
-    }
-    return replace(message, **fields)
-
-
 def test_three_nodes_make_one_network(messages):
     # c stands beside b and sees a as b does: the two pairs look at the same stations at the same time.
-    both = derived([*messages, *(renamed(message, b="c") for message in messages)])
+    both = derived([*messages, *(world.renamed(message, b="c") for message in messages)])
     assert len(both.legs) == 10
     assert {frozenset((leg.from_node, leg.to_node)) for leg in both.legs} == {frozenset("ab"), frozenset("ac")}
     shared = {leg.from_ for leg in both.legs[:5]} | {leg.to for leg in both.legs[:5]}
@@ -451,18 +355,6 @@ def test_three_nodes_make_one_network(messages):
         at_a_too = {second.from_node: second.from_, second.to_node: second.to}
         assert at_a["a"] == at_a_too["a"]
         assert at_a_too["c"] not in shared
-
-
-def test_two_pairs_are_watched_live():
-    rng = np.random.default_rng(11)
-    course = world.line(rng, 3)
-    messages = world.dive(course, rng, rest_s=8.0, swim_s=2.0)
-    wrong = [replace(m, depth_m=m.depth_m + 3.0) if isinstance(m, Depth) and m.node == "b" else m for m in messages]
-    live = LiveLegs(SurveySettings(), AlarmSettings())
-    said = []
-    for message in wrong:
-        said += live.handle(message) + live.handle(renamed(message, a="c", b="d"))
-    assert {mark.node for mark in said if mark.name == "depth"} == {"a", "b", "c", "d"}
 
 
 def test_a_second_dive_takes_numbers_of_its_own(messages):

@@ -30,22 +30,20 @@ def find_blinks(seen: Iterable[Candidates], poses: Mapping[int, RelativePose]) -
 
     seen: one node's candidates; poses: of a pair that it is in, by trigger.
     """
-    runs: list[tuple[str, int, int, bool]] = []
-    for other, lit in _stretches(seen, poses):
-        runs += [(other, *run) for run in _runs(lit)]
-        runs.append(("", 0, 0, False))
     marks = []
     length = 2 * BLINKS + 1
-    for k in range(len(runs) - length + 1):
-        part = runs[k : k + length]
-        times = [end_ns - start_ns for _, start_ns, end_ns, _ in part]
-        if not all(other for other, *_ in part) or not part[0][3] or min(times[0], times[-1]) < STEADY_NS:
-            continue
-        between = times[1:-1]
-        if min(between) < SHORTEST_NS or max(between) > LONGEST_NS:
-            continue
-        if all(max(one) <= ALIKE * min(one) for one in (between[::2], between[1::2])):
-            marks.append(Mark(node=part[0][0], stamp_ns=part[1][1], kind="point", note="by three blinks"))
+    for other, lit in _stretches(seen, poses):
+        runs = _runs(lit)
+        for k in range(len(runs) - length + 1):
+            part = runs[k : k + length]
+            times = [end_ns - start_ns for start_ns, end_ns, _ in part]
+            if not part[0][2] or min(times[0], times[-1]) < STEADY_NS:
+                continue
+            between = times[1:-1]
+            if min(between) < SHORTEST_NS or max(between) > LONGEST_NS:
+                continue
+            if all(max(one) <= ALIKE * min(one) for one in (between[::2], between[1::2])):
+                marks.append(Mark(node=other, stamp_ns=part[1][0], kind="point", note="by three blinks"))
     return marks
 
 

@@ -188,12 +188,7 @@ class _Chain:
         self.tagged: list[set[str]] = [set() for _ in self.found]
         self.named = self._named(out, corrected)
         stops = [
-            Stop(
-                rest.line_m,
-                {end.node: end.depth.value if end.depth else None for end in shot.ends},
-                stations,
-                frozenset(tagged),
-            )
+            stop_of(rest, shot, stations, tagged)
             for rest, shot, stations, tagged in zip(self.found, shots, self.named, self.tagged, strict=True)
         ]
         first = settings.first if settings.first in readings.nodes else readings.nodes[0]
@@ -261,8 +256,7 @@ class _Chain:
         station, track = self._standing_at(mark.stamp_ns, other), self.readings.track
         if station is None or station == mark.name:
             return f"where node {other} stood is not known"
-        off_ns = np.abs(track.stamps_ns - mark.stamp_ns) if track is not None else np.array([TRACK_NEAR_NS + 1])
-        if track is None or off_ns.min() > TRACK_NEAR_NS:
+        if track is None or (off_ns := np.abs(track.stamps_ns - mark.stamp_ns)).min() > TRACK_NEAR_NS:
             return "no track at this time"
         held_m = math.hypot(self.settings.centering_m, self.settings.passing_m) / math.sqrt(2)
         settings = replace(self.settings, centering_m=held_m)
@@ -285,6 +279,12 @@ class _Chain:
         leg = replace(one_leg(shot, station, rear, self.usual), dive=self.dive, disturbed=bad)
         leg = replace(leg, alarms=alarms.of_leg(leg, shot, self.usual, self.limits))
         return replace(leg, grade=alarms.grade(leg))
+
+
+def stop_of(rest: Rest, shot: Shot, stations: dict[str, str], tagged: set[str]) -> Stop:
+    """Return a rest as the chain of stations needs it. stations: known by node; tagged: nodes named by a tag."""
+    depths_m = {end.node: end.depth.value if end.depth else None for end in shot.ends}
+    return Stop(rest.line_m, depths_m, stations, frozenset(tagged))
 
 
 def rest_of(mark: Mark, found: Sequence[Rest]) -> int | None:

@@ -18,8 +18,8 @@ from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, RE
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
-from buddyline.tools.survey.chain import Standing, Stop, find_standings
-from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, time_text
+from buddyline.tools.survey.chain import Standing, find_standings
+from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, stop_of, time_text
 from buddyline.tools.survey.magnetism import Field, off_usual, usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg
 from buddyline.tools.survey.readings import of_messages
@@ -201,12 +201,7 @@ class LiveLegs:
                 named[at][mark.node] = mark.name
                 tagged[at] = tagged[at] - {mark.node} | ({mark.node} if mark.tag is not UNSET else set())
         stops = [
-            Stop(
-                one.rest.line_m,
-                {end.node: end.depth.value if end.depth else None for end in one.shot.ends},
-                stations,
-                frozenset(read),
-            )
+            stop_of(one.rest, one.shot, stations, read)
             for one, stations, read in zip(legs, named, tagged, strict=True)
             if one.shot is not None
         ]

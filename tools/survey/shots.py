@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from buddyline.tools.survey.averages import (
@@ -23,7 +24,7 @@ from buddyline.tools.survey.sights import Sights
 from numpy.typing import NDArray
 
 # Sensors are averaged over this time on either side of a single fix.
-BESIDE_NS = 500_000_000
+BESIDE_NS: Final = 500_000_000
 
 
 @dataclass(frozen=True)
