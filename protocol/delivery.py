@@ -157,13 +157,19 @@ class Delivery(Generic[T]):
 
 
 class Repeats:
-    """Knows the newest messages of each key, by their bytes, to tell one that is sent again."""
+    """Knows the newest messages of each key, by their bytes, to leave out one that is sent again.
 
-    def __init__(self) -> None:
+    history: whether the subscriber wants what was sent before it came.
+    """
+
+    def __init__(self, *, history: bool) -> None:
+        self._history = history
         self._known: OrderedDict[str, OrderedDict[int, None]] = OrderedDict()
 
-    def is_new(self, key: str, payload: bytes, *, again: bool) -> bool:
+    def is_wanted(self, key: str, payload: bytes, *, again: bool) -> bool:
         """Note a message; return whether to deliver it. again: its publisher says that it is sent again."""
+        if again and not self._history:
+            return False
         known = self._known.setdefault(key, OrderedDict())
         number = hash(payload)
         if again and number in known:

@@ -105,11 +105,10 @@ class LocalSubscription:
         self, network: LocalNetwork, key_exprs: Sequence[str], delivery: Delivery[Received], *, history: bool
     ) -> None:
         self.joined = False
-        self._history = history
         self._key_exprs = key_exprs
         self._network = network
         self._delivery = delivery
-        self._repeats = Repeats()
+        self._repeats = Repeats(history=history)
 
     @property
     def dropped(self) -> int:
@@ -121,11 +120,9 @@ class LocalSubscription:
         return any(key_matches(key_expr, key) for key_expr in self._key_exprs)
 
     def offer(self, publisher: LocalPublisher, payload: bytes, *, again: bool = False) -> None:
-        """Queue a message of publisher; again: unless it is known."""
-        if publisher.topic.repeated:
-            is_new = self._repeats.is_new(publisher.key, payload, again=again)
-            if not is_new or (again and not self._history):
-                return
+        """Queue a message of publisher; again: if it is wanted."""
+        if publisher.topic.repeated and not self._repeats.is_wanted(publisher.key, payload, again=again):
+            return
         now_ns = self._network.clock.now_ns()
         received = Received(publisher.key, payload, now_ns, publisher.topic.encoding)
         self._delivery.offer(received, len(payload), queue_of(publisher.key, payload, now_ns) if self.joined else "")

@@ -28,11 +28,11 @@ OTHER_HZ: Final = 100.0
 # Keys of an owner, and owners, that have a limit of their own.
 MAX_KEYS: Final = 128
 MAX_OWNERS: Final = 256
-# What makes a flood, from look to look; and so many owners are still heard beside one.
+# So much left out between two looks is a flood; so many other owners are heard while one is shut out.
 FLOOD_MESSAGES: Final = 500
 FLOOD_BYTES: Final = 500_000
 MAX_HEARD: Final = 32
-# So long after the last message that was left out its owner is named; the first so many are.
+# How long an owner is named after its last message that was left out, and how many owners are named at most.
 SAID_S: Final = 15.0
 MAX_SAID: Final = 4
 

@@ -54,7 +54,7 @@ class Intake:
                 is_flood = False
                 while sample is not None:
                     is_flood |= not self._accept(sample)
-                    # Without a wait for what is there: it would give the interpreter to a busy thread for milliseconds.
+                    # A call that may wait gives the interpreter to a busy thread for milliseconds.
                     sample = self._next(wait=False)
                 if is_flood:
                     # The interpreter changes threads every 5 ms where none waits: the others would crawl.

@@ -57,7 +57,7 @@ class ZenohSubscription:
         self._lock = threading.Lock()
         self._joined = False
         self._sequence = SampleSequence(self._deliver)
-        self._repeats = Repeats()
+        self._repeats = Repeats(history=history)
         self._fetching: dict[threading.Thread, str] = {}
         self._stop = threading.Event()
         subscribers = [(key_expr, self._take, self._declare(key_expr)) for key_expr in key_exprs]
@@ -208,16 +208,13 @@ class ZenohSubscription:
                 yield reply.ok
 
     def _deliver(self, sample: zenoh.Sample) -> None:
-        key = str(sample.key_expr)
-        parsed = parse_key(key)
-        if parsed is not None and parsed[0].repeated:
-            again = _attachment(sample) == AGAIN
-            is_new = self._repeats.is_new(key, bytes(sample.payload), again=again)
-            if not is_new or (again and not self._history):
-                return
+        key, payload = str(sample.key_expr), bytes(sample.payload)
+        parsed, again = parse_key(key), _attachment(sample) == AGAIN
+        if parsed is not None and parsed[0].repeated and not self._repeats.is_wanted(key, payload, again=again):
+            return
         received = Received(
             key=key,
-            payload=bytes(sample.payload),
+            payload=payload,
             receive_ns=self._clock.now_ns(),
             encoding=str(sample.encoding),
         )
