@@ -32,7 +32,7 @@ class Blinker:
     def run(self, stop: threading.Event) -> None:
         """Switch the lamp until stop is set."""
         while True:
-            # Each slot anew from the clock, which may have been set.
+            # The clock may have been set since the last slot.
             now_ns = self._clock.now_ns()
             self.switch(now_ns)
             if self._clock.wait_until_ns(next_slot_ns(self._blink, now_ns), stop):
@@ -40,7 +40,7 @@ class Blinker:
 
     def switch(self, now_ns: int) -> None:
         """Set the lamp as it is to be in the slot of this instant."""
-        # Of a lamp that is not switched the code says that it is lit.
+        # `lit` calls a lamp that does not blink lit. So all are lit when the one that blinks is lit.
         self._pin.write(self._shines() and all(lit(self._blink, now_ns)))
 
     def close(self) -> None:

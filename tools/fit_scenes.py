@@ -1,22 +1,25 @@
 """The simulated scenes to which the detector's score and sigma are fitted, in five waters.
 
-With and without decoys, at several exposures and resolutions, with the nodes' lamps lit or dark.
+They have decoys or none, several exposures and resolutions, and the nodes' lamps lit or dark.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 from buddyline.node.detect.source import SourceDetector
 from buddyline.protocol.clock import MS_NS
+from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from buddyline.node.capture.exposure import Exposure
     from buddyline.node.sim.world import World
+
+T = TypeVar("T")
 
 SEEDS: Final = range(1000, 1050)
 HELD_OUT: Final = range(2000, 2012)
@@ -46,6 +49,8 @@ DECOYS: Final = (
     ("walls",),
     ("walls", "slabs", "clock"),
 )
+NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
+"""A candidate counts as a lamp within 3 px or 1 % of the width, the greater."""
 
 
 class FitPicture(NamedTuple):
@@ -56,6 +61,40 @@ class FitPicture(NamedTuple):
     world: World
     node: str
     stamp_ns: int
+
+
+def near_px(width_px: int) -> float:
+    """Return how far from a lamp a candidate counts as that lamp."""
+    return max(NEAR_PX, NEAR_WIDTHS * width_px)
+
+
+def to_fit_and_held_out(simulated: Callable[[Iterable[int], Progress, int], Iterator[T]]) -> tuple[list[T], list[T]]:
+    """Return what a function yields for SEEDS, and for HELD_OUT. Its arguments are those of `scenes`."""
+    from buddyline.node.sim.scenario import ENVIRONMENTS
+
+    first, others = len(SEEDS) * len(ENVIRONMENTS), len(HELD_OUT) * len(ENVIRONMENTS)
+    with Progress("fit", first + others) as progress:
+        return list(simulated(SEEDS, progress, 0)), list(simulated(HELD_OUT, progress, first))
+
+
+def named_fit() -> str:
+    """Return which pictures are fitted to, for the provenance."""
+    return f"seeds {SEEDS.start} to {SEEDS.stop - 1} in each water, {VIEWS} pictures each"
+
+
+def named_held_out() -> str:
+    """Return which pictures say how well it fits, for a comment."""
+    return f"pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}"
+
+
+def scenes(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[tuple[int, Iterator[FitPicture]]]:
+    """Yield the seed and the views of each scene, in every water. done: scenes that the progress counts already."""
+    from buddyline.node.sim.scenario import ENVIRONMENTS
+
+    for i, seed in enumerate(seeds):
+        for k, environment in enumerate(ENVIRONMENTS):
+            progress.show(done + i * len(ENVIRONMENTS) + k, f"{environment}, seed {seed}")
+            yield seed, views(environment, seed)
 
 
 def views(environment: str, seed: int) -> Iterator[FitPicture]:

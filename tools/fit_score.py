@@ -1,7 +1,6 @@
 """`buddyline tune --fit`: fit the detector's score to the simulator's pictures, and to pictures without any lamp.
 
-The simulator knows where every lamp is. It draws five waters, with and without decoys, at several exposures and
-resolutions, with the nodes' lamps lit or dark. Real pictures without lamps are added.
+The simulator knows where every lamp is in its pictures (fit_scenes.py). Real pictures without lamps are added.
 """
 
 from __future__ import annotations
@@ -11,23 +10,18 @@ import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
 from buddyline.node.detect.score import NAMES, probability
 from buddyline.node.detect.source import SourceDetector
-from buddyline.tools.fit_scenes import HELD_OUT, SEEDS, VIEWS, FitPicture, views
+from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, near_px, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    pass
-
 Floats = NDArray[np.float64]
 
-NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
-"""A candidate counts as a lamp within 3 px or 1 % of the width, the greater."""
 BESIDE_RADII: Final = 1.5
 """A candidate farther off, but within this many of its core's radii, counts neither as a lamp nor as none."""
 MAGNIFIED: Final = (1, 3, 5)
@@ -80,13 +74,9 @@ def score_error(likely: Floats, lamp: NDArray[np.bool_]) -> float:
 
 def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[Sample]:
     """Yield the candidates of rendered pictures, with what they are."""
-    from buddyline.node.sim.scenario import ENVIRONMENTS
-
-    for i, seed in enumerate(seeds):
-        for k, environment in enumerate(ENVIRONMENTS):
-            progress.show(done + i * len(ENVIRONMENTS) + k, f"{environment}, seed {seed}")
-            for view in views(environment, seed):
-                yield from _labelled(view)
+    for _, views in scenes(seeds, progress, done):
+        for view in views:
+            yield from _labelled(view)
 
 
 def _labelled(view: FitPicture) -> Iterator[Sample]:
@@ -99,9 +89,9 @@ def _labelled(view: FitPicture) -> Iterator[Sample]:
     at_px = np.array([lamp[:2] for lamp in lamps]).reshape(-1, 2)
     visible = np.array([lamp[2] for lamp in lamps], bool)
     away_px = np.linalg.norm(seen.lights.centre_px[:, None] - at_px, axis=-1)
-    near_px = max(NEAR_PX, NEAR_WIDTHS * picture.shape[1])
-    lamp = (away_px[:, visible] <= near_px).any(axis=1)
-    beside = (away_px <= BESIDE_RADII * np.maximum(seen.lights.core_px, near_px)[:, None]).any(axis=1)
+    reach_px = near_px(picture.shape[1])
+    lamp = (away_px[:, visible] <= reach_px).any(axis=1)
+    beside = (away_px <= BESIDE_RADII * np.maximum(seen.lights.core_px, reach_px)[:, None]).any(axis=1)
     kept = lamp | ~beside
     yield Sample(world.scenario.environment, seen.features[kept].astype(float), lamp[kept])
 
@@ -121,12 +111,9 @@ def without_lamps(pictures: Iterable[NDArray[np.uint8]]) -> Iterator[Sample]:
 
 def run(folders: Sequence[str], pictures: Iterable[NDArray[np.uint8]], note: str) -> int:
     """Fit the score to simulated pictures and to real ones without lamps; write it to stdout as TOML; return 0."""
-    from buddyline.node.sim.scenario import ENVIRONMENTS
-
-    scenes = len(SEEDS) * len(ENVIRONMENTS)
-    with Progress("fit", scenes + len(HELD_OUT) * len(ENVIRONMENTS)) as progress:
-        samples = [*simulated(SEEDS, progress), *without_lamps(pictures)]
-        held_out = list(simulated(HELD_OUT, progress, scenes))
+    real = list(without_lamps(pictures))
+    rendered, held_out = to_fit_and_held_out(simulated)
+    samples = [*rendered, *real]
     sys.stdout.write(described(fit(samples), samples, held_out, folders, note))
     return 0
 
@@ -143,7 +130,7 @@ def described(
         "# Written by `buddyline tune --fit`. score.py says what the features are.",
         "",
         "[provenance]",
-        f'simulator = "seeds {SEEDS.start} to {SEEDS.stop - 1} in each water, {VIEWS} pictures each"',
+        f'simulator = "{named_fit()}"',
         f"real_pictures_without_lamps = {json.dumps(list(folders))}",
         f"note = {json.dumps(note)}",
         f"candidates = {sum(len(sample.lamp) for sample in samples)}",
@@ -152,7 +139,7 @@ def described(
         "[provenance.pictures]",
         *(f"{name} = {number}" for name, number in sorted(count.items())),
         "",
-        f"# Mean distance of score and share of lamps, on pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}.",
+        f"# Mean distance of score and share of lamps, on {named_held_out()}.",
         "[calibration_error]",
         *(
             f"{name} = {calibration_error([one for one in held_out if one.source == name], weights):.3f}"

@@ -24,8 +24,7 @@ from buddyline.node.detect.detection import focal_of
 from buddyline.node.detect.score import probability
 from buddyline.node.detect.sigma import NAMES, Doubt, direct_px2, long_px2
 from buddyline.node.detect.source import SourceDetector
-from buddyline.tools.fit_scenes import HELD_OUT, SEEDS, VIEWS, FitPicture, views
-from buddyline.tools.fit_score import NEAR_PX, NEAR_WIDTHS
+from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, near_px, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
@@ -112,14 +111,10 @@ def _least(of: Callable[[float], float], low: float, high: float) -> float:
 
 def simulated(seeds: Iterable[int], progress: Progress, done: int = 0) -> Iterator[Errors]:
     """Yield the located lights of rendered pictures."""
-    from buddyline.node.sim.scenario import ENVIRONMENTS
-
-    for i, seed in enumerate(seeds):
-        for k, environment in enumerate(ENVIRONMENTS):
-            progress.show(done + i * len(ENVIRONMENTS) + k, f"{environment}, seed {seed}")
-            rng = np.random.default_rng(seed)
-            for view in views(environment, seed):
-                yield from _located(view, rng)
+    for seed, views in scenes(seeds, progress, done):
+        rng = np.random.default_rng(seed)
+        for view in views:
+            yield from _located(view, rng)
 
 
 def _located(view: FitPicture, rng: np.random.Generator) -> Iterator[Errors]:
@@ -142,7 +137,7 @@ def located(
         return
     found = locate_sources(picture, lights, focal_px)
     away_px = np.linalg.norm(found.centre_px[:, None] - lamps_px, axis=-1).min(axis=1)
-    kept = found.holds & (away_px <= max(NEAR_PX, NEAR_WIDTHS * picture.shape[1]))
+    kept = found.holds & (away_px <= near_px(picture.shape[1]))
     own = found.doubt
     focal = np.full(int(kept.sum()), own.focal)
     doubt = Doubt(own.model_px2[kept], own.growth_px2[kept], own.halo[kept], focal, own.elongation[kept])
@@ -167,13 +162,8 @@ def run(dives: Sequence[str], known: Iterable[Errors]) -> int:
 
     dives: their names. known: of their pictures.
     """
-    from buddyline.node.sim.scenario import ENVIRONMENTS
-
     others = list(known)
-    scenes = len(SEEDS) * len(ENVIRONMENTS)
-    with Progress("fit", scenes + len(HELD_OUT) * len(ENVIRONMENTS)) as progress:
-        errors = list(simulated(SEEDS, progress))
-        held_out = list(simulated(HELD_OUT, progress, scenes))
+    errors, held_out = to_fit_and_held_out(simulated)
     sys.stdout.write(described(fit(errors, others), [*errors, *others], held_out, dives))
     return 0
 
@@ -191,13 +181,13 @@ def described(
         "# Written by `buddyline tune --fit-sigma`. sigma.py says what the sizes are.",
         "",
         "[provenance]",
-        f'simulator = "seeds {SEEDS.start} to {SEEDS.stop - 1} in each water, {VIEWS} pictures each"',
+        f'simulator = "{named_fit()}"',
         f"dives = {json.dumps([Path(dive).stem for dive in dives])}",
         "",
         "[provenance.lights]",
         *(f"{name} = {number}" for name, number in sorted(count.items())),
         "",
-        f"# On pictures of seeds {HELD_OUT.start} to {HELD_OUT.stop - 1}:",
+        f"# On {named_held_out()}:",
         "# mean squared error over the variance per axis, and the share of errors beyond 3 sigma.",
         "[nees]",
         *(f"{name} = {nees:.2f}" for name, (nees, _) in truth.items()),

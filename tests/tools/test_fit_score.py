@@ -38,8 +38,8 @@ def test_the_shipped_score_is_a_probability_in_fresh_waters():
 
 
 def test_the_command_writes_weights_with_their_provenance(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(fit_score, "SEEDS", range(1, 2))
-    monkeypatch.setattr(fit_score, "HELD_OUT", range(2, 3))
+    monkeypatch.setattr(fit_scenes, "SEEDS", range(1, 2))
+    monkeypatch.setattr(fit_scenes, "HELD_OUT", range(2, 3))
     monkeypatch.setattr(fit_scenes, "VIEWS", 2)
     monkeypatch.setattr(fit_scenes, "SIZES", ((410, 308),))
     picture = np.random.default_rng(1).integers(0, 255, (40, 60), np.uint8)

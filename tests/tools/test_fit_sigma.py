@@ -52,8 +52,8 @@ def test_the_shipped_sigma_is_true_in_fresh_waters():
 
 
 def test_the_command_writes_sizes_with_their_provenance(monkeypatch, capsys):
-    monkeypatch.setattr(fit_sigma, "SEEDS", range(1, 2))
-    monkeypatch.setattr(fit_sigma, "HELD_OUT", range(2, 3))
+    monkeypatch.setattr(fit_scenes, "SEEDS", range(1, 2))
+    monkeypatch.setattr(fit_scenes, "HELD_OUT", range(2, 3))
     monkeypatch.setattr(fit_scenes, "VIEWS", 2)
     monkeypatch.setattr(fit_scenes, "SIZES", ((410, 308),))
     assert main(["tune", "--fit-sigma"]) == 0

@@ -1,11 +1,10 @@
 """The cost of a whole node: time from a picture in memory to its candidates on the bus, processor, memory, log.
 
 The node runs in this process as on a Pi: a picture at each trigger, the drivers of a MinIMU-9 v6 at 100 Hz with its
-attitude filter and of a Bar30 at 20 Hz over a bus in memory, detector, log, recorded pictures and previews, and a real
-hub on loopback. Another process has
-rendered the pictures before; each is copied from memory, as the camera's driver does. The measured time begins with
-that copy, and ends when the bus has taken the candidates. Exposure, readout and the camera's own pipeline are not in
-it.
+attitude filter and of a Bar30 at 20 Hz over an I2C bus in memory, detector, log, recorded pictures and previews, and a
+real hub on loopback. Another process has rendered the pictures before; each is copied from memory, as the camera's
+driver does. The measured time begins with that copy, and ends when the Zenoh bus has taken the candidates. Exposure,
+readout and the camera's own pipeline are not in it.
 """
 
 from __future__ import annotations
