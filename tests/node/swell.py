@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Dive:
+class SwellDive:
     """times_s (n,), R_ned_body (n, 3, 3), samples (n); disturbed (n,): whether foreign iron is near."""
 
     times_s: Array
@@ -29,7 +29,7 @@ class Dive:
     disturbed: NDArray[np.bool_]
 
 
-def log_of(dive: Dive) -> list[Imu]:
+def log_of(dive: SwellDive) -> list[Imu]:
     """Give the samples as a node's log has them."""
     found = []
     for s in dive.samples:
@@ -74,7 +74,7 @@ def simulate(
     accel_bias_mps2: float = 0.0,
     calibrated: bool = True,
     cooling_radps: Array | None = None,
-) -> Dive:
+) -> SwellDive:
     """A node that lies still for rest_s, then sways.
 
     disturbances: (begin s, end s, T) of a foreign field that comes and goes smoothly, fixed in the body's frame.
@@ -117,4 +117,4 @@ def simulate(
     if not calibrated:
         mag = mag @ np.array([[1.1, 0.03, 0.0], [0.03, 0.95, -0.02], [0.0, -0.02, 1.04]]) + [8e-6, -12e-6, 5e-6]
     samples = [ImuSample(START_NS + round(t[i] * 1e9), accel[i], gyro[i], mag[i]) for i in range(n)]
-    return Dive(t, R, samples, disturbed)
+    return SwellDive(t, R, samples, disturbed)

@@ -44,7 +44,7 @@ def matrix(q_xyzw: tuple[float, float, float, float]) -> np.ndarray:
     return quaternion_to_matrix(np.array([w, x, y, z]))
 
 
-def estimate(dive: swell.Dive, estimator: VqfAttitude) -> Run:
+def estimate(dive: swell.SwellDive, estimator: VqfAttitude) -> Run:
     found = [(i, out) for i, s in enumerate(dive.samples) if (out := estimator.update(s)) is not None]
     index = [i for i, _ in found]
     R = np.array([matrix(out.q_ned_body_xyzw) for _, out in found])

@@ -128,14 +128,14 @@ def test_a_clock_that_is_set_is_said_before_the_first_beacon_after_it():
     wall, sent, stop = [NOW_NS], [], threading.Event()
     clock = NodeClock(lambda: wall[0], lambda: 5_000_000_000, lambda: 7_000_000_000)
 
-    class Outlet:
+    class BeaconOutlet:
         def send(self, message):
             sent.append(message)
             wall[0] = NOW_NS + 36_000_000
             if len(sent) == 3:
                 stop.set()
 
-    ClockSync("a", "x", clock, lambda: None).send_beacons(Outlet(), stop)
+    ClockSync("a", "x", clock, lambda: None).send_beacons(BeaconOutlet(), stop)
     assert [type(message) for message in sent] == [ClockBeacon, ClockSet, ClockBeacon]
     assert [message.stamp_ns for message in sent] == [NOW_NS, NOW_NS + 36_000_000, NOW_NS + 36_000_000]
     assert sent[1].moved_ns == 36_000_000

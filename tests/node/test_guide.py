@@ -40,7 +40,7 @@ def of_lamps(lamps=LAMPS, **how):
     return [light(u, v, side, **how) for side, (u, v) in zip(("left", "right"), lamps, strict=False)]
 
 
-class Eye:
+class LampSearch:
     """A node's search of pictures of lamps, ten a second."""
 
     def __init__(self, *, solver=True):
@@ -68,7 +68,7 @@ def finds(candidates, *lamps):
 
 
 def test_expected_lights_are_looked_for_where_they_are_expected():
-    eye = Eye()
+    eye = LampSearch()
     assert not guided(eye.look(LAMPS, *of_lamps()))
     for _ in range(5):
         candidates = eye.look(LAMPS, *of_lamps())
@@ -77,7 +77,7 @@ def test_expected_lights_are_looked_for_where_they_are_expected():
 
 
 def test_a_lamp_that_is_dark_by_its_code_is_not_lost():
-    eye = Eye()
+    eye = LampSearch()
     blink = Blink(code=0, lamp="left", slot_ns=PERIOD_NS)
     looks = []
     for _ in range(20):
@@ -140,7 +140,7 @@ def finds_both(found):
 
 @pytest.mark.slow
 def test_the_whole_picture_is_searched_once_a_second():
-    eye = Eye()
+    eye = LampSearch()
     looks = [eye.look(LAMPS, *of_lamps()) for _ in range(40)]
     whole = [one.stamp_ns for one in looks if not guided(one)]
     assert max(np.diff(whole)) <= S_NS
@@ -161,7 +161,7 @@ def test_the_whole_picture_is_searched_once_a_second():
     ids=["elsewhere", "outside", "absurd", "too wide", "too fast", "on top of each other", "nothing"],
 )
 def test_a_lying_expectation_blinds_no_picture(lie):
-    eye = Eye()
+    eye = LampSearch()
     eye.look(LAMPS)
     eye.look(LAMPS, *of_lamps())
     for _ in range(6):
@@ -170,7 +170,7 @@ def test_a_lying_expectation_blinds_no_picture(lie):
 
 def test_an_expectation_on_a_strange_lamp_does_not_hide_the_lights():
     strange = 600.0, 400.0
-    eye = Eye()
+    eye = LampSearch()
     eye.look([*LAMPS, strange])
     for _ in range(6):
         candidates = eye.look([*LAMPS, strange], light(*strange))
@@ -179,7 +179,7 @@ def test_an_expectation_on_a_strange_lamp_does_not_hide_the_lights():
 
 
 def test_after_a_jump_the_same_picture_is_searched_as_a_whole():
-    eye = Eye()
+    eye = LampSearch()
     for _ in range(3):
         eye.look(LAMPS, *of_lamps())
     moved = [(u + 150.0, v + 100.0) for u, v in LAMPS]
@@ -189,7 +189,7 @@ def test_after_a_jump_the_same_picture_is_searched_as_a_whole():
 
 
 def test_one_hidden_light_is_searched_for_in_the_whole_picture():
-    eye = Eye()
+    eye = LampSearch()
     for _ in range(3):
         eye.look(LAMPS, *of_lamps())
     candidates = eye.look(LAMPS[:1], *of_lamps())
@@ -199,7 +199,7 @@ def test_one_hidden_light_is_searched_for_in_the_whole_picture():
 
 @pytest.mark.parametrize("late", [PERIOD_NS * 6, -PERIOD_NS * 6], ids=["stale", "of later"])
 def test_an_expectation_of_another_time_is_none(late):
-    eye = Eye()
+    eye = LampSearch()
     for _ in range(3):
         eye.look(LAMPS)
     told = expect(eye.k + 1, *of_lamps())
@@ -208,7 +208,7 @@ def test_an_expectation_of_another_time_is_none(late):
 
 
 def test_an_expectation_for_another_node_is_refused():
-    eye = Eye()
+    eye = LampSearch()
     eye.look(LAMPS)
     eye.guide.expect(expect(eye.k + 1, *of_lamps(), node="b", seen="a"))
     assert eye.guide.refused == 1
@@ -216,7 +216,7 @@ def test_an_expectation_for_another_node_is_refused():
 
 
 def test_an_expectation_follows_its_rate_to_a_later_picture():
-    eye = Eye()
+    eye = LampSearch()
     for _ in range(2):
         eye.look(LAMPS, *of_lamps())
     moved = [(u + 60.0, v) for u, v in LAMPS]
@@ -229,7 +229,7 @@ def test_an_expectation_follows_its_rate_to_a_later_picture():
 
 
 def test_without_a_solver_the_last_pictures_guide():
-    eye = Eye(solver=False)
+    eye = LampSearch(solver=False)
     looks = []
     for i in range(12):
         lamps = [(u + 5.0 * i, v + 2.0 * i) for u, v in LAMPS]
@@ -240,14 +240,14 @@ def test_without_a_solver_the_last_pictures_guide():
 
 
 def test_a_solver_without_a_track_gets_whole_pictures():
-    eye = Eye()
+    eye = LampSearch()
     assert not any(guided(eye.look(LAMPS)) for _ in range(6))
     eye.guide.saw_process("solver/any", False)
     assert any(guided(eye.look(LAMPS)) for _ in range(3))
 
 
 def test_a_new_lamp_is_found_within_a_second_and_then_followed():
-    eye = Eye()
+    eye = LampSearch()
     for _ in range(4):
         eye.look(LAMPS, *of_lamps())
     new = 650.0, 450.0
@@ -260,7 +260,7 @@ def test_a_new_lamp_is_found_within_a_second_and_then_followed():
 
 
 def test_what_was_elsewhere_is_told():
-    eye = Eye()
+    eye = LampSearch()
     first = eye.look(LAMPS, *of_lamps())
     second = eye.look(LAMPS, *of_lamps())
     assert len(second.blobs) + second.elsewhere >= len(first.blobs)
@@ -269,7 +269,7 @@ def test_what_was_elsewhere_is_told():
 def test_both_lights_come_first_among_eight_strange_lamps():
     rng = np.random.default_rng(8)
     both = 0
-    eye = Eye()
+    eye = LampSearch()
     strange = [(100.0 + 90.0 * i, 420.0 + 100.0 * (i % 2)) for i in range(8)]
     for _ in range(20):
         shaken = [tuple(np.add(lamp, rng.normal(0.0, 2.0, 2))) for lamp in LAMPS]
@@ -312,7 +312,7 @@ def test_a_detector_without_regions_searches_whole_pictures():
 
 
 def test_pictures_of_two_sizes_have_their_own_whole_searches():
-    eye = Eye()
+    eye = LampSearch()
     eye.look(LAMPS, *of_lamps())
     eye.k += 1
     eye.guide.expect(expect(eye.k, *of_lamps()))

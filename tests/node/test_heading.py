@@ -22,7 +22,7 @@ def level_field(delta_rad: float, norm_t: float = 48e-6, dip_rad: float = DIP_RA
     return np.array([horizontal * math.sin(delta_rad), horizontal * math.cos(delta_rad), -norm_t * math.sin(dip_rad)])
 
 
-class Node:
+class TurningNode:
     """A node that turns to and fro by 100 deg (twice swing_rad) every 20 s, and a compass with 0.8 uT of noise."""
 
     def __init__(self, heading: HeadingFilter, seed: int = 1, swing_rad: float = math.radians(50)) -> None:
@@ -58,7 +58,7 @@ def test_angles_wrap_to_within_pi(angle):
 
 @pytest.mark.parametrize("delta_rad", [0.0, 2.0, 3.1, -3.1])
 def test_the_filter_finds_the_angle_and_its_sigma_shrinks(delta_rad):
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
     node.run(60, delta_rad)
     assert node.off_deg(delta_rad) < 1.0
@@ -67,7 +67,7 @@ def test_the_filter_finds_the_angle_and_its_sigma_shrinks(delta_rad):
 
 
 def test_the_filter_follows_a_drifting_gyroscope_across_pi():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     delta_rad = node.run(120, 3.0, drift_radps=math.radians(0.1))
     assert node.off_deg(delta_rad) < 2.0
     assert node.heading.problem == ""
@@ -75,7 +75,7 @@ def test_the_filter_follows_a_drifting_gyroscope_across_pi():
 
 @pytest.mark.parametrize("changed", [{"norm_t": 53e-6}, {"norm_t": 42e-6}, {"dip_rad": DIP_RAD + 0.15}])
 def test_strength_and_dip_that_are_not_the_earths_are_left_out(changed):
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.run(10, 1.5, **changed)
     assert "disturbed" in node.heading.problem
@@ -84,7 +84,7 @@ def test_strength_and_dip_that_are_not_the_earths_are_left_out(changed):
 
 
 def test_a_turned_compass_of_the_right_strength_and_dip_is_left_out_too():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.run(10, 1.0 + math.radians(30))
     assert "differ" in node.heading.problem
@@ -92,7 +92,7 @@ def test_a_turned_compass_of_the_right_strength_and_dip_is_left_out_too():
 
 
 def test_sigma_grows_while_the_compass_is_left_out():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(60, 1.0)
     before = node.heading.sigma_rad(TILT_SIGMA)
     node.run(60, 1.0, norm_t=60e-6)
@@ -101,7 +101,7 @@ def test_sigma_grows_while_the_compass_is_left_out():
 
 def test_a_rig_field_is_not_taken_for_the_earths_while_the_node_turns():
     """Learned without knowing the place; then iron on the rig, for as long as it stays."""
-    node = Node(HeadingFilter(None))
+    node = TurningNode(HeadingFilter(None))
     node.run(60, 1.0)
     node.run(120, 1.0, rig_t=9e-6)
     assert node.off_deg(1.0) < 6.0
@@ -111,7 +111,7 @@ def test_a_rig_field_is_not_taken_for_the_earths_while_the_node_turns():
 
 def test_started_beside_steel_the_filter_recovers_without_a_known_place():
     """A boat's field at the start, learned for the Earth's; the true one shows by standing still in a turn."""
-    node = Node(HeadingFilter(None))
+    node = TurningNode(HeadingFilter(None))
     node.run(10, 1.0 + math.radians(40), norm_t=62e-6, dip_rad=DIP_RAD - 0.3)
     node.run(3, 1.0)
     assert "disturbed" in node.heading.problem
@@ -124,7 +124,7 @@ def test_started_beside_steel_the_filter_recovers_without_a_known_place():
 
 def test_a_first_reading_slightly_off_raises_no_lasting_alarm():
     """Started on a deck, 10 % and 4 deg from the field of the place; the node hardly turns."""
-    node = Node(HeadingFilter(None), swing_rad=math.radians(10))
+    node = TurningNode(HeadingFilter(None), swing_rad=math.radians(10))
     node.run(3, 1.0, norm_t=43e-6, dip_rad=DIP_RAD + 0.07)
     node.run(5, 1.0)
     assert "disturbed" in node.heading.problem
@@ -135,14 +135,14 @@ def test_a_first_reading_slightly_off_raises_no_lasting_alarm():
 
 
 def test_a_steady_field_of_another_strength_is_not_adopted_where_the_place_is_known():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(120, 1.0, norm_t=62e-6)
     assert "disturbed" in node.heading.problem
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
 
 
 def test_an_unmeasured_rotation_widens_the_gate():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.heading.widen(math.radians(30))
     assert math.degrees(node.heading.sigma_rad(TILT_SIGMA)) > 30
@@ -152,7 +152,7 @@ def test_an_unmeasured_rotation_widens_the_gate():
 
 
 def test_an_unmeasured_rotation_of_any_size_restarts_the_filter():
-    node = Node(HeadingFilter(HERE))
+    node = TurningNode(HeadingFilter(HERE))
     node.run(60, 1.0)
     node.heading.widen(math.pi)
     assert node.heading.sigma_rad(TILT_SIGMA) == UNKNOWN_SIGMA_RAD
@@ -164,8 +164,8 @@ def test_noise_alone_is_covered_by_sigma():
     """Fifty starts: the angle's error against the sigma of the state, calibration and mount left aside."""
     offs = []
     for seed in range(50):
-        node = Node(HeadingFilter(HERE), seed)
+        node = TurningNode(HeadingFilter(HERE), seed)
         node.run(5, 0.3)
         offs.append(node.off_deg(0.3))
-    assert max(offs) < 3 * math.degrees(Node(HeadingFilter(HERE)).heading.sigma_rad(0.0))
+    assert max(offs) < 3 * math.degrees(TurningNode(HeadingFilter(HERE)).heading.sigma_rad(0.0))
     assert np.sqrt(np.mean(np.square(offs))) < 2.0

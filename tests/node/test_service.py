@@ -242,7 +242,7 @@ def test_pictures_keep_their_rate_when_the_clock_is_set(step_ns):
     assert len(taken) in (8, 9)
 
 
-class Outlet:
+class PictureOutlet:
     """Takes what would be recorded and what would be shown."""
 
     def __init__(self):
@@ -258,7 +258,7 @@ class Outlet:
      (1000, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 2.6, 3.6, 4.6, 5.6])],
 )  # fmt: skip
 def test_pictures_of_the_scene_are_recorded_and_shown_before_those_of_the_lamps(every, recorded, shown):
-    outlet = Outlet()
+    outlet = PictureOutlet()
     images = Images(NodeConfig(node="a"), outlet)
     for i in range(60):
         context = None if every is None else i % every == 0
@@ -267,7 +267,7 @@ def test_pictures_of_the_scene_are_recorded_and_shown_before_those_of_the_lamps(
     assert outlet.shown == shown
 
 
-class Silent:
+class SilentSensor:
     """A sensor that gives nothing."""
 
     name = "depth"
@@ -282,7 +282,7 @@ def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, mo
     monkeypatch.setattr("buddyline.node.service.FIRST_S", -10.0)
     config = NodeConfig(node="a", camera=CameraConfig(name="stored"), record=RecordConfig(directory=str(tmp_path)))
     service = NodeService(config)
-    service.sources = [Silent(problem)]
+    service.sources = [SilentSensor(problem)]
     assert service.progressing() is progresses
 
 

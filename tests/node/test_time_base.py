@@ -14,7 +14,7 @@ LOOK_NS = 250 * MS_NS
 EPOCH_NS = 1_764_000_000 * S_NS
 
 
-class Clocks:
+class MachineClocks:
     """A machine's clocks: a slew moves CLOCK_BOOTTIME and the wall clock alike, a step the wall clock alone."""
 
     def __init__(self):
@@ -30,7 +30,7 @@ class Clocks:
 
 @pytest.fixture
 def clocks():
-    return Clocks()
+    return MachineClocks()
 
 
 @pytest.fixture

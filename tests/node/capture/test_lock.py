@@ -19,7 +19,7 @@ SEEN_FROM = 8
 """Grey level from which a lamp is found."""
 
 
-class Eye:
+class LampCamera:
     """A camera that looks at one lamp of `light` per ms, with a delay, a tone curve, and noise in its grey levels."""
 
     def __init__(self, light, delay=0, true_curve="square", believed="square", noise=0.0, seed=0):
@@ -70,7 +70,7 @@ curves = st.sampled_from(sorted(CURVES))
 @settings(max_examples=150, deadline=None)
 @given(lights, lights, delays, curves, curves, st.integers(0, 60))
 def test_it_recovers_from_any_change_of_light(before, after, delay, true_curve, believed, frames):
-    eye = Eye(before, delay, true_curve, believed, noise=0.05)
+    eye = LampCamera(before, delay, true_curve, believed, noise=0.05)
     eye.run(frames)
     eye.light = after
     eye.run(80 + 4 * delay)
@@ -81,7 +81,7 @@ def test_it_recovers_from_any_change_of_light(before, after, delay, true_curve, 
 @given(lights, delays, curves, curves, st.floats(0.0, 0.08), st.integers(0, 5))
 def test_it_never_hunts_at_a_constant_light(light, delay, true_curve, believed, noise, seed):
     """Once settled it may follow the noise by a step, and then stands still, whatever delay and tone curve are."""
-    eye = Eye(light, delay, true_curve, believed, noise, seed)
+    eye = LampCamera(light, delay, true_curve, believed, noise, seed)
     eye.run(120 + 4 * delay)
     before = len(eye.asked)
     eye.run(200)
@@ -93,7 +93,7 @@ def test_it_never_hunts_at_a_constant_light(light, delay, true_curve, believed, 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(lights, st.booleans()), max_size=40), delays)
 def test_every_exposure_is_one_that_the_camera_has(steps, delay):
-    eye = Eye(1.0, delay)
+    eye = LampCamera(1.0, delay)
     for light, seen in steps:
         eye.light = light
         eye.run(3, seen)
@@ -109,7 +109,7 @@ def test_every_exposure_is_one_that_the_camera_has(steps, delay):
 @pytest.mark.parametrize("delay", [0, 4, 10])
 def test_a_lamp_that_turns_towards_the_camera_is_clipped_for_few_frames(delay):
     """Sixty times as bright from one frame to the next: the rungs are asked for without waiting for answers."""
-    eye = Eye(0.1, delay)
+    eye = LampCamera(0.1, delay)
     eye.run(60)
     eye.light = 6.0
     levels = eye.run(60)
@@ -119,7 +119,7 @@ def test_a_lamp_that_turns_towards_the_camera_is_clipped_for_few_frames(delay):
 
 @pytest.mark.parametrize("delay", [0, 4, 10])
 def test_a_single_flash_changes_nothing(delay):
-    eye = Eye(0.3, delay)
+    eye = LampCamera(0.3, delay)
     eye.run(80)
     before = eye.lock.plan.lamps
     for _ in range(5):
@@ -132,7 +132,7 @@ def test_a_single_flash_changes_nothing(delay):
 
 
 def test_more_comes_slowly_and_less_at_once():
-    eye = Eye(1.0)
+    eye = LampCamera(1.0)
     eye.run(60)
     amounts = []
     for light in (0.25, 1.0):
@@ -145,7 +145,7 @@ def test_more_comes_slowly_and_less_at_once():
 
 
 def test_a_lamp_that_is_lost_is_searched_between_the_last_exposure_and_the_scenes():
-    eye = Eye(2.0)
+    eye = LampCamera(2.0)
     eye.run(60)
     good = eye.lock.plan.lamps.amount
     eye.run(LOST + 1, seen=False)  # one of them is a context frame
@@ -163,7 +163,7 @@ def test_a_lamp_that_is_lost_is_searched_between_the_last_exposure_and_the_scene
 
 def test_a_lamp_seen_in_context_frames_alone_counts_as_lost():
     """Else an exposure that is too short for a lamp would never be left."""
-    eye = Eye(0.5)
+    eye = LampCamera(0.5)
     eye.run(60)
     eye.light = 1e-3
     eye.run(100)
@@ -172,14 +172,14 @@ def test_a_lamp_seen_in_context_frames_alone_counts_as_lost():
 
 def test_the_scenes_exposure_follows_the_scene():
     for scene_light, expected in ((0.03, 5.0), (1e-5, 100.0)):
-        eye = Eye(0.3)
+        eye = LampCamera(0.3)
         eye.scene_light = scene_light
         eye.run(600)
         assert eye.lock.plan.scene.amount == pytest.approx(expected, rel=0.35)
 
 
 def test_context_frames_are_those_of_the_same_triggers_in_all_nodes():
-    plan = Eye(0.3).lock.plan
+    plan = LampCamera(0.3).lock.plan
     assert [k for k in range(100, 200) if plan.at(k) is plan.scene] == [100, 120, 140, 160, 180]
 
 
@@ -205,7 +205,7 @@ def test_pulsed_lamps_get_whole_periods():
 @pytest.mark.parametrize("delay", [0, 4, 10])
 def test_a_lamp_that_is_hidden_is_made_room_for_without_hunting(delay):
     """Context frames show a second lamp that needs 500 times the light that the first one wants."""
-    eye = Eye(30.0, delay)
+    eye = LampCamera(30.0, delay)
     needed = 500 * 0.6 / 30.0 * 0.01
     pipe = deque([eye.lock.plan] * delay)
     amounts = []

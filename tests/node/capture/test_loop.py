@@ -24,7 +24,7 @@ LINEAR = (np.arange(256) / 255) ** 2
 SMALL = {"width_px": 410, "height_px": 308, "interruptions": False}
 
 
-class Node:
+class ExposingNode:
     """A camera in a simulated water, with detector and loop."""
 
     def __init__(self, delay=4, config=None, **scenario):
@@ -55,7 +55,7 @@ class Node:
 
 @cache
 def dive(environment):
-    node = Node(environment=environment, seed=5)
+    node = ExposingNode(environment=environment, seed=5)
     return node, node.run(120)
 
 
@@ -93,7 +93,7 @@ def test_context_frames_show_the_scene(environment):
 
 @pytest.mark.parametrize("range_m", [1.0, 3.0, 10.0])
 def test_the_loop_follows_the_range(range_m):
-    node = Node(environment="cavern", seed=3, trajectory="rest", range_min_m=range_m, range_max_m=range_m)
+    node = ExposingNode(environment="cavern", seed=3, trajectory="rest", range_min_m=range_m, range_max_m=range_m)
     taken = node.run(60)[30:]
     errors = [error for _, of_frame in taken for error in of_frame]
     assert node.loop.state == "locked"
@@ -101,7 +101,7 @@ def test_the_loop_follows_the_range(range_m):
 
 
 def test_a_lamp_that_is_switched_off_and_on_is_found_again():
-    node = Node(environment="night_reef", seed=3, trajectory="rest", other_lamps=0)
+    node = ExposingNode(environment="night_reef", seed=3, trajectory="rest", other_lamps=0)
     node.run(30)
     lit, dark = node.world, World(Scenario(**SMALL, environment="night_reef", seed=3, trajectory="rest", other_lamps=0,
                                            dead_lamps=("b.left", "b.right")))  # fmt: skip
@@ -116,7 +116,7 @@ def test_a_lamp_that_is_switched_off_and_on_is_found_again():
 
 def test_one_lamp_that_goes_out_leaves_the_other_well_exposed():
     scenario = {"environment": "night_reef", "seed": 3, "trajectory": "rest", "other_lamps": 0}
-    node = Node(**scenario)
+    node = ExposingNode(**scenario)
     node.run(30)
     node.world = World(Scenario(**SMALL, **scenario, dead_lamps=("b.left",)))
     taken = node.run(40)[20:]
@@ -126,7 +126,7 @@ def test_one_lamp_that_goes_out_leaves_the_other_well_exposed():
 
 def test_a_strobe_leaves_the_exposure_alone():
     scenario = {"environment": "cavern", "seed": 3, "trajectory": "rest", "other_lamps": 0}
-    node, quiet = Node(**scenario, strobe_s=1.3), Node(**scenario)
+    node, quiet = ExposingNode(**scenario, strobe_s=1.3), ExposingNode(**scenario)
     amounts = [[frame.exposure.amount for frame, _ in n.run(60)[30:] if not frame.context] for n in (node, quiet)]
     assert max(amounts[0]) <= 1.4 * max(amounts[1])
     assert min(amounts[0]) >= min(amounts[1]) / 1.4
@@ -135,11 +135,11 @@ def test_a_strobe_leaves_the_exposure_alone():
 def test_pulsed_lamps_are_noticed_and_whole_periods_mend_it():
     scenario = {"environment": "night_reef", "seed": 3, "trajectory": "rest", "range_min_m": 6.0, "range_max_m": 6.0}
     scenario |= {"row_time_ns": 40_000, "pwm_hz": 937.0, "other_lamps": 0}
-    node = Node(**scenario)
+    node = ExposingNode(**scenario)
     node.run(60)
     assert "flicker" in node.loop.problem
     assert "flicker_hz" in node.loop.problem
-    told = Node(**scenario, config=ExposureConfig(flicker_hz=937.0))
+    told = ExposingNode(**scenario, config=ExposureConfig(flicker_hz=937.0))
     taken = told.run(60)
     assert told.loop.problem == ""
     periods = taken[-1][0].exposure.time_ns * 937.0 / 1e9
@@ -150,7 +150,7 @@ def test_pulsed_lamps_are_noticed_and_whole_periods_mend_it():
 def test_pulses_at_a_multiple_of_the_frame_rate_are_noticed_by_their_bands(range_m, pwm_hz):
     scenario = {"environment": "night_reef", "seed": 3, "trajectory": "rest", "row_time_ns": 40_000, "other_lamps": 0}
     scenario |= {"range_min_m": range_m, "range_max_m": range_m}
-    steady, pulsed = Node(**scenario), Node(**scenario, pwm_hz=pwm_hz)
+    steady, pulsed = ExposingNode(**scenario), ExposingNode(**scenario, pwm_hz=pwm_hz)
     errors = [np.median([x for _, found in node.run(30)[10:] for x in found]) for node in (steady, pulsed)]
     assert errors[1] > errors[0] + 0.1
     assert "from row to row" in pulsed.loop.problem
@@ -158,7 +158,7 @@ def test_pulses_at_a_multiple_of_the_frame_rate_are_noticed_by_their_bands(range
 
 
 def test_a_frame_that_does_not_say_its_exposure_changes_nothing():
-    node = Node(environment="cavern", seed=3)
+    node = ExposingNode(environment="cavern", seed=3)
     before = node.loop.plan
     assert node.loop.update(Frame(np.full((308, 410, 3), 255, np.uint8), 0), message([])) is before
 

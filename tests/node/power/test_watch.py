@@ -104,7 +104,7 @@ def test_the_firmwares_program_is_never_asked_where_there_is_a_file(kernel, monk
     assert board.Throttled(kernel.root).read() == 0
 
 
-class Chip:
+class Gauge:
     """A gauge that can be taken off the bus; also its bus."""
 
     def __init__(self):
@@ -124,7 +124,7 @@ class Chip:
 
 
 def test_the_battery_is_in_the_status_and_an_empty_one_is_a_problem(kernel):
-    config, chip = NodeConfig(node="a", camera=PI, power=PowerConfig(battery="ina219", cells=3)), Chip()
+    config, chip = NodeConfig(node="a", camera=PI, power=PowerConfig(battery="ina219", cells=3)), Gauge()
     power = PowerWatch(config, BatteryGauge(config, lambda: (chip, chip)), kernel.root)
     power.look(0.0)
     assert "battery_v" not in power.status_fields()
@@ -138,7 +138,7 @@ def test_the_battery_is_in_the_status_and_an_empty_one_is_a_problem(kernel):
 
 
 def test_a_gauge_that_falls_silent_is_named_has_no_reading_and_is_set_up_again():
-    config, chip = NodeConfig(node="a", power=PowerConfig(battery="ina219")), Chip()
+    config, chip = NodeConfig(node="a", power=PowerConfig(battery="ina219")), Gauge()
     gauge = BatteryGauge(config, lambda: (chip, chip))
     gauge.look(0.0)
     gauge.look(1.0)

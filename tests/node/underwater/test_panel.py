@@ -44,7 +44,7 @@ def status(candidates_hz=10.0, lights_seen=0):
     )
 
 
-class Rig:
+class PanelRig:
     """A panel, its mock pins, and what it sends."""
 
     def __init__(self, **table):
@@ -78,14 +78,14 @@ class Rig:
 
 @pytest.fixture
 def rig():
-    rig = Rig()
+    rig = PanelRig()
     rig.run(0.1)
     yield rig
     rig.panel.close()
 
 
 def test_the_surveys_verdict_is_shown_for_ten_seconds():
-    rig = Rig()
+    rig = PanelRig()
     rig.news = (status(), [])
     rig.run(1.0)
     for kind, name, verdict in (("leg", "good", Verdict.GOOD), ("alarm", "sights", Verdict.AGAIN)):
@@ -146,7 +146,7 @@ def test_stop_and_start_switch_the_dive_lights_and_the_pictures_and_are_noted(ri
      ([sys.executable, "-c", "import sys; sys.exit('not allowed')"], "exit status 1: not allowed")],
 )  # fmt: skip
 def test_a_shutdown_that_cannot_be_is_said_and_the_dive_goes_on(command, refusal):
-    rig = Rig(**ALL, shutdown_command=command)
+    rig = PanelRig(**ALL, shutdown_command=command)
     rig.run(0.1)
     rig.press(9.0)
     assert [problem for problem in rig.panel.problems if refusal in problem]
@@ -157,7 +157,7 @@ def test_a_shutdown_that_cannot_be_is_said_and_the_dive_goes_on(command, refusal
 
 
 def test_a_shutdown_runs_the_command_and_turns_the_lights_off(tmp_path):
-    rig = Rig(**ALL, shutdown_command=[sys.executable, "-c", f"open({str(tmp_path / 'done')!r}, 'w')"])
+    rig = PanelRig(**ALL, shutdown_command=[sys.executable, "-c", f"open({str(tmp_path / 'done')!r}, 'w')"])
     rig.run(0.1)
     rig.press(9.0)
     assert (tmp_path / "done").exists()
@@ -213,7 +213,7 @@ def test_closing_turns_everything_off(rig):
 
 def test_a_pin_in_use_is_named_the_others_work_and_it_is_tried_again(monkeypatch):
     monkeypatch.setattr(pins_module, "RETRY_S", 0.0)
-    rig = Rig()
+    rig = PanelRig()
     from gpiozero import LED
 
     other = LED(LAMP, pin_factory=rig.factory)
@@ -262,7 +262,7 @@ def test_a_pin_that_fails_in_mid_dive_is_opened_again(monkeypatch):
 
 def test_a_machine_without_gpiozero_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gpiozero", None)
-    rig = Rig()
+    rig = PanelRig()
     rig.run(0.1)
     assert all("needs gpiozero: make install EXTRAS=pi" in problem for problem in rig.panel.problems)
     assert len(rig.panel.problems) == len(ALL)
