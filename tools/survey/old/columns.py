@@ -8,8 +8,8 @@ from datetime import date
 from pathlib import Path
 from typing import Final
 
-from buddyline.tools.survey.old.centreline import FOOT_M
 from buddyline.tools.survey.old.model import CrossSection, North, OldFix, OldShot, OldSurvey, Passage, SurveyPath
+from buddyline.tools.survey.old.row_settings import FOOT_M
 from buddyline.tools.survey.old.source import SourceLine, lines_of
 
 # Column names, without units, to the readings of a shot.

@@ -9,8 +9,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from buddyline.tools.survey.old.centreline import FOOT_M
 from buddyline.tools.survey.old.model import CrossSection, North, OldFix, OldShot, OldSurvey, Passage, SurveyPath
+from buddyline.tools.survey.old.row_settings import FOOT_M
 from buddyline.tools.survey.old.source import SourceLine, beside, lines_of, text_of
 
 # Compass writes -999 for what was not read, Karst 999.

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from datetime import date
 from pathlib import Path
 from typing import Final
 
-from buddyline.tools.survey.old.centreline import (
+from buddyline.tools.survey.old.centreline import Rows
+from buddyline.tools.survey.old.model import North, OldFix, OldSurvey, StationName, SurveyPath
+from buddyline.tools.survey.old.row_settings import (
+    CHANGES,
     NORMAL_ORDER,
     QUANTITIES,
     STYLES,
-    Rows,
     RowSettings,
+    date_of,
     factor_of,
-    with_calibration,
-    with_sigmas,
-    with_units,
+    sigmas_of_fix,
+    with_flags,
+    with_inferred,
 )
-from buddyline.tools.survey.old.model import North, OldFix, OldSurvey, StationName, SurveyPath
 from buddyline.tools.survey.old.source import DEEPEST, SourceLine, beside, lines_of
 
 CHARACTERS: Final = {
@@ -38,7 +39,7 @@ CHARACTERS: Final = {
 # Commands that change nothing that is kept.
 SILENT: Final = frozenset(("require", "export"))
 _SIGNS: Final = {"minus": "-", "plus": "+", "decimal": "."}
-FLAGS: Final = frozenset(("surface", "duplicate", "splay"))
+FLAGS: Final = {name: name for name in ("surface", "duplicate", "splay")}
 
 
 @dataclass(frozen=True)
@@ -147,8 +148,11 @@ class SvxReader:
         part = part.lower() if case == "tolower" else part.upper() if case == "toupper" else part
         return part[: self._scope.truncate]
 
+    def _take(self, settings: RowSettings) -> None:
+        self._scope = replace(self._scope, settings=settings)
+
     def _set(self, **changes: object) -> None:
-        self._scope = replace(self._scope, settings=replace(self._scope.settings, **changes))  # type: ignore[arg-type]
+        self._take(replace(self._scope.settings, **changes))  # type: ignore[arg-type]
 
     def _command(self, text: str, line: SourceLine) -> None:
         match = re.match(r"[A-Za-z]+", text)
@@ -156,10 +160,8 @@ class SvxReader:
             raise line.error(f"'*{text}': a command has a name")
         name, rest = match[0].lower(), text[match.end() :].strip()
         words = self._words(rest)
-        settings = self._scope.settings
-        if name in ("units", "calibrate", "sd"):
-            change = {"units": with_units, "calibrate": with_calibration, "sd": with_sigmas}[name]
-            self._scope = replace(self._scope, settings=change(settings, self._numbers(words), line))
+        if name in CHANGES:
+            self._take(CHANGES[name](self._scope.settings, self._numbers(words), line))
         elif (act := getattr(self, f"_do_{name}", None)) is not None:
             act(words, line)
         elif name in ("title", "team", "instrument", "copyright", "ref"):
@@ -238,23 +240,10 @@ class SvxReader:
         self._set(style=STYLES[style], order=NORMAL_ORDER if style == "default" else columns)
 
     def _do_flags(self, words: list[str], line: SourceLine) -> None:
-        flags, on = set(self._scope.settings.flags), True
-        for word in (one.lower() for one in words):
-            if word == "not":
-                on = False
-                continue
-            if word not in FLAGS:
-                raise line.error(f"*flags {word}: no such flag; known: {' '.join(sorted(FLAGS))}")
-            flags = flags | {word} if on else flags - {word}
-            on = True
-        self._set(flags=frozenset(flags))
+        self._take(with_flags(self._scope.settings, words, FLAGS, line))
 
     def _do_infer(self, words: list[str], line: SourceLine) -> None:
-        if len(words) != 2 or words[1].lower() not in ("on", "off"):
-            raise line.error(f"*infer {' '.join(words)}: not plumbs, equates or exports, on or off")
-        inferred = self._scope.settings.inferred
-        what = frozenset((words[0].lower(),))
-        self._set(inferred=inferred | what if words[1].lower() == "on" else inferred - what)
+        self._take(with_inferred(self._scope.settings, words, line))
 
     def _do_equate(self, words: list[str], line: SourceLine) -> None:
         if len(words) < 2:
@@ -272,9 +261,7 @@ class SvxReader:
         if len(values) not in (0, 3, 4, 5, 6, 9):
             raise line.error(f"*fix {words[0]}: x, y and z, and 1, 2 or 3 standard errors, not {len(values)} numbers")
         x, y, z = values[:3] or (0.0, 0.0, 0.0)
-        errors = values[3:6]
-        one, other, height = {0: (0.0,) * 3, 1: errors * 3, 2: [*errors[:1] * 2, *errors[1:]]}.get(len(errors), errors)
-        fix = OldFix(self._full(words[0], line), (x, y, z), (one, other, height), self._system, line.place)
+        fix = OldFix(self._full(words[0], line), (x, y, z), sigmas_of_fix(values[3:]), self._system, line.place)
         self.survey.fixes.append(fix)
 
     def _do_cs(self, words: list[str], line: SourceLine) -> None:
@@ -335,19 +322,6 @@ class SvxReader:
         found = re.findall(r"[xX]([0-9A-Fa-f]{2})|(\S)", said)
         characters = "".join(chr(int(code, 16)) if code else one for code, one in found)
         self._scope = replace(self._scope, characters=self._scope.characters | {name: characters})
-
-
-def date_of(word: str, line: SourceLine) -> date:
-    """Return the first day of a date such as 2000, 2000.10, 1987.07.27 or a range of those."""
-    iso = re.match(r"(\d{4})-(\d\d)-(\d\d)(?!\d)", word)
-    match = iso or re.match(r"(\d{4}|\d{2}(?!\d))(?:\.(\d{1,2}))?(?:\.(\d{1,2}))?(?=$|[-@:.])", word)
-    try:
-        if match is None:
-            raise ValueError
-        year = int(match[1]) + (1900 if len(match[1]) == 2 else 0)
-        return date(year, int(match[2] or 7), int(match[3] or 1))
-    except ValueError:
-        raise line.error(f"{word!r} is no date such as 1987.07.27") from None
 
 
 def read_svx(survey: OldSurvey, path: Path, _prefix: SurveyPath) -> None:

@@ -8,28 +8,29 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from buddyline.tools.survey.old.centreline import (
+from buddyline.tools.survey.old.centreline import Rows
+from buddyline.tools.survey.old.model import North, OldFix, OldSurvey, StationName, SurveyPath
+from buddyline.tools.survey.old.row_settings import (
+    CHANGES,
     QUANTITIES,
     STYLES,
-    Rows,
     RowSettings,
+    date_of,
     factor_of,
-    with_calibration,
-    with_sigmas,
-    with_units,
+    sigmas_of_fix,
+    with_flags,
+    with_inferred,
 )
-from buddyline.tools.survey.old.model import North, OldFix, OldSurvey, StationName, SurveyPath
 from buddyline.tools.survey.old.source import DEEPEST, SourceLine, beside, lines_of
-from buddyline.tools.survey.old.svx import date_of
 
 CENTRELINES: Final = frozenset(("centreline", "centerline"))
 # Blocks of drawings, left out to their ends; and commands that say nothing of positions.
 DRAWN: Final = frozenset(("map", "surface", "scrap", "scan", "lookup", "layout", "comment", "grade"))
-SILENT: Final = frozenset(("join", "select", "source", "export", "import", "revise", "encoding"))
+SILENT: Final = frozenset(("join", "select", "source", "export", "revise", "encoding"))
 SILENT_INSIDE: Final = frozenset(
     ("copyright", "explo-date", "explo-team", "walls", "vthreshold", "mark", "grade", "break")
 )
-FLAGS: Final = frozenset(("surface", "splay", "duplicate", "approximate", "approx"))
+FLAGS: Final = {name: name for name in ("surface", "splay", "duplicate", "approximate")} | {"approx": "approximate"}
 ROLES: Final = re.compile(r"/")
 DASHED: Final = frozenset((".", "-"))
 
@@ -176,10 +177,8 @@ class ThReader:
                 raise line.error("endgroup without group")
             self._rows.reset()
             now.settings = now.groups.pop()
-        elif name in ("units", "calibrate", "sd"):
-            north = settings.north
-            change = {"units": with_units, "calibrate": with_calibration, "sd": with_sigmas}[name]
-            now.settings = replace(change(settings, rest, line), north=north)
+        elif name in CHANGES:
+            now.settings = replace(CHANGES[name](settings, rest, line), north=settings.north)
         elif name == "data":
             self._data(now, rest, line)
         elif name == "date":
@@ -193,9 +192,9 @@ class ThReader:
             value = line.number_of(rest[0], "grid-angle") if rest else 0.0
             now.settings = replace(settings, north=replace(settings.north, kind="grid", value_deg=-value))
         elif name == "flags":
-            now.settings = replace(settings, flags=_flags(settings.flags, rest, line))
+            now.settings = with_flags(settings, rest, FLAGS, line)
         elif name == "infer":
-            self._infer(now, rest, line)
+            now.settings = with_inferred(settings, rest, line)
         elif name == "cs":
             now.system = " ".join(rest)
         elif name == "fix":
@@ -230,12 +229,6 @@ class ThReader:
             columns = tuple({"x": "dx", "y": "dy", "z": "dz"}.get(one, one) for one in columns)
         now.settings = replace(now.settings, style=STYLES[style], order=columns)
 
-    def _infer(self, now: _Centreline, rest: list[str], line: SourceLine) -> None:
-        if len(rest) != 2 or rest[1].lower() not in ("on", "off"):
-            raise line.error(f"infer {' '.join(rest)}: not plumbs or equates, on or off")
-        inferred, what = now.settings.inferred, frozenset((rest[0].lower(),))
-        now.settings = replace(now.settings, inferred=inferred | what if rest[1].lower() == "on" else inferred - what)
-
     def _fix(self, now: _Centreline, rest: list[str], line: SourceLine) -> None:
         numbers = [line.number_of(word, "fix") for word in rest[1:]]
         if len(numbers) not in (3, 4, 5, 6, 9):
@@ -243,12 +236,11 @@ class ThReader:
                 f"fix {' '.join(rest[:1])}: x, y and z, and standard deviations, not {len(numbers)} numbers"
             )
         x, y, z, *errors = numbers
-        sigmas = {0: [0.0] * 3, 1: errors * 3, 2: [*errors[:1] * 2, *errors[1:]]}.get(len(errors), errors)
         station = self._full(rest[0], line)
         system = now.system
         if system.lower() == "lat-long":
             system, x, y = "long-lat", y, x
-        self.survey.fixes.append(OldFix(station, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]), system, line.place))
+        self.survey.fixes.append(OldFix(station, (x, y, z), sigmas_of_fix(errors), system, line.place))
 
     def _station(self, rest: list[str], line: SourceLine) -> None:
         if not rest:
@@ -296,20 +288,6 @@ def _sides(words: list[str]) -> list[str]:
     return [
         word.strip("[]").split()[0] if word.startswith("[") and word.strip("[]").split() else word for word in words
     ]
-
-
-def _flags(flags: frozenset[str], words: list[str], line: SourceLine) -> frozenset[str]:
-    on = True
-    for word in (one.lower() for one in words):
-        if word == "not":
-            on = False
-            continue
-        if word not in FLAGS:
-            raise line.error(f"flags {word}: no such flag; known: {' '.join(sorted(FLAGS))}")
-        flag = frozenset(("approximate" if word == "approx" else word,))
-        flags = flags | flag if on else flags - flag
-        on = True
-    return flags
 
 
 def _extended(settings: RowSettings, rest: list[str]) -> RowSettings:

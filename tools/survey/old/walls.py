@@ -10,15 +10,15 @@ from datetime import date
 from pathlib import Path
 from typing import Final
 
-from buddyline.tools.survey.old.centreline import FOOT_M
 from buddyline.tools.survey.old.model import CrossSection, North, OldFix, OldShot, OldSurvey, Passage, SurveyPath
+from buddyline.tools.survey.old.row_settings import FOOT_M
 from buddyline.tools.survey.old.source import SourceLine, lines_of
 
 MISSING: Final = re.compile(r"-{2,}|-(?=/)|")
 PERCENT: Final = "p"
 ANGLES: Final = {"d": 1.0, "g": 0.9, "m": 360 / 6400}
 SIDES: Final = "LRUD"
-# Options of #units that change nothing here, or only what is warned of.
+# Options of #units that change nothing here, and those that are read apart.
 SILENT: Final = frozenset(
     ("uv", "uvh", "uvv", "flag", "typeab", "typevb", "note", "save", "restore", "reset", "prefix")
 )
