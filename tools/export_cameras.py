@@ -17,6 +17,7 @@ from buddyline.protocol.topics import IMAGE, NET_POSE
 from buddyline.tools.columns import in_order
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
+from buddyline.tools.newfile import check_new
 
 # A picture between two poses that are this far apart has none.
 MOST_GAP_NS: Final = S_NS // 2
@@ -80,12 +81,17 @@ def _pose_at(poses: Sequence[NodePose], stamp_ns: int) -> tuple[Floats, Floats] 
 
 
 @contextmanager
-def new_folder(output: Path) -> Iterator[Path]:
-    """Yield a folder that becomes output, which must not exist, when all is written."""
-    if output.exists():
-        raise BuddylineError(f"{output}: exists already; it is not overwritten")
-    with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as parent:
-        folder = Path(parent) / "new"
-        folder.mkdir()
-        yield folder
-        folder.rename(output)
+def whole_folder(output: Path) -> Iterator[Path]:
+    """Yield a folder that becomes output when all is written.
+
+    Raises BuddylineError if output exists, or cannot be written.
+    """
+    check_new(output)
+    try:
+        with TemporaryDirectory(dir=output.parent, prefix=f".{output.name}.") as parent:
+            folder = Path(parent) / "new"
+            folder.mkdir()
+            yield folder
+            folder.rename(output)
+    except OSError as error:
+        raise BuddylineError(f"{output}: cannot be written: {error.strerror}") from error

@@ -9,14 +9,14 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import Floats
-from buddyline.tools.export_cameras import new_folder, write_views
+from buddyline.tools.export_cameras import whole_folder, write_views
 
 
 def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write the model into a new folder; return the number of pictures. World: east, north, up, m."""
     if what not in (None, "net"):
         raise BuddylineError(f"--format colmap --what {what}: it has all nodes")
-    with new_folder(output) as folder:
+    with whole_folder(output) as folder:
         views, infos = write_views(dive, folder)
         number = {node: i for i, node in enumerate(infos, 1)}
         cameras = [f"{number[node]} {_camera(info)}\n" for node, info in infos.items()]

@@ -9,7 +9,7 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
-from buddyline.tools.export_cameras import new_folder, write_views
+from buddyline.tools.export_cameras import whole_folder, write_views
 
 
 def export(dive: Dive, output: Path, what: str | None = None) -> int:
@@ -19,7 +19,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     document = ElementTree.Element("document", version="1.2.0")
     chunk = ElementTree.SubElement(document, "chunk")
     sensors, cameras = (ElementTree.SubElement(chunk, name) for name in ("sensors", "cameras"))
-    with new_folder(output) as folder:
+    with whole_folder(output) as folder:
         views, infos = write_views(dive, folder)
         for number, (node, info) in enumerate(infos.items()):
             _add_sensor(sensors, number, node, info)

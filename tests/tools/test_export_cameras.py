@@ -75,7 +75,9 @@ def test_colmap_s_text_has_cameras_and_pictures(tmp_path, dive):
         np.testing.assert_allclose(R @ ahead_m + t, [0.0, 0.0, 2.0], atol=1e-5)
         assert (out / "images" / row[9]).read_bytes() == b"\xff\xd8"
     assert (out / "points3D.txt").exists()
-    with pytest.raises(BuddylineError, match="exists already"):
+    with pytest.raises(BuddylineError, match="cannot be written"):
+        export_colmap.export(dive, tmp_path / "nowhere" / "model")
+    with pytest.raises(BuddylineError, match="exists"):
         export_colmap.export(dive, out)
 
 

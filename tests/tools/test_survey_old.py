@@ -217,6 +217,9 @@ def test_the_command_takes_old_surveys_into_a_project(tmp_path, capsys):
     assert run("export", path, "--format", "stations", "-o", "-") == 0
     rows = capsys.readouterr().out.splitlines()
     assert any(row.startswith("side.cave.side.c,station") for row in rows)
+    path.write_text(path.read_text().replace("[place]\n", "[place]\ndeclination_deg = 3.0\n"))
+    assert run("export", path, "--format", "dat", "-o", "-") == 1
+    assert "left out: old surveys" in capsys.readouterr().err
     with pytest.raises(BuddylineError, match="two old surveys have it"):
         run("import", path, tmp_path / "side.th")
     with pytest.raises(BuddylineError, match="no reader"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -253,13 +254,18 @@ def _report(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
+    """Write the survey in one of FORMATS; return 1 where the format leaves old surveys out."""
     from buddyline.tools.newfile import write_output
 
     if args.style not in STYLES.get(args.format, ("auto",)):
         known = "; ".join(f"{name}: {', '.join(styles)}" for name, styles in STYLES.items())
         raise BuddylineError(f"--style {args.style}: {args.format} has no such style ({known})")
     target = args.output or str(args.project.with_suffix(FORMATS[args.format]))
-    write_output(target, exported(_sheet(args), args.format, args.style))
+    sheet = _sheet(args)
+    write_output(target, exported(sheet, args.format, args.style))
+    if sheet.olds and args.format == "dat":
+        print(f"{args.project}: left out: old surveys, which dat has not; svx and th have them", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -119,11 +119,12 @@ def geopackage(sheet: Sheet) -> bytes:
         base.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?2 || ':' || ?3, ?1, ?2, ?3, ?4, NULL)", systems)
         for table, shape, count in (("stations", "POINT", 1), ("lines", "LINESTRING", 2)):
             own = [one for one in features if len(one[2]) == count]
-            ends = [(float(f(p[:, k])) if own else 0.0) for f in (min, max) for k in (0, 1) for p in [_all(own)]]
+            every = _all(own)[:, :2]
+            bounds = [*every.min(axis=0).tolist(), *every.max(axis=0).tolist()]
             base.execute(f"CREATE TABLE {table} (id INTEGER PRIMARY KEY, geom {shape}, name TEXT, kind TEXT)")
             base.execute(
                 "INSERT INTO gpkg_contents VALUES (?, 'features', ?, ?, '1970-01-01T00:00:00.000Z', ?, ?, ?, ?, ?)",
-                (table, table, sheet.title, *ends, code),
+                (table, table, sheet.title, *bounds, code),
             )
             base.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 1, 0)", (table, shape, code))
             rows = [(_geometry(places, code), name, kind) for name, kind, places in own]
@@ -133,6 +134,7 @@ def geopackage(sheet: Sheet) -> bytes:
 
 
 def _all(features: Sequence[Feature]) -> Floats:
+    """Return all places (n, 3) of features; one of zeros if there is none."""
     return np.concatenate([places for _, _, places in features]) if features else np.zeros((1, 3))
 
 
