@@ -82,7 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="FILE",
         type=Path,
-        help="Survex .svx, Therion .th, Compass .dat or .mak, Walls .srv, a table .csv, PocketTopo .txt",
+        help="Survex .svx, Therion .th, Compass .dat or .mak, Walls .srv, a table .csv, PocketTopo .txt, "
+        "Mnemo and JedEye .dmp, Ariane .tml",
     )
     imported.add_argument("--name", metavar="NAME", help="before its stations' names; default: the file's")
     adjust = add("adjust the network and print loops, residuals and probable blunders", _adjust, "adjust cave.toml")

@@ -21,6 +21,8 @@ READERS: Final[Mapping[str, tuple[str, str, str]]] = {
     ".srv": ("walls", "read_srv", "Walls"),
     ".csv": ("columns", "read_csv", "a table"),
     ".txt": ("columns", "read_pockettopo", "PocketTopo"),
+    ".dmp": ("mnemo", "read_dmp", "Mnemo, JedEye"),
+    ".tml": ("ariane", "read_tml", "Ariane"),
 }
 
 
