@@ -92,6 +92,8 @@ class Sheet:
         if grid.declination is None:
             return "declination not known: north is magnetic"
         readings = self.readings
+        if not readings:
+            return f"declination: {grid.declination.source}"
         why = f"declination {_span([one.declination_deg for one in readings])} deg: {grid.declination.source}"
         if grid.projection is None:
             return why
@@ -240,5 +242,5 @@ class Sheet:
 
 def _span(values: list[float]) -> str:
     """Write one number, or the least and the largest."""
-    ends = list(dict.fromkeys(f"{value + 0.0:.2f}" for value in (min(values), max(values)))) if values else ["0.00"]
+    ends = list(dict.fromkeys(f"{value + 0.0:.2f}" for value in (min(values), max(values))))
     return " to ".join(ends)
