@@ -122,6 +122,39 @@ def places_of_vectors(adjusted):
     return dict(zip(at, adjusted.positions["0"].position_m + np.vstack([np.zeros(3), moved_m]), strict=True))
 
 
+def with_sections(project, sections):
+    """Return a project whose stations of these names have notes with their cross-sections."""
+    stations = [replace(one, notes=[sections[one.name]] if one.name in sections else []) for one in project.station]
+    return replace(project, station=stations)
+
+
+def test_cross_sections_follow_the_legs():
+    project, adjusted = survey(world.line, 6)
+    sections = {"0": "LRUD 1 2 3 4", "1": "LRUD 1.5 - 3 4 wide", "3": "LRUD 1 1 1 1"}
+    sheet = Sheet(with_sections(project, sections), adjusted)
+    assert [[one.station for one in passage] for passage in sheet.passages] == [["0", "1"], ["3"]]
+    lines = survex.svx(sheet).splitlines()
+    assert lines[(at := lines.index("*data passage station left right up down")) + 2] == "1\t1.500\t-\t3.000\t4.000"
+    assert lines[at + 3] == "*data passage station left right up down"
+    assert "    1 1.500 - 3.000 4.000" in survex.th(sheet)
+    # Feet; left, up, down, right.
+    assert " 4.92 9.84 13.12 -9.90 " in tables.compass_dat(sheet_with_north(project, sections))
+
+
+def sheet_with_north(project, sections):
+    project = replace(with_sections(project, sections), place=Place(declination_deg=3.0))
+    return Sheet(project, adjust(project))
+
+
+@CAVERN
+def test_cavern_takes_cross_sections(tmp_path):
+    project, adjusted = survey(world.line, 6)
+    text = survex.svx(Sheet(with_sections(project, {str(i): "LRUD 1 2 3 4" for i in range(7)}), adjusted))
+    said, _, found = world.cavern(tmp_path, text)
+    assert not said
+    assert max(differences(adjusted, found)) <= SAME_M
+
+
 @CAVERN
 @pytest.mark.parametrize("seed", range(3, 6))
 def test_held_depths_cost_cavern_s_rounding_and_a_second_order(tmp_path, seed):

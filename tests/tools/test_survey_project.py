@@ -18,7 +18,9 @@ from buddyline.protocol.messages import Depth, Imu, Mark, NodeInfo, Rejected, Re
 from buddyline.protocol.topics import INFO, MARK, key_of, parse_key
 from buddyline.tools.survey import command, mark
 from buddyline.tools.survey.live import Watch
-from buddyline.tools.survey.project import MARKER, load_project
+from buddyline.tools.survey.marks import section_of
+from buddyline.tools.survey.old.model import CrossSection
+from buddyline.tools.survey.project import MARKER, Station, load_project
 from msgspec.structs import replace
 
 from tests.processes import PATIENCE_S
@@ -217,6 +219,19 @@ def test_a_mark_by_command():
     for words in (("T 1", "--node", "a"), ("--node", "a", "--kind", "note"), ("T1", "--node", "A")):
         with pytest.raises(BuddylineError):
             mark.mark_of(mark_arguments(*words), 5)
+
+
+def test_a_cross_section_goes_with_the_mark_of_its_station():
+    said = mark.mark_of(mark_arguments("T1", "--node", "a", "--lrud", "1.2", "-", "2", "0.5", "--note", "silt"), 5)
+    assert said.note == "LRUD 1.2 - 2 0.5 silt"
+    assert section_of(Station(name="T1", notes=["muddy", said.note])) == CrossSection("T1", 1.2, None, 2.0, 0.5)
+    assert section_of(Station(name="T1", notes=["muddy"])) is None
+    with pytest.raises(BuddylineError, match="--lrud: right: 'wide' is neither a length in metres nor -"):
+        mark.mark_of(mark_arguments("T1", "--node", "a", "--lrud", "1", "wide", "1", "1"), 5)
+    with pytest.raises(BuddylineError, match="--lrud is of a station, not of a point"):
+        mark.mark_of(mark_arguments("T1", "--node", "a", "--kind", "point", "--lrud", "1", "1", "1", "1"), 5)
+    with pytest.raises(BuddylineError, match="station 'T1': note 'LRUD 1 2': LRUD and four lengths"):
+        section_of(Station(name="T1", notes=["LRUD 1 2"]))
 
 
 def test_live_alarms_are_published_on_the_bus(messages):

@@ -72,7 +72,7 @@ def _round_below(length_m: float) -> float:
 
 
 def profile(adjusted: Adjusted, title: str) -> Figure:
-    """Draw the survey unrolled: the way along the legs against altitude, each leg once."""
+    """Draw the extended elevation: the way along the legs against altitude, each leg once."""
     along_m: dict[str, float] = {}
     segments = []
     names: list[tuple[str, tuple[float, float]]] = []
@@ -87,7 +87,7 @@ def profile(adjusted: Adjusted, title: str) -> Figure:
         names += [] if names else [(line.leg.from_, (begin_m, float(start_m[2])))]
         names.append((line.leg.to, (reached_m, float(end_m[2]))))
     places = [place for along, altitude, _ in segments for place in zip(along, altitude, strict=True)]
-    figure, axis = _page(places, f"{title}: profile, unrolled along the legs", "along the legs, m", "altitude, m")
+    figure, axis = _page(places, f"{title}: extended elevation", "along the legs, m", "altitude, m")
     for along, altitude, alarm in segments:
         axis.plot(along, altitude, color=ALARM_COLOUR if alarm else LINE_COLOUR, linewidth=1.2)
     _names(figure, axis, names)

@@ -13,7 +13,7 @@ from buddyline.protocol.security import SURVEYOR
 from buddyline.protocol.topics import MARK, check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
 from buddyline.tools.live import LiveClient
-from buddyline.tools.survey.marks import KINDS, stamp_ns_of, time_of
+from buddyline.tools.survey.marks import KINDS, section_note, stamp_ns_of, time_of
 from buddyline.tools.survey.project import STATION_NAME
 
 if TYPE_CHECKING:
@@ -26,6 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--node", required=True, metavar="NODE", help="the node that stands there")
     parser.add_argument("--kind", choices=KINDS, default="station", help="default: station")
     parser.add_argument("--note", default="", metavar="TEXT", help="a remark on the place")
+    parser.add_argument(
+        "--lrud",
+        nargs=4,
+        metavar=("LEFT", "RIGHT", "UP", "DOWN"),
+        help="a station's cross-section, metres, seen along the line; - for what was not measured",
+    )
     parser.add_argument("--at", metavar="TIME", help="UTC, such as 2026-05-01T10:20:30Z; default: now")
     add_client_arguments(parser, SURVEYOR)
     parser.add_argument(
@@ -46,7 +52,10 @@ def mark_of(args: argparse.Namespace, now_ns: int) -> Mark:
         stamp_ns = stamp_ns_of(time_of(args.at), now_ns) if args.at else now_ns
     except ValueError as error:
         raise BuddylineError(f"--at {args.at}: {error}") from error
-    return Mark(node=check_node_id(args.node), stamp_ns=stamp_ns, kind=args.kind, name=args.name, note=args.note)
+    if args.lrud and args.kind != "station":
+        raise BuddylineError(f"--lrud is of a station, not of a {args.kind}")
+    note = section_note(args.lrud, args.note) if args.lrud else args.note
+    return Mark(node=check_node_id(args.node), stamp_ns=stamp_ns, kind=args.kind, name=args.name, note=note)
 
 
 def run(args: argparse.Namespace) -> int:

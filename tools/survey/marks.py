@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, get_args
@@ -11,11 +13,41 @@ from typing import Final, get_args
 import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
+from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
-from buddyline.tools.survey.project import HandMark, MarkKind
+from buddyline.tools.survey.old.model import CrossSection
+from buddyline.tools.survey.project import HandMark, MarkKind, Station
 from msgspec import UNSET
 
 KINDS: Final = get_args(MarkKind)
+
+
+# How a station's note says its cross-section: left, right, up, down in metres, - for what was not measured.
+SECTION_WORD: Final = "LRUD"
+
+
+def section_note(sides: Sequence[str], note: str) -> str:
+    """Return a mark's note with a cross-section before it; raise BuddylineError naming a value that is no length."""
+    for name, side in zip(("left", "right", "up", "down"), sides, strict=True):
+        if side != "-" and not _is_length(side):
+            raise BuddylineError(f"--lrud: {name}: {side!r} is neither a length in metres nor -")
+    return " ".join(filter(None, [SECTION_WORD, *sides, note]))
+
+
+def section_of(station: Station) -> CrossSection | None:
+    """Return a station's cross-section by its notes, the last one; None without. Raise ConfigError if it is none."""
+    found = None
+    for note in station.notes:
+        word, *sides = note.split()[:5] or [""]
+        if word == SECTION_WORD:
+            if len(sides) < 4 or not all(side == "-" or _is_length(side) for side in sides):
+                raise ConfigError(f"station {station.name!r}: note {note!r}: {SECTION_WORD} and four lengths, or -")
+            found = CrossSection(station.name, *(None if side == "-" else float(side) for side in sides))
+    return found
+
+
+def _is_length(word: str) -> bool:
+    return re.fullmatch(r"\d{1,4}(\.\d{0,6})?", word) is not None
 
 
 def time_of(text: str) -> datetime | float:

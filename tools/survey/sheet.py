@@ -12,9 +12,10 @@ import numpy as np
 from buddyline.tools.survey.assembly import Fixed
 from buddyline.tools.survey.geodesy import leg_date, survey_date
 from buddyline.tools.survey.lines import Line, bearing_of
+from buddyline.tools.survey.marks import section_of
 from buddyline.tools.survey.network import Adjusted
 from buddyline.tools.survey.old.joining import same_place
-from buddyline.tools.survey.old.model import OldSurvey
+from buddyline.tools.survey.old.model import CrossSection, OldSurvey
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
 
@@ -169,6 +170,21 @@ class Sheet:
         stated = [[name for name in one.stations if name in ours | of_old] for one in self.project.equate]
         shared = [[name, self.local(name)] for name in sorted(ours) if "." in name and name in of_old]
         return [same for same in [*stated, *shared] if len(same) > 1 and self.olds]
+
+    @cached_property
+    def passages(self) -> list[list[CrossSection]]:
+        """Cross-sections of stations, one after the other along consecutive legs."""
+        known = {one.name: section for one in self.project.station if (section := section_of(one)) is not None}
+        found: list[list[CrossSection]] = []
+        for reading in self.readings:
+            start, end = known.get(reading.leg.from_), known.get(reading.leg.to)
+            if start is not None and (not found or found[-1][-1] is not start):
+                found.append([start])
+            if end is not None and start is None:
+                found.append([])
+            if end is not None:
+                found[-1].append(end)
+        return found
 
     @property
     def entrances(self) -> list[str]:

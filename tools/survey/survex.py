@@ -8,7 +8,15 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from buddyline.tools.survey.averages import Floats
-from buddyline.tools.survey.old.writing import quoted, svx_of, svx_system, th_of, therion_person
+from buddyline.tools.survey.old.writing import (
+    quoted,
+    svx_of,
+    svx_passage,
+    svx_system,
+    th_of,
+    th_passage,
+    therion_person,
+)
 from buddyline.tools.survey.sheet import Reading, Sheet
 
 
@@ -174,6 +182,7 @@ def svx(sheet: Sheet, style: str = "auto") -> str:
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
         *SURVEX.data(sheet, map(sheet.renamed, sheet.readings), by_clino),
+        *(row for sections in sheet.passages for row in svx_passage(sections, sheet.local)),
     ]
     return _svx_file(sheet, body)
 
@@ -263,6 +272,7 @@ def th(sheet: Sheet, style: str = "auto") -> str:
         "units compass clino degrees",
         "calibrate depth 0 -1",
         *THERION.data(sheet, readings, lambda reading: reading.by_clino),
+        *(row for sections in sheet.passages for row in th_passage(sections, sheet.local)),
     ]
     head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
     body = [*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey"]

@@ -15,6 +15,7 @@ from buddyline.tools.survey.connected import station_depths
 from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.geodesy import leg_date
 from buddyline.tools.survey.observations import CHECKED
+from buddyline.tools.survey.old.model import CrossSection
 from buddyline.tools.survey.project import Leg
 from buddyline.tools.survey.sheet import Reading, Sheet
 from buddyline.tools.survey.survex import corrected
@@ -33,6 +34,7 @@ MAP_PROPERTIES: Final = ("name", "kind", "ellipse_major_m", "ellipse_minor_m", "
 
 FOOT_M: Final = 0.3048
 MISSING: Final = "-999.00"
+NO_SIDE: Final = "-9.90"
 # Bearings in degrees, lengths and passages in feet, inclinations in degrees; backsights present.
 COMPASS_FORMAT: Final = "DDDDLUDRLADadBF"
 
@@ -170,6 +172,12 @@ def compass_dat(sheet: Sheet) -> str:
     return "".join(_compass_section(sheet, *key, readings) for key, readings in sections.items())
 
 
+def _compass_sides(section: CrossSection) -> str:
+    """Return left, up, down and right in feet."""
+    left_m, right_m, up_m, down_m = section.sides_m
+    return " ".join(NO_SIDE if one is None else f"{one / FOOT_M:.2f}" for one in (left_m, up_m, down_m, right_m))
+
+
 def _compass_section(sheet: Sheet, when: date, turn_deg: str, readings: list[Reading]) -> str:
     """Return the legs of one date and one declination."""
     comment = f"{sheet.title}; {sheet.why}".replace("\n", " ")[:76]
@@ -184,6 +192,7 @@ def _compass_section(sheet: Sheet, when: date, turn_deg: str, readings: list[Rea
         "FROM TO LENGTH BEARING INC LEFT UP DOWN RIGHT AZM2 INC2 FLAGS COMMENTS",
         "",
     ]
+    sides = {one.station: _compass_sides(one) for sections in sheet.passages for one in sections}
     # The format has no corrections of a single leg.
     for reading in map(corrected, readings):
         leg, fore_deg, back_deg, remark = reading.leg, reading.compass_deg, reading.back_deg, reading.remark
@@ -193,6 +202,6 @@ def _compass_section(sheet: Sheet, when: date, turn_deg: str, readings: list[Rea
         fore, back = (MISSING if angle is None else f"{angle:.2f}" for angle in (fore_deg, back_deg))
         rows.append(
             f"{leg.from_:>12} {leg.to:>12} {reading.distance_m / FOOT_M:.3f} {fore} {reading.clino_deg:.3f} "
-            f"-9.90 -9.90 -9.90 -9.90 {back} {MISSING} {remark}"
+            f"{sides.get(leg.from_, ' '.join([NO_SIDE] * 4))} {back} {MISSING} {remark}"
         )
     return "\r\n".join(rows) + "\r\n\f\r\n"

@@ -153,6 +153,11 @@ class CrossSection:
     up_m: float | None = None
     down_m: float | None = None
 
+    @property
+    def sides_m(self) -> tuple[float | None, float | None, float | None, float | None]:
+        """Left, right, up, down."""
+        return self.left_m, self.right_m, self.up_m, self.down_m
+
 
 @dataclass(frozen=True)
 class Passage:

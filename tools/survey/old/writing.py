@@ -8,7 +8,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
-from buddyline.tools.survey.old.model import SIGMAS, North, OldShot, OldSurvey, Passage, StationName, SurveyPath
+from buddyline.tools.survey.old.model import (
+    SIGMAS,
+    CrossSection,
+    North,
+    OldShot,
+    OldSurvey,
+    Passage,
+    StationName,
+    SurveyPath,
+)
 from buddyline.tools.survey.old.systems import DEGREES, convergence_deg, map_system
 
 UNITS: Final = {name: "metres" for name in SIGMAS} | {
@@ -250,10 +259,21 @@ def _svx_north(shot: OldShot, state: Mapping[str, str], turn_deg: float) -> dict
 
 def _svx_passages(block: _Block, names: _Names) -> Iterator[str]:
     for passage in block.passages:
-        yield "*data passage station left right up down"
-        for one in passage.sections:
-            sides = [_number(side, 3) for side in (one.left_m, one.right_m, one.up_m, one.down_m)]
-            yield "\t".join([names.local(one.station, block.path), *sides])
+        yield from svx_passage(passage.sections, lambda name: names.local(name, block.path))
+
+
+def svx_passage(sections: Sequence[CrossSection], name: Callable[[StationName], str]) -> Iterator[str]:
+    """Yield cross-sections of one passage for Survex. name: gives a station's name there."""
+    yield "*data passage station left right up down"
+    for one in sections:
+        yield "\t".join([name(one.station), *(_number(side, 3) for side in one.sides_m)])
+
+
+def th_passage(sections: Sequence[CrossSection], name: Callable[[StationName], str]) -> Iterator[str]:
+    """Yield cross-sections of one passage for Therion. name: gives a station's name there."""
+    yield "data dimensions station left right up down"
+    for one in sections:
+        yield " ".join([name(one.station), *(_number(side, 3) for side in one.sides_m)])
 
 
 def remark_of(shot: OldShot) -> str:
@@ -368,10 +388,7 @@ def _th_rows(block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
         ]
         yield " ".join([*ends, *row.values(), f"# {remark_of(shot)}"])
     for passage in block.passages:
-        yield "data dimensions station left right up down"
-        for one in passage.sections:
-            sides = [_number(side, 3) for side in (one.left_m, one.right_m, one.up_m, one.down_m)]
-            yield " ".join([names.local(one.station, block.path), *sides])
+        yield from th_passage(passage.sections, lambda name: names.local(name, block.path))
 
 
 _TH_SIGMAS: Final = frozenset(
