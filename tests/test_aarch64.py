@@ -54,7 +54,7 @@ def test_everything_has_a_wheel(wheel, version, tmp_path):
 
 
 @dataclass
-class Pi:
+class Arm64:
     """A program of arm64's Python with Buddyline in it."""
 
     root: Path
@@ -97,7 +97,7 @@ def pi(tmp_path_factory, wheel):
         assert run("dpkg-deb", "-x", deb, root, cwd=folder).returncode == 0, deb
     done = installed("--target", packages, *of_pi(PYTHON), wheel, cwd=folder)
     assert done.returncode == 0, done.stderr
-    yield Pi(root, packages)
+    yield Arm64(root, packages)
     shutil.rmtree(folder)
 
 

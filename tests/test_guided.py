@@ -32,7 +32,7 @@ def is_calibrated(service, node):
     return stream is not None and stream.calibration(0) is not None
 
 
-class Told(Guide):
+class GuideTold(Guide):
     """A guide that remembers what it is told of."""
 
     def __init__(self, node):
@@ -50,7 +50,7 @@ def test_a_node_hears_where_its_next_picture_shows_the_lights():
     with open_hub(endpoint), join(endpoint) as nodes, join(endpoint) as own:
         service = SolverService(SolverConfig(nodes=["a", "b"]), clock=ManualClock(messages[0].stamp_ns))
         with join(endpoint) as solvers:
-            guides = {node: Told(node) for node in ("a", "b")}
+            guides = {node: GuideTold(node) for node in ("a", "b")}
             for node, guide in guides.items():
                 own.subscribe(EXPECT.key(node), guide.hear, history=False)
             own.watch_alive(guides["a"].saw_process)

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is no
 FAKE = '#!/bin/sh\necho "$(basename "$0") $*" >> "$(dirname "$0")/said"\n'
 
 
-class Checkout:
+class FakeInstallation:
     """A copy of what make reads, with a pip and a program that only note how they are called."""
 
     def __init__(self, folder: Path) -> None:
@@ -51,11 +51,11 @@ class Checkout:
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Checkout:
-    return Checkout(tmp_path)
+def checkout(tmp_path: Path) -> FakeInstallation:
+    return FakeInstallation(tmp_path)
 
 
-def test_extras_add_up_and_stay(checkout: Checkout) -> None:
+def test_extras_add_up_and_stay(checkout: FakeInstallation) -> None:
     assert checkout.installs("install") == ["constraints.txt -e ."]
     assert checkout.installs("install", "EXTRAS=keys,monitor") == ["constraints.txt -e .[keys,monitor]"]
     assert checkout.installs("install", "EXTRAS=plots") == ["constraints.txt -e .[keys,monitor,plots]"]
@@ -65,7 +65,7 @@ def test_extras_add_up_and_stay(checkout: Checkout) -> None:
     assert checkout.installs("demo") == ["constraints.txt -e .[keys,monitor,plots]"]
 
 
-def test_a_pi_sees_the_systems_packages_and_keeps_its_constraints(checkout: Checkout) -> None:
+def test_a_pi_sees_the_systems_packages_and_keeps_its_constraints(checkout: FakeInstallation) -> None:
     other = "CONSTRAINTS=node/examples/bookworm.txt"
     calls = checkout.make("install", "EXTRAS=pi", other)
     assert calls[0] == "fake_python -m venv --system-site-packages .venv"

@@ -15,7 +15,7 @@ import sys
 from buddyline.tools.measure.tables import markdown_head, markdown_row
 
 from tests.faults.observer import Tally
-from tests.faults.scenarios import SCENARIOS, Report
+from tests.faults.scenarios import SCENARIOS, FaultRow
 
 HEAD = (
     "fault",
@@ -34,7 +34,7 @@ HEAD = (
 )
 
 
-def row(report: Report) -> str:
+def row(report: FaultRow) -> str:
     tally = report.tally
     counts = [getattr(tally, field.name) for field in dataclasses.fields(tally) if field.name != "reasons"]
     recovered = [f"{statistics.median(report.recover_s):.2f}", f"{max(report.recover_s):.2f}"]

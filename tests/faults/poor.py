@@ -21,7 +21,7 @@ from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.topics import parse_key
 from buddyline.tools.measure.tables import markdown_table
 
-from tests.faults.shaper import Link, poor_link
+from tests.faults.shaper import PoorLink, poor_link
 from tests.faults.system import System
 
 RATE_HZ = 5.0
@@ -71,13 +71,13 @@ def main() -> int:
     """Run; print the table."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.poor", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--rate-bps", type=float, default=Link.rate_bps)
+    parser.add_argument("--rate-bps", type=float, default=PoorLink.rate_bps)
     parser.add_argument("--congestion", help="the nodes' TCP congestion control; default: the system's")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="where the logs stay")
     args = parser.parse_args()
     # A SIGTERM also ends the processes that were started.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    with tempfile.TemporaryDirectory() as temporary, poor_link(Link(rate_bps=args.rate_bps)) as (namespace, host):
+    with tempfile.TemporaryDirectory() as temporary, poor_link(PoorLink(rate_bps=args.rate_bps)) as (namespace, host):
         if args.congestion:
             words = ["sysctl", "-q", "-w", f"net.ipv4.tcp_congestion_control={args.congestion}"]
             subprocess.run(["ip", "netns", "exec", namespace, *words], check=True)

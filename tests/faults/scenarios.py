@@ -27,7 +27,7 @@ FREEZE_S = 5.0
 
 
 @dataclass
-class Report:
+class FaultRow:
     """One row of the table. recover_s: from the end of the fault to the first trigger matched again."""
 
     fault: str
@@ -47,7 +47,7 @@ def running(endpoint: str | None = None) -> Iterator[System]:
         yield system
 
 
-def measure(system: System, report: Report, since_ns: int) -> None:
+def measure(system: System, report: FaultRow, since_ns: int) -> None:
     """Wait for the first trigger that was exposed, matched and answered since the path was back."""
     assert system.observer is not None
     try:
@@ -58,9 +58,9 @@ def measure(system: System, report: Report, since_ns: int) -> None:
     report.recover_s.append((matched_ns - since_ns) / S_NS)
 
 
-def kill_and_return(name: str, times: int, seed: int) -> Report:
+def kill_and_return(name: str, times: int, seed: int) -> FaultRow:
     """kill -9, a pause of 0 to 4 s, and the same process again."""
-    report, rng = Report(f"{name} killed (-9) and back"), random.Random(seed)
+    report, rng = FaultRow(f"{name} killed (-9) and back"), random.Random(seed)
     with running() as system:
         for _ in range(times):
             time.sleep(rng.uniform(0.5, 2.5))
@@ -72,11 +72,11 @@ def kill_and_return(name: str, times: int, seed: int) -> Report:
     return report
 
 
-def hub(times: int) -> Report:
+def hub(times: int) -> FaultRow:
     return kill_and_return("hub", times, seed=1)
 
 
-def freeze_and_return(name: str, seconds: float, report: Report, times: int) -> Report:
+def freeze_and_return(name: str, seconds: float, report: FaultRow, times: int) -> FaultRow:
     """A process is stopped, and then continued."""
     with running() as system:
         for _ in range(times):
@@ -89,22 +89,22 @@ def freeze_and_return(name: str, seconds: float, report: Report, times: int) -> 
     return report
 
 
-def frozen_hub(times: int) -> Report:
+def frozen_hub(times: int) -> FaultRow:
     """The hub is stopped for longer than its clients' time-out."""
-    return freeze_and_return("hub", FREEZE_S, Report(f"hub stopped for {FREEZE_S:g} s"), times)
+    return freeze_and_return("hub", FREEZE_S, FaultRow(f"hub stopped for {FREEZE_S:g} s"), times)
 
 
-def node(times: int) -> Report:
+def node(times: int) -> FaultRow:
     return kill_and_return("a", times, seed=2)
 
 
-def solver(times: int) -> Report:
+def solver(times: int) -> FaultRow:
     return kill_and_return("solver", times, seed=3)
 
 
-def hub_and_solver(times: int) -> Report:
+def hub_and_solver(times: int) -> FaultRow:
     """Both are killed at once: nobody but the solver's journal knows what was answered."""
-    report, rng = Report("hub and solver killed (-9) and back"), random.Random(5)
+    report, rng = FaultRow("hub and solver killed (-9) and back"), random.Random(5)
     with running() as system:
         for _ in range(times):
             time.sleep(rng.uniform(0.5, 2.5))
@@ -117,9 +117,9 @@ def hub_and_solver(times: int) -> Report:
     return report
 
 
-def frozen_viewer(times: int) -> Report:
+def frozen_viewer(times: int) -> FaultRow:
     """A recorder of everything is stopped for 5 s; the others are not affected, and it misses nothing."""
-    report = Report(f"viewer frozen for {FREEZE_S:g} s")
+    report = FaultRow(f"viewer frozen for {FREEZE_S:g} s")
     with running() as system:
         assert system.observer is not None
         system.start("recorder")
@@ -143,19 +143,19 @@ def frozen_viewer(times: int) -> Report:
     return report
 
 
-def frozen_node(times: int) -> Report:
+def frozen_node(times: int) -> FaultRow:
     """A node's process is stopped for 15 s, as a link that is cut: its lease runs out and it comes back."""
-    return freeze_and_return("b", CUT_S, Report(f"node stopped for {CUT_S:g} s"), times)
+    return freeze_and_return("b", CUT_S, FaultRow(f"node stopped for {CUT_S:g} s"), times)
 
 
-def cut_link(times: int) -> Report:
+def cut_link(times: int) -> FaultRow:
     """One node lives in a network namespace of its own, and its cable is pulled for 15 s. Needs root."""
-    report = Report(f"link of one node cut for {CUT_S:g} s")
+    report = FaultRow(f"link of one node cut for {CUT_S:g} s")
     with namespace() as (name, host), running(f"tcp/{host}:17447") as system:
         assert system.observer is not None
         system.processes.pop("b").end()
         system.spawn("b", namespace=name).wait_for("connected")
-        measure(system, Report(""), time.time_ns())
+        measure(system, FaultRow(""), time.time_ns())
         for _ in range(times):
             time.sleep(1.0)
             ip("link", "set", f"{name}h", "down")
@@ -166,9 +166,9 @@ def cut_link(times: int) -> Report:
     return report
 
 
-def start_orders(times: int) -> Report:
+def start_orders(times: int) -> FaultRow:
     """Hub, nodes and solver in each of the six orders, 1.5 s apart."""
-    report = Report("six start orders")
+    report = FaultRow("six start orders")
     orders = itertools.cycle(itertools.permutations(("hub", "nodes", "solver")))
     for _, order in zip(range(max(times, 6)), orders, strict=False):
         with tempfile.TemporaryDirectory() as directory, System(Path(directory), RATE_HZ) as system:
@@ -207,7 +207,7 @@ def ip(*words: str) -> None:
     subprocess.run(["ip", *words], check=True, capture_output=True)
 
 
-SCENARIOS: dict[str, Callable[[int], Report]] = {
+SCENARIOS: dict[str, Callable[[int], FaultRow]] = {
     "hub": hub,
     "frozen_hub": frozen_hub,
     "node": node,

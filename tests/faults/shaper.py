@@ -30,7 +30,7 @@ _IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
 
 
 @dataclass(frozen=True)
-class Link:
+class PoorLink:
     """What the link does to packets, in each direction. late_s: how much longer a reordered packet takes.
 
     queue_bytes: what waits for its turn; packets beyond are dropped, as a modem does.
@@ -44,10 +44,10 @@ class Link:
     queue_bytes: int = 32 * 1024
 
 
-class Direction:
+class OneWay:
     """One direction of the link: packets that are on their way, by when they arrive."""
 
-    def __init__(self, link: Link, rng: random.Random) -> None:
+    def __init__(self, link: PoorLink, rng: random.Random) -> None:
         self._link = link
         self._rng = rng
         self._free_s = 0.0
@@ -79,7 +79,7 @@ class Direction:
 
 def main() -> None:
     """Pass packets between the two ends until the parent closes stdin."""
-    namespace, link = sys.argv[1], Link(*map(float, sys.argv[2:]))
+    namespace, link = sys.argv[1], PoorLink(*map(float, sys.argv[2:]))
     libc = ctypes.CDLL(None, use_errno=True)
     here = _tun("buddyline0")
     # The device stays in the namespace it was made in, whatever namespace its reader goes to.
@@ -89,7 +89,7 @@ def main() -> None:
     there = _tun("buddyline0")
     print("ready", flush=True)
     rng = random.Random(SEED)
-    ways = {here: (Direction(link, rng), there), there: (Direction(link, rng), here)}
+    ways = {here: (OneWay(link, rng), there), there: (OneWay(link, rng), here)}
     while True:
         soonest_s = min(way.next_s for way, _ in ways.values())
         timeout_s = max(min(soonest_s - time.monotonic(), 1.0), 0.0)
@@ -111,7 +111,7 @@ def _tun(name: str) -> int:
 
 
 @contextmanager
-def poor_link(link: Link) -> Iterator[tuple[str, str]]:
+def poor_link(link: PoorLink) -> Iterator[tuple[str, str]]:
     """Make a namespace behind such a link; yield its name and this end's address."""
     name = f"bt{os.getpid() % 100000}"
     _ip("netns", "add", name)

@@ -21,7 +21,7 @@ from tests.protocol.inbox import Inbox
 from tests.protocol.test_bus_zenoh import run_client
 
 
-class Clock:
+class SecondsClock:
     now_s = 100.0
 
     def __call__(self) -> float:
@@ -33,7 +33,7 @@ def admitted(limit: RateLimit, key: str, count: int, size_bytes: int = 100) -> i
 
 
 def test_each_topic_may_come_several_times_as_fast_as_its_table_says() -> None:
-    clock = Clock()
+    clock = SecondsClock()
     limit = RateLimit(clock)
     for topic in topics.TOPICS:
         key = topic.key(*("abc"[: len(topic.id_fields)]))
@@ -45,7 +45,7 @@ def test_each_topic_may_come_several_times_as_fast_as_its_table_says() -> None:
 
 
 def test_what_is_more_is_left_out_and_its_owner_named_for_a_while() -> None:
-    clock = Clock()
+    clock = SecondsClock()
     limit = RateLimit(clock)
     key, hz = topics.IMU.key("c"), most_hz(topics.IMU)
     assert admitted(limit, key, 100_000) == BURST_S * hz
@@ -62,12 +62,12 @@ def test_what_is_more_is_left_out_and_its_owner_named_for_a_while() -> None:
 
 
 def test_bytes_count_too() -> None:
-    limit, key = RateLimit(Clock()), topics.CANDIDATES.key("c")
+    limit, key = RateLimit(SecondsClock()), topics.CANDIDATES.key("c")
     assert admitted(limit, key, 1000, 65536) == int(BYTES_BURST_S * MOST_BYTES_PER_S / 65536)
 
 
 def test_keys_that_an_owner_invents_share_one_limit_and_take_nothing_from_others() -> None:
-    limit = RateLimit(Clock())
+    limit = RateLimit(SecondsClock())
     for number in range(100_000):
         limit.admits(f"buddyline/node/c/x{number}", 1)
         limit.admits(f"buddyline/pair/c/x{number}/pose", 1)
@@ -78,7 +78,7 @@ def test_keys_that_an_owner_invents_share_one_limit_and_take_nothing_from_others
 
 
 def test_owners_that_are_invented_are_forgotten() -> None:
-    limit = RateLimit(Clock())
+    limit = RateLimit(SecondsClock())
     for number in range(10 * rate_limit.MAX_OWNERS):
         limit.admits(topics.IMU.key(f"x{number}"), 1)
     assert len(limit._owners) == rate_limit.MAX_OWNERS

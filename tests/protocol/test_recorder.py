@@ -28,7 +28,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(module, "RETRY_S", 0.02)
 
 
-class Sender:
+class NumberedSender:
     """Numbers what it records: stamps are 1, 2, 3 ..."""
 
     def __init__(self, recorder):
@@ -67,7 +67,7 @@ def recording(path, min_free_bytes=0):
 def test_pictures_are_in_files_beside_the_log_and_read_with_it(tmp_path):
     path = tmp_path / "a-1.mcap"
     with recording(path, min_free_bytes=MIB) as recorder:  # files of half a MiB
-        sender = Sender(recorder)
+        sender = NumberedSender(recorder)
         for _ in range(12):
             sender.depth()
             sender.picture(150_000)
@@ -90,7 +90,7 @@ def test_only_this_nodes_pictures_are_deleted_the_oldest_first(tmp_path):
             (disk / name / "000000.mcap").write_bytes(os.urandom(MIB))
         path = disk / "a-1.mcap"
         with recording(path, min_free_bytes=MIB) as recorder:
-            sender = Sender(recorder)
+            sender = NumberedSender(recorder)
             problems = []
             while recorder.pictures.deleted < 4:
                 for _ in range(4):
@@ -118,7 +118,7 @@ def test_without_pictures_to_delete_no_more_are_recorded_until_there_is_room(tmp
         ballast.write_bytes(bytes(3 * MIB + MIB // 2))
         path = disk / "a-1.mcap"
         with recording(path, min_free_bytes=MIB) as recorder:
-            sender = Sender(recorder)
+            sender = NumberedSender(recorder)
             sender.depth()
             until(lambda: "no pictures are recorded" in recorder.pictures.problem)
             sender.picture()
@@ -137,7 +137,7 @@ def test_a_full_disk_is_named_and_nothing_is_lost_once_there_is_room(tmp_path, c
     with small_disk(tmp_path / "disk", 1024) as disk:
         path = disk / "a-1.mcap"
         with recording(path) as recorder:
-            sender = Sender(recorder)
+            sender = NumberedSender(recorder)
             sender.depth()
             until(lambda: path.stat().st_size > 0)
             ballast = disk / "ballast"
@@ -162,7 +162,7 @@ def test_a_full_disk_is_named_and_nothing_is_lost_once_there_is_room(tmp_path, c
 def test_a_disk_that_turns_read_only_is_named_and_its_end_is_an_error(tmp_path, monkeypatch):
     path = tmp_path / "a-1.mcap"
     recorder = recording(path)
-    sender = Sender(recorder)
+    sender = NumberedSender(recorder)
     sender.depth()
     until(lambda: path.stat().st_size > 0 and stamps(path, DEPTH) == [1])
     plain = os.write
@@ -193,7 +193,7 @@ def test_memory_is_bounded_and_pictures_are_dropped_before_messages(tmp_path, mo
     monkeypatch.setattr(module, "MAX_QUEUED_BYTES", 20_000)
     monkeypatch.setattr(DiveLogWriter, "write", _refuse)
     recorder = recording(tmp_path / "a-1.mcap")
-    sender = Sender(recorder)
+    sender = NumberedSender(recorder)
     sender.depth()
     until(lambda: recorder.error is not None)
     for _ in range(4):
@@ -216,7 +216,7 @@ def test_what_is_being_written_counts_among_what_waits(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PictureLog, "write", stand)
     with recording(tmp_path / "a-1.mcap") as recorder:
-        sender = Sender(recorder)
+        sender = NumberedSender(recorder)
         sender.picture(9000)
         assert begun.wait(PATIENCE_S)
         for _ in range(4):

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from buddyline.tools.measure.tables import markdown_table
 
-from tests.soak.system import Minute, Result, soak
+from tests.soak.system import Minute, SoakResult, soak
 
 RATES = ("candidates", "attitude", "imu", "depth", "pose", "rejected")
 
@@ -34,7 +34,7 @@ def show(minute: Minute) -> None:
     )
 
 
-def report(result: Result) -> None:
+def report(result: SoakResult) -> None:
     rows: list[list[object]] = []
     for row in result.rows:
         cells: list[object] = [row.key, "-" if row.published is None else row.published]

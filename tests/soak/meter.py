@@ -63,7 +63,7 @@ class Streams:
         self.by_key.setdefault(envelope.key, Stream()).take(int(getattr(message, "stamp_ns")), seq)  # noqa: B009
 
 
-class Viewer:
+class CountingViewer:
     """A client of the bus that counts all that it is sent; latencies: from exposure to pose, this minute's."""
 
     def __init__(self, endpoint: str) -> None:

@@ -50,7 +50,7 @@ def moved(message: Message, by_triggers: int, period_ns: int) -> Message:
 
 
 @dataclass
-class Told:
+class SolversTold:
     """What the solvers have told: by pair and trigger, when each outcome came; when each node of the net was told."""
 
     outcomes: dict[tuple[str, str, int], list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -86,7 +86,7 @@ class LiveDive:
     """
 
     def __init__(self, bus: Bus, messages: list[Message], rate_hz: float) -> None:
-        self.told = Told()
+        self.told = SolversTold()
         self.expected: set[tuple[str, str, int]] = set()
         self._messages, self._period_ns = messages, round(S_NS / rate_hz)
         self._nodes = sorted({one.node for one in messages})
@@ -127,7 +127,7 @@ class LiveDive:
 
 
 @dataclass
-class Result:
+class SharedSoak:
     """How it went."""
 
     triggers: int
@@ -140,7 +140,7 @@ class Result:
 
 def soak(
     work: Path, kills: int, *, solvers: int, nodes: int, rate_hz: float, track_hz: float, again_s: float, seed: int = 1
-) -> Result:
+) -> SharedSoak:
     """Run the solvers, kill one after another with -9, and start it again. track_hz: 0 for neither tracks nor net."""
     messages = simulated(nodes, rate_hz, 20.0, imu=track_hz > 0)
     config = work / "solver.toml"
@@ -182,7 +182,7 @@ def soak(
         finally:
             for one in running:
                 one.end()
-    return Result(
+    return SharedSoak(
         triggers=len(due),
         missing=len(due - came.keys()),
         doubled=sum(count > 1 for count in came.values()),

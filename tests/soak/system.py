@@ -17,7 +17,7 @@ from buddyline.tools.measure.load import Load, load_of
 
 from tests.faults.system import System
 from tests.processes import PATIENCE_S, Process
-from tests.soak.meter import Stream, Streams, Viewer, stamps_of, streams_of
+from tests.soak.meter import CountingViewer, Stream, Streams, stamps_of, streams_of
 
 RATE_HZ = 30.0
 # The first frames wait for those of the node that starts last.
@@ -60,7 +60,7 @@ class Row:
 
 
 @dataclass
-class Result:
+class SoakResult:
     """All measurements, and the bounds that were exceeded."""
 
     minutes: list[Minute] = field(default_factory=list)
@@ -69,12 +69,14 @@ class Result:
     failures: list[str] = field(default_factory=list)
 
 
-def soak(directory: Path, seconds: float, every_s: float, show: Callable[[Minute], None] = lambda _: None) -> Result:
+def soak(
+    directory: Path, seconds: float, every_s: float, show: Callable[[Minute], None] = lambda _: None
+) -> SoakResult:
     """Run the system for `seconds`; measure every `every_s`, and at the end compare with the nodes' logs."""
-    result, repeating = Result(), {"devices": "repeating", "width_px": 205, "preview_hz": 1.0}
+    result, repeating = SoakResult(), {"devices": "repeating", "width_px": 205, "preview_hz": 1.0}
     with System(directory, RATE_HZ, **repeating, node_module="tests.soak.node") as system, ExitStack() as stack:
         system.start("hub")
-        viewer = Viewer(system.endpoint)
+        viewer = CountingViewer(system.endpoint)
         stack.callback(viewer.bus.close)
         system.start("recorder", *(["monitor"] if find_spec("websockets") else []), "solver", "a", "b")
         processes = dict(system.processes)
@@ -104,9 +106,9 @@ def _wait_at_most(seconds: float, condition: Callable[[], bool]) -> None:
 
 
 def _measure(
-    result: Result,
+    result: SoakResult,
     processes: dict[str, Process],
-    viewer: Viewer,
+    viewer: CountingViewer,
     pace: Process,
     seconds: float,
     every_s: float,
@@ -142,7 +144,7 @@ def _measure(
         before, viewer_before = at_s, counts
 
 
-def _compare(result: Result, directory: Path, viewer: Streams) -> None:
+def _compare(result: SoakResult, directory: Path, viewer: Streams) -> None:
     """Count what was published, by the nodes' own logs, from the first of each key that was on the bus."""
     seen = {"viewer": viewer, "recorder": streams_of(directory / "recorder.mcap")}
     published = {key: stamps for log in sorted(directory.glob("[ab]-*.mcap")) for key, stamps in stamps_of(log).items()}
@@ -179,7 +181,7 @@ def _compare(result: Result, directory: Path, viewer: Streams) -> None:
             result.failures.append(f"{name}: of {len(due)} triggers {without} without an outcome, {doubled} with two")
 
 
-def _judge_loads(result: Result) -> None:
+def _judge_loads(result: SoakResult) -> None:
     settled = [minute for minute in result.minutes if minute.at_s >= min(SETTLED_S, result.minutes[-1].at_s / 2)]
     first, last = settled[0], settled[-1]
     hours = (last.at_s - first.at_s) / 3600

@@ -59,7 +59,7 @@ def quaternion(R):
 
 
 @dataclass
-class Scene:
+class PairScene:
     """One true pose and what it takes to see it."""
 
     rig_a: Rig
@@ -150,7 +150,7 @@ def random_scene(rng, range_m, rig_a=IDEAL, rig_b=IDEAL, roll_rad=0.2, lean_rad=
         back = -R_ned_a @ u
         heading = math.atan2(back[1], back[0]) + rng.normal(0, lean_rad)
         R_ned_b = upright(heading, -math.asin(back[2]) + rng.normal(0, lean_rad), rng.normal(0, roll_rad))
-        scene = Scene(rig_a, rig_b, r * u, R_ned_a.T @ R_ned_b, R_ned_a, rng.uniform(2, 40))
+        scene = PairScene(rig_a, rig_b, r * u, R_ned_a.T @ R_ned_b, R_ned_a, rng.uniform(2, 40))
         if scene.visible:
             return scene
 

@@ -21,10 +21,10 @@ from tests.solver_service.track.dives import (
     FOCAL_PX,
     HEIGHT_PX,
     WIDTH_PX,
-    Dive,
-    Motion,
+    KnownDive,
     Setting,
-    Sway,
+    SineSway,
+    SwayingPair,
     make,
 )
 
@@ -33,7 +33,7 @@ BAR_M = np.array(((-0.44, 0.0, 0.0), (0.44, 0.0, 0.0)))
 NAMES = ("a", "b")
 
 
-class Facing(Motion):
+class Facing(SwayingPair):
     """Two nodes that look at each other, beside a mirror or divers with like bars."""
 
     def __init__(self, rng: np.random.Generator, setting: Setting, kind: Kind) -> None:
@@ -46,7 +46,7 @@ class Facing(Motion):
         self._at = np.stack([mean_m * np.array((rng.uniform(0.4, 1.4), rng.normal(0.0, 0.25), rng.normal(0.0, 0.08)))
                              for _ in range(3)])  # fmt: skip
         self._yaw = rng.normal(0.0, 0.5, 3) + self._heading + math.pi
-        self._sways = [Sway(rng, 5.0, 16.0) for _ in range(3)]
+        self._sways = [SineSway(rng, 5.0, 16.0) for _ in range(3)]
 
     def lamps(self, node: int, t: Floats) -> Floats:
         """Give the strangers' lamps (M, 3) that may be in a node's picture at t (1,), in north-east-down."""
@@ -70,7 +70,7 @@ class Facing(Motion):
         return own + 2.0 * np.outer(self._wall_m - own @ across, across)
 
 
-class Onlookers(Motion):
+class Onlookers(SwayingPair):
     """Two nodes that look at a third's bar from about equal range, apart_rad from each other as seen from there.
 
     goes: the third comes and goes along the middle. together: both go around it, and to and fro, in step.
@@ -83,7 +83,7 @@ class Onlookers(Motion):
         self._range_m = rng.uniform(setting.near_m, setting.far_m)
         self._aims = rng.normal(0.0, 0.08, 2)
         self._bar_yaw = self._heading + rng.normal(0.0, 0.1)
-        self._third = Sway(rng, 5.0, 16.0)
+        self._third = SineSway(rng, 5.0, 16.0)
 
     def places(self, node: int, t: Floats) -> Floats:
         """Positions (N, 3) in north-east-down; the third is near (0, 0, 9)."""
@@ -110,7 +110,7 @@ class Onlookers(Motion):
         return self.third(t)[0] + BAR_M[:, :1] * np.array((-math.sin(self._bar_yaw), math.cos(self._bar_yaw), 0.0))
 
 
-def strangers_dive(seed: int, kind: Kind, setting: Setting, apart_deg: float = 90.0) -> Dive:
+def strangers_dive(seed: int, kind: Kind, setting: Setting, apart_deg: float = 90.0) -> KnownDive:
     """Make a dive of one kind."""
     rng = np.random.default_rng((seed, 29))
     motion: Facing | Onlookers
@@ -121,7 +121,7 @@ def strangers_dive(seed: int, kind: Kind, setting: Setting, apart_deg: float = 9
     return make(seed, setting, motion, motion.lamps)
 
 
-def messages_of(dive: Dive, setting: Setting, compass_off_rad: float = 0.0) -> list[Message]:
+def messages_of(dive: KnownDive, setting: Setting, compass_off_rad: float = 0.0) -> list[Message]:
     """Give a dive's messages in the order of time; compass_off_rad: what B's compass is off by, beside its noise."""
     period_ns = round(S_NS / setting.rate_hz)
     timed: list[tuple[int, Message]] = []
@@ -170,7 +170,7 @@ def messages_of(dive: Dive, setting: Setting, compass_off_rad: float = 0.0) -> l
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StrangersTally:
     """What was published of a dive: how many poses and track rows of how many triggers, and how many wrong.
 
     reasons: of the rejections; covered: the share of triggers with a track of a sigma below 5 % of the range.
@@ -188,7 +188,9 @@ class Outcome:
     covered_smooth: float = 0.0
 
 
-def outcome(dive: Dive, messages: Iterable[Message], modes: Iterable[str] = ("filter", "smooth")) -> Outcome:
+def outcome(
+    dive: KnownDive, messages: Iterable[Message], modes: Iterable[str] = ("filter", "smooth")
+) -> StrangersTally:
     """Solve a dive and judge it against its truth."""
     modes = frozenset(modes)
     core = SolverCore(Settings(), [NAMES], track=TrackSettings(modes, rate_hz=10.0) if modes else None)
@@ -214,7 +216,7 @@ def outcome(dive: Dive, messages: Iterable[Message], modes: Iterable[str] = ("fi
     counts = dict(core.counts)
     counts.pop("solved", None)
     asked = max(sum(s >= EPOCH_NS + 200_000_000 for s in dive.stamps_ns) / 2, 1)
-    return Outcome(
+    return StrangersTally(
         triggers=sum(core.counts.values()), poses=poses, wrong_poses=wrong, rows=rows["filter"],
         wrong_rows=wrong_rows["filter"], covered=covered["filter"] / asked, reasons=counts,
         wrong_smooth=wrong_rows["smooth"], smooth=rows["smooth"], covered_smooth=covered["smooth"] / asked,

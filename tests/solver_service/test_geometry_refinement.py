@@ -12,7 +12,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
 
-from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, project, random_scene
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, PairScene, project, random_scene
 
 STILL = Motion(np.zeros(6), np.zeros((6, 6)))
 DISTORTED = Camera("pinhole", 1640, 1232, 1800.0, 1795.0, 830.0, 610.0, (-0.2, 0.08, 5e-4, -4e-4, 0.01))
@@ -25,7 +25,7 @@ RIGS = {
 
 
 @dataclass
-class Estimate:
+class RefinedPoses:
     T_a_b: SE3
     covariance: np.ndarray
     chi2: np.ndarray
@@ -41,7 +41,7 @@ def refine(T_a_b, frames, rig_a, rig_b, motion=STILL, dt_s=(0.0, 0.0, 0.0, 0.0))
     found = refine_lights(T_a_b, frames, np.array((rig_a.lights_m, rig_b.lights_m)))
     times_s = np.tile(np.repeat(dt_s, 2), (len(frames), 1))
     solved = at_one_instant(found.rows, times_s, np.repeat((1.0, -1.0), 4), motion)
-    return Estimate(found.T_a_b.retract(solved.step), solved.covariance, solved.chi2, found.sound)
+    return RefinedPoses(found.T_a_b.retract(solved.step), solved.covariance, solved.chi2, found.sound)
 
 
 def sightings(scenes, rng=None, sigma_px=1.0):
@@ -121,9 +121,9 @@ def moving(rng, rates, dt_s, count):
     for s in scenes:
         clear = []
         for light, dt in enumerate(dt_s):
-            now = Scene(s.rig_a, s.rig_b, s.t + dt * rates[:3], rotation_exp(dt * rates[3:]) @ s.R, s.R_ned_a)
+            now = PairScene(s.rig_a, s.rig_b, s.t + dt * rates[:3], rotation_exp(dt * rates[3:]) @ s.R, s.R_ned_a)
             clear.append((now.clear_a if light < 2 else now.clear_b)[light % 2])
-        moved = Scene(s.rig_a, s.rig_b, s.t, s.R, s.R_ned_a)
+        moved = PairScene(s.rig_a, s.rig_b, s.t, s.R, s.R_ned_a)
         moved.clear_a, moved.clear_b = np.array(clear[:2]), np.array(clear[2:])
         views.append(moved)
     return scenes, views

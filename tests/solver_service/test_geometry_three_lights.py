@@ -8,7 +8,7 @@ from buddyline.solver_service.geometry.rotation import rotation_exp
 from buddyline.solver_service.geometry.se3 import SE3
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Prior, Sensed, Settings
 
-from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, Scene, random_scene, solve_trigger, view
+from tests.solver_service.scenes import IDEAL, ODD_A, ODD_B, PairScene, random_scene, solve_trigger, view
 
 SETTINGS = Settings()
 
@@ -140,7 +140,7 @@ def test_another_lamp_does_not_pass_for_a_light_whose_node_is_not_in_view():
         # Far enough for the angle to be no bar's length.
         scene = random_scene(rng, (5.0, 8.0))
         turn = rotation_exp(np.array([0.0, rng.choice((-0.5, 0.5)), 0.0]))
-        elsewhere = Scene(scene.rig_a, scene.rig_b, scene.t, scene.R @ turn, scene.R_ned_a)
+        elsewhere = PairScene(scene.rig_a, scene.rig_b, scene.t, scene.R @ turn, scene.R_ned_a)
         if not elsewhere.visible:
             continue
         (seen_by_a, _), (lamp_of_b, _) = elsewhere.views(rng, 0.3)

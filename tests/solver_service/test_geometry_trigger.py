@@ -16,7 +16,7 @@ from tests.solver_service.scenes import (
     IDEAL,
     ODD_A,
     ODD_B,
-    Scene,
+    PairScene,
     project,
     quaternion,
     random_scene,
@@ -41,7 +41,7 @@ def facing(range_m=4.0, rig_a=IDEAL, rig_b=IDEAL):
     """Two upright nodes, face to face, heading north and south, a little turned."""
     R_ned_a = rig_a.R_body_camera
     R = rotation((0, 1, 0), math.pi + 0.1) @ rotation((0, 0, 1), 0.07)
-    return Scene(rig_a, rig_b, np.array([0.1, 0.2, range_m]), R, R_ned_a)
+    return PairScene(rig_a, rig_b, np.array([0.1, 0.2, range_m]), R, R_ned_a)
 
 
 @pytest.mark.parametrize("rigs", [(IDEAL, IDEAL), (ODD_A, ODD_B)], ids=["ideal", "odd"])
@@ -144,7 +144,7 @@ def test_sensors_name_themselves_among_the_checks():
 def test_gravity_tells_left_from_right():
     """A diver hangs upside down: with attitude the pose is right, without it is taken for upright."""
     scene = facing()
-    rolled = Scene(IDEAL, IDEAL, scene.t, scene.R @ rotation((0, 0, 1), math.pi), scene.R_ned_a)
+    rolled = PairScene(IDEAL, IDEAL, scene.t, scene.R @ rotation((0, 0, 1), math.pi), scene.R_ned_a)
     (a, _), (b, _) = rolled.views()
     fix = solve(rolled, (a, b), rolled.sensed())
     assert np.abs(error(fix, rolled)).max() < 1e-6

@@ -50,7 +50,7 @@ class NoSolver:
         return None
 
 
-class Node:
+class ScheduledNode:
     """One node: its clock, its link, and what it has not delivered yet."""
 
     def __init__(self, name, period_ns):
@@ -98,7 +98,7 @@ class Schedules(RuleBasedStateMachine):
     def begin(self, period_ms, chosen):
         self.true_ns = self.tick_ns = START_NS
         self.host_ahead_ns = 0
-        self.nodes = {name: Node(name, period_ms * MS_NS) for name in NODES}
+        self.nodes = {name: ScheduledNode(name, period_ms * MS_NS) for name in NODES}
         self.core = SolverCore(Settings(), PAIRS if chosen else None)
         self.outcomes = Counter()
         self.ended = defaultdict(list)

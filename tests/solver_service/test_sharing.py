@@ -10,7 +10,7 @@ PAIRS: list[Task] = [*combinations("abcdefgh", 2)]
 TASKS: list[Task] = [*PAIRS, NETWORK]
 
 
-class Team:
+class SharingTeam:
     """Solvers on a bus on which every name is seen at once."""
 
     def __init__(self, count: int) -> None:
@@ -55,7 +55,7 @@ class Team:
 
 
 def test_each_task_is_done_by_one_and_all_have_some() -> None:
-    team = Team(3)
+    team = SharingTeam(3)
     for _ in range(3):
         team.tick()
     assert team.done() == set(TASKS)
@@ -63,7 +63,7 @@ def test_each_task_is_done_by_one_and_all_have_some() -> None:
 
 
 def test_the_tasks_of_a_killed_one_go_on_within_two_ticks_and_no_other_moves() -> None:
-    team = Team(3)
+    team = SharingTeam(3)
     for _ in range(3):
         team.tick()
     before = {one.instance: set(one.begun) for one in team.solvers}
@@ -75,7 +75,7 @@ def test_the_tasks_of_a_killed_one_go_on_within_two_ticks_and_no_other_moves() -
 
 
 def test_one_that_joins_takes_only_its_share_and_never_before_it_is_let_go() -> None:
-    team = Team(2)
+    team = SharingTeam(2)
     for _ in range(3):
         team.tick()
     before = {one.instance: set(one.begun) for one in team.solvers}

@@ -135,7 +135,7 @@ def wait_for_server(address: str) -> None:
     until(answers, pause_s=0.1)
 
 
-class Line:
+class CuttableLine:
     """A line between page and monitor that can be cut: what is sent then waits, as on a dead network."""
 
     def __init__(self, port: int) -> None:

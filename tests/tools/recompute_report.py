@@ -61,7 +61,7 @@ def stats(errors: list[float]) -> dict[str, Any]:
     }
 
 
-class Truth:
+class TruePlaces:
     """True places by time: the cubic through two before and two after, where they are near enough."""
 
     def __init__(self, rows: list[dict[str, Any]]) -> None:
@@ -140,7 +140,7 @@ def recompute(path: str) -> dict[str, Any]:
         kept = [row["depth_m"] for row in thinned(rows, max(round(DEPTH_SPACING_S * 1e9), spacing_ns))]
         if kept:
             depths[node] = {"least_m": min(kept), "most_m": max(kept), "sigma_m": rows[-1][1]["sigma_m"]}
-    truth = Truth([row for _, row in of("truth")])
+    truth = TruePlaces([row for _, row in of("truth")])
     return {
         "dive": {
             "begun": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(start // 10**9)),
@@ -203,7 +203,7 @@ def of_track(
     }
 
 
-def against(truth: Truth, poses: list[dict[str, Any]], tracks: list[dict[str, Any]]) -> dict[str, Any]:
+def against(truth: TruePlaces, poses: list[dict[str, Any]], tracks: list[dict[str, Any]]) -> dict[str, Any]:
     known = [(row, place) for row in poses if (place := truth.at(row["stamp_ns"])) is not None]
     said: dict[str, Any] = {
         "poses": {

@@ -24,7 +24,7 @@ SIGMAS = {"sigma_azimuth_rad": 0.05, "sigma_inclination_rad": 0.01}
 WORLD = World(Scenario(environment="cavern", seed=1, start_ns=START_NS))
 
 
-class Watch:
+class WatchedPair:
     """A dashboard, and a clock that stands still."""
 
     def __init__(self) -> None:
@@ -42,9 +42,9 @@ def estimate(k: int, off_m: float = 1.0) -> dict[str, object]:
     return {"t_a_b_m": tuple(t_m), "q_a_b_xyzw": true.q_a_b_xyzw, "range_m": float(np.linalg.norm(t_m))}
 
 
-def running() -> Watch:
+def running() -> WatchedPair:
     """Eleven poses, twenty rejections, and a track that goes on; one sample of it is wrong."""
-    watch = Watch()
+    watch = WatchedPair()
     for k in range(31):
         watch.take(pose(k, **estimate(k, 2.0)) if k % 3 == 0 else rejection(k))
         for mode in ("filter", "lag"):
@@ -75,7 +75,7 @@ def test_a_stale_track_is_replaced_by_the_last_pose_with_a_note():
 
 
 def test_a_track_without_poses_is_shown():
-    watch = Watch()
+    watch = WatchedPair()
     assert "no pose yet" in watch.dashboard.line()
     assert "no pose yet" in watch.dashboard.screen(80, 24)
     watch.take(track(0, **estimate(0)))
@@ -146,7 +146,7 @@ def test_the_summary_has_the_track_s_errors_beside_the_poses():
 
 
 def test_a_run_without_a_track_has_no_track_figures():
-    watch = Watch()
+    watch = WatchedPair()
     watch.now_s = 1.0
     assert summary_text(watch.dashboard.summary({})).startswith("no pose in 1 s")
     watch.take(pose(0, **estimate(0)))

@@ -23,7 +23,7 @@ from msgspec import UNSET
 from tests.tools.test_health import CALIBRATION, EXAMPLES, INFO_A, REST, status
 
 
-class Chips:
+class SilentChips:
     """An inertial unit that says nothing is wrong."""
 
     name, problem, retries = "imu", "", 0
@@ -48,7 +48,7 @@ class Chips:
 )
 def test_a_calibrated_magnetometer_that_is_silent_is_a_problem(calibrated, mag_t, level, monkeypatch):
     monkeypatch.setattr(rig, "LISTEN_S", 0.1)
-    monkeypatch.setattr(rig, "open_sensors", lambda *_: [Chips(msgspec.structs.replace(REST, mag_t=mag_t))])
+    monkeypatch.setattr(rig, "open_sensors", lambda *_: [SilentChips(msgspec.structs.replace(REST, mag_t=mag_t))])
     sensors = msgspec.structs.replace(CALIBRATION.sensors, **calibrated)
     found = rig.check_sensors(msgspec.structs.replace(CALIBRATION, sensors=sensors))
     assert levels(found) == {"imu": "ok", "compass": level, "imu place": "warning"}

@@ -22,7 +22,7 @@ from tests.tools.browsed import (
     SCREENSHOTS,
     SIZES,
     Browser,
-    Line,
+    CuttableLine,
     Processes,
     chromium_browser,
     free_port,
@@ -91,7 +91,7 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
     # The page is there before the hub is, and finds it by itself.
     processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
     wait_for_server(f"http://127.0.0.1:{port}")
-    line = Line(port)
+    line = CuttableLine(port)
     with looking(chromium, "live") as seen, closing(line):
         seen.page.goto(f"http://127.0.0.1:{line.port}")
         seen.wait_for("Nothing has come over the bus yet")

@@ -25,7 +25,7 @@ esac
 """
 
 
-class Pi:
+class PiInFolder:
     """A Pi in a folder: its files, and what its programs were called with."""
 
     def __init__(self, folder):
@@ -58,7 +58,7 @@ class Pi:
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    machine = Pi(tmp_path)
+    machine = PiInFolder(tmp_path)
     (tmp_path / "copy" / ".venv").mkdir(parents=True)
     (tmp_path / "copy" / "Makefile").touch()
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")

@@ -23,7 +23,7 @@ WORLD = World(SCENARIO)
 COVARIANCE = [1e-4 if i % 7 == 0 else 0.0 for i in range(36)]
 
 
-class Watch:
+class WatchedTeam:
     """A dashboard of three nodes, and a clock that stands still."""
 
     def __init__(self, scenario=SCENARIO):
@@ -43,7 +43,7 @@ class Watch:
 
 
 def test_the_line_shows_each_node_and_how_far_it_is_off():
-    watch = Watch()
+    watch = WatchedTeam()
     watch.tell("a", 0)
     watch.tell("b", 0, east_m=0.02)
     line = watch.dashboard.line()
@@ -54,7 +54,7 @@ def test_the_line_shows_each_node_and_how_far_it_is_off():
 
 
 def test_the_screen_fits_the_terminal_and_counts_pairs():
-    watch = Watch()
+    watch = WatchedTeam()
     watch.tell("b", 0)
     for k in range(4):
         watch.take(pose(k) if k else rejection(k))
@@ -65,7 +65,7 @@ def test_the_screen_fits_the_terminal_and_counts_pairs():
 
 
 def test_the_summary_has_each_nodes_errors():
-    watch = Watch()
+    watch = WatchedTeam()
     for k in range(0, 20, 2):
         watch.tell("a", k)
         watch.tell("b", k, east_m=0.01)
@@ -83,14 +83,14 @@ def test_the_summary_has_each_nodes_errors():
 
 
 def test_without_a_fixed_node_places_count_from_the_origin():
-    watch = Watch(Scenario(**(asdict(SCENARIO) | {"fixed_nodes": ()})))
+    watch = WatchedTeam(Scenario(**(asdict(SCENARIO) | {"fixed_nodes": ()})))
     watch.tell("a", 0, origin="a")
     watch.tell("b", 0, origin="a")
     assert watch.dashboard.line().count("off 0 mm") == 2
 
 
 def test_the_truth_is_of_all_pairs_and_nodes():
-    stamped = list(Watch().dashboard.truth(at(3)))
+    stamped = list(WatchedTeam().dashboard.truth(at(3)))
     assert {key for _, key, _ in stamped} == {
         *(f"buddyline/pair/{pair}/truth" for pair in ("a/b", "a/c", "b/c")),
         *(f"buddyline/net/main/truth/{node}" for node in "abc"),

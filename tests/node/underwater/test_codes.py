@@ -76,7 +76,7 @@ def test_a_pattern_is_on_and_off_as_it_says():
     assert (once.is_on(0.05), once.is_on(0.15), once.is_over(0.05), once.is_over(0.1)) == (True, False, False, True)
 
 
-class Diver:
+class PanelDiver:
     """Presses the button of a state machine, with time passing in turns."""
 
     def __init__(self):
@@ -103,11 +103,11 @@ class Diver:
      (8.1, PanelAction.SHUT_DOWN), (19.9, PanelAction.SHUT_DOWN), (20.1, None), (300.0, None)],
 )  # fmt: skip
 def test_the_length_of_a_hold_says_what_it_means(held_s, action):
-    assert Diver().press(held_s) == ([action] if action else [])
+    assert PanelDiver().press(held_s) == ([action] if action else [])
 
 
 def test_stop_and_start_take_turns_and_switch_the_lights():
-    diver = Diver()
+    diver = PanelDiver()
     assert diver.state.lights
     assert diver.press(3.0) == [PanelAction.STOP]
     assert not diver.state.lights
@@ -118,7 +118,7 @@ def test_stop_and_start_take_turns_and_switch_the_lights():
 
 
 def test_a_contact_that_bounces_is_one_press():
-    diver = Diver()
+    diver = PanelDiver()
     for _ in range(3):
         diver.wait(0.02, pressed=True)
         diver.wait(0.02)
@@ -130,14 +130,14 @@ def test_a_contact_that_bounces_is_one_press():
 
 
 def test_a_magnet_that_is_there_at_the_start_does_nothing_until_it_has_been_away():
-    diver = Diver.__new__(Diver)
+    diver = PanelDiver.__new__(PanelDiver)
     diver.state, diver.now_ns, diver.actions, diver.given = PanelState(), S_NS, [], {}
     assert diver.press(9.0) == []
     assert diver.press(0.5) == [PanelAction.MARK]
 
 
 def test_the_lamp_counts_along_while_the_button_is_held():
-    diver = Diver()
+    diver = PanelDiver()
     for seconds, hold in ((1.0, HOLDS[0]), (3.0, HOLDS[1]), (8.0, HOLDS[2])):
         diver.wait(seconds, pressed=True)
         assert diver.state.lamp == hold.lamp
@@ -154,14 +154,14 @@ def test_the_lamp_counts_along_while_the_button_is_held():
 def test_the_lamp_tells_the_most_urgent_first(given, words):
     situation = Situation(**given)
     assert words in code_of(situation).words
-    diver = Diver()
+    diver = PanelDiver()
     diver.given = given
     diver.wait(0.1)
     assert diver.state.lamp == code_of(situation).lamp
 
 
 def test_the_buzzer_answers_the_button_names_a_new_fault_once_and_a_leak_until_it_is_dry():
-    diver = Diver()
+    diver = PanelDiver()
     diver.given = {"fault": True}
     diver.wait(0.1)
     assert diver.state.sound == FAULT_BEEP

@@ -19,7 +19,7 @@ def still() -> NetState:
     return lone(NODE, np.zeros(3), np.eye(3))[0]
 
 
-class Course:
+class RandomCourse:
     """A random course of steps and updates with a growing and shrinking state, twice: as trail, and as one big normal.
 
     Of the big one the mean and covariance of all errors at all times are kept, and conditioned on all residuals.
@@ -113,7 +113,7 @@ class Course:
 
 @pytest.mark.parametrize("anchor", [None, 0])
 def test_smoothing_conditions_each_state_on_all_that_was_seen(anchor: int | None) -> None:
-    course = Course(3, anchor)
+    course = RandomCourse(3, anchor)
     for act in "tulstlsgtlslstlsdtlslst":
         {"t": course.tell, "u": course.learn, "l": course.learn, "s": course.step, "g": course.grow, "d": course.drop}[
             act
@@ -135,7 +135,7 @@ def test_smoothing_conditions_each_state_on_all_that_was_seen(anchor: int | None
 
 
 def test_what_was_before_the_last_row_is_forgotten() -> None:
-    course = Course(1, None)
+    course = RandomCourse(1, None)
     for act in range(6):
         course.tell()
         course.step()

@@ -41,7 +41,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Dive:
+class KnownDive:
     """A dive and its truth at stamps (N,): t_a_b (N, 3), R_a_b (N, 3, 3)."""
 
     records: tuple[NodeRecord, NodeRecord]
@@ -51,7 +51,7 @@ class Dive:
     R_a_b: Floats
 
 
-class Sway:
+class SineSway:
     """A sum of sines (3 axes) with random phases and periods, of about unit deviation."""
 
     def __init__(self, rng: np.random.Generator, shortest_s: float, longest_s: float) -> None:
@@ -62,14 +62,14 @@ class Sway:
         return np.sin(t[:, None, None] * self._rate + self._phase).sum(1) / np.sqrt(2.0)
 
 
-class Motion:
+class SwayingPair:
     """A rests and sways, B comes and goes before it; each looks at the other, roughly."""
 
     def __init__(self, rng: np.random.Generator, setting: Setting) -> None:
         self._s = setting
-        self._sway = [Sway(rng, 5.0, 16.0), Sway(rng, 5.0, 16.0)]
-        self._turn = [Sway(rng, 4.0, 14.0), Sway(rng, 4.0, 14.0)]
-        self._shake = [Sway(rng, 0.4, 0.7), Sway(rng, 0.4, 0.7)]
+        self._sway = [SineSway(rng, 5.0, 16.0), SineSway(rng, 5.0, 16.0)]
+        self._turn = [SineSway(rng, 4.0, 14.0), SineSway(rng, 4.0, 14.0)]
+        self._shake = [SineSway(rng, 0.4, 0.7), SineSway(rng, 0.4, 0.7)]
         self._heading, self._cycle_s, self._phase = rng.uniform(-3.0, 3.0), rng.uniform(25.0, 45.0), rng.uniform(0, 6.0)
 
     def places(self, node: int, t: Floats) -> Floats:
@@ -102,10 +102,10 @@ class Motion:
         return turned
 
 
-def make(seed: int, setting: Setting, motion: Motion | None = None, lamps: Lamps | None = None) -> Dive:
+def make(seed: int, setting: Setting, motion: SwayingPair | None = None, lamps: Lamps | None = None) -> KnownDive:
     """Make a dive; lamps: of others than the two nodes."""
     rng = np.random.default_rng((seed, 17))
-    motion = motion or Motion(rng, setting)
+    motion = motion or SwayingPair(rng, setting)
     camera = Camera("pinhole", WIDTH_PX, HEIGHT_PX, FOCAL_PX, FOCAL_PX, 409.5, 307.5)
     nodes = []
     units = []
@@ -144,7 +144,7 @@ def make(seed: int, setting: Setting, motion: Motion | None = None, lamps: Lamps
     R_a, R_b = motion.attitudes(0, times), motion.attitudes(1, times)
     apart = motion.places(1, times) - motion.places(0, times)
     toward = np.swapaxes(R_a, 1, 2)
-    return Dive((records[0], records[1]), fixes, stamps, (toward @ apart[:, :, None])[:, :, 0], toward @ R_b)
+    return KnownDive((records[0], records[1]), fixes, stamps, (toward @ apart[:, :, None])[:, :, 0], toward @ R_b)
 
 
 def filter_of(records: tuple[NodeRecord, NodeRecord], fixes: Sequence[FixSeen]) -> TrackFilter:
@@ -170,7 +170,7 @@ def project(X: Floats) -> Floats:
 
 def _frames(
     rng: np.random.Generator,
-    motion: Motion,
+    motion: SwayingPair,
     nodes: list[TrackNode],
     node: int,
     triggers: Floats,
@@ -219,7 +219,10 @@ def _seen(rng: np.random.Generator, X: Floats, setting: Setting) -> Floats:
 
 
 def _fix(
-    nodes: list[TrackNode], one: tuple[FrameSeen | None, Floats], two: tuple[FrameSeen | None, Floats], motion: Motion
+    nodes: list[TrackNode],
+    one: tuple[FrameSeen | None, Floats],
+    two: tuple[FrameSeen | None, Floats],
+    motion: SwayingPair,
 ) -> FixSeen | None:
     """Fit a pose to the eight coordinates of a trigger, from the truth on."""
     assert one[0] is not None
@@ -250,7 +253,7 @@ def _fix(
 
 def _sensors(
     rng: np.random.Generator,
-    motion: Motion,
+    motion: SwayingPair,
     node: TrackNode,
     index: int,
     setting: Setting,
@@ -274,7 +277,7 @@ def _sensors(
     accel = force @ to_unit.T + accel_bias + rng.normal(0.0, 0.03, (len(t), 3))
     clock_ns = round((setting.clock_s if index else 0.0) * 1e9)
     stamps = EPOCH_NS + clock_ns + np.round((t + late_s) * 1e9).astype(np.int64)
-    slow, fast = Sway(rng, 8.0, 40.0), Sway(rng, 1.4, 3.0)
+    slow, fast = SineSway(rng, 8.0, 40.0), SineSway(rng, 1.4, 3.0)
     at = np.arange(0.05, setting.seconds, 0.02)
     sigma = np.array((np.radians(1.0), np.radians(1.0), np.radians(4.0)))
     errors = sigma * (0.6 * slow(at) + 0.5 * fast(at) + 0.5 * rng.normal(0.0, 1.0, (len(at), 3)))
@@ -306,7 +309,7 @@ class Score:
     rows: int
 
 
-def score(dive: Dive, rows: Iterable[TrackRow]) -> Score:
+def score(dive: KnownDive, rows: Iterable[TrackRow]) -> Score:
     """Judge rows of a track."""
     told = list(rows)
     place = {stamp: i for i, stamp in enumerate(dive.stamps_ns)}
@@ -336,7 +339,7 @@ def _vector(x: float, y: float, z: float, w: float) -> Floats:
     return axis * (2.0 * np.arctan2(sine, abs(w)) / sine) if sine > 1e-12 else 2.0 * axis
 
 
-def fix_errors(dive: Dive) -> Floats:
+def fix_errors(dive: KnownDive) -> Floats:
     """Position errors of the dive's fixes, m, against the truth between its stamps."""
     stamps = np.array([stamp - dive.stamps_ns[0] for stamp in dive.stamps_ns], dtype=float)
     out = []

@@ -14,12 +14,12 @@ from buddyline.solver_service.track.dive import last_ns, smooth
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.tracking import TrackSettings
 
-from tests.solver_service.track.dives import EPOCH_NS, Dive, Setting, filter_of, make, score
+from tests.solver_service.track.dives import EPOCH_NS, KnownDive, Setting, filter_of, make, score
 
 LAMPS = ((1, 0), (1, 1), (0, 0), (0, 1))
 
 
-def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> Dive:
+def dead_lamp_dive(seed: int, lamp: tuple[int, int], seconds: float) -> KnownDive:
     """A dive that lacks a lamp; its `fixes`, for the scores' span, are those that it would have with it."""
     setting = Setting(seconds=seconds, dead=(lamp,))
     return replace(make(seed, setting), fixes=make(seed, replace(setting, dead=())).fixes)

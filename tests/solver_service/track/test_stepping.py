@@ -110,7 +110,7 @@ def test_a_walk_is_learned_only_once_the_clock_is_known(monkeypatch: pytest.Monk
     assert learned
 
 
-class Told:
+class ToldAttitudes:
     """Attitude messages of one node: one of a certain attitude at every time."""
 
     def __init__(self, R_level_camera: Floats) -> None:
@@ -131,7 +131,7 @@ def startled(offs: Floats) -> list[bool]:
     F = np.eye(SIZE)[:MOVING]
     found = []
     for off in offs:
-        track.turning[1] = Told(rotation_exp(SIGMA_RAD * off) @ state.R[1])  # type: ignore[call-overload]
+        track.turning[1] = ToldAttitudes(rotation_exp(SIGMA_RAD * off) @ state.R[1])  # type: ignore[call-overload]
         found.append(track._startled(estimate, state, F, 1, still, STEP_S).gap_rate_radps > 0.0)
     return found
 

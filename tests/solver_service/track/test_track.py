@@ -13,13 +13,13 @@ from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
 
-from tests.solver_service.track.dives import Dive, Setting, filter_of, fix_errors, make, score
+from tests.solver_service.track.dives import KnownDive, Setting, filter_of, fix_errors, make, score
 
 SHORT = Setting(seconds=12.0)
 
 
 @pytest.fixture(scope="module")
-def dive() -> Dive:
+def dive() -> KnownDive:
     return make(1, SHORT)
 
 
@@ -42,7 +42,7 @@ def test_whole_dive_beats_its_fixes_and_is_honest(poor: bool) -> None:
     assert 0.4 < judged.nees < 2.0
 
 
-def test_filter_covers_the_dive(dive: Dive) -> None:
+def test_filter_covers_the_dive(dive: KnownDive) -> None:
     judged = score(dive, filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns))
     assert judged.covered >= 0.97
     assert judged.wrong == 0
@@ -50,14 +50,14 @@ def test_filter_covers_the_dive(dive: Dive) -> None:
     assert 0.4 < judged.nees < 2.0
 
 
-def test_without_attitudes_a_track_starts_with_the_first_fix(dive: Dive) -> None:
+def test_without_attitudes_a_track_starts_with_the_first_fix(dive: KnownDive) -> None:
     a, b = (replace(record, attitudes=()) for record in dive.records)
     rows = filter_of((a, b), dive.fixes[5:]).advance(last_ns(dive.records), dive.stamps_ns)
     assert rows[0].stamp_ns >= dive.fixes[5].stamp_ns
     assert not filter_of((a, b), []).advance(last_ns(dive.records), dive.stamps_ns)
 
 
-def fed(dive: Dive, order: random.Random | None, chunk_ns: int, window_ns: int = 400_000_000) -> list[TrackRow]:
+def fed(dive: KnownDive, order: random.Random | None, chunk_ns: int, window_ns: int = 400_000_000) -> list[TrackRow]:
     """Feed a live filter by pieces, each piece in any order."""
     a, b = dive.records
     track = TrackFilter(a.node, b.node)
@@ -88,14 +88,14 @@ def fed(dive: Dive, order: random.Random | None, chunk_ns: int, window_ns: int =
     return rows + track.advance(end_ns, [s for s in dive.stamps_ns if s > done])
 
 
-def test_live_gives_the_same_in_any_order_and_by_any_steps(dive: Dive) -> None:
-    short = Dive(dive.records, dive.fixes, dive.stamps_ns[:80], dive.t_a_b_m, dive.R_a_b)
+def test_live_gives_the_same_in_any_order_and_by_any_steps(dive: KnownDive) -> None:
+    short = KnownDive(dive.records, dive.fixes, dive.stamps_ns[:80], dive.t_a_b_m, dive.R_a_b)
     whole = filter_of(dive.records, dive.fixes).advance(last_ns(dive.records), short.stamps_ns)
     assert same(fed(short, None, 100_000_000), whole)
     assert same(fed(short, random.Random(3), 70_000_000), whole)
 
 
-def test_lag_is_better_than_the_filter(dive: Dive) -> None:
+def test_lag_is_better_than_the_filter(dive: KnownDive) -> None:
     track = filter_of(dive.records, dive.fixes)
     lag = TrackLag(track)
     lag.ask(dive.stamps_ns)
@@ -115,7 +115,7 @@ def test_lag_is_better_than_the_filter(dive: Dive) -> None:
     assert 0.3 < judged.nees < 2.0
 
 
-def bare_of(dive: Dive) -> tuple[NodeRecord, NodeRecord]:
+def bare_of(dive: KnownDive) -> tuple[NodeRecord, NodeRecord]:
     """The records without inertial samples."""
     none = np.zeros((0, 3))
     a, b = (
@@ -126,7 +126,7 @@ def bare_of(dive: Dive) -> tuple[NodeRecord, NodeRecord]:
 
 
 @pytest.mark.slow
-def test_without_inertial_units(dive: Dive) -> None:
+def test_without_inertial_units(dive: KnownDive) -> None:
     bare = bare_of(dive)
     for records in ((bare[0], bare[1]), (dive.records[0], bare[1]), (bare[0], dive.records[1])):
         judged = score(dive, smooth(records, dive.fixes, dive.stamps_ns).rows)
@@ -150,7 +150,7 @@ def test_two_seconds_of_darkness() -> None:
     assert judged.errors_m.max() < 0.06
 
 
-def test_a_wrong_fix_changes_nothing_for_long(dive: Dive) -> None:
+def test_a_wrong_fix_changes_nothing_for_long(dive: KnownDive) -> None:
     wrong = [
         FixSeen(fix.stamp_ns, fix.t_a_b_m + np.array((3.0, 0.0, 2.0)), fix.R_a_b, fix.covariance)
         if i in (20, 21, 22)
@@ -162,7 +162,7 @@ def test_a_wrong_fix_changes_nothing_for_long(dive: Dive) -> None:
     assert judged.covered >= 0.97
 
 
-def test_a_track_that_began_wrong_is_replaced(dive: Dive) -> None:
+def test_a_track_that_began_wrong_is_replaced(dive: KnownDive) -> None:
     first = dive.fixes[0]
     wrong = FixSeen(first.stamp_ns, first.t_a_b_m + np.array((3.0, 0.0, 2.0)), first.R_a_b, first.covariance)
     rows = filter_of(dive.records, [wrong, *dive.fixes[1:]]).advance(last_ns(dive.records), dive.stamps_ns)
@@ -172,7 +172,7 @@ def test_a_track_that_began_wrong_is_replaced(dive: Dive) -> None:
 
 
 @pytest.mark.parametrize("harm", ["nan", "doubled", "gap", "stops", "no attitude", "no depth"])
-def test_bad_input_costs_little(dive: Dive, harm: str) -> None:
+def test_bad_input_costs_little(dive: KnownDive, harm: str) -> None:
     a, b = dive.records
     stamps, accel, gyro = b.imu_stamps_ns.copy(), b.accel_mps2.copy(), b.gyro_radps.copy()
     keep = np.ones(len(stamps), dtype=bool)
@@ -227,7 +227,7 @@ def test_a_dead_lamp_and_no_fix_at_all() -> None:
     assert judged.wrong == 0
 
 
-def test_nodes_that_do_not_face_each_other_get_no_track(dive: Dive) -> None:
+def test_nodes_that_do_not_face_each_other_get_no_track(dive: KnownDive) -> None:
     """Both look at a third's bar: the lights fit, the headings do not."""
     a, b = dive.records
     about_down = np.diag((-1.0, -1.0, 1.0))
@@ -256,7 +256,7 @@ def test_clocks_far_apart_without_inertial_units_give_no_track() -> None:
 
 
 @pytest.mark.parametrize("fault", ["g", "mount", "clipped"])
-def test_a_faulty_unit_is_named_and_left_out(dive: Dive, fault: str) -> None:
+def test_a_faulty_unit_is_named_and_left_out(dive: KnownDive, fault: str) -> None:
     a, b = dive.records
     about = np.array(((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)))
     if fault == "g":
@@ -276,7 +276,7 @@ def test_a_faulty_unit_is_named_and_left_out(dive: Dive, fault: str) -> None:
 
 
 @pytest.mark.parametrize("harm", ["nothing", "one node", "pixels", "fixes", "frames twice", "attitudes", "no sensors"])
-def test_absurd_input_never_crashes(dive: Dive, harm: str) -> None:
+def test_absurd_input_never_crashes(dive: KnownDive, harm: str) -> None:
     a, b = dive.records
     fixes = list(dive.fixes)
     if harm == "nothing":
@@ -310,7 +310,7 @@ def test_absurd_input_never_crashes(dive: Dive, harm: str) -> None:
 
 @pytest.mark.parametrize(("parts_clock_s", "expected"), [([0.02], False), ([0.02, 0.05], False), ([0.0, 0.2], True)])
 def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
-    dive: Dive, parts_clock_s: list[float], expected: bool
+    dive: KnownDive, parts_clock_s: list[float], expected: bool
 ) -> None:
     first = filter_of(dive.records, dive.fixes)
     first.advance(dive.stamps_ns[0] + 3_000_000_000)

@@ -12,7 +12,7 @@ from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.strapdown import integrate, moved_by_shares, propagate
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 
-from tests.solver_service.track.dives import Dive, Setting, make, score
+from tests.solver_service.track.dives import KnownDive, Setting, make, score
 from tests.solver_service.track.test_track_jacobians import a_state, samples
 
 STAMPS_NS = np.arange(2000) * 10_000_000
@@ -104,7 +104,7 @@ def test_what_a_share_moves(column: int) -> None:
     assert moved[:, column] == pytest.approx(numeric[: len(moved)], abs=0.02 * np.abs(numeric).max())
 
 
-def shaken(dive: Dive, size_radps: float) -> Dive:
+def shaken(dive: KnownDive, size_radps: float) -> KnownDive:
     """The dive with B's unit turned to and fro in its mount, which its camera is not."""
     b = dive.records[1]
     t = (b.imu_stamps_ns - b.imu_stamps_ns[0]) * 1e-9
