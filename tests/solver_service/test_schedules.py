@@ -2,8 +2,11 @@
 
 The core is told the receive time as the live service tells it. True time runs on by itself; a node's stamps are on its
 own clock.
+
+`python -m tests.solver_service.test_schedules 100000` tries as many schedules that no run has seen before.
 """
 
+import sys
 from collections import Counter, defaultdict
 from itertools import combinations
 
@@ -288,3 +291,10 @@ def test_an_old_frame_that_comes_again_and_again_is_no_new_time():
     again = [("deliver_again", 10)] * 6
     played = play(2500, ("go_on", 20.0), *again, ("go_on", 8.0))
     assert all(stream.newest_ns > START_NS + 25 * S_NS for stream in played.core.streams.values())
+
+
+if __name__ == "__main__":
+    # A thousand at a time: Hypothesis remembers all that it has tried.
+    for done in range(0, int(sys.argv[1]), 1000):
+        run_state_machine_as_test(Schedules, settings=limits(1000, derandomize=False))
+        print(f"{done + 1000} schedules, no failure", flush=True)
