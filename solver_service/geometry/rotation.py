@@ -20,11 +20,11 @@ for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
 _IDENTITY: Final[Floats] = np.eye(3)
 # The products (16,) of a quaternion's components, row by row, times this: the matrix (9,), times the quaternion's
 # square length: (w^2 - |v|^2) I + 2 v v^T + 2 w [v x].
-_MATRIX_OF_PRODUCTS: Final[Floats] = np.zeros((4, 4, 9))
-_MATRIX_OF_PRODUCTS[:3, :3] = 2.0 * np.eye(9).reshape(3, 3, 9)
-_MATRIX_OF_PRODUCTS[range(4), range(4)] += np.outer((-1.0, -1.0, -1.0, 1.0), _IDENTITY.ravel())
-_MATRIX_OF_PRODUCTS[3, :3] = 2.0 * _CROSS
-_MATRIX_OF_PRODUCTS.shape = (16, 9)
+_MATRIX_OF_PRODUCTS: Final[Floats] = np.zeros((16, 9))
+_by_pair = _MATRIX_OF_PRODUCTS.reshape(4, 4, 9)
+_by_pair[:3, :3] = 2.0 * np.eye(9).reshape(3, 3, 9)
+_by_pair[range(4), range(4)] += np.outer((-1.0, -1.0, -1.0, 1.0), _IDENTITY.ravel())
+_by_pair[3, :3] = 2.0 * _CROSS
 # An angle whose sine is itself.
 _TINY: Final = 1e-100
 # Up to this many rotations, Python's numbers are faster than arrays.
