@@ -1,7 +1,7 @@
 """The commands in the documents work as they stand: each document's are run in order, in a folder of its own.
 
 Addresses are replaced, and what would take long is shortened. What needs hardware, another machine, root or a person is
-left out by name. Every other command of the programs in COMMAND must end well.
+left out by name. Every other command of the programs in COMMAND must end well. Python in fences runs as well.
 """
 
 from __future__ import annotations
@@ -159,3 +159,23 @@ def test_all_commands_of_a_document_end_well(name: str, folder: Path) -> None:
             assert done.returncode == wanted, (
                 f"{name}: `{command}` ended with {done.returncode}:\n{done.stdout[-2000:]}"
             )
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/library.md", "docs/theory.md"])
+def test_the_python_of_a_document_runs(name: str, folder: Path) -> None:
+    text = (REPOSITORY / name).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    assert blocks, "the document has no Python"
+    assert main(["sample"]) == 0
+    for solved in ("solved.mcap", "poses.mcap"):
+        assert main(["solve", "sample.mcap", "-o", solved]) == 0
+    endpoint = free_endpoint()
+    script = "\n".join(blocks).replace('"tcp/192.168.2.1:7447"', f'"{endpoint}", seconds=5')
+    with ExitStack() as stack:
+        if endpoint in script:
+            for words in (("hub", "--listen"), ("solver", "--connect"), ("play", "sample.mcap", "--loop", "--connect")):
+                stack.enter_context(Process(*words, endpoint, cwd=folder))
+        (folder / "script.py").write_text(script)
+        done = run(f"{sys.executable} -W error script.py", folder)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert endpoint not in script or len(done.stdout.splitlines()) > 3, "no poses have come"

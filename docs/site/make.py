@@ -1,11 +1,13 @@
 """Make the site of documents: `python docs/site/make.py SITE`. A link to a page that is not there is an error.
 
 The pages lie all over the repository, beside what they describe. They are gathered into SITE.pages, with a page of all
-commands that is made from their own help, and Sphinx makes SITE out of them.
+commands that is made from their own help and one of all messages that is made from their code, and Sphinx makes SITE
+out of them.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
 import posixpath
 import re
@@ -15,6 +17,9 @@ import sys
 from pathlib import Path
 from typing import Final
 
+import msgspec
+from buddyline.protocol import messages as kinds
+from buddyline.protocol.topics import TOPICS
 from buddyline.tools.cli import COMMANDS
 
 REPOSITORY: Final = Path(__file__).resolve().parents[2]
@@ -22,8 +27,8 @@ PAGES: Final = {
     "Learn": ["docs/tutorial.md", "docs/install.md", "docs/dives.md", "docs/security.md", "docs/troubleshooting.md"],
     "Use from elsewhere": ["docs/library.md", "docs/bridge.md", "docs/blueos.md", "protocol/README.md"],
     "Build and survey": ["docs/build/README.md", "node/README.md", "tools/survey/README.md"],
-    "Reference": ["commands", "docs/glossary.md"],
-    "How it works": ["docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md"],
+    "Reference": ["commands", "messages", "docs/glossary.md"],
+    "How it works": ["docs/theory.md", "docs/track.md", "docs/network.md", "docs/geodesy.md", "docs/decisions.md"],
     "Develop": ["CONTRIBUTING.md", "CHANGELOG.md"],
 }
 LINK: Final = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s#]+)(#[^)\s]*)?\)")
@@ -64,13 +69,40 @@ def commands() -> str:
     return "\n".join(said)
 
 
+def messages() -> str:
+    """Return the page of all messages: their keys, what they are, and their fields with types."""
+    said = [
+        "# Messages\n\nThey are JSON; [the protocol](protocol.md) says how they travel. A field with `UnsetType` may "
+        "be missing, and one with `= ...` has this value where it is.\n"
+    ]
+    structures = [one for one in vars(kinds).values() if inspect.isclass(one) and issubclass(one, msgspec.Struct)]
+    for one in sorted(structures, key=lambda each: each.__name__):
+        keys = [f"`{topic.template}`" for topic in TOPICS if topic.schema is one]
+        travels = f"On {' and '.join(keys)}." if keys else "Part of other messages."
+        said.append(
+            f"## {one.__name__}\n\n{travels}\n\n```text\n{inspect.getdoc(one)}\n```\n\n| field | type |\n|---|---|"
+        )
+        for field in msgspec.structs.fields(one):
+            written = next(
+                str(base.__annotations__[field.name]) for base in one.__mro__ if field.name in base.__annotations__
+            )
+            default = "" if field.default in (msgspec.NODEFAULT, msgspec.UNSET) else f" = {field.default!r}"
+            said.append(f"| `{field.encode_name}` | `{(written + default).replace('|', 'or')}` |")
+        said.append("")
+    return "\n".join(said)
+
+
+MADE: Final = {"commands": commands, "messages": messages}
+
+
 def gather(pages: Path) -> None:
     """Write all pages, and the list of them, into a new folder."""
     pages.mkdir(parents=True)
-    for path in ["README.md", *(path for paths in PAGES.values() for path in paths if path != "commands")]:
+    for path in ["README.md", *(path for paths in PAGES.values() for path in paths if path not in MADE)]:
         text = linked((REPOSITORY / path).read_text(encoding="utf-8"), path, pages)
         (pages / page_of(path)).write_text(text, encoding="utf-8")
-    (pages / "commands.md").write_text(commands(), encoding="utf-8")
+    for name, text_of in MADE.items():
+        (pages / f"{name}.md").write_text(text_of(), encoding="utf-8")
     with open(pages / "index.md", "a", encoding="utf-8") as index:
         for caption, paths in PAGES.items():
             names = "\n".join(page_of(path).removesuffix(".md") for path in paths)

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import shutil
 import signal
 import socket
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,6 +34,24 @@ FLAGS = [
 PATIENCE_MS = 240_000
 GREEN = """() => document.getElementById("banner").className === "ok"
     && Number(getComputedStyle(document.getElementById("well")).opacity) > 0.5"""
+WELL_BGR = [160, 224, 127]
+# A colour this far from it is not green any more.
+FADED = 30
+NODE_TOML = """
+node = "{node}"
+connect = "{endpoint}"
+rate_hz = 2.0
+[camera]
+name = "simulated"
+[sensors]
+name = "simulated"
+[record]
+directory = {directory}
+[simulation]
+environment = "cavern"
+seed = 1
+start_ns = {start_ns}
+"""
 
 
 class Browser:
@@ -100,6 +122,55 @@ def looking(chromium: Any, name: str, size: str = "desk") -> Iterator[Browser]:
         yield Browser(page, f"{name}-{size}")
     finally:
         page.close()
+
+
+class Film:
+    """The banner as the screen shows it, filmed from outside the page: it goes on while the page's thread is held."""
+
+    def __init__(self, chromium: Any, seen: Browser) -> None:
+        self._clock = chromium.new_page()
+        self._camera = seen.page.context.new_cdp_session(seen.page)
+        self._colour: list[int] = []
+        self._shown_s = 0.0
+        self._camera.on("Page.screencastFrame", self._filmed)
+        self._camera.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1})
+
+    def _filmed(self, frame: dict[str, Any]) -> None:
+        import cv2
+        import numpy as np
+
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(frame["data"]), np.uint8), cv2.IMREAD_COLOR)
+        self._colour, self._shown_s = picture[20, 700].tolist(), frame["metadata"]["timestamp"]
+        self._camera.send("Page.screencastFrameAck", {"sessionId": frame["sessionId"]})
+
+    def wait_for_green(self, green: bool = True, timeout_s: float = PATIENCE_MS / 1e3) -> float:
+        """Wait until the screen shows that all is well, or no longer does; return since when, in s since the epoch."""
+        began_s = time.monotonic()
+        while not self._colour or self._green() != green:
+            assert time.monotonic() < began_s + timeout_s, f"{'not' if green else 'still'} green"
+            self._clock.wait_for_timeout(20)
+        return self._shown_s
+
+    def _green(self) -> bool:
+        return all(abs(one - other) < FADED for one, other in zip(self._colour, WELL_BGR, strict=True))
+
+    def close(self) -> None:
+        self._camera.detach()
+        self._clock.close()
+
+
+def hold(seen: Browser, seconds: float) -> None:
+    """Let the page's thread do nothing else for a while, as in a frozen tab."""
+    held = f"const from = performance.now(); while (performance.now() < from + {1e3 * seconds});"
+    seen.page.evaluate(f"setTimeout(() => {{ {held} }}, 9)")
+
+
+def write_nodes(folder: Path, endpoint: str) -> None:
+    """Write the configurations of two simulated nodes, a.toml and b.toml."""
+    start_ns = time.time_ns()
+    for node in "ab":
+        text = NODE_TOML.format(node=node, endpoint=endpoint, directory=json.dumps(str(folder)), start_ns=start_ns)
+        (folder / f"{node}.toml").write_text(text)
 
 
 class Processes:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import json
 import shutil
 import signal
 import subprocess
 import tarfile
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -23,11 +20,14 @@ from tests.tools.browsed import (
     SIZES,
     Browser,
     CuttableLine,
+    Film,
     Processes,
     chromium_browser,
     free_port,
+    hold,
     looking,
     wait_for_server,
+    write_nodes,
 )
 from tests.tools.evaluated import INFOS, rejection, write_log
 from tests.tools.watched import at, image, tick
@@ -35,22 +35,6 @@ from tests.tools.watched import at, image, tick
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 pytest.importorskip("websockets", reason="websockets is not installed")
-
-NODE_TOML = """
-node = "{node}"
-connect = "{endpoint}"
-rate_hz = 2.0
-[camera]
-name = "simulated"
-[sensors]
-name = "simulated"
-[record]
-directory = {directory}
-[simulation]
-environment = "cavern"
-seed = 1
-start_ns = {start_ns}
-"""
 
 
 @pytest.fixture(scope="module")
@@ -83,11 +67,7 @@ def box_of(part: Any) -> dict[str, float]:
 def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Processes, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port = free_port()
-    start_ns = time.time_ns()
-    for node in "ab":
-        directory = json.dumps(str(tmp_path))
-        text = NODE_TOML.format(node=node, endpoint=endpoint, directory=directory, start_ns=start_ns)
-        (tmp_path / f"{node}.toml").write_text(text)
+    write_nodes(tmp_path, endpoint)
     # The page is there before the hub is, and finds it by itself.
     processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
     wait_for_server(f"http://127.0.0.1:{port}")
@@ -154,48 +134,24 @@ BEYOND_SCREEN = """() => [...document.querySelectorAll(".figure .big, .figure .b
     each => Math.max(each.scrollWidth, each.getBoundingClientRect().right) > innerWidth).map(each => each.outerHTML)"""
 BEYOND_PAPER = """() => [...document.querySelectorAll("td, th, p, svg, img, canvas")].filter(
     each => each.getBoundingClientRect().right > innerWidth + 1).map(each => each.outerHTML.slice(0, 99))"""
-WELL_BGR = [160, 224, 127]
 # How long the page's thread is held: long enough for a loaded machine to film the end of green within it.
-HELD_MS = 20_000
+HELD_S = 20.0
 FIGURE_PX = """() => [...document.querySelectorAll("#figures .big")].map(
     each => parseFloat(getComputedStyle(each).fontSize))"""
 
 
 def test_green_fades_in_a_page_whose_script_hangs(chromium: Any, processes: Processes, tmp_path: Path) -> None:
     """A dive that plays is green; then the page's thread is held, and the screen is filmed from outside it."""
-    import cv2
-    import numpy as np
-
     port = free_port()
     whole = [*INFOS.values(), *(message for k in range(3000) for message in tick(k))]
     processes.start("view", "view", write_log(tmp_path / "well.mcap", *whole), "--port", str(port))
     wait_for_server(f"http://127.0.0.1:{port}")
-    with looking(chromium, "hang") as seen:
+    with looking(chromium, "hang") as seen, closing(Film(chromium, seen)) as film:
         seen.page.goto(f"http://127.0.0.1:{port}")
         seen.wait_for_green()
-        films: list[Any] = []
-        camera = seen.page.context.new_cdp_session(seen.page)
-
-        def filmed(frame: dict[str, Any]) -> None:
-            picture = cv2.imdecode(np.frombuffer(base64.b64decode(frame["data"]), np.uint8), cv2.IMREAD_COLOR)
-            films.append(picture[20, 700].tolist())
-            camera.send("Page.screencastFrameAck", {"sessionId": frame["sessionId"]})
-
-        camera.on("Page.screencastFrame", filmed)
-        camera.send("Page.startScreencast", {"format": "png", "everyNthFrame": 1})
-        clock = chromium.new_page()
-        while not films:
-            clock.wait_for_timeout(50)
-        assert films[-1] == WELL_BGR
-        hold = (
-            f"setTimeout(() => {{ const from = performance.now(); while (performance.now() < from + {HELD_MS}); }}, 9)"
-        )
-        seen.page.evaluate(hold)
-        began_s = time.monotonic()
-        while films[-1] == WELL_BGR:
-            assert time.monotonic() < began_s + HELD_MS / 1e3, "still green"
-            clock.wait_for_timeout(50)
-        clock.close()
+        film.wait_for_green()
+        hold(seen, HELD_S)
+        film.wait_for_green(False, HELD_S)
 
 
 def dive_log(directory: Path) -> str:
