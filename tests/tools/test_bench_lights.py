@@ -4,6 +4,8 @@ import contextlib
 import io
 import json
 
+import cv2
+import numpy as np
 import pytest
 from buddyline.tools.bench.__main__ import main
 
@@ -36,3 +38,18 @@ def test_every_light_belongs_to_one_range(figures):
     assert sum(count for name, count in number.items() if name.endswith(" m")) == number["all"]
     assert number["clipped"] + number["not clipped"] == number["all"]
     assert number["not clipped"] > number["clipped"]
+
+
+def test_what_is_taken_for_a_lamp_is_counted_in_pictures_without_any(tmp_path, capsys):
+    deep = tmp_path / "site" / "day"
+    deep.mkdir(parents=True)
+    dark = np.full((200, 300, 3), 10, np.uint8)
+    cv2.imwrite(str(deep / "1.png"), dark)
+    cv2.imwrite(str(tmp_path / "2.png"), cv2.circle(dark.copy(), (150, 100), 8, (255, 255, 255), -1, cv2.LINE_AA))
+    assert main(["lights", str(tmp_path), "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["folders"]
+    assert row["pictures"] == 2
+    assert row["false"] == 0.5
+    assert row["calibration"] > 0.4
+    assert main(["lights", str(deep)]) == 0
+    assert str(deep) in capsys.readouterr().out

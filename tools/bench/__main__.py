@@ -18,6 +18,7 @@ BENCHMARKS: Final = {
     "solve": "the solver: time per trigger and per hypothesis, beside Eq. 1 alone in compiled C",
     "accuracy": "the solver: errors over the Cramer-Rao bound, and the right lights among false ones",
     "detect": "the detector: time per picture beside other finders, memory",
+    "instructions": "the detector: machine instructions per picture, and what they may take on a Pi 3",
     "lights": "the detector: lights found in rendered pictures, and the truth of sigma and score",
     "monitor": "the monitor: processor and memory with viewers, latency beside it, weight of the page",
     "coach": "the coach: fixes within 5 s, where its words are followed",
@@ -27,7 +28,7 @@ BENCHMARKS: Final = {
 
 def main(argv: list[str] | None = None) -> int:
     """Run one benchmark and print its figures; return the exit status."""
-    listing = "\n".join(f"  {name:8} {does}" for name, does in BENCHMARKS.items())
+    listing = "\n".join(f"  {name:12} {does}" for name, does in BENCHMARKS.items())
     parser = argparse.ArgumentParser(
         prog=PROGRAM,
         description=f"benchmarks:\n{listing}",

@@ -13,8 +13,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -25,6 +25,7 @@ from buddyline.node.detect import GuidedDetector, Region, make_detector
 from buddyline.node.detect.detection import is_likely
 from buddyline.node.guide import FLOOR, SIGMAS
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.bench.lights import FIRST_COUNTED, SIGMA, loop_frames
 from buddyline.tools.measure.load import load_of
 from buddyline.tools.measure.pictures import simulated_world, spread, stored_pictures, views
 from buddyline.tools.measure.tables import text_table
@@ -40,9 +41,9 @@ ASPECT: Final = 616 / 820
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin")
 SEED: Final = 3
 GUIDED: Final = f"{OURS}, guided"
-# How far the track foretells a light off its place at 10 Hz, 1 sd, as a share of the picture's width.
-SIGMA: Final = 0.0025
 STEP_S: Final = 3.7
+LOOP_STEP: Final = 23
+"""Every so many pictures of the node's loop count."""
 ROUNDS: Final = 5
 APRILTAGS: Final = "pupil-apriltags"
 APRILTAGS_PROGRAM: Final = """
@@ -69,11 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pictures", type=int, default=12, metavar="N", help="of each environment; default: 12")
     parser.add_argument("--width", type=int, nargs="+", default=list(WIDTHS_PX), metavar="PX")
     parser.add_argument(
-        "--stops",
-        type=float,
-        default=0.0,
-        metavar="EV",
-        help="render so far below the scene's exposure, as a node does that follows the lamps (about 4); default: 0",
+        "--lamps", action="store_true", help="render at the exposure that the node's own loop chooses, not the scene's"
     )
     parser.add_argument(
         "--frames", type=int, metavar="N", help="measure only our detector's memory, up to this many pictures"
@@ -85,16 +82,14 @@ def measure(args: argparse.Namespace) -> Any:
 
     A row: ms per picture of each finder, and our detector's time over each finder's.
     """
-    if args.stops < 0:
-        raise BuddylineError("--stops: 0 or more")
     if args.pictures < 1 or min(args.width) < 64 or (args.frames is not None and args.frames < 10):
         raise BuddylineError("--pictures: at least 1; --width: at least 64; --frames: at least 10")
     cv2.setNumThreads(1)
     sources = args.dives or list(ENVIRONMENTS)
     if args.frames:
-        return growth(_pictures(sources[0], args.width[0], args.pictures, args.stops), args.frames)
+        return growth(pictures_of(sources[0], args.width[0], args.pictures, lamps=args.lamps), args.frames)
     return [
-        compare(Path(source).stem, width_px, _pictures(source, width_px, args.pictures, args.stops))
+        compare(Path(source).stem, width_px, pictures_of(source, width_px, args.pictures, lamps=args.lamps))
         for source in sources
         for width_px in args.width
     ]
@@ -106,7 +101,7 @@ def compare(source: str, width_px: int, pictures: Pictures) -> dict[str, Any]:
     def over_all(finder: Finder) -> Callable[[], object]:
         return lambda: [finder(picture) for picture in pictures]
 
-    guided = _Guided(pictures)
+    guided = Guided(pictures)
     rounds = by_turns({name: over_all(finder) for name, finder in (_finders() | {GUIDED: guided}).items()}, ROUNDS)
     ms: dict[str, float | None] = {name: 1e3 * float(np.median(s)) / len(pictures) for name, s in rounds.items()}
     ratio: dict[str, float | None] = {
@@ -117,35 +112,37 @@ def compare(source: str, width_px: int, pictures: Pictures) -> dict[str, Any]:
     return {"source": source, "width_px": width_px, "ms": ms, "ratio": ratio, "guided_share": guided.share}
 
 
-class _Guided:
+class Guided:
     """Our detector where two lights of each picture are expected: as far off as the track foretells them at 10 Hz.
 
-    share: of the pictures, how many are searched in regions only; the others as a whole, in which nothing is likely, or
-    the lights are large.
+    searched: the pictures that are searched in regions only; in the others nothing is likely, or the lights are large.
+    share: of all pictures, how many these are. whole: searches a whole picture.
     """
 
     def __init__(self, pictures: Pictures) -> None:
-        self._detector = make_detector(OURS)
-        if not isinstance(self._detector, GuidedDetector):
+        detector = make_detector(OURS)
+        if not isinstance(detector, GuidedDetector):
             raise TypeError(f"{OURS} searches no regions")
-        self._detect_near = self._detector.detect_near
+        self.whole, self._detect_near = detector.detect, detector.detect_near
         self._regions: dict[int, list[Region]] = {}
         rng = np.random.default_rng(SEED)
         for picture in pictures:
             sigma_px = SIGMA * picture.shape[1]
             regions: list[Region] = []
-            for d in self._detector.detect(picture):
+            for d in self.whole(picture):
                 if is_likely(d.blob) and len(regions) < 2:
                     u, v = np.add((d.blob.u_px, d.blob.v_px), rng.normal(0.0, sigma_px, 2)).tolist()
                     radius_px = SIGMAS * sigma_px + FLOOR * picture.shape[1]
                     regions.append(Region((u, v), radius_px, float(np.sqrt(d.blob.area_px / np.pi))))
             if regions and self._detect_near(picture, regions) is not None:
                 self._regions[id(picture)] = regions
+        self.searched = [picture for picture in pictures if id(picture) in self._regions]
         self.share = len(self._regions) / len(pictures)
 
     def __call__(self, picture: NDArray[np.uint8]) -> object:
+        """Search a picture: the regions only, if it is one of `searched`."""
         regions = self._regions.get(id(picture))
-        return self._detector.detect(picture) if regions is None else self._detect_near(picture, regions)
+        return self.whole(picture) if regions is None else self._detect_near(picture, regions)
 
 
 def growth(pictures: Pictures, frames: int) -> dict[str, int]:
@@ -211,20 +208,22 @@ def _apriltags_ms(pictures: Pictures) -> float | None:
     return 1e3 * float(np.mean([float(word) for word in done.stdout.split()])) if done.returncode == 0 else None
 
 
-def _pictures(source: str, width_px: int, count: int, stops: float) -> Pictures:
-    """Return colour pictures of this width, from a dive, or rendered of an environment so far below its exposure."""
+def pictures_of(source: str, width_px: int, count: int, *, lamps: bool) -> Pictures:
+    """Return colour pictures of this width, from a dive, or rendered of an environment.
+
+    lamps: rendered ones have the exposure that the node's loop has locked to the lamps, and not the scene's.
+    """
     height_px = round(width_px * ASPECT)
     if source.endswith(".mcap"):
         stored = [_in_colour(picture, width_px, height_px) for picture in stored_pictures(source)]
         if not stored:
             raise BuddylineError(f"{source}: holds no pictures")
         return spread(stored, count)
-    from buddyline.node.sim.sensor import scene_exposure
-
     world = simulated_world(source, SEED, width_px, height_px)
-    scene = scene_exposure(world.scenario.water)
-    exposure = replace(scene, time_ns=max(round(scene.time_ns * 2.0**-stops), 1)) if stops else None
-    return [world.render(node, stamp_ns, exposure) for node, stamp_ns in views(world, count, STEP_S)]
+    if not lamps:
+        return [world.render(node, stamp_ns) for node, stamp_ns in views(world, count, STEP_S)]
+    frames = loop_frames(world, world.scenario.node_a, FIRST_COUNTED + count * LOOP_STEP)
+    return [frame.image for frame, _ in islice(frames, 0, None, LOOP_STEP)][:count]
 
 
 def _in_colour(picture: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:

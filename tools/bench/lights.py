@@ -3,12 +3,15 @@
 Each scene is a dive at 5 Hz in one water. Its pictures have the exposure that the node's own loop chooses; with
 `--scene` they have the scene's. Pictures before the loop has locked count as well, but not those of the first second.
 Pictures of the scene, which the loop takes every few frames for people, do not count. With `--guided` the other node's
-lights are expected, as a solver with a track expects them, with the errors that `bench detect` gives them.
+lights are expected, as a solver with a track expects them, with the errors that a track has at 10 Hz.
 
 A light is one of the other node's that is in view. It is found by the candidate nearest to it, within 1 % of the
 picture's width. NEES: the mean squared error over the variance, per axis; 1 if sigma is true. Beyond: the share of
 errors outside of the circle that should hold 99.73 % of them, which is 3 sigma of one number. False: a candidate with
 score 0.5 or more that is near no lamp of anyone.
+
+With folders of pictures that show no lamp, the figures are those of what is taken for one in them. They go by the name
+of their folder, as deep as it may be.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import cv2
@@ -27,12 +31,12 @@ from buddyline.node.config import ExposureConfig
 from buddyline.node.detect import make_detector
 from buddyline.node.detect.detection import LIKELY
 from buddyline.node.devices import Frame
+from buddyline.node.drivers.stored import decode_picture, picture_files
 from buddyline.node.guide import Guide
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob, Expect, ExpectedLight
-from buddyline.tools.bench.detect import SIGMA
 from buddyline.tools.fit_score import score_error
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
@@ -43,6 +47,8 @@ if TYPE_CHECKING:
 
 ENVIRONMENTS: Final = ("cavern", "night_reef", "lake", "basin", "day_reef")
 PERIOD_NS: Final = S_NS // 5
+SIGMA: Final = 0.0025
+"""How far the track foretells a light off its place at 10 Hz, 1 sd, as a share of the picture's width."""
 FIRST_SEED: Final = 5000
 FIRST_COUNTED: Final = 5
 """Number of each scene's first picture that counts: those of the first second do not."""
@@ -106,6 +112,9 @@ class SeenLights:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the benchmark's arguments."""
+    parser.add_argument(
+        "folders", nargs="*", metavar="FOLDER", help="of pictures without lamps; default: rendered ones"
+    )
     parser.add_argument("--environment", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS), metavar="WATER")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first scene; default: {FIRST_SEED}")
     parser.add_argument("--scenes", type=int, default=3, metavar="N", help="in each water; default: 3")
@@ -116,10 +125,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of both tables: by water, and by class of lights."""
+    """Return the rows of each table: by water and by class of lights, or by folder."""
     if args.scenes < 1 or args.seconds <= FIRST_COUNTED * PERIOD_NS / S_NS or args.strange < 0 or args.seed < 0:
         raise BuddylineError("--scenes: at least 1; --seconds: above 1; --strange, --seed: 0 or more")
     cv2.setNumThreads(1)
+    if args.folders:
+        return {"folders": [without_lamps(Path(folder)) for folder in args.folders]}
     seen = {water: SeenLights() for water in args.environment}
     for water, found in seen.items():
         for seed in range(args.seed, args.seed + args.scenes):
@@ -134,6 +145,15 @@ def measure(args: argparse.Namespace) -> dict[str, list[dict[str, Any]]]:
     }
 
 
+def without_lamps(folder: Path) -> dict[str, Any]:
+    """Return the row of a folder with pictures that show no lamp, each seen by a detector of its own."""
+    seen = SeenLights()
+    for file in (file for place in sorted({folder, *folder.rglob("*/")}) for file in picture_files(place)):
+        blobs = [d.blob for d in make_detector().detect(decode_picture(file.read_bytes(), str(file)))]
+        seen.add(blobs, [], [False] * len(blobs))
+    return {"folder": str(folder), **_of_candidates(seen)}
+
+
 Picture = tuple[list[Blob], list[Light], list[bool]]
 
 
@@ -141,13 +161,18 @@ def look(environment: str, seed: int, seconds: float, strange: int, *, scene: bo
     """Yield of each picture of a scene the candidates, the lights in view, and which candidates are lamps."""
     world = simulated_world(environment, seed, other_lamps=strange)
     for node in (world.scenario.node_a, world.scenario.node_b):
-        for frame, blobs in _frames(world, node, round(seconds * S_NS / PERIOD_NS), scene=scene, guided=guided):
+        for frame, blobs in loop_frames(world, node, round(seconds * S_NS / PERIOD_NS), scene=scene, guided=guided):
             lights = _lights(world, node, frame, blobs)
             yield blobs, lights, _lamps(world, node, frame, blobs)
 
 
-def _frames(world: World, node: str, count: int, *, scene: bool, guided: bool) -> Iterator[tuple[Frame, list[Blob]]]:
-    """Yield a node's frames that count, each with its candidates."""
+def loop_frames(
+    world: World, node: str, count: int, *, scene: bool = False, guided: bool = False
+) -> Iterator[tuple[Frame, list[Blob]]]:
+    """Yield those of a node's first `count` frames that count, each with its candidates.
+
+    scene: at the scene's exposure instead of the loop's. guided: with the other node's lights expected.
+    """
     from buddyline.node.sim.sensor import DelayedControls
 
     controls = DelayedControls()
@@ -244,14 +269,20 @@ def _of_water(water: str, seen: SeenLights) -> dict[str, Any]:
     lights = seen.lights
     return {
         "water": water,
-        "pictures": seen.pictures,
         "lights": len(lights),
         "recall": _share([light.away_px <= CLOSE_PX for light in lights]),
         "both_first": seen.pairs_first / max(seen.pairs, 1),
         "median_px": _median([light.away_px for light in lights if light.near]),
+        **_of_candidates(seen),
+        **_truth_of_sigma(lights),
+    }
+
+
+def _of_candidates(seen: SeenLights) -> dict[str, float]:
+    return {
+        "pictures": seen.pictures,
         "false": seen.false / max(seen.pictures, 1),
         "calibration": score_error(np.array(seen.scores), np.array(seen.lamp, bool)) if seen.scores else 0.0,
-        **_truth_of_sigma(lights),
     }
 
 
@@ -282,7 +313,10 @@ def _median(values: Sequence[float]) -> float:
 
 
 def table(figures: dict[str, list[dict[str, Any]]]) -> str:
-    """Return both tables as text."""
+    """Return the tables as text."""
+    candidates = {"pictures": "{pictures}", "false": "{false:.3f}", "calibration error": "{calibration:.3f}"}
+    if "folders" in figures:
+        return text_table(cells_of(figures["folders"], {"folder": "{folder}"} | candidates))
     sigma = {"NEES": "{nees:.2f}", "beyond": "{beyond:.3f}"}
     waters = {
         "water": "{water}",
