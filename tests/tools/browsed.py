@@ -35,8 +35,6 @@ PATIENCE_MS = 240_000
 GREEN = """() => document.getElementById("banner").className === "ok"
     && Number(getComputedStyle(document.getElementById("well")).opacity) > 0.5"""
 WELL_BGR = [160, 224, 127]
-# A colour this far from it is not green any more.
-FADED = 30
 NODE_TOML = """
 node = "{node}"
 connect = "{endpoint}"
@@ -146,13 +144,10 @@ class Film:
     def wait_for_green(self, green: bool = True, timeout_s: float = PATIENCE_MS / 1e3) -> float:
         """Wait until the screen shows that all is well, or no longer does; return since when, in s since the epoch."""
         began_s = time.monotonic()
-        while not self._colour or self._green() != green:
+        while not self._colour or (self._colour == WELL_BGR) != green:
             assert time.monotonic() < began_s + timeout_s, f"{'not' if green else 'still'} green"
             self._clock.wait_for_timeout(20)
         return self._shown_s
-
-    def _green(self) -> bool:
-        return all(abs(one - other) < FADED for one, other in zip(self._colour, WELL_BGR, strict=True))
 
     def close(self) -> None:
         self._camera.detach()
