@@ -236,15 +236,16 @@ class Dashboard:
             return ["no pose yet"]
         off_m, off_range_m, turned_deg = self._off(shown)
         roll_deg, pitch_deg, yaw_deg = (math.degrees(angle_rad) for angle_rad in _turned(shown))
-        lights = "   ".join(
-            f"{name} sees {status.lights_seen} lights"
+        seen = ", ".join(
+            f"{name} {status.lights_seen}"
             for name, status in sorted(self._nodes.items())
             if status.lights_seen is not UNSET
         )
+        turned = f"roll {roll_deg:+.0f} pitch {pitch_deg:+.0f} yaw {yaw_deg:+.0f} deg"
         return [
             f"range {shown.range_m:.3f} m, 1 sd {sigma_m(shown) * 1e3:.1f} mm   {self._age(shown)}",
             _direction(shown),
-            f"B from A: roll {roll_deg:+.2f}  pitch {pitch_deg:+.2f}  yaw {yaw_deg:+.2f} deg   {lights}",
+            f"B from A: {turned}  lights: {seen or 'none yet'}",
             f"truth: {off_m * 1e3:.1f} mm off, range {off_range_m * 1e3:+.1f} mm, turned {turned_deg:.2f} deg",
         ]
 

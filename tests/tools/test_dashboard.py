@@ -14,9 +14,10 @@ from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import key_of
 from buddyline.tools.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
+from msgspec.structs import replace
 
 from tests.tools.evaluated import pose, rejection, track
-from tests.tools.watched import START_NS, at, solver_status
+from tests.tools.watched import START_NS, at, solver_status, status
 
 OFF_M = np.array((0.0, 0.0, 0.02))
 NED = {"azimuth_rad": 1.0, "inclination_rad": 0.1}
@@ -85,6 +86,8 @@ def test_a_track_without_poses_is_shown():
 @pytest.mark.parametrize("size", [(60, 14), (80, 24), (200, 60)])
 def test_the_screen_fits_its_terminal(size):
     watch = running()
+    for node in "ab":
+        watch.take(replace(status(node, at(30)), lights_seen=2))
     text = watch.dashboard.screen(*size)
     # Never cleared as a whole, which flickers; each line clears its own rest, and the end what is below.
     assert "\x1b[2J" not in text
@@ -96,6 +99,7 @@ def test_the_screen_fits_its_terminal(size):
     assert "from above; a row is" in text
     assert "range" in text
     assert "last without a pose: " in text
+    assert "deg  lights: a 2, b 2" in text
     assert ("latency" in text) == (size[1] > 24)
 
 
