@@ -120,7 +120,7 @@ class LinkBudget:
             self._clear_s = now_s
 
     def words(self, now_s: float) -> str:
-        """Return what the link leaves out, for people; "" if nothing."""
+        """Return what the link leaves out, and how late the rest is, for people; "" if nothing."""
         with self._lock:
             if now_s - self._counted_s > WORDS_S:
                 parts = [
@@ -129,6 +129,10 @@ class LinkBudget:
                 ]
                 rate = "" if self._limit is None else f" of about {self._limit / 1000:.0f} kB/s"
                 self._words = f"slow link{rate}: sent of {', '.join(parts)}; the log has all" if parts else ""
+                behind_s = now_s - self._clear_s
+                if self._seen and behind_s > BEHIND_S:
+                    late = f"messages wait for more than {BEHIND_S:g} s, for {behind_s:.0f} s now"
+                    self._words = f"{self._words}; {late}" if parts else f"slow link{rate}: {late}"
                 self._sent.clear()
                 self._left_out.clear()
                 self._counted_s = now_s

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator
+from itertools import count, takewhile
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
@@ -20,8 +21,8 @@ from mcap.exceptions import McapError
 from mcap.records import Message as McapMessage
 from mcap.records import Metadata
 
-# Not packed; a single message may be larger.
-PAGE_BYTES: Final = 32 * 1024
+# Not packed; a single message may be larger. On a slow link urgent messages wait for a page that is under way.
+PAGE_BYTES: Final = 16 * 1024
 MOST_PAGE_BYTES: Final = 128 * 1024
 MOST_UNPACKED_BYTES: Final = 1024 * 1024
 # A question's stretch: what is beyond it is left out of the answer.
@@ -126,8 +127,15 @@ def pages_of(messages: Iterator[Logged]) -> Iterator[bytes]:
     yield packer.compress(msgspec.msgpack.encode(Page(number, True, waiting)))
 
 
-def whole(pages: list[bytes]) -> list[Logged] | None:
-    """Return the messages of an answer; None if pages are missing. Raises MessageError for what is no page."""
+class LogAnswer(NamedTuple):
+    """The messages of an answer, up to the first page that has not come. is_whole: all pages have."""
+
+    messages: list[Logged]
+    is_whole: bool
+
+
+def answer_of(pages: list[bytes]) -> LogAnswer:
+    """Unpack the pages of an answer. Raises MessageError for what is no page."""
     found: dict[int, Page] = {}
     for packed in pages:
         try:
@@ -138,6 +146,6 @@ def whole(pages: list[bytes]) -> list[Logged] | None:
         except (zstandard.ZstdError, msgspec.DecodeError, UnicodeDecodeError) as error:
             raise MessageError(f"a page of a log: {error}") from error
         found[page.number] = page
-    if not found or set(found) != set(range(len(found))) or not found[len(found) - 1].last:
-        return None
-    return [one for _, page in sorted(found.items()) for one in page.messages]
+    in_order = [found[k] for k in takewhile(found.__contains__, count())]
+    messages = [one for page in in_order for one in page.messages]
+    return LogAnswer(messages, bool(in_order) and in_order[-1].last)

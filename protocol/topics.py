@@ -165,7 +165,8 @@ CLOCK: Final = Topic(
     max_bytes=SAMPLE_BYTES,
 )
 CLOCK_SET: Final = Topic("clock_set", "buddyline/node/{node}/clock_set", messages.ClockSet, 0.0, "data")
-DIGEST: Final = Topic("digest", "buddyline/node/{node}/digest", messages.Digest, 1.0, "data_low", shed=4)
+# One in ten seconds tells that others are missing, and of which run.
+DIGEST: Final = Topic("digest", "buddyline/node/{node}/digest", messages.Digest, 1.0, "data_low", shed=4, keep_hz=0.1)
 LIGHT_TRUTH: Final = Topic("light_truth", "buddyline/node/{node}/light_truth", messages.LightTruth, 10.0, "data_low")
 MARK: Final = Topic("mark", "buddyline/node/{node}/mark", messages.Mark, 0.0, "data")
 POSE: Final = Topic(

@@ -1,7 +1,7 @@
 """Complete a recording from the nodes' own logs, over the bus, while it is being made.
 
-What the recording lacks shows by the nodes' digests. It is asked for, a second at a time, and written when its checksum
-is right.
+What the recording lacks shows by the nodes' digests. It is asked for, some seconds at a time, and written when its
+checksum is right.
 """
 
 from __future__ import annotations
@@ -11,14 +11,16 @@ import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
+from buddyline.protocol.codec import payload_stamp_ns
 from buddyline.protocol.digest import end_of, sum_of
 from buddyline.protocol.digest_check import Discrepancy
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.log_pages import MOST_NS, Logged, Question, whole
+from buddyline.protocol.log_pages import MOST_NS, LogAnswer, Logged, Question, answer_of
 from buddyline.protocol.topics import DIGEST, LOG
 
 if TYPE_CHECKING:
@@ -33,6 +35,12 @@ AGAIN_S: Final = 2.0
 MAX_GAPS: Final = 20_000
 # Of one gap in the digests, which may state any time; what is older is not asked for.
 MOST_MISSING_NS: Final = 24 * 3600 * S_NS
+# Seconds that one question is about, at most: less is packed, and on a long link waited, than for each on its own.
+MOST_JOINED: Final = 8
+# Gaps among which those that follow on the oldest one are looked for.
+MAX_LOOK: Final = 100
+# A digest is written this long after its stamp, at most.
+WRITTEN_NS: Final = S_NS // 2
 
 # Key, payload, log time.
 Write = Callable[[str, bytes, int], None]
@@ -45,6 +53,10 @@ class _Second(NamedTuple):
     boot: str
     since_ns: int
     until_ns: int
+
+    def follows(self, other: _Second) -> bool:
+        """Return whether it begins where the other ends."""
+        return (self.node, self.boot, self.since_ns) == (other.node, other.boot, other.until_ns)
 
 
 class Filler:
@@ -60,6 +72,7 @@ class Filler:
         self._began_ns = began_ns - round(CACHE_S * S_NS)
         self._stop = stop
         self._open: OrderedDict[_Second, list[Discrepancy]] = OrderedDict()
+        self._joined = 1
         self._changed = threading.Condition()
 
     @property
@@ -77,7 +90,7 @@ class Filler:
         since_ns = max(one.since_ns, self._began_ns, end_ns - MOST_MISSING_NS)
         with self._changed:
             while since_ns < end_ns:
-                until_ns = min(since_ns + MOST_NS, end_ns)
+                until_ns = min(since_ns + MOST_NS - WRITTEN_NS, end_ns)
                 self._open.setdefault(_Second(one.node, one.boot, since_ns, until_ns), []).append(one)
                 since_ns = until_ns
             while len(self._open) > MAX_GAPS:
@@ -92,40 +105,62 @@ class Filler:
                 if not self._open:
                     self._changed.wait(AGAIN_S)
                     continue
-                second, missing = self._open.popitem(last=False)
-            left = self._fill(second, missing)
+                asked = self._next()
+            left = self._fill(asked)
             with self._changed:
-                if left:
-                    self._open.setdefault(second, []).extend(left)
+                for second, missing in left.items():
+                    self._open.setdefault(second, []).extend(missing)
                 failed = failed + 1 if left else 0
                 waiting = len(self._open)
+            # A shorter answer may come where a long one does not.
+            self._joined = max(self._joined // 2, 1) if left else min(2 * self._joined, MOST_JOINED)
             # With nothing but failures, all gaps are tried again in turn, slowly.
             self._stop.wait(AGAIN_S if failed >= max(min(waiting, 10), 1) else PAUSE_S)
 
-    def _fill(self, second: _Second, missing: list[Discrepancy]) -> list[Discrepancy]:
+    def _next(self) -> dict[_Second, list[Discrepancy]]:
+        """Take the oldest second, and the ones of its node that follow on it."""
+        taken = [next(iter(self._open))]
+        for one in islice(self._open, 1, MAX_LOOK):
+            # Where digests are missing, nothing else is asked for.
+            alone = any(missing.stretch is None for missing in (*self._open[one], *self._open[taken[0]]))
+            if one.follows(taken[-1]) and not alone and len(taken) < self._joined:
+                taken.append(one)
+        return {one: self._open.pop(one) for one in taken}
+
+    def _fill(self, asked: dict[_Second, list[Discrepancy]]) -> dict[_Second, list[Discrepancy]]:
         """Return what is missing after an attempt."""
-        topics = {end_of(DIGEST) if one.stretch is None else one.stretch.topic for one in missing}
-        question = Question(second.boot, second.since_ns, second.until_ns, tuple(sorted(topics)))
+        first, last = next(iter(asked)), next(reversed(asked))
+        every = [one for missing in asked.values() for one in missing]
+        topics = {end_of(DIGEST) if one.stretch is None else one.stretch.topic for one in every}
+        late_ns = WRITTEN_NS if end_of(DIGEST) in topics else 0
+        question = Question(first.boot, first.since_ns, last.until_ns + late_ns, tuple(sorted(topics)))
         try:
-            found = whole(self._bus.ask(LOG.format(node=second.node), question.text(), ANSWER_S))
+            answer = answer_of(self._bus.ask(LOG.format(node=first.node), question.text(), ANSWER_S))
         except MessageError as error:
-            log.warning("node %s: %s", second.node, error)
-            return missing
-        if found is None:
-            return missing
-        left = []
-        for one in missing:
-            chosen = _digests(second.node, found) if one.stretch is None else _missing_of(one, found)
-            for logged in chosen or ():
-                self._write(logged.key, logged.payload, logged.time_ns)
-                self.filled[second.node] += 1
-            if chosen is None:
-                left.append(one)
+            log.warning("node %s: %s", first.node, error)
+            return asked
+        left: dict[_Second, list[Discrepancy]] = {}
+        for second, missing in asked.items():
+            for one in missing:
+                chosen = _digests(second, answer) if one.stretch is None else _missing_of(one, answer.messages)
+                for logged in chosen or ():
+                    self._write(logged.key, logged.payload, logged.time_ns)
+                    self.filled[second.node] += 1
+                if chosen is None:
+                    left.setdefault(second, []).append(one)
         return left
 
 
-def _digests(node: str, found: list[Logged]) -> list[Logged]:
-    return [one for one in found if one.key == DIGEST.key(node)]
+def _digests(second: _Second, answer: LogAnswer) -> list[Logged] | None:
+    """Return the digests that were made then, and written a moment later; None: not all have come."""
+    if not answer.is_whole:
+        return None
+    return [
+        one
+        for one in answer.messages
+        if one.key == DIGEST.key(second.node)
+        and second.since_ns < (payload_stamp_ns(one.payload) or 0) <= second.until_ns
+    ]
 
 
 def _missing_of(one: Discrepancy, found: list[Logged]) -> list[Logged] | None:

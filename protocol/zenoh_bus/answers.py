@@ -15,15 +15,16 @@ from buddyline.protocol.zenoh_bus.session import SecondLink
 # Questions that wait; of more, the oldest are not answered.
 MAX_QUESTIONS: Final = 16
 BYTES_PER_S: Final = 250_000.0
-# The rest of an answer that has to wait longer for room on the link is left out.
-PATIENCE_S: Final = 5.0
+# What could not be sent of an answer for so long is left out; nobody waits longer for it.
+PATIENCE_S: Final = 10.0
 LOOK_S: Final = 0.05
 
 
 class AnswerDesk:
     """A thread that answers the questions on a key, in the session for large messages.
 
-    budget: says when the link has room to spare. Each payload's number in its answer goes as its attachment.
+    budget: says when the link has room to spare, is_sent: whether nothing of the payload before waits any longer. Each
+    payload's number in its answer goes as its attachment.
     """
 
     def __init__(
@@ -32,12 +33,14 @@ class AnswerDesk:
         key: str,
         reply: Callable[[str], Iterable[bytes]],
         budget: LinkBudget,
+        is_sent: Callable[[], bool],
         failures: FailureLatch,
     ) -> None:
         self._link = link
         self._key = key
         self._reply = reply
         self._budget = budget
+        self._is_sent = is_sent
         self._failures = failures
         self._stop = threading.Event()
         self._declared: zenoh.Queryable[zenoh.Handler[zenoh.Query]] | None = None
@@ -72,9 +75,9 @@ class AnswerDesk:
                 self._failures.report(self._thread.name, error)
 
     def _answer(self, query: zenoh.Query) -> None:
+        ends_s = time.monotonic() + PATIENCE_S
         for number, payload in enumerate(self._reply(str(query.parameters))):
-            ends_s = time.monotonic() + PATIENCE_S
-            while not self._budget.admits_spare(len(payload), time.monotonic()):
+            while not (self._is_sent() and self._budget.admits_spare(len(payload), time.monotonic())):
                 if time.monotonic() > ends_s or self._stop.wait(LOOK_S):
                     return
             # With the priority of the question.

@@ -30,7 +30,7 @@ from buddyline.protocol.security import PLAYER, Tls
 from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
 from buddyline.protocol.zenoh_bus.answers import AnswerDesk, ask
-from buddyline.protocol.zenoh_bus.link import Link
+from buddyline.protocol.zenoh_bus.link import Bulk, Link
 from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
 from buddyline.protocol.zenoh_bus.subscription import AGAIN, COPY, QUERY_S, ZenohSubscription
@@ -147,7 +147,7 @@ class ZenohBus(Bus):
         session.liveliness().declare_subscriber(f"{ALIVE}/{PLAYER}/*", self._note_player, history=True)
         self._asking = zenoh.CancellationToken()
         self._budget = LinkBudget()
-        self._link = Link(session, self._budget)
+        self._link = Link(session, self._budget, Bulk(self._bulk))
         self._watchdog = Watchdog(session, self._link)
         # A thread inside Zenoh at the interpreter's end aborts the process, so the bus closes before that.
         atexit.register(self.close)
@@ -220,7 +220,7 @@ class ZenohBus(Bus):
 
     def answer(self, key: str, reply: Callable[[str], Iterable[bytes]]) -> None:
         """Answer questions on key until the bus closes, with what the link has to spare."""
-        answers = AnswerDesk(self._bulk, key, reply, self._budget, self._failures)
+        answers = AnswerDesk(self._bulk, key, reply, self._budget, self._link.bulk.is_sent, self._failures)
         with self._lock:
             self._answers.append(answers)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -11,6 +12,7 @@ import zenoh
 from buddyline.protocol.connection import Connection
 from buddyline.protocol.delivery import CLOSE_S
 from buddyline.protocol.link_budget import LinkBudget
+from buddyline.protocol.zenoh_bus.session import SecondLink
 
 LOOK_S: Final = 0.1
 # The connection is looked for at most this often.
@@ -32,13 +34,15 @@ log = logging.getLogger(__name__)
 class Link:
     """The TCP connection of a session, observed by a thread of its own. Outside Linux nothing is observed.
 
-    budget: takes the observations. is_long: whether the round trip is long. Zenoh (1.10) gives up a connection that
+    budget: takes the observations. bulk: the session for large messages, whose connection shares the link; what the hub
+    acknowledges of it counts, too. is_long: whether the round trip is long. Zenoh (1.10) gives up a connection that
     takes too long to open; if this happens after it has started to send and before it has started to receive, half a
     connection stays, whose bytes nobody reads. It is cut, and Zenoh makes a new one.
     """
 
-    def __init__(self, session: zenoh.Session, budget: LinkBudget) -> None:
+    def __init__(self, session: zenoh.Session, budget: LinkBudget, bulk: Bulk) -> None:
         self._session = session
+        self.bulk = bulk
         self._budget = budget
         self._stop = threading.Event()
         self._flush = threading.Event()
@@ -77,15 +81,11 @@ class Link:
             if connection is not None:
                 with connection:
                     self._follow(connection)
+        self.bulk.close()
 
     def connection(self) -> Connection | None:
         """Return the session's connection with the hub; None if there is none now."""
-        for link in self._session.info.links():
-            host, _, port = str(link.src).partition("/")[2].rpartition(":")
-            found = Connection.find(host.strip("[]"), int(port)) if port.isdecimal() else None
-            if found is not None:
-                return found
-        return None
+        return _connection(self._session)
 
     def _follow(self, connection: Connection) -> None:
         connection.hold_back(AHEAD_BYTES)
@@ -108,7 +108,7 @@ class Link:
             if state.min_rtt_s > LONG_RTT_S and not self.is_long:
                 connection.bear_losses()
             self.is_long = state.min_rtt_s > LONG_RTT_S
-            self._budget.observe(state, now_s)
+            self._budget.observe(state._replace(acked=state.acked + self.bulk.acked(now_s)), now_s)
             read_before, read = read, state.received - state.unread
             if read != read_before:
                 self._heard_s = now_s
@@ -118,3 +118,47 @@ class Link:
                 log.warning("nobody reads what the hub sends for %.1f s: connecting again", now_s - changed_s)
                 connection.cut()
                 return
+
+
+class Bulk:
+    """The connections of a second session, observed by the thread of `Link`."""
+
+    def __init__(self, link: SecondLink) -> None:
+        self._link = link
+        self._connection: Connection | None = None
+        self._found_s = float("-inf")
+        self._before = self._of_this = 0
+
+    def acked(self, now_s: float) -> int:
+        """Return how many bytes the hub has acknowledged, over all connections so far."""
+        state = None if self._connection is None else self._connection.state()
+        if state is not None:
+            self._of_this = state.acked
+        elif self._link.session is not None and now_s - self._found_s > FIND_S:
+            self.close()
+            self._found_s = now_s
+            with contextlib.suppress(zenoh.ZError):
+                self._connection = _connection(self._link.session)
+        return self._before + self._of_this
+
+    def is_sent(self) -> bool:
+        """Return whether nothing waits to be sent, as far as is known."""
+        connection = self._connection
+        state = None if connection is None else connection.state()
+        return state is None or not state.waiting
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        self._before, self._of_this = self._before + self._of_this, 0
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
+
+
+def _connection(session: zenoh.Session) -> Connection | None:
+    for link in session.info.links():
+        host, _, port = str(link.src).partition("/")[2].rpartition(":")
+        found = Connection.find(host.strip("[]"), int(port)) if port.isdecimal() else None
+        if found is not None:
+            return found
+    return None

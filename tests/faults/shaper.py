@@ -1,7 +1,8 @@
 """A poor link between this network namespace and a new one: rate, delay, loss and reordering. Needs root.
 
 Written for kernels without netem: each end is a TUN device, and a process of its own passes the packets between them.
-Run as `python -m tests.faults.shaper NAMESPACE` it is that process.
+Run as `python -m tests.faults.shaper NAMESPACE` it is that process. At its end it says what share of the packets it has
+passed later than it should have: a machine that is too busy is another link.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from dataclasses import asdict, dataclass
 
 HERE, THERE = "10.249.78.1", "10.249.78.2"
 SEED = 20
+# A packet that is passed so much later than it arrives.
+LATE_S = 0.05
 
 _CLONE_NEWNET = 0x40000000
 _TUNSETIFF = 0x400454CA
@@ -53,6 +56,7 @@ class OneWay:
         self._free_s = 0.0
         self._order = itertools.count()
         self._under_way: list[tuple[float, int, bytes]] = []
+        self.passed = self.late = 0
 
     def send(self, packet: bytes, now_s: float) -> None:
         """Take a packet; it may be lost."""
@@ -69,7 +73,10 @@ class OneWay:
     def arrived(self, now_s: float) -> Iterator[bytes]:
         """Return the packets that have arrived."""
         while self._under_way and self._under_way[0][0] <= now_s:
-            yield heapq.heappop(self._under_way)[2]
+            arrived_s, _, packet = heapq.heappop(self._under_way)
+            self.passed += 1
+            self.late += now_s - arrived_s > LATE_S
+            yield packet
 
     @property
     def next_s(self) -> float:
@@ -95,6 +102,8 @@ def main() -> None:
         timeout_s = max(min(soonest_s - time.monotonic(), 1.0), 0.0)
         readable, _, _ = select.select([here, there, sys.stdin], [], [], timeout_s)
         if sys.stdin in readable:
+            passed, late = (sum(getattr(way, name) for way, _ in ways.values()) for name in ("passed", "late"))
+            print(late / max(passed, 1), flush=True)
             return
         now_s = time.monotonic()
         for end in readable:
@@ -110,9 +119,18 @@ def _tun(name: str) -> int:
     return device
 
 
+@dataclass
+class Tether:
+    """A namespace behind a link. host: the address of this end. late: once it has ended, the share of late packets."""
+
+    namespace: str
+    host: str
+    late: float = 0.0
+
+
 @contextmanager
-def poor_link(link: PoorLink) -> Iterator[tuple[str, str]]:
-    """Make a namespace behind such a link; yield its name and this end's address."""
+def poor_link(link: PoorLink) -> Iterator[Tether]:
+    """Make a namespace behind such a link."""
     name = f"bt{os.getpid() % 100000}"
     _ip("netns", "add", name)
     try:
@@ -126,7 +144,10 @@ def poor_link(link: PoorLink) -> Iterator[tuple[str, str]]:
                     _ip(*prefix, "address", "add", own, "peer", other, "dev", "buddyline0")
                     _ip(*prefix, "link", "set", "buddyline0", "up")
                 _ip("-n", name, "link", "set", "lo", "up")
-                yield name, HERE
+                tether = Tether(name, HERE)
+                yield tether
+                shaper.stdin.close()
+                tether.late = float(shaper.stdout.readline())
             finally:
                 shaper.stdin.close()
     finally:

@@ -20,7 +20,7 @@ name = "{devices}"
 width_px = {width_px}
 height_px = {height_px}
 [sensors]
-name = "{devices}"
+name = "{sensors}"
 [record]
 directory = "{directory}"
 images_hz = 0.0
@@ -37,7 +37,7 @@ READY |= {"monitor": "look at"}
 class System:
     """Processes by name: hub, a, b, solver, recorder (of everything, into recorder.mcap, recorder-2.mcap ...), monitor.
 
-    devices: the nodes' camera and sensors; node_module: what runs them.
+    devices: the nodes' camera and sensors; node_module: what runs them. node: what nodes are started with.
     """
 
     def __init__(
@@ -55,7 +55,14 @@ class System:
         self.endpoint = endpoint or free_endpoint()
         self.processes: dict[str, Process] = {}
         self.observer: Observer | None = None
-        self._node = {"rate_hz": rate_hz, "devices": devices, "width_px": width_px, "preview_hz": preview_hz}
+        self.node: dict[str, object] = {
+            "rate_hz": rate_hz,
+            "devices": devices,
+            "sensors": devices,
+            "width_px": width_px,
+            "height_px": round(width_px * 308 / 410),
+            "preview_hz": preview_hz,
+        }
         self._node_module = node_module
         self._recordings = 0
 
@@ -76,9 +83,8 @@ class System:
             words = ["monitor", *connect, "--port", str(free_port())]
         else:
             config, module = self.directory / f"{name}.toml", self._node_module
-            height_px = round(int(self._node["width_px"]) * 308 / 410)
-            place = {"endpoint": self.endpoint, "directory": self.directory, "height_px": height_px}
-            config.write_text(NODE.format(node=name, **place, **self._node))
+            place = {"endpoint": self.endpoint, "directory": self.directory}
+            config.write_text(NODE.format(node=name, **place, **self.node))
             words = [*(["node"] if module == "buddyline" else []), "--config", str(config)]
         prefix = ("ip", "netns", "exec", namespace) if namespace else ()
         self.processes[name] = Process(*words, prefix=prefix, module=module)

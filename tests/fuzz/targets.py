@@ -23,7 +23,7 @@ from buddyline.protocol.config import Config, ConfigError, parse_config
 from buddyline.protocol.digest_check import DigestCheck
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.log_pages import Logged, Question, pages_of, whole
+from buddyline.protocol.log_pages import Logged, Question, answer_of, pages_of
 from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose
 from buddyline.protocol.topics import TOPICS, Topic, key_of, topic_of
 from buddyline.solver_service.config import SolverConfig
@@ -356,7 +356,7 @@ def fuzz_digests(data: st.DataObject) -> None:
     Question.of(data.draw(st.text(max_size=200)))
     pages = list(pages_of(iter([Logged(STAMP_NS, "buddyline/node/a/imu", b"{}")])))
     with contextlib.suppress(MessageError):
-        whole([spoil(pages[0], data.draw(edits)), *pages])
+        answer_of([spoil(pages[0], data.draw(edits)), *pages])
 
 
 TARGETS = {

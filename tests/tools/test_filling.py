@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import threading
 from pathlib import Path
@@ -14,23 +15,28 @@ from buddyline.protocol.digest_check import Discrepancy
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.log_pages import MOST_NS, PAGE_BYTES, Logged, Question, pages_of, whole
+from buddyline.protocol.log_pages import MOST_NS, PAGE_BYTES, LogAnswer, Logged, Question, answer_of, pages_of
 from buddyline.protocol.messages import Depth
 from buddyline.protocol.recorder import Recorder
 from buddyline.protocol.topics import LOG, key_of
 from buddyline.tools.authenticity import check_logs
-from buddyline.tools.filling import MOST_MISSING_NS, Filler
+from buddyline.tools.filling import MOST_MISSING_NS, WRITTEN_NS, Filler
 from buddyline.tools.record import Recording
 
 from tests.processes import until
 from tests.protocol.test_digest import BEGAN_NS, Line, written
 
+LATER_NS = 50_000
 EVERYTHING = Question("x", BEGAN_NS - 1, BEGAN_NS + 60_000_000_000, ("depth", "attitude", "digest", "info"))
 
 
 def own_log(folder: Path, boot: str = "x") -> tuple[DiveLogWriter, list[Line]]:
     writer = DiveLogWriter(folder / f"a-20260101T000000Z-{boot}.mcap", metadata={"node": "a", "boot": boot})
-    lines = written("a", None, boot, ended=False)
+    # A digest is written a moment after its stamp.
+    lines = [
+        (key, payload, time_ns + (LATER_NS if key.endswith("/digest") else 0))
+        for key, payload, time_ns in written("a", None, boot, ended=False)
+    ]
     for key, payload, time_ns in lines:
         writer.write(key, payload, time_ns)
     writer.flush(sync=True)
@@ -40,16 +46,16 @@ def own_log(folder: Path, boot: str = "x") -> tuple[DiveLogWriter, list[Line]]:
 def test_a_log_that_is_being_written_is_handed_out(tmp_path: Path) -> None:
     writer, lines = own_log(tmp_path)
     desk = LogDesk(tmp_path, "a")
-    found = whole(list(desk.answer(EVERYTHING.text())))
-    assert found is not None
-    assert [(one.key, one.payload, one.time_ns) for one in found] == lines
+    found = answer_of(list(desk.answer(EVERYTHING.text())))
+    assert found.is_whole
+    assert [(one.key, one.payload, one.time_ns) for one in found.messages] == lines
     writer.write(lines[-1][0], lines[-1][1], lines[-1][2] + 1)
     writer.close()
-    again = whole(list(desk.answer(EVERYTHING.text())))
-    assert again is not None
-    assert len(again) == len(lines) + 1
+    again = answer_of(list(desk.answer(EVERYTHING.text())))
+    assert len(again.messages) == len(lines) + 1
     second = Question("x", lines[10][2], lines[20][2], ("depth",))
-    assert {one.key for one in whole(list(desk.answer(second.text()))) or []} == {"buddyline/node/a/depth"}
+    of_second = answer_of(list(desk.answer(second.text())))
+    assert {one.key for one in of_second.messages} == {"buddyline/node/a/depth"}
 
 
 @pytest.mark.parametrize(
@@ -58,19 +64,23 @@ def test_a_log_that_is_being_written_is_handed_out(tmp_path: Path) -> None:
 def test_other_questions_have_no_answer(tmp_path: Path, text: str) -> None:
     own_log(tmp_path)[0].close()
     assert list(LogDesk(tmp_path, "a").answer(text)) == []
-    assert whole([]) is None
+    assert answer_of([]) == LogAnswer([], is_whole=False)
 
 
-def test_an_answer_that_lacks_a_page_is_not_whole() -> None:
+def test_an_answer_that_lacks_a_page_is_read_up_to_it() -> None:
     rng = random.Random(1)
     messages = [Logged(k, "buddyline/node/a/depth", rng.randbytes(1000)) for k in range(100)]
     pages = list(pages_of(iter(messages)))
     assert len(pages) >= 100 * 1000 // PAGE_BYTES
-    assert whole(pages) == messages
-    assert all(whole(pages[:k] + pages[k + 1 :]) is None for k in range(len(pages)))
+    assert answer_of(pages) == LogAnswer(messages, is_whole=True)
+    for k in range(len(pages)):
+        begun = answer_of(pages[:k] + pages[k + 1 :])
+        assert not begun.is_whole
+        assert begun.messages == messages[: len(begun.messages)]
+        assert bool(begun.messages) == bool(k)
     for broken in (b"", b"x" * 100, pages[0][:-1], pages[0].replace(pages[0][8:12], b"abcd")):
         with pytest.raises(MessageError):
-            whole([broken])
+            answer_of([broken])
 
 
 @pytest.mark.parametrize("lost", ["some messages", "whole seconds", "all but the ends", "the first digests"])
@@ -123,6 +133,6 @@ def test_a_recording_is_filled(tmp_path: Path, lost: str) -> None:
 def test_a_digest_of_centuries_ahead_asks_for_a_day() -> None:
     filler = Filler(LocalNetwork().connect(), lambda *_: None, BEGAN_NS, threading.Event())
     filler.want(Discrepancy("a", "missing", BEGAN_NS, 2**63 - 1, "1 digests are missing", "x"))
-    assert len(filler.open) == MOST_MISSING_NS // MOST_NS
+    assert len(filler.open) == math.ceil(MOST_MISSING_NS / (MOST_NS - WRITTEN_NS))
     filler.want(Discrepancy("b", "missing", BEGAN_NS, BEGAN_NS + 90 * S_NS, "9 digests are missing", "x"))
     assert [one.node for one in filler.open].count("b") == 2
