@@ -219,9 +219,7 @@ class PairMatcher:
             pairs = ((stream_a.node, known_a), (stream_b.node, known_b))
             missing = " and ".join(node for node, known in pairs if known is None)
             return self._give_up(frame_a, "no_info", f"no NodeInfo of {missing}")
-        covered = stream_a.sensors_cover(frame_a.stamp_ns, live=waiting.live) and stream_b.sensors_cover(
-            frame_b.stamp_ns, live=waiting.live
-        )
+        covered = stream_a.sensors_cover(frame_a.stamp_ns) and stream_b.sensors_cover(frame_b.stamp_ns)
         if not (covered or at_once):
             return None
         self.matched += 1

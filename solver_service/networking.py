@@ -17,9 +17,9 @@ from buddyline.solver_service.network.belief import KnownPlace
 from buddyline.solver_service.network.estimate import NetRow
 from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.results import view_of
-from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen
-from buddyline.solver_service.tracking import STOPPED_NS, TrackSettings, fix_of, frame_of, same_rig, track_node_of
+from buddyline.solver_service.tracking import TrackSettings, fix_of, frame_of, same_rig, track_node_of
 from msgspec import UNSET
 
 NET: Final = "main"
@@ -127,14 +127,11 @@ class NetTracker:
     def _frontier_ns(self) -> int:
         """Return up to when everything has come: outcomes, and samples of the sensors that have not stopped.
 
-        A pair, or a sensor, that is a second behind the newest outcome has stopped.
+        A pair that is a second behind the newest outcome has stopped.
         """
-        newest = max(self._settled_ns.values(), default=0)
-        sensors = [
-            sensor for stream in self._streams.values() for sensor in (stream.imu, stream.attitude, stream.depth)
-        ]
-        known = [*self._settled_ns.values(), *(sensor.newest_ns for sensor in sensors)]
-        return min([newest, *(ns for ns in known if ns is not None and ns > newest - STOPPED_NS)])
+        newest_ns = max(self._settled_ns.values(), default=0)
+        pairs_ns = [ns for ns in self._settled_ns.values() if ns > newest_ns - STOPPED_NS]
+        return min([*pairs_ns, *(stream.complete_ns(newest_ns) for stream in self._streams.values())], default=0)
 
     def _take(self, fixes: Sequence[RelativePose], to_ns: int) -> list[Message]:
         self._meet(to_ns)

@@ -63,7 +63,7 @@ class SampleStream(Generic[S]):
 
     def __init__(self, lag_ns: int) -> None:
         self.missing_ns = 0
-        self._lag_ns = lag_ns
+        self.lag_ns = lag_ns
         self._stamps: list[int] = []
         self._samples: list[S] = []
         self._jump = BackwardJump()
@@ -90,17 +90,6 @@ class SampleStream(Generic[S]):
             keep = max(bisect.bisect_left(self._stamps, self._stamps[-1] - KEPT_NS), len(self._stamps) - MAX_SAMPLES)
             del self._stamps[:keep], self._samples[:keep]
 
-    def covers(self, stamp_ns: int, first_frame_ns: int, newest_frame_ns: int, *, live: bool) -> bool:
-        """Return whether the samples for a frame at stamp_ns are here, or will not come.
-
-        A sensor without samples for three seconds has stopped. A live dive counts receive time, because a backlog
-        arrives in a burst; other dives count their own time. first_frame_ns, newest_frame_ns: stamps of the node's
-        frames so far.
-        """
-        newest_ns = self._stamps[-1] if self._stamps else first_frame_ns
-        missing_ns = self.missing_ns if live else newest_frame_ns - newest_ns
-        return missing_ns > SENSOR_WAIT_NS or newest_ns >= stamp_ns - self._lag_ns
-
     def around(self, stamp_ns: int) -> tuple[S | None, S | None]:
         """Return the last sample at or before stamp_ns, and the first after it; None where there is none."""
         at = bisect.bisect_right(self._stamps, stamp_ns)
@@ -114,9 +103,13 @@ class SampleStream(Generic[S]):
 
 
 class ImuWindow:
-    """The last minute of a node's inertial samples, sorted by stamp, as arrays; memory is bounded."""
+    """The last minute of a node's inertial samples, sorted by stamp, as arrays; memory is bounded.
+
+    missing_ns: as of SampleStream.
+    """
 
     def __init__(self) -> None:
+        self.missing_ns = 0
         self._stamps = np.empty(2 * MAX_SAMPLES, dtype=np.int64)
         self._values = np.empty((2 * MAX_SAMPLES, 6))
         self._start = self._end = 0

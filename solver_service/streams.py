@@ -9,7 +9,7 @@ import bisect
 from collections import OrderedDict, deque
 from collections.abc import Iterable
 from enum import Enum
-from typing import Final
+from typing import Final, TypeAlias
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Attitude, Candidates, Depth, Imu, NodeInfo
@@ -25,9 +25,13 @@ FAR_NS: Final = 5 * S_NS
 FRAMES_TO_BELIEVE: Final = 5
 # Each frame adds at most this much to elapsed_ns: during a gap in the dive no frames could have come.
 LONGEST_STEP_NS: Final = 1 * S_NS
+# A node with neither frames nor samples in this time before the newest outcome is not waited for.
+STOPPED_NS: Final = 1 * S_NS
 MAX_FRAME_BYTES: Final = 8 << 20
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
+
+Sensor: TypeAlias = ImuWindow | SampleStream[Attitude] | SampleStream[Depth]
 
 
 class Arrival(Enum):
@@ -92,6 +96,7 @@ class NodeStream:
 
     received: number of frames so far. first_ns, newest_ns: stamps of the first and newest frame since the node's clock
     was last set. elapsed_ns: time covered by the frames, without gaps: the waiting clock of a dive read from a log.
+    live: whether the frames are of now.
     """
 
     def __init__(self, node: str) -> None:
@@ -104,6 +109,7 @@ class NodeStream:
         self.first_ns: int | None = None
         self.newest_ns: int | None = None
         self.elapsed_ns = 0
+        self.live = False
         self._newest_receive_ns: int | None = None
         self._calibrations: list[tuple[NodeInfo, Rig]] = []
         self._sequence: OrderedDict[int, tuple[int, int, int]] = OrderedDict()  # trigger: hash of boot, seq, stamp
@@ -128,11 +134,11 @@ class NodeStream:
 
     def add_sample(self, sample: Attitude | Depth | Imu) -> None:
         """Take a sample of one of the sensors."""
+        sensor: Sensor
         if isinstance(sample, Imu):
+            sensor = self.imu
             self.imu.add(sample)
-            return
-        sensor: SampleStream[Attitude] | SampleStream[Depth]
-        if isinstance(sample, Attitude):
+        elif isinstance(sample, Attitude):
             sensor = self.attitude
             self.attitude.add(sample)
         else:
@@ -141,15 +147,19 @@ class NodeStream:
         if self.newest_ns is None or sample.stamp_ns >= self.newest_ns - SENSOR_WAIT_NS:
             sensor.missing_ns = 0
 
-    def add_frame(self, frame: Candidates, others_ns: Iterable[int], receive_ns: int | None) -> Arrival:
+    def add_frame(
+        self, frame: Candidates, others_ns: Iterable[int], receive_ns: int | None, *, live: bool = False
+    ) -> Arrival:
         """Take a frame, and return the verdict on it.
 
-        others_ns: newest stamps of the other nodes; after a gap, a stamp near to the frame's confirms it.
+        others_ns: newest stamps of the other nodes; after a gap, a stamp near to the frame's confirms it. live: whether
+        its stamp is of now.
         """
         self.received += 1
         verdict = self._place_in_time(frame.stamp_ns, others_ns)
         if verdict is Arrival.FAR:
             return verdict
+        self.live = live
         identity = hash(frame.boot), frame.seq, frame.stamp_ns
         seen = self._sequence.get(frame.trigger)
         if seen is not None:
@@ -178,12 +188,38 @@ class NodeStream:
         boot_1, seq_1, _ = self._sequence[after]
         return boot_0 == boot_1 and seq_1 == seq_0 + 1
 
-    def sensors_cover(self, stamp_ns: int, *, live: bool) -> bool:
+    def sensors_cover(self, stamp_ns: int) -> bool:
         """Return whether attitude and depth for a frame at stamp_ns are here, or will not come."""
-        if self.first_ns is None or self.newest_ns is None:
-            return True
-        first_ns, newest_ns = self.first_ns, self.newest_ns
-        return all(sensor.covers(stamp_ns, first_ns, newest_ns, live=live) for sensor in (self.attitude, self.depth))
+        return all(
+            self._has_stopped(sensor) or self._newest_ns(sensor) >= stamp_ns - sensor.lag_ns
+            for sensor in (self.attitude, self.depth)
+        )
+
+    def complete_ns(self, end_ns: int) -> int:
+        """Return up to when, at most end_ns, all samples are here that will come.
+
+        end_ns: of the newest outcome. Samples may be later than the frames of their time: a publisher sends frames
+        first.
+        """
+        lately_ns = end_ns - STOPPED_NS
+        waited = self.newest_ns is not None and self.newest_ns > lately_ns
+        for sensor in (self.imu, self.attitude, self.depth):
+            newest_ns = -1 if sensor.newest_ns is None else sensor.newest_ns
+            if newest_ns > lately_ns or (waited and not self._has_stopped(sensor)):
+                end_ns = min(end_ns, newest_ns)
+        return end_ns
+
+    def _newest_ns(self, sensor: Sensor) -> int:
+        """Return the stamp of a sensor's newest sample; of one without samples that of the first frame."""
+        return (self.first_ns or 0) if sensor.newest_ns is None else sensor.newest_ns
+
+    def _has_stopped(self, sensor: Sensor) -> bool:
+        """Return whether a sensor has been without samples for three seconds.
+
+        A live dive counts receive time, because a backlog arrives in a burst; other dives count their own time.
+        """
+        missing_ns = sensor.missing_ns if self.live else (self.newest_ns or 0) - self._newest_ns(sensor)
+        return missing_ns > SENSOR_WAIT_NS
 
     def _place_in_time(self, stamp_ns: int, others_ns: Iterable[int]) -> Arrival:
         if self.newest_ns is None:
@@ -216,8 +252,8 @@ class NodeStream:
             return
         if self._newest_receive_ns is not None:
             step_ns = min(max(receive_ns - self._newest_receive_ns, 0), LONGEST_STEP_NS)
-            self.attitude.missing_ns += step_ns
-            self.depth.missing_ns += step_ns
+            for sensor in (self.imu, self.attitude, self.depth):
+                sensor.missing_ns += step_ns
         self._newest_receive_ns = receive_ns
 
 

@@ -30,6 +30,7 @@ from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
 from buddyline.solver_service.resting import LOOK_APART, LOOKS
 from buddyline.solver_service.results import view_of
+from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.track.clocks import Clocks, clock_now, clocks_of
 from buddyline.solver_service.track.dive import NodeRecord, feed, joined, smooth
@@ -41,8 +42,6 @@ from buddyline.solver_service.track.output import TrackRow
 from msgspec import UNSET
 from msgspec.structs import replace
 
-# A sensor this far behind the newest outcome has stopped: the track goes on without it.
-STOPPED_NS: Final = S_NS
 # For how long after its stamp an expectation serves: its sigma has grown to a large part of the picture by then.
 EXPECT_VALID_NS: Final = S_NS // 2
 
@@ -219,10 +218,7 @@ class PairTracker:
 
     def _frontier_ns(self) -> int:
         """Return up to when everything has come: outcomes, and the samples of the sensors that have not stopped."""
-        sensors = [sensor for stream in self._streams for sensor in (stream.imu, stream.attitude, stream.depth)]
-        newest = [sensor.newest_ns for sensor in sensors]
-        running = [ns for ns in newest if ns is not None and ns > self._settled_ns - STOPPED_NS]
-        return min([self._settled_ns, *running])
+        return min(stream.complete_ns(self._settled_ns) for stream in self._streams)
 
     def _advance(self, to_ns: int) -> list[Message]:
         if to_ns <= self._taken_ns:
@@ -241,15 +237,20 @@ class PairTracker:
     def _live(self, to_ns: int) -> list[Message]:
         if self._filter is None:
             return []
-        due = self._due(self._told_ns + 1, to_ns)
-        self._told_ns = to_ns
-        rows = self._filter.advance(to_ns, due)
-        if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
-            raise ArithmeticError("no finite covariance")
-        messages = list(self._messages(rows, "filter")) if "filter" in self._settings.modes else []
-        if self._lag is not None:
-            self._lag.ask(due)
-            messages += self._messages(self._lag.rows(), "lag")
+        messages: list[Message] = []
+        while self._told_ns < to_ns:
+            # After a wait for late samples there is much to take at once; the lag looks at every part of it.
+            part_ns = min(to_ns, max(self._told_ns, to_ns - KEPT_NS) + round(EVERY_S * S_NS))
+            due = self._due(self._told_ns + 1, part_ns)
+            self._told_ns = part_ns
+            rows = self._filter.advance(part_ns, due)
+            if self._filter.main is not None and not np.isfinite(self._filter.main.covariance).all():
+                raise ArithmeticError("no finite covariance")
+            if "filter" in self._settings.modes:
+                messages += self._messages(rows, "filter")
+            if self._lag is not None:
+                self._lag.ask(due)
+                messages += self._messages(self._lag.rows(), "lag")
         return messages + (self._expect(self._filter, to_ns) if self._settings.expect else [])
 
     def _expect(self, track: TrackFilter, to_ns: int) -> list[Message]:

@@ -19,6 +19,7 @@ from buddyline.solver_service.track.units import clipped, fault_of
 
 CHECK_EVERY_S: Final = 2.0
 REJECTED_TO_SAY: Final = 10
+SILENT_S: Final = 1.0
 LEAST_SIGMA_RAD: Final = 1e-3
 # Taken for roll, pitch and yaw where a message states a sigma below LEAST_SIGMA_RAD, which no attitude filter reaches.
 UNTOLD_SIGMA_RAD: Final = np.radians((1.5, 1.5, 6.0))
@@ -148,6 +149,9 @@ class TrackIntake:
             samples.trusted = fault is None
             if fault is not None:
                 self._problems.report(fault, t_s)
+            elif len(samples) and not len(samples.last(t_s + SILENT_S, 2.0 * SILENT_S)):
+                name = self.nodes[node].name
+                self._problems.report(f"node {name}: inertial samples are missing: the track does without them", t_s)
             if samples.rejected > self._rejected[node] + REJECTED_TO_SAY:
                 name = self.nodes[node].name
                 said = f"node {name}: inertial samples not finite, clipped or sent twice are left out"

@@ -79,8 +79,8 @@ class Samples:
         self._count = need
 
     def forget_before(self, time_s: float) -> None:
-        """Drop samples older than time_s."""
-        first = int(np.searchsorted(self.times_s, time_s))
+        """Drop samples older than time_s, but for the last one."""
+        first = min(int(np.searchsorted(self.times_s, time_s)), self._count - 1)
         if first > self._count // 2:
             kept = self._count - first
             self._t[:kept], self._values[:kept] = self._t[first : self._count], self._values[first : self._count]

@@ -49,6 +49,34 @@ def test_the_live_filter_gives_the_same_track_however_messages_are_interleaved(i
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("late_s", [0.6, 1.5, 2.5])
+def test_a_track_waits_for_inertial_samples_that_come_after_the_pictures(inertial_dive, late_s):
+    messages, _ = inertial_dive
+    messages = [message for message in messages if message.stamp_ns < messages[0].stamp_ns + 5 * S_NS]
+    expected, _ = tracks_of(messages, "filter", "lag")
+    late = sorted(messages, key=lambda m: m.stamp_ns + (round(late_s * S_NS) if isinstance(m, Imu) else 0))
+    found, core = tracks_of(late, "filter", "lag")
+    assert sorted((one.mode, one.stamp_ns) for one in found) == sorted((one.mode, one.stamp_ns) for one in expected)
+    for one, other in zip(*([row for row in rows if row.mode == "filter"] for rows in (found, expected)), strict=True):
+        np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
+    assert core.pairs["a", "b"].tracker.problems == []
+
+
+def test_a_track_goes_on_without_inertial_samples_and_says_so(inertial_dive):
+    messages, world = inertial_dive
+    gap_ns = [messages[0].stamp_ns + seconds * S_NS for seconds in (3, 7)]
+    gappy = [m for m in messages if not (isinstance(m, Imu) and m.node == "a" and gap_ns[0] < m.stamp_ns < gap_ns[1])]
+    found, core = tracks_of(gappy, "filter")
+    inside = [one for one in found if gap_ns[0] < one.stamp_ns < gap_ns[1]]
+    assert len(inside) > 0.9 * 4 * 20
+    off_m = np.array(errors_m(inside, world))
+    sigma_m = np.sqrt([one.covariance[0] + one.covariance[7] + one.covariance[14] for one in inside])
+    assert (off_m < 4.0 * sigma_m + 0.002).mean() > 0.98
+    said = [problem for problem in core.pairs["a", "b"].tracker.problems if "inertial samples are missing" in problem]
+    assert len(said) == 1
+    assert said[0].startswith("node a:")
+
+
 def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once():
     messages, _ = dive_messages(seconds=4.0, imu=True)
     expected, _ = tracks_of(messages, "smooth")
