@@ -191,7 +191,7 @@ class NodeStream:
     def sensors_cover(self, stamp_ns: int) -> bool:
         """Return whether attitude and depth for a frame at stamp_ns are here, or will not come."""
         return all(
-            self._has_stopped(sensor) or self._newest_ns(sensor) >= stamp_ns - sensor.lag_ns
+            self._has_stopped(sensor) or _newest_ns(sensor) >= stamp_ns - sensor.lag_ns
             for sensor in (self.attitude, self.depth)
         )
 
@@ -204,22 +204,18 @@ class NodeStream:
         lately_ns = end_ns - STOPPED_NS
         waited = self.newest_ns is not None and self.newest_ns > lately_ns
         for sensor in (self.imu, self.attitude, self.depth):
-            newest_ns = -1 if sensor.newest_ns is None else sensor.newest_ns
+            newest_ns = _newest_ns(sensor)
             if newest_ns > lately_ns or (waited and not self._has_stopped(sensor)):
                 end_ns = min(end_ns, newest_ns)
         return end_ns
-
-    def _newest_ns(self, sensor: Sensor) -> int:
-        """Return the stamp of a sensor's newest sample; of one without samples that of the first frame."""
-        return (self.first_ns or 0) if sensor.newest_ns is None else sensor.newest_ns
 
     def _has_stopped(self, sensor: Sensor) -> bool:
         """Return whether a sensor has been without samples for three seconds.
 
         A live dive counts receive time, because a backlog arrives in a burst; other dives count their own time.
         """
-        missing_ns = sensor.missing_ns if self.live else (self.newest_ns or 0) - self._newest_ns(sensor)
-        return missing_ns > SENSOR_WAIT_NS
+        own_ns = (self.newest_ns or 0) - (sensor.newest_ns or self.first_ns or 0)
+        return (sensor.missing_ns if self.live else own_ns) > SENSOR_WAIT_NS
 
     def _place_in_time(self, stamp_ns: int, others_ns: Iterable[int]) -> Arrival:
         if self.newest_ns is None:
@@ -255,6 +251,11 @@ class NodeStream:
             for sensor in (self.imu, self.attitude, self.depth):
                 sensor.missing_ns += step_ns
         self._newest_receive_ns = receive_ns
+
+
+def _newest_ns(sensor: Sensor) -> int:
+    """Return the stamp of a sensor's newest sample, -1 for none."""
+    return -1 if sensor.newest_ns is None else sensor.newest_ns
 
 
 def _since(calibration: tuple[NodeInfo, Rig]) -> int:

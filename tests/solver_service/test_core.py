@@ -82,6 +82,12 @@ def test_same_result_in_any_order_within_the_window(dive):
         assert solve(shuffled)[0] == expected
 
 
+def test_the_first_frame_too_waits_for_its_attitude_and_depth(dive):
+    messages, _ = dive
+    late = sorted(messages, key=lambda m: m.stamp_ns + (S_NS if isinstance(m, Attitude | Depth) else 0))
+    assert solve(late)[0] == solve(messages)[0]
+
+
 def test_frames_out_of_order_are_matched(dive):
     messages, _ = dive
     expected, _ = solve(messages)
