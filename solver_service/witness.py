@@ -83,9 +83,12 @@ class Witnesses:
         return Witnessed(gap_rad, gap_scatter)
 
     def _believed(self) -> float:
-        """Return how many witnesses are needed: those of BELIEVED_NS, by the mean time between triggers."""
-        apart_ns = (self._seen[-1][0] - self._seen[0][0]) / max(len(self._seen) - 1, 1)
-        return min(max(BELIEVED_NS / max(apart_ns, 1.0), FEWEST), MOST)
+        """Return how many witnesses are needed: those of BELIEVED_NS, by the median time between triggers.
+
+        A pause would raise the mean: a few triggers after it would be enough.
+        """
+        apart_ns = np.median(np.diff([stamp_ns for stamp_ns, _ in self._seen])) if len(self._seen) > 1 else 1.0
+        return min(max(BELIEVED_NS / max(float(apart_ns), 1.0), FEWEST), MOST)
 
 
 def _about_mean(angles_rad: list[float]) -> tuple[float, float]:

@@ -10,10 +10,11 @@ from typing import Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.solver_service.track.dive import TOLD_CLOCK_S, Records, in_order, smooth
+from buddyline.solver_service.track.dive import Records, in_order, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.state import CLOCK
+from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S
 
 # A stretch of about this length: on a much shorter one a track estimates the offset worse than over a dive.
 STRETCH_NS: Final = 60 * S_NS
@@ -104,6 +105,6 @@ def _clock_of_stretch(records: Records, fixes: Sequence[FixSeen]) -> tuple[float
         return None
     found = smooth(records, fixes, ())
     offset_s, sigma_s = found.clock_offset_s, found.clock_sigma_s
-    if not sigma_s < TOLD_CLOCK_S:
+    if not sigma_s < KNOWN_CLOCK_S:
         return None
     return 0.5 * (fixes[0].stamp_ns + fixes[-1].stamp_ns) / S_NS, offset_s, sigma_s, len(fixes)

@@ -21,7 +21,7 @@ from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
 from buddyline.solver_service.track.state import CLOCK, NAV
-from buddyline.solver_service.track.stepping import PassGuide
+from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S, PassGuide
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
 from buddyline.solver_service.track.walking import joint
@@ -37,8 +37,7 @@ MOST_LEFT_S: Final = 0.06
 CLOCK_ROUNDS: Final = 4
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
-# An offset is believed where its sigma is below this; it differs from the assumed one where it is so many sigmas off.
-TOLD_CLOCK_S: Final = 0.008
+# An offset differs from the assumed one where it is so many sigmas off.
 TOLD_SIGMAS: Final = 6.0
 # Offsets that are tried where a first pass gives more than one track; a pass finds one up to 0.3 s from each. There is
 # no result if the best pass is in pieces: tracks whose offsets differ by more than so many s, and so many sigmas.
@@ -183,7 +182,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         return replace(_smoothed(only, parts_of(only), outputs_ns), clock_sigma_s=math.inf)
     # B's stamps are moved by the offset that the first pass found: for what is left the second is linear.
     learned = parts[-1]
-    shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < TOLD_CLOCK_S**2 else 0.0
+    shift_s = learned.state.clock_s if learned.covariance[CLOCK, CLOCK] < KNOWN_CLOCK_S**2 else 0.0
     clock_sigma_s = CLOCK_LEFT_S + 3.0 * math.sqrt(learned.covariance[CLOCK, CLOCK])
     second = _empty_filter(records, clock_ns + round(shift_s * 1e9), clock_sigma_s)
     second.restarts = False

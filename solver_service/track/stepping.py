@@ -59,8 +59,8 @@ TOGETHER_S: Final = 0.005
 ATTITUDE_EVERY_S: Final = 0.5
 # A light nearer to the picture's edge need not be found: part of its spot is outside.
 EDGE_PX: Final = 2.0
-# How much the biases walk is learned only while the clocks' offset is known better than this, 1 sd: an unknown offset
-# looks like a walk.
+# The clocks' offset is believed where it is known better than this, 1 sd. Only then is learned how much the biases
+# walk: an unknown offset looks like a walk.
 KNOWN_CLOCK_S: Final = 0.008
 # Without units, the place must also be known better than to this share of the range, 1 sd: the error of linearization
 # looks like a walk, too.

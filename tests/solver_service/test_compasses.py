@@ -93,12 +93,18 @@ def test_as_many_witnesses_are_needed_as_two_seconds_have_triggers(rate_hz, need
     assert [k for k, one in enumerate(told, start=1) if one] == list(range(needed, MOST + 2))
 
 
-def at_rest(rate_hz, count, gap_deg, scatter_deg):
-    """What so many triggers of nodes that do not move have witnessed, one after another."""
+def test_after_a_pause_no_fewer_witnesses_are_needed():
+    told = at_rest(10, MOST + 1, 20, 3, pause_s=20)
+    assert [k for k, one in enumerate(told, start=1) if one] == [MOST, MOST + 1]
+
+
+def at_rest(rate_hz, count, gap_deg, scatter_deg, pause_s=0):
+    """What so many triggers of nodes that do not move have witnessed, one after another; a pause after the third."""
     witnesses, told = Witnesses(), []
     for k, off_deg in enumerate(np.random.default_rng(3).normal(gap_deg, scatter_deg, count)):
         gap = HeadingGap(math.radians(off_deg), 1e-4, 0.5, agrees=False, contradicts=True)
-        told.append(witnesses.take(k * S_NS // rate_hz, Contradiction(gap, 4.0)))
+        stamp_ns = k * S_NS // rate_hz + (pause_s * S_NS if k >= 3 else 0)
+        told.append(witnesses.take(stamp_ns, Contradiction(gap, 4.0)))
     return told
 
 
