@@ -253,10 +253,11 @@ class TrackFilter(TrackPool):
                 gained = main.evidence - challenger.baseline
                 better = challenger.evidence > max(gained, 0.0) + REPLACED and min(challenger.evidence_by) > MUTUAL
                 if better and self._is_whole(challenger, FIXES_TO_REPLACE, math.inf):
-                    # What went wrong did so after the last fix that agreed.
-                    main.end_s = min(challenger.start_s, main.agreed_s)
-                    main.steps.drop_after(main.end_s)
-                    self.finished.append(main)
+                    # What went wrong did so after the last fix that agreed; without any it may never have been right.
+                    if main.agreed:
+                        main.end_s = min(challenger.start_s, main.agreed_s)
+                        main.steps.drop_after(main.end_s)
+                        self.finished.append(main)
                     self.main = self._again(challenger)
                     self.challengers = []
                     self.main.confirmed = True
