@@ -167,10 +167,9 @@ def _clock_words(logs: list[str], file: Path) -> list[str]:
 
 def run_command(words: list[str]) -> int:
     """Run one command of this program; what it could not read is reported with all other losses."""
-    from buddyline.tools.cli import COMMANDS
+    from buddyline.tools.cli import command_named
 
-    command = next(command for command in COMMANDS if command.name == words[0])
     with collected() as lost:
-        status = command.run(words[1:])
+        status = command_named(words[0]).run(words[1:])
     report_losses(lost.lines())
     return status

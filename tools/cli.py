@@ -244,6 +244,11 @@ COMMANDS: Final = (
 )
 
 
+def command_named(name: str) -> Command:
+    """Return the command of this name; raise KeyError for none."""
+    return {command.name: command for command in COMMANDS}[name]
+
+
 def overview() -> str:
     """Return what `buddyline --help` prints."""
     width = max(len(command.name) for command in COMMANDS)

@@ -256,7 +256,7 @@ class DiveColumns:
 
     def rejections(self, pair: Pair | None = None) -> RejectionColumns:
         """Return the triggers without a pose; pair: needed if there are several."""
-        return rejection_columns(self._of_pair(REJECTED, Rejected, pair))
+        return columns_of(RejectionColumns, self._of_pair(REJECTED, Rejected, pair))
 
     def attitudes(self, node: str) -> AttitudeColumns:
         """Return a node's attitudes."""
@@ -405,11 +405,6 @@ def of_mode(tracks: Sequence[Track], mode: TrackMode | None = None) -> list[Trac
 def track_columns(tracks: Sequence[Track]) -> TrackColumns:
     """Return a track's estimates, in their order and of one mode, as columns."""
     return columns_of(TrackColumns, tracks, mode=tracks[0].mode if tracks else "")
-
-
-def rejection_columns(rejected: Sequence[Rejected]) -> RejectionColumns:
-    """Return rejections, in their order, as columns."""
-    return columns_of(RejectionColumns, rejected)
 
 
 def candidate_columns(frames: Sequence[Candidates]) -> CandidateColumns:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 
-from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.extras import needed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,12 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the shell's script."""
-    try:
-        import shtab
-    except ImportError as error:
-        raise BuddylineError(
-            "completion needs shtab, which is not installed: make install EXTRAS=completion"
-        ) from error
+    shtab = needed("shtab", "completion", "completion")
     print(shtab.complete(_whole(shtab.FILE), shell=args.shell))
     return 0
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from typing import Final
 
 import numpy as np
-from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Rejected, RelativePose, Track, Truth
 from buddyline.tools.columns import in_order, of_mode
@@ -21,6 +18,7 @@ from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.export_formats import ExportFormat, format_of
+from buddyline.tools.measure.tables import csv_lines, tum_line
 from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
 
@@ -71,16 +69,14 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
-    if args.format == "trc" or (args.what == "net" and args.format not in ("c3d", "colmap", "metashape")):
-        return _export_network(args)
-    if args.node is not None:
+    of_net = args.format == "trc" or (args.what == "net" and args.format not in ("c3d", "colmap", "metashape"))
+    if args.node is not None and not of_net:
         raise BuddylineError("--node: only with --what net")
-    if form.module:
+    if form.module and not of_net:
         return _export_file(args, form)
     if args.output is not None:
         check_new(args.output)
-    recorded = load(args.logs, pair=args.pair)
-    what, lines = _lines(args, recorded)
+    what, lines = _network_lines(args) if of_net else _lines(args, load(args.logs, pair=args.pair))
     if args.output is None:
         sys.stdout.writelines(lines)
     else:
@@ -100,7 +96,7 @@ def _lines(args: argparse.Namespace, recorded: Recorded) -> tuple[str, Iterator[
         said, estimates = chosen(recorded, args.what, name)
         return said, tum_lines(estimates)
     said, names, rows = rows_of(recorded, args.what, name, rejected=args.rejected)
-    return said, _csv(names, rows)
+    return said, csv_lines(names, ([row.get(name, "") for name in names] for row in rows))
 
 
 def chosen(recorded: Recorded, what: str | None, name: str) -> tuple[str, list[RelativePose] | list[Track]]:
@@ -138,20 +134,12 @@ def rows_of(
     return said, _CSV_FIELDS, [_csv_row(pose, truth) for pose in poses]
 
 
-def _export_network(args: argparse.Namespace) -> int:
+def _network_lines(args: argparse.Namespace) -> tuple[str, Iterator[str]]:
     from buddyline.tools.export_network import network_lines
 
     if args.what not in (None, "net") or format_of(args.format).module or args.truth or args.rejected or args.pair:
         raise BuddylineError(f"--format {args.format} --what {args.what}: all nodes go as tum, csv or trc, alone")
-    if args.output is not None:
-        check_new(args.output)
-    what, lines = network_lines(args.logs, args.format, args.node, str(args.output or "buddyline.trc"))
-    if args.output is None:
-        sys.stdout.writelines(lines)
-    else:
-        write_new(args.output, "".join(lines))
-    print(f"{', '.join(args.logs)}: {what}", file=sys.stderr)
-    return 0
+    return network_lines(args.logs, args.format, args.node, str(args.output or "buddyline.trc"))
 
 
 def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
@@ -167,23 +155,9 @@ def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
 
 
 def tum_lines(poses: Iterable[RelativePose | Track | Truth]) -> Iterator[str]:
-    """Yield `t x y z qx qy qz qw` of T_a_b by time; t in s, with all nine decimals that its ns have."""
+    """Yield `t x y z qx qy qz qw` of T_a_b by time."""
     for pose in sorted(poses, key=lambda pose: pose.stamp_ns):
-        seconds, rest_ns = divmod(pose.stamp_ns, S_NS)
-        numbers = " ".join(map(repr, (*pose.t_a_b_m, *pose.q_a_b_xyzw)))
-        yield f"{seconds}.{rest_ns:09d} {numbers}\n"
-
-
-def _csv(names: Sequence[str], rows: Iterable[dict[str, object]]) -> Iterator[str]:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        yield text.getvalue()
-        text.seek(0)
-        text.truncate()
-        writer.writerow(row)
-    yield text.getvalue()
+        yield tum_line(pose.stamp_ns, pose.t_a_b_m, pose.q_a_b_xyzw)
 
 
 def _csv_row(result: RelativePose | Rejected, truth: TruthTrack) -> dict[str, object]:

@@ -10,6 +10,7 @@ import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.dives import Dive
 from buddyline.tools.export_network import load_markers
+from buddyline.tools.extras import needed
 from buddyline.tools.newfile import new_file
 
 # A C3D file has one rate and no times: a missing row is a frame without markers. It has at most so many frames.
@@ -18,12 +19,7 @@ MOST_FRAMES: Final = 65535
 
 def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write the nodes' cameras and lamps into output, which must not exist, in mm; return the number of frames."""
-    try:
-        import ezc3d
-    except ImportError as error:
-        raise BuddylineError(
-            f"--format c3d needs ezc3d, which is not installed ({error.name}): make install EXTRAS=c3d"
-        ) from error
+    ezc3d = needed("ezc3d", "--format c3d", "c3d")
     if what not in (None, "net"):
         raise BuddylineError(f"--format c3d --what {what}: it has all nodes")
     markers = load_markers([str(reader.path) for reader in dive.readers])

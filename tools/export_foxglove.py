@@ -38,6 +38,7 @@ from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
 from buddyline.tools.enu import R_ENU_NED, BaseCamera
+from buddyline.tools.extras import needed
 from buddyline.tools.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.health.words import reason_words
 from buddyline.tools.monitor.frames import rig_outline
@@ -304,13 +305,9 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
 
     what: "poses" leaves the track out, "track" asks for one; None: with the track if there is one.
     """
-    try:
-        from foxglove import messages as fox
-    except ImportError as error:
-        raise BuddylineError(
-            "--format foxglove needs foxglove-sdk, which is not installed: make install EXTRAS=foxglove"
-        ) from error
     from mcap.writer import CompressionType, Writer
+
+    fox = needed("foxglove.messages", "--format foxglove", "foxglove", "foxglove-sdk")
 
     layout_path = output.with_name(f"{output.name}.layout.json")
     check_new(layout_path)

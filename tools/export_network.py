@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
@@ -18,6 +16,7 @@ from buddyline.protocol.topics import NET_POSE
 from buddyline.tools.columns import in_order
 from buddyline.tools.dives import first_with_net, open_each
 from buddyline.tools.evaluation.rotation import Floats, normalized, rotate
+from buddyline.tools.measure.tables import csv_lines, tum_line
 
 _CSV: Final = (
     *("stamp_ns", "net", "node", "fixed", "mode", "north_m", "east_m", "down_m", "q_x", "q_y", "q_z", "q_w"),
@@ -39,10 +38,10 @@ def network_lines(logs: Sequence[str], form: str, node: str | None, name: str) -
     if form == "trc":
         return said, _trc_lines(_markers_of(poses, infos), name)
     if form == "csv":
-        return said, _csv_lines(poses)
+        return said, csv_lines(_CSV, map(_csv_row, poses))
     if node is None:
         raise BuddylineError(f"--format tum --what net: one node a file; choose with --node: {', '.join(known)}")
-    return said, _tum_lines(poses)
+    return said, (tum_line(pose.stamp_ns, pose.p_m, pose.q_xyzw) for pose in poses)
 
 
 def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
@@ -60,23 +59,10 @@ def _load(paths: Sequence[str]) -> tuple[list[NodePose], dict[str, NodeInfo]]:
     return sorted(poses, key=lambda pose: pose.stamp_ns), infos
 
 
-def _tum_lines(poses: Sequence[NodePose]) -> Iterator[str]:
-    for pose in poses:
-        seconds, rest_ns = divmod(pose.stamp_ns, S_NS)
-        yield f"{seconds}.{rest_ns:09d} {' '.join(map(repr, (*pose.p_m, *pose.q_xyzw)))}\n"
-
-
-def _csv_lines(poses: Sequence[NodePose]) -> Iterator[str]:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_CSV)
-    for pose in poses:
-        sigmas = [math.sqrt(max(variance, 0.0)) for variance in pose.covariance[::7]]
-        head = (pose.stamp_ns, pose.net, pose.node, int(pose.fixed), pose.mode)
-        writer.writerow((*head, *pose.p_m, *pose.q_xyzw, *pose.v_mps, *sigmas, pose.age_s))
-        yield text.getvalue()
-        text.seek(0)
-        text.truncate()
+def _csv_row(pose: NodePose) -> tuple[object, ...]:
+    sigmas = [math.sqrt(max(variance, 0.0)) for variance in pose.covariance[::7]]
+    head = (pose.stamp_ns, pose.net, pose.node, int(pose.fixed), pose.mode)
+    return (*head, *pose.p_m, *pose.q_xyzw, *pose.v_mps, *sigmas, pose.age_s)
 
 
 @dataclass(frozen=True, eq=False)

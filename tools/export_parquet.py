@@ -5,20 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.dives import Dive
+from buddyline.tools.extras import needed
 from buddyline.tools.newfile import new_file
 
 
 def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write the best track, or the poses, into output, which must not exist; return the number of rows."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise BuddylineError(
-            f"--format parquet needs pyarrow, which is not installed ({error.name}): make install EXTRAS=parquet"
-        ) from error
+    pa, pq = (needed(name, "--format parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
     from buddyline.tools.evaluation.logs import load
     from buddyline.tools.export import rows_of
 

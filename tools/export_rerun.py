@@ -14,7 +14,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -30,6 +29,7 @@ from buddyline.protocol.messages import (
 from buddyline.tools.dives import Dive
 from buddyline.tools.enu import BaseCamera
 from buddyline.tools.export_foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, track_of
+from buddyline.tools.extras import needed
 from buddyline.tools.health.words import reason_words
 from buddyline.tools.newfile import new_file
 
@@ -41,12 +41,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """
     # It only writes a file: no usage is reported.
     os.environ.setdefault("RERUN_ANALYTICS", "0")
-    try:
-        import rerun
-    except ImportError as error:
-        raise BuddylineError(
-            "--format rerun needs rerun-sdk, which is not installed: make install EXTRAS=rerun"
-        ) from error
+    rerun = needed("rerun", "--format rerun", "rerun", "rerun-sdk")
     track = track_of(dive, what)
     count = 0
     with new_file(output) as part:

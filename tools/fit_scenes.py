@@ -49,8 +49,6 @@ DECOYS: Final = (
     ("walls",),
     ("walls", "slabs", "clock"),
 )
-NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
-"""A candidate counts as a lamp within 3 px or 1 % of the width, the greater."""
 
 
 class FitPicture(NamedTuple):
@@ -61,11 +59,6 @@ class FitPicture(NamedTuple):
     world: World
     node: str
     stamp_ns: int
-
-
-def near_px(width_px: int) -> float:
-    """Return how far from a lamp a candidate counts as that lamp."""
-    return max(NEAR_PX, NEAR_WIDTHS * width_px)
 
 
 def to_fit_and_held_out(simulated: Callable[[Iterable[int], Progress, int], Iterator[T]]) -> tuple[list[T], list[T]]:

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from buddyline.node.detect.score import NAMES, probability
 from buddyline.node.detect.source import SourceDetector
-from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, near_px, scenes, to_fit_and_held_out
+from buddyline.tools.evaluation.lights import tolerance_px
+from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
@@ -89,7 +90,7 @@ def _labelled(view: FitPicture) -> Iterator[Sample]:
     at_px = np.array([lamp[:2] for lamp in lamps]).reshape(-1, 2)
     visible = np.array([lamp[2] for lamp in lamps], bool)
     away_px = np.linalg.norm(seen.lights.centre_px[:, None] - at_px, axis=-1)
-    reach_px = near_px(picture.shape[1])
+    reach_px = tolerance_px(picture.shape[1])
     lamp = (away_px[:, visible] <= reach_px).any(axis=1)
     beside = (away_px <= BESIDE_RADII * np.maximum(seen.lights.core_px, reach_px)[:, None]).any(axis=1)
     kept = lamp | ~beside

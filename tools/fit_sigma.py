@@ -24,7 +24,8 @@ from buddyline.node.detect.detection import focal_of
 from buddyline.node.detect.score import probability
 from buddyline.node.detect.sigma import NAMES, Doubt, direct_px2, long_px2
 from buddyline.node.detect.source import SourceDetector
-from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, near_px, scenes, to_fit_and_held_out
+from buddyline.tools.evaluation.lights import tolerance_px
+from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
 from numpy.typing import NDArray
 
@@ -137,7 +138,7 @@ def located(
         return
     found = locate_sources(picture, lights, focal_px)
     away_px = np.linalg.norm(found.centre_px[:, None] - lamps_px, axis=-1).min(axis=1)
-    kept = found.holds & (away_px <= near_px(picture.shape[1]))
+    kept = found.holds & (away_px <= tolerance_px(picture.shape[1]))
     own = found.doubt
     focal = np.full(int(kept.sum()), own.focal)
     doubt = Doubt(own.model_px2[kept], own.growth_px2[kept], own.halo[kept], focal, own.elongation[kept])

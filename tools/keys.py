@@ -14,6 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.security import HUB, PLAYER, ROS, SOLVER, SURVEYOR, VIEWER, node_name
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.arguments import subcommand
+from buddyline.tools.extras import needed
 from buddyline.tools.hub import load_hub_config
 from buddyline.tools.newfile import write_new
 
@@ -67,10 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Make keys and certificates; never overwrite a file."""
-    try:
-        from buddyline.tools.authority import Authority
-    except ImportError as error:
-        raise BuddylineError("keys: the package cryptography is missing; `make install EXTRAS=keys`") from error
+    needed("cryptography", "keys", "keys")
+    from buddyline.tools.authority import Authority
+
     if args.days is not None and args.days < 1:
         raise BuddylineError(f"--days {args.days}: at least 1")
     directory = Path(args.directory)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.service import Service
+from buddyline.protocol.topics import IMAGE, Topic
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, KeyExprs, Received, Subscription
@@ -92,6 +93,25 @@ def open_bus_within(config: ClientConfig, seconds: float) -> Bus:
 def no_hub(config: ClientConfig, seconds: float) -> NoHubError:
     """Return the error of a hub that did not answer."""
     return NoHubError(f"no hub at {config.connect} within {seconds:g} s (start one with `buddyline hub`)")
+
+
+def follow_running(
+    bus: Bus,
+    states: Sequence[Topic],
+    streams: Sequence[Topic],
+    refusals: Refusals,
+    take: Callable[[Envelope], None],
+    *,
+    pictures: bool = True,
+) -> None:
+    """Follow running nodes and solver. states: whose last message is fetched; streams: from now on; and pictures.
+
+    A history of the streams would load the link that the solver needs. Each queue drops its oldest message, so what is
+    slow here does not slow the publishers.
+    """
+    of_pictures = [((IMAGE,), 4, False)] if pictures else []
+    for topics, capacity, history in ((states, 64, True), (streams, 1024, False), *of_pictures):
+        follow(bus, tuple(topic.key_any() for topic in topics), refusals, take, capacity=capacity, history=history)
 
 
 def follow(

@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, islice
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +16,7 @@ from buddyline.protocol.errors import BuddylineError
 
 if TYPE_CHECKING:
     import numpy as np
-    from buddyline.protocol.messages import FixedPlace, Message, NodePose
+    from buddyline.protocol.messages import FixedPlace, NodePose
     from numpy.typing import NDArray
 
 log = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
     from buddyline.solver_service.core import SolverCore
     from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
     from buddyline.tools.dives import Dive
-    from buddyline.tools.solve import TOGETHER
+    from buddyline.tools.solve import solved
     from msgspec import UNSET
     from msgspec.structs import replace
 
@@ -118,21 +118,14 @@ def find(paths: Sequence[str], still: Sequence[str], net: str) -> dict[str, Stan
             lone=sorted(infos.keys() - set(full)),
         )
         found: dict[str, list[NodePose]] = {node: [] for node in still}
-
-        def take(messages: Sequence[Message]) -> None:
-            for one in messages:
-                if isinstance(one, NodePose) and one.node in found:
-                    found[one.node].append(one)
-
         messages = (envelope.message for envelope in dive.messages("info", "candidates", "imu", "attitude", "depth"))
-        while together := list(islice(messages, TOGETHER)):
-            take(
-                core.handle_many(
-                    replace(one, fixed=exact if one.node == origin else UNSET) if isinstance(one, NodeInfo) else one
-                    for one in together
-                )
-            )
-        take(core.flush())
+        placed = (
+            replace(one, fixed=exact if one.node == origin else UNSET) if isinstance(one, NodeInfo) else one
+            for one in messages
+        )
+        for one in solved(core, placed):
+            if isinstance(one, NodePose) and one.node in found:
+                found[one.node].append(one)
     stands = {origin: Stand(at_origin, len(found[origin]))}
     for node in still[1:]:
         stands[node] = _stand(node, found[node], net)

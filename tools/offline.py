@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 from buddyline.protocol.errors import BuddylineError
@@ -27,13 +26,13 @@ from buddyline.tools.columns import (
     PoseColumns,
     RejectionColumns,
     TrackColumns,
+    columns_of,
     in_order,
     pose_columns,
-    rejection_columns,
     track_columns,
 )
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import TOGETHER
+from buddyline.tools.solve import solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,15 +72,12 @@ def solve_messages(
     if clocks is None:
         clocks = {chosen[1]: ClockCurve.constant(clock_offset_s or 0.0)}
     core = SolverCore(settings, [chosen], clocks, track=track_settings(track, track_hz))
-    rest, outcomes = iter(taken), list[Message]()
-    # A node's streams keep a minute of messages, so each batch spans less than that.
-    while together := list(islice(rest, TOGETHER)):
-        outcomes += core.handle_many(together)
-    outcomes += core.flush()
+    outcomes = list(solved(core, taken))
+    rejected = sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)
     return SolvedDive(
         chosen,
         pose_columns(in_order(one for one in outcomes if isinstance(one, RelativePose))),
-        rejection_columns(sorted((one for one in outcomes if isinstance(one, Rejected)), key=lambda one: one.stamp_ns)),
+        columns_of(RejectionColumns, rejected),
         track_columns(in_order(one for one in outcomes if isinstance(one, Track))),
     )
 

@@ -18,7 +18,7 @@ from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.security import ROS
 from buddyline.tools.client import client_config
-from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.live import LiveClient, follow_running
 from buddyline.tools.ros_messages import RosMessage, Translation, type_store
 
 if TYPE_CHECKING:
@@ -116,12 +116,9 @@ def run(args: argparse.Namespace) -> int:
                     except MessageError as error:
                         client.refusals.note(envelope.key, error)
 
-            for topic in (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS):
-                follow(bus, topic.key_any(), client.refusals, publish, capacity=64)
+            states = (topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS)
             streams = (topics.ATTITUDE, topics.DEPTH, topics.POSE, topics.TRACK, topics.TRACK_LAG, topics.REJECTED)
-            for topic in streams:
-                follow(bus, topic.key_any(), client.refusals, publish, capacity=256, history=False)
-            follow(bus, topics.IMAGE.key_any(), client.refusals, publish, capacity=4, history=False)
+            follow_running(bus, states, streams, client.refusals, publish)
             client.wait()
         finally:
             session.close()

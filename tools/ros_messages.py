@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError, MessageError
+from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import (
     NODE_ID_PATTERN,
     Attitude,
@@ -30,6 +30,7 @@ from buddyline.protocol.messages import (
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.estimate import range_sigma_m
+from buddyline.tools.extras import needed
 from buddyline.tools.health.words import reason_words
 
 MAP: Final = "map"
@@ -294,8 +295,5 @@ class Translation:
 
 def type_store() -> Any:
     """Return ROS 2 Jazzy's types; raise BuddylineError if rosbags is not installed."""
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise BuddylineError("ROS 2's types need rosbags, which is not installed: make install EXTRAS=ros2") from error
-    return get_typestore(Stores.ROS2_JAZZY)
+    typesys = needed("rosbags.typesys", "what ROS 2 reads", "ros2")
+    return typesys.get_typestore(typesys.Stores.ROS2_JAZZY)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, fields
+from typing import Any
 
 from buddyline.node.sim.scenario import (
     DECOYS,
@@ -25,37 +27,34 @@ ASPECT = 616 / 820
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Declare the command's arguments. What is a field of Scenario or DivePlan has its name, and its default."""
     scenario, plan = Scenario(), DivePlan()
+
+    def choice(to: argparse._ActionsContainer, field: str, choices: Sequence[str], text: str = "") -> None:
+        default = getattr(scenario if hasattr(scenario, field) else plan, field)
+        to.add_argument(f"--{field}", choices=choices, default=default, help=f"{text}default: %(default)s")
+
+    def number(to: argparse._ActionsContainer, option: str, field: str, metavar: str, text: str = "") -> None:
+        default = getattr(scenario if hasattr(scenario, field) else plan, field)
+        help_text = f"{text}default: %(default)s"
+        to.add_argument(option, dest=field, type=type(default), default=default, metavar=metavar, help=help_text)
+
     parser.add_argument("output", metavar="OUT.mcap", help="the dive log to write; must not exist")
-    parser.add_argument("--environment", choices=ENVIRONMENTS, default=scenario.environment, help="default: cavern")
-    parser.add_argument("--seconds", type=float, default=plan.seconds, help="default: %(default)s")
-    parser.add_argument("--rate", type=float, default=plan.rate_hz, metavar="HZ", help="triggers; default: %(default)s")
+    choice(parser, "environment", ENVIRONMENTS)
+    number(parser, "--seconds", "seconds", "S")
+    number(parser, "--rate", "rate_hz", "HZ", "triggers; ")
     parser.add_argument("--seed", type=int, default=1, help="each seed gives another dive; default: %(default)s")
     parser.add_argument("--images", action="store_true", help="rendered pictures in place of synthetic candidates")
-    parser.add_argument(
-        "--exposure",
-        choices=EXPOSURES,
-        default=plan.exposure,
-        help="of pictures; auto: locked to the lamps, as a node's camera does it; default: %(default)s",
-    )
+    choice(parser, "exposure", EXPOSURES, "of pictures; auto: locked to the lamps, as a node's camera does it; ")
     parser.add_argument("--imu", action="store_true", help="with raw inertial samples")
-    parser.add_argument(
-        "--inertial",
-        choices=INERTIAL_GRADES,
-        default=scenario.inertial,
-        help="poor: mounted 1 deg off, stamped late, with walking biases, shaken by fins; default: %(default)s",
-    )
-    parser.add_argument("--width", type=int, default=scenario.width_px, metavar="PX", help="default: %(default)s")
+    poor = "poor: mounted 1 deg off, stamped late, with walking biases, shaken by fins; "
+    choice(parser, "inertial", INERTIAL_GRADES, poor)
+    number(parser, "--width", "width_px", "PX")
     world = parser.add_argument_group("the dive")
-    world.add_argument("--trajectory", choices=TRAJECTORIES, default=scenario.trajectory, help="default: circles")
-    world.add_argument(
-        "--range-min", type=float, default=scenario.range_min_m, metavar="M", help="default: %(default)s"
-    )
-    world.add_argument("--range-max", type=float, default=0.0, metavar="M", help="default: as far as the water allows")
-    world.add_argument(
-        "--baseline", type=float, default=scenario.baseline_a_m, metavar="M", help="default: %(default)s"
-    )
+    choice(world, "trajectory", TRAJECTORIES)
+    number(world, "--range-min", "range_min_m", "M")
+    number(world, "--range-max", "range_max_m", "M", "0: as far as the water allows; ")
+    number(world, "--baseline", "baseline_a_m", "M")
     world.add_argument(
         "--nodes", type=int, default=2, metavar="N", help="a, b, c, ...: above 2 in two groups; default: %(default)s"
     )
@@ -63,15 +62,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fixed", action="append", default=[], metavar="NODE", help="a node that stands still, such as a; repeatable"
     )
     world.add_argument("--blink", action="store_true", help="each node's left lamp blinks by a code of its own")
-    world.add_argument("--others", type=int, default=scenario.other_lamps, metavar="N", help="other divers' lamps")
+    number(world, "--others", "other_lamps", "N", "other divers' lamps; ")
     world.add_argument("--tags", action="store_true", help="two AR tags on each node, for comparison")
     world.add_argument("--undisturbed", action="store_true", help="no diver looks away, nothing passes before a light")
     faults = parser.add_argument_group("noise and faults")
-    faults.add_argument("--sigma-px", type=float, default=scenario.sigma_px, metavar="PX", help="noise of candidates")
-    faults.add_argument("--gross", type=float, default=scenario.gross_share, metavar="SHARE", help="off by pixels")
-    faults.add_argument("--misses", type=float, default=scenario.miss_share, metavar="SHARE", help="lights not found")
-    faults.add_argument("--false", type=int, default=scenario.false_lights, metavar="N", help="false ones a picture")
-    faults.add_argument("--lost", type=float, default=plan.lost_share, metavar="SHARE", help="frames lost")
+    number(faults, "--sigma-px", "sigma_px", "PX", "noise of candidates; ")
+    number(faults, "--gross", "gross_share", "SHARE", "off by pixels; ")
+    number(faults, "--misses", "miss_share", "SHARE", "lights not found; ")
+    number(faults, "--false", "false_lights", "N", "false ones a picture; ")
+    number(faults, "--lost", "lost_share", "SHARE", "frames lost; ")
     faults.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="MS", help="b's clock ahead of a's")
     faults.add_argument("--clock-drift-ppm", type=float, default=0.0, metavar="PPM", help="and gaining")
     faults.add_argument("--magnetometer-off-deg", type=float, default=0.0, metavar="DEG", help="b's heading is wrong")
@@ -81,8 +80,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     faults.add_argument(
         "--decoy", action="append", default=[], choices=DECOYS, help="in pictures, what is taken for lamps; repeatable"
     )
-    faults.add_argument("--pwm-hz", type=float, default=0.0, metavar="HZ", help="lights dimmed by pulses")
-    faults.add_argument("--strobe-s", type=float, default=0.0, metavar="S", help="a strobe flashes so often")
+    number(faults, "--pwm-hz", "pwm_hz", "HZ", "lights dimmed by pulses; ")
+    number(faults, "--strobe-s", "strobe_s", "S", "a strobe flashes so often; ")
     faults.add_argument("--row-time-us", type=float, default=0.0, metavar="US", help="rolling shutter: time a row")
 
 
@@ -94,44 +93,22 @@ def run(args: argparse.Namespace) -> int:
     from buddyline.tools.newfile import new_dive_log
 
     cv2.setNumThreads(1)
-    plan = DivePlan(
-        seconds=args.seconds,
-        rate_hz=args.rate,
-        images=args.images,
-        exposure=args.exposure,
-        imu=args.imu,
-        lost_share=args.lost,
-    )
+    plan = DivePlan(**_given(args, DivePlan))
     scenario = Scenario(
-        environment=args.environment,
-        seed=args.seed,
+        **_given(args, Scenario),
         start_ns=START_NS,
         more_nodes=more_nodes(args.nodes),
         fixed_nodes=tuple(args.fixed),
-        width_px=args.width,
-        height_px=round(args.width * ASPECT),
+        height_px=round(args.width_px * ASPECT),
         row_time_ns=round(args.row_time_us * 1000),
-        baseline_a_m=args.baseline,
-        baseline_b_m=args.baseline,
-        trajectory=args.trajectory,
-        range_min_m=args.range_min,
-        range_max_m=args.range_max,
-        sigma_px=args.sigma_px,
-        gross_share=args.gross,
-        miss_share=args.misses,
-        false_lights=args.false,
-        other_lamps=args.others,
-        tags=args.tags,
+        baseline_b_m=args.baseline_a_m,
         interruptions=not args.undisturbed,
         clock_offset_ns=round(args.clock_offset_ms * MS_NS),
         clock_drift=1e-6 * args.clock_drift_ppm,
         magnetometer_off_rad=math.radians(args.magnetometer_off_deg),
-        inertial=args.inertial,
         dead_lamps=tuple(args.dead_lamp),
         decoys=tuple(args.decoy),
         blink_slot_ns=plan.period_ns if args.blink else 0,
-        pwm_hz=args.pwm_hz,
-        strobe_s=args.strobe_s,
     )
     metadata = {name: str(value) for name, value in (_differing(scenario) | asdict(plan)).items()}
     with (
@@ -144,6 +121,11 @@ def run(args: argparse.Namespace) -> int:
         count = writer.count
     print(f"{args.output}: {plan.seconds:g} s of {scenario.environment}, {count} messages", file=sys.stderr)
     return 0
+
+
+def _given(args: argparse.Namespace, kind: type[Scenario | DivePlan]) -> dict[str, Any]:
+    """Return the arguments that have the names of fields."""
+    return {field.name: getattr(args, field.name) for field in fields(kind) if hasattr(args, field.name)}
 
 
 def _differing(scenario: Scenario) -> dict[str, object]:

@@ -181,6 +181,17 @@ def messages_of(
                 yield found
 
 
+def solved(core: SolverCore, messages: Iterable[Message]) -> Iterator[Message]:
+    """Yield what the solver makes of messages, many at a time, to the end of the dive's triggers.
+
+    A node's streams keep a minute of messages, so each batch spans less than that.
+    """
+    rest = iter(messages)
+    while together := list(islice(rest, TOGETHER)):
+        yield from core.handle_many(together)
+    yield from core.flush()
+
+
 @dataclass
 class Tracked:
     """What was written of one pair's track. rows: how often it tells; span_s: from its first to its last time.

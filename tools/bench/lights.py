@@ -37,7 +37,9 @@ from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob, Expect, ExpectedLight
+from buddyline.tools.evaluation.lights import tolerance_px
 from buddyline.tools.fit_score import score_error
+from buddyline.tools.fit_sigma import BEYOND
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
 from numpy.typing import NDArray
@@ -54,12 +56,8 @@ FIRST_COUNTED: Final = 5
 """Number of each scene's first picture that counts: those of the first second do not."""
 CLOSE_PX: Final = 2.0
 """A light with a candidate this near counts as found in the share `within 2 px`."""
-NEAR_PX, NEAR_WIDTHS = 3.0, 0.01
-"""A candidate is near a lamp within 3 px or 1 % of the width, the greater."""
 FIRST: Final = 3
 """So many candidates, the likeliest, should have both lights."""
-BEYOND: Final = 11.83
-"""Squared error over the variance per axis that 99.73 % of the errors do not exceed."""
 RANGES_M: Final = (0.0, 2.0, 3.0, 5.0, 50.0)
 UNCLIPPED: Final = 240.0
 """A candidate whose peak is below this grey level counts as not clipped."""
@@ -224,7 +222,7 @@ def _lights(world: World, node: str, frame: Frame, blobs: Sequence[Blob]) -> lis
             continue
         away_px = [math.hypot(blob.u_px - true.u_px, blob.v_px - true.v_px) for blob in blobs]
         nearest = blobs[int(np.argmin(away_px))] if blobs else None
-        near_px = max(NEAR_PX, NEAR_WIDTHS * width)
+        near_px = tolerance_px(width)
         border_px = math.inf
         if nearest is not None:
             u, v = nearest.u_px, nearest.v_px
@@ -238,7 +236,7 @@ def _lights(world: World, node: str, frame: Frame, blobs: Sequence[Blob]) -> lis
 
 def _lamps(world: World, node: str, frame: Frame, blobs: Sequence[Blob]) -> list[bool]:
     """Return which candidates are near a lamp, of anyone, that is in view or hidden."""
-    near_px = max(NEAR_PX, NEAR_WIDTHS * frame.image.shape[1])
+    near_px = tolerance_px(frame.image.shape[1])
     lamps = world.lamps(node, frame.stamp_ns)
     return [any(math.hypot(blob.u_px - u, blob.v_px - v) <= near_px for u, v, _ in lamps) for blob in blobs]
 

@@ -30,6 +30,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, FoxgloveTime, RelativePose
 from buddyline.protocol.topics import CANDIDATES, IMAGE, POSE
 from buddyline.tools.client import ClientConfig
+from buddyline.tools.extras import needed
 from buddyline.tools.live import follow, open_bus_within
 from buddyline.tools.measure.children import Child, free_endpoint, free_port
 from buddyline.tools.measure.tables import cells_of, text_table
@@ -181,17 +182,14 @@ def monitor(endpoint: str) -> Iterator[tuple[Child, str]]:
 @contextmanager
 def viewer(address: str) -> Iterator[list[int]]:
     """Connect to a page as its client does, and receive everything; yield a list with the number of bytes so far."""
-    try:
-        from websockets.sync.client import connect
-    except ImportError as error:
-        raise BuddylineError(f"{error.name} is not installed: make install EXTRAS=monitor") from error
+    client = needed("websockets.sync.client", "a viewer", "monitor")
     taken = [0]
 
     def take(connection: Any) -> None:
         for data in connection:
             taken[0] += len(data)
 
-    with connect(f"ws://{address}/ws", max_size=None) as connection:
+    with client.connect(f"ws://{address}/ws", max_size=None) as connection:
         taker = threading.Thread(target=take, args=(connection,))
         taker.start()
         try:

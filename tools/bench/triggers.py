@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from buddyline.node.sim.rotation import from_euler
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat
@@ -112,10 +113,5 @@ def _upright(rng: np.random.Generator, heading_rad: float) -> Floats:
 
 
 def _turn(yaw_pitch_roll_rad: Floats) -> Floats:
-    R = np.eye(3)
-    for (i, j), angle in zip(((0, 1), (2, 0), (1, 2)), yaw_pitch_roll_rad, strict=True):
-        turn = np.eye(3)
-        turn[i, i] = turn[j, j] = math.cos(angle)
-        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
-        R = R @ turn
-    return R
+    yaw_rad, pitch_rad, roll_rad = yaw_pitch_roll_rad.tolist()
+    return from_euler(roll_rad, pitch_rad, yaw_rad)

@@ -14,7 +14,7 @@ from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.options import above_zero
 from buddyline.protocol.topics import check_node_id
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.live import LiveClient, follow_running
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus
@@ -108,9 +108,7 @@ def run(args: argparse.Namespace) -> int:
         states = [topics.INFO, topics.NODE_STATUS, topics.SOLVER_STATUS]
         streams = [topics.ATTITUDE, topics.DEPTH, topics.TRACK, topics.POSE]
         streams += [topic for topic in topics.TOPICS if topic.schema is NodePose and "truth" not in topic.template]
-        for followed, history in ((states, True), (streams, False)):
-            keys = tuple(topic.key_any() for topic in followed)
-            follow(bus, keys, client.refusals, bridge.take, capacity=1024, history=history)
+        follow_running(bus, states, streams, client.refusals, bridge.take, pictures=False)
         while not client.stop.wait(HEARTBEAT_S):
             bridge.tick()
 

@@ -13,11 +13,11 @@ from typing import Any, Final
 
 import numpy as np
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError
 from buddyline.solver_service.geometry.rotation import Floats, matrix_to_quat, rotation_log
 from buddyline.tools.bridge.nmea import M_PER_HDOP, SATELLITES
 from buddyline.tools.bridge.place import GeoPoint, OnEarth
 from buddyline.tools.bridge.placed import Placed, euler_covariance, euler_rad
+from buddyline.tools.extras import needed
 
 KINDS: Final = ("odometry", "estimate", "delta", "gps")
 # A change of position is told between two estimates at most this far apart.
@@ -29,22 +29,11 @@ WEEK_S: Final = 7 * 86_400
 _UPPER: Final = np.triu_indices(6)
 
 
-def dialect() -> Any:
-    """Return pymavlink's messages; raise BuddylineError if it is not installed."""
-    try:
-        from pymavlink.dialects.v20 import ardupilotmega
-    except ImportError as error:
-        raise BuddylineError(
-            f"--mavlink needs pymavlink, which is not installed ({error.name}): make install EXTRAS=bridge"
-        ) from error
-    return ardupilotmega
-
-
 class MavlinkTranslation:
     """Translates places into packets. kinds: which messages, of KINDS; system: the vehicle's system id."""
 
     def __init__(self, kinds: Sequence[str], system: int) -> None:
-        self._mavlink = dialect()
+        self._mavlink = needed("pymavlink.dialects.v20.ardupilotmega", "--mavlink", "bridge")
         self._kinds = kinds
         self._link = self._mavlink.MAVLink(
             None, srcSystem=system, srcComponent=self._mavlink.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY

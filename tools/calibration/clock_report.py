@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
-from buddyline.protocol.bus import Bus, Received
+from buddyline.protocol.bus import Bus
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.envelope import Refusals
+from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import ClockBeacon, Message, NodeStatus
 from buddyline.protocol.topics import CLOCK, NODE_STATUS
@@ -27,7 +27,7 @@ from buddyline.tools.calibration.clock import (
 )
 from buddyline.tools.client import ClientConfig
 from buddyline.tools.dives import Dive
-from buddyline.tools.live import open_bus_within
+from buddyline.tools.live import follow, open_bus_within
 from buddyline.tools.progress import Progress
 from msgspec import UNSET
 
@@ -69,12 +69,11 @@ def hear(bus: Bus, seconds: float) -> Heard:
     heard, began_s = Heard(), time.monotonic()
     refusals = Refusals("calibrate clock")
 
-    def take(received: Received) -> None:
-        envelope = refusals.open(received)
-        if envelope is not None:
-            heard.add(envelope.message, time.monotonic() - began_s)
+    def take(envelope: Envelope) -> None:
+        heard.add(envelope.message, time.monotonic() - began_s)
 
-    subscriptions = [bus.subscribe(CLOCK.key_any(), take, history=False), bus.subscribe(NODE_STATUS.key_any(), take)]
+    topics = ((CLOCK, False), (NODE_STATUS, True))
+    subscriptions = [follow(bus, topic.key_any(), refusals, take, history=history) for topic, history in topics]
     over = threading.Event()
     with Progress("listening to both clocks", seconds) as progress:
         while (passed_s := time.monotonic() - began_s) < seconds:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.extras import needed
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -61,10 +62,7 @@ _STYLE: Final[dict[Any, Any]] = {
 
 def check() -> None:
     """Raise BuddylineError if matplotlib is missing. Call it before the work, not after."""
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        raise BuddylineError("drawing needs matplotlib: make install EXTRAS=plots") from None
+    mpl = needed("matplotlib", "drawing", "plots")
     mpl.rcParams.update(_STYLE)
     from matplotlib import font_manager
 

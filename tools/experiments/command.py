@@ -31,7 +31,7 @@ from buddyline.tools.experiments.runs import (
     long_dive,
     rendered,
 )
-from buddyline.tools.measure.tables import markdown_table
+from buddyline.tools.measure.tables import cells_of, markdown_table, number
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
@@ -45,7 +45,14 @@ PAIRS_NOTE = (
 )
 
 
-BOUND_HEAD = ("range", "poses", "bound, RMS, m", "RMS / RMS", "bound, median, m", "median / median")
+BOUND_COLUMNS = {
+    "range": "{from_m:g} to {to_m:g} m",
+    "poses": "{poses}",
+    "bound, RMS, m": "{bound_rms_m:.3f}",
+    "RMS / RMS": "{rms_ratio:.2f} ± {rms_sd:.2f}",
+    "bound, median, m": "{bound_median_m:.3f}",
+    "median / median": "{median_ratio:.2f}",
+}
 BOUND_NOTE = (
     "<p>The bound (Cramér-Rao) is of one trigger's four lights with the noise of their places in the pictures. RMS is "
     "compared with the bound's RMS, the median with the median of errors at the bound. ±: by how much the ratio varies "
@@ -157,11 +164,6 @@ def curves_of(dive: Rendered) -> list[ErrorCurve]:
     ]
 
 
-def number(value: Any, digits: int = 3) -> str:
-    """Return a figure as text; a dash for None."""
-    return "-" if value is None else f"{value:.{digits}f}" if isinstance(value, float) else str(value)
-
-
 def pair_rows(pairs: dict[str, dict[str, dict[str, Any]]]) -> list[list[str]]:
     """Return the rows of the table of right pairs."""
     return [
@@ -178,25 +180,10 @@ def pair_rows(pairs: dict[str, dict[str, dict[str, Any]]]) -> list[list[str]]:
     ]
 
 
-def bound_rows(rows: list[dict[str, float]]) -> list[list[str]]:
-    """Return the rows of the table of errors over their bound."""
-    return [
-        [
-            f"{row['from_m']:g} to {row['to_m']:g} m",
-            str(row["poses"]),
-            number(row["bound_rms_m"]),
-            f"{row['rms_ratio']:.2f} ± {row['rms_sd']:.2f}",
-            number(row["bound_median_m"]),
-            f"{row['median_ratio']:.2f}",
-        ]
-        for row in rows
-    ]
-
-
 def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output: Path) -> str:
     """Return the report's HTML."""
     quick = "<p><b>Quick look: short dives, not figures to quote.</b></p>" if found["quick"] else ""
-    head = table(rows, numbers.HEAD)
+    head, bounds = table(rows, numbers.HEAD), cells_of(found["bound"], BOUND_COLUMNS)
     sections = [
         ("At a glance", quick + head + "<p>Simulated dives, of seeds that nothing was tuned on: not the sea.</p>"),
         (
@@ -206,7 +193,7 @@ def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output:
         (
             "Error against distance",
             picture(output / "error_over_range.png", "Median position error by range")
-            + table(bound_rows(found["bound"]), BOUND_HEAD)
+            + table(bounds[1:], bounds[0])
             + BOUND_NOTE,
         ),
         (
@@ -238,7 +225,9 @@ def report(found: dict[str, Any], rows: list[tuple[str, str, str, str]], output:
             costs.append([f"a frame, {environment}: {name}", number(frame[detector], 1)])
     sections.append(("Run time", table(costs, ("processor time of one thread, this machine", "ms"))))
     if "tank" in found:
-        listed = [[name.replace("_", " "), number(value)] for name, value in found["tank"].items()]
+        listed = [
+            [name.replace("_", " "), f"{value:.4g}"] for name, value in found["tank"].items() if value is not None
+        ]
         sections.append(("AR tags in real water", table(listed, ("underwater-apriltags' video", ""))))
     parts = [section(heading, content) for heading, content in sections]
     return page("Buddyline: the paper's experiments, again", *parts)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools.cli import COMMANDS
+from buddyline.tools.cli import command_named
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.logs import load_for_evaluation
 from buddyline.tools.evaluation.result import Result, evaluate
@@ -56,9 +56,8 @@ QUICK: Final = Size(seconds=8.0, rate_hz=2.0, long_seconds=42.0, long_rate_hz=2.
 
 def call(name: str, *words: str) -> None:
     """Run one command of the program, without its output; raise BuddylineError if it fails."""
-    command = next(command for command in COMMANDS if command.name == name)
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        status = command.run(words)
+        status = command_named(name).run(words)
     # `artag` also returns 1 if no picture shows a tag, which is a result here.
     if status and name != "artag":
         raise BuddylineError(f"buddyline {name} {' '.join(words)}: ended with {status}")

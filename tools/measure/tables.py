@@ -1,11 +1,16 @@
-"""Tables for people, as aligned text or as Markdown, and figures for programs, as JSON."""
+"""Tables for people, as aligned text or as Markdown, and for programs, as JSON, CSV or TUM's trajectories."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from typing import TypeVar
+
+from buddyline.protocol.clock import S_NS
 
 Figures = TypeVar("Figures")
 
@@ -38,6 +43,23 @@ def markdown_head(cells: Sequence[object]) -> str:
 def markdown_table(head: Sequence[object], rows: Sequence[Sequence[object]]) -> str:
     """Return a table as Markdown."""
     return "\n".join([markdown_head(head), *map(markdown_row, rows)]) + "\n"
+
+
+def csv_lines(head: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """Yield a table as lines of CSV."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for row in chain([head], rows):
+        writer.writerow(row)
+        yield text.getvalue()
+        text.seek(0)
+        text.truncate()
+
+
+def tum_line(stamp_ns: int, t_m: Sequence[float], q_xyzw: Sequence[float]) -> str:
+    """Return a pose as TUM's format has it: t in s, with all nine decimals that its ns have, place, quaternion."""
+    seconds, rest_ns = divmod(stamp_ns, S_NS)
+    return f"{seconds}.{rest_ns:09d} {' '.join(map(repr, (*t_m, *q_xyzw)))}\n"
 
 
 def number(value: float | None, digits: int = 3) -> str:

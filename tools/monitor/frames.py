@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.envelope import Envelope
-from buddyline.protocol.messages import NodeInfo, RelativePose
+from buddyline.protocol.messages import NodeInfo
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
-from buddyline.tools.estimate import Estimate, known, sigma_m
+from buddyline.tools.estimate import Estimate
 from buddyline.tools.health.pair import findings
 from buddyline.tools.health.words import sentence
 from buddyline.tools.monitor import panel
 from buddyline.tools.monitor.overview import Overview
-from buddyline.tools.monitor.picture import NodePicture, PairPicture, Point
+from buddyline.tools.monitor.picture import QUANTITIES, NodePicture, PairPicture, Point
 from buddyline.tools.monitor.scene import SceneFrame, ellipsoid, fields_of_view
 from buddyline.tools.pairs import Pair
 
@@ -160,24 +160,11 @@ def numbers(value: Any, path: str = "") -> dict[str, float]:
 def row(point: Point) -> Row:
     """Return a point of trail and plots: time (ms), 1 for the track, north, east, down, then the plotted quantities.
 
-    They are range (m), azimuth and inclination (deg), the position's sigma and the gap of the two ranges (mm), latency
-    (ms); None where a quantity is not known.
+    They are those of QUANTITIES; None where one is not known.
     """
-    estimate = point.estimate
-    quantities = (
-        estimate.range_m,
-        _degrees(known(estimate, "azimuth_rad")),
-        _degrees(known(estimate, "inclination_rad")),
-        1e3 * sigma_m(estimate),
-        1e3 * estimate.range_gap_m if isinstance(estimate, RelativePose) else None,
-        None if math.isnan(point.latency_s) else 1e3 * point.latency_s,
-    )
-    rounded = [None if value is None else round(value, 4) for value in (*point.t_m, *quantities)]
+    values = (*point.t_m, *(quantity(point) for _, quantity in QUANTITIES))
+    rounded = [None if math.isnan(value) else round(value, 4) for value in values]
     return [point.at_ns / MS_NS, int(point.tracked), *rounded]
-
-
-def _degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else math.degrees(angle_rad)
 
 
 def scene(overview: Overview, picture: PairPicture, now_ns: int) -> dict[str, Any]:

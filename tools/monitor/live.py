@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from buddyline.protocol import topics
 from buddyline.protocol.options import above_zero
 from buddyline.tools.client import add_client_arguments, client_config
-from buddyline.tools.live import LiveClient, follow
+from buddyline.tools.live import LiveClient, follow_running
 from buddyline.tools.pairs import add_pair_argument
 
 if TYPE_CHECKING:
@@ -124,11 +124,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def subscribe(bus: Bus, refusals: Refusals, overview: Overview, lock: threading.Lock) -> None:
-    """Subscribe to everything that is shown; messages go into overview, under the lock.
-
-    Only the last message of each latest-only topic is fetched: a history of the rest would load the link that the
-    solver needs. Each subscription's queue drops its oldest message, so a slow page does not slow the publishers.
-    """
+    """Subscribe to everything that is shown; messages go into overview, under the lock."""
 
     def take(envelope: Envelope) -> None:
         with lock:
@@ -138,6 +134,5 @@ def subscribe(bus: Bus, refusals: Refusals, overview: Overview, lock: threading.
         with lock:
             overview.alive(name, is_alive, bus.clock.now_ns())
 
-    for followed, capacity, history in ((STATES, 64, True), (STREAMS, 1024, False), ((topics.IMAGE,), 4, False)):
-        follow(bus, tuple(topic.key_any() for topic in followed), refusals, take, capacity=capacity, history=history)
+    follow_running(bus, STATES, STREAMS, refusals, take)
     bus.watch_alive(alive)

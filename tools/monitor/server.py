@@ -24,6 +24,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.extras import needed
 from buddyline.tools.monitor.frames import RATE_HZ, Viewer, fields
 
 if TYPE_CHECKING:
@@ -107,12 +108,7 @@ class PageServer:
 
 def open_listener(host: str, port: int) -> socket.socket:
     """Listen on host and port, or the next free port; raise BuddylineError if that cannot be."""
-    try:
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise BuddylineError(
-            f"the page needs websockets, which is not installed ({error.name}): make install EXTRAS=monitor"
-        ) from error
+    needed("websockets", "the page", "monitor")
     if not 0 <= port < 65536:
         raise BuddylineError(f"--port {port}: 0 to 65535")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import sqlite3
 import struct
 from collections.abc import Iterator, Sequence
@@ -12,6 +10,7 @@ from typing import Final, TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
+from buddyline.tools.measure.tables import csv_lines
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.geodesy import leg_date
 from buddyline.tools.survey.old.joining import leg_of, same_place
@@ -172,7 +171,7 @@ def control_csv(sheet: Sheet) -> str:
         [one.name, *(f"{value:z.4f}" for value in (*one.position_m.tolist(), *np.maximum(one.sigmas_m, 1e-4).tolist()))]
         for one in [*sheet.adjusted.positions.values(), *sheet.adjusted.points]
     ]
-    return _rows(("label", "x_m", "y_m", "z_m", "accuracy_x_m", "accuracy_y_m", "accuracy_z_m"), rows)
+    return "".join(csv_lines(("label", "x_m", "y_m", "z_m", "accuracy_x_m", "accuracy_y_m", "accuracy_z_m"), rows))
 
 
 def scale_bars_csv(sheet: Sheet) -> str:
@@ -183,12 +182,4 @@ def scale_bars_csv(sheet: Sheet) -> str:
         if " " not in end:
             scale = 1 + solution.correction(number, "distance") if leg.from_node else 1.0
             rows.append([start, end, f"{leg.distance_m / scale:.4f}", f"{leg.distance_sigma_m:.4f}"])
-    return _rows(("label_a", "label_b", "distance_m", "accuracy_m"), rows)
-
-
-def _rows(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return text.getvalue()
+    return "".join(csv_lines(("label_a", "label_b", "distance_m", "accuracy_m"), rows))

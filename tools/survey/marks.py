@@ -8,20 +8,20 @@ import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, get_args
+from typing import TYPE_CHECKING, Final, get_args
 
 import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Mark
-from buddyline.tools.survey.old.model import CrossSection
 from buddyline.tools.survey.project import HandMark, MarkKind, Station
 from msgspec import UNSET
 
+if TYPE_CHECKING:
+    from buddyline.tools.survey.old.model import CrossSection
+
 KINDS: Final = get_args(MarkKind)
-
-
 # How a station's note says its cross-section: left, right, up, down in metres, - for what was not measured.
 SECTION_WORD: Final = "LRUD"
 
@@ -36,6 +36,9 @@ def section_note(sides: Sequence[str], note: str) -> str:
 
 def section_of(station: Station) -> CrossSection | None:
     """Return a station's cross-section by its notes, the last one; None without. Raise ConfigError if it is none."""
+    # Here, so that `buddyline mark --help` answers at once.
+    from buddyline.tools.survey.old.model import CrossSection
+
     found = None
     for note in station.notes:
         word, *sides = note.split()[:5] or [""]

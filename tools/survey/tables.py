@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from datetime import date
 from typing import Any, Final
 
 from buddyline.protocol.errors import BuddylineError
+from buddyline.tools.measure.tables import csv_lines
 from buddyline.tools.survey.connected import station_depths
 from buddyline.tools.survey.fit import detectable
 from buddyline.tools.survey.geodesy import leg_date
@@ -39,12 +38,8 @@ NO_SIDE: Final = "-9.90"
 COMPASS_FORMAT: Final = "DDDDLUDRLADadBF"
 
 
-def _csv(columns: Iterable[str], rows: Iterable[dict[str, Any]]) -> str:
-    out = io.StringIO()
-    writer = csv.DictWriter(out, list(columns), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return out.getvalue()
+def _csv(columns: Collection[str], rows: Iterable[dict[str, Any]]) -> str:
+    return "".join(csv_lines(list(columns), ([row.get(name, "") for name in columns] for row in rows)))
 
 
 def legs_csv(sheet: Sheet) -> str:

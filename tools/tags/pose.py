@@ -13,7 +13,16 @@ from typing import Final
 import cv2
 import numpy as np
 from buddyline.protocol.messages import CameraModel
-from buddyline.tools.evaluation.rotation import Floats, conjugate, multiply, normalized, rotate, rotation_vector
+from buddyline.solver_service.geometry.rotation import skew
+from buddyline.tools.evaluation.rotation import (
+    Floats,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalized,
+    rotate,
+    rotation_vector,
+)
 from buddyline.tools.tags.layout import Layout
 
 # Noise of a refined corner, per axis, and its weight against a picture's own residuals, as a number of residuals.
@@ -181,23 +190,11 @@ def _starts(reading: TagReading) -> list[tuple[Floats, Floats]]:
     for turn, shift in zip(turns[:count], shifts[:count], strict=True):
         w = np.asarray(turn, dtype=np.float64).ravel()
         t = np.asarray(shift, dtype=np.float64).ravel()
-        q = _exp(w)
+        q = from_rotation_vector(w)
         if not np.isfinite(t).all() or t[2] < -10.0:
             continue
         starts.append((t, q) if reading.by_a else (-rotate(conjugate(q), t), conjugate(q)))
     return starts
-
-
-def _exp(w_rad: Floats) -> Floats:
-    half = 0.5 * float(np.linalg.norm(w_rad))
-    return np.append(0.5 * np.sinc(half / np.pi) * w_rad, np.cos(half))
-
-
-def _cross(v: Floats) -> Floats:
-    """Return the matrices (..., 3, 3) of v x."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    o = np.zeros_like(x)
-    return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
 
 
 def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[Floats, Floats] | None:
@@ -215,7 +212,7 @@ def _residuals(t_m: Floats, q_xyzw: Floats, stack: tuple[Floats, ...]) -> tuple[
     toward[:, :, 2] = -image
     toward *= focal_px[:, :, None] / depth[:, :, None]
     by_shift = np.where(by_a[:, :, None], np.eye(3), -R.T)
-    by_turn = np.where(by_a[:, :, None], -_cross(turned), R.T @ _cross(turned))
+    by_turn = np.where(by_a[:, :, None], -skew(turned), R.T @ skew(turned))
     J = toward @ np.concatenate([by_shift, by_turn], axis=2)
     return ((image - rays) * focal_px).ravel(), J.reshape(-1, 6)
 
@@ -238,7 +235,7 @@ def _fit(start: tuple[Floats, Floats], readings: Sequence[TagReading]) -> _Fit |
         H = J.T @ J
         damped = H + damping * np.diag(np.diag(H)) + 1e-9 * np.eye(6)
         step: Floats = np.asarray(np.linalg.solve(damped, -J.T @ r), dtype=np.float64)
-        moved = t_m + step[:3], normalized(multiply(_exp(step[3:]), q_xyzw))
+        moved = t_m + step[:3], normalized(multiply(from_rotation_vector(step[3:]), q_xyzw))
         then = _residuals(*moved, stack)
         if then is None or float(then[0] @ then[0]) > float(r @ r):
             damping *= 10.0

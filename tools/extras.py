@@ -1,0 +1,22 @@
+"""Packages of the extras (pyproject.toml), which may be missing."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from buddyline.protocol.errors import BuddylineError
+
+
+def needed(module: str, what: str, extra: str, package: str = "") -> Any:
+    """Return a module of an extra; raise BuddylineError where it is missing. what: needs it, in words.
+
+    package: its name for pip, where it is not the module's.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = package or module.partition(".")[0]
+        raise BuddylineError(
+            f"{what} needs {package}, which is not installed ({error.name}): make install EXTRAS={extra}"
+        ) from error
