@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         raise BuddylineError("--rejected: only with --format csv")
     if args.what == "track" and (args.truth or args.rejected):
         raise BuddylineError(f"--what track: not with {'--truth' if args.truth else '--rejected'}")
-    of_net = args.format == "trc" or (args.what == "net" and args.format not in ("c3d", "colmap", "metashape"))
+    of_net = args.format == "trc" or (args.what == "net" and not form.of_net)
     if args.node is not None and not of_net:
         raise BuddylineError("--node: only with --what net")
     if form.module and not of_net:
@@ -147,6 +147,8 @@ def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
 
     if args.output is None:
         raise BuddylineError(f"--format {form.name}: give -o FILE")
+    if form.of_net and args.what not in (None, "net"):
+        raise BuddylineError(f"--format {form.name} --what {args.what}: it has all nodes")
     module = import_module(f"buddyline.tools.{form.module}")
     with Dive(args.logs) as dive:
         count = module.export(dive, args.output, args.what)

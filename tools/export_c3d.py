@@ -17,11 +17,9 @@ from buddyline.tools.newfile import new_file
 MOST_FRAMES: Final = 65535
 
 
-def export(dive: Dive, output: Path, what: str | None = None) -> int:
+def export(dive: Dive, output: Path, _what: str | None = None) -> int:
     """Write the nodes' cameras and lamps into output, which must not exist, in mm; return the number of frames."""
     ezc3d = needed("ezc3d", "--format c3d", "c3d")
-    if what not in (None, "net"):
-        raise BuddylineError(f"--format c3d --what {what}: it has all nodes")
     markers = load_markers([str(reader.path) for reader in dive.readers])
     period_ns = 1e9 / markers.rate_hz
     frames = [round((stamp_ns - markers.stamps_ns[0]) / period_ns) for stamp_ns in markers.stamps_ns]

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat
 from buddyline.tools.dives import Dive
 from buddyline.tools.export_cameras import whole_folder, write_views
 
 
-def export(dive: Dive, output: Path, what: str | None = None) -> int:
+def export(dive: Dive, output: Path, _what: str | None = None) -> int:
     """Write the model into a new folder; return the number of pictures. World: east, north, up, m."""
-    if what not in (None, "net"):
-        raise BuddylineError(f"--format colmap --what {what}: it has all nodes")
     with whole_folder(output) as folder:
         views, infos = write_views(dive, folder)
         number = {node: i for i, node in enumerate(infos, 1)}

@@ -10,24 +10,30 @@ from typing import Final
 class ExportFormat:
     """A format. module: below buddyline.tools, with export(dive, output, what) -> number of messages or rows.
 
-    "": text, which tools/export.py writes to a file or to standard output. counts: what its number is of.
+    "": text, which tools/export.py writes to a file or to standard output. counts: what its number is of. of_net: it
+    has all nodes of a net, whatever is asked for.
     """
 
     name: str
     says: str
     module: str = ""
     counts: str = "messages"
+    of_net: bool = False
 
 
 FORMATS: Final = (
     ExportFormat("tum", "t x y z qx qy qz qw, for evo and others"),
     ExportFormat("csv", "a row for each sample, units in the header"),
     ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
-    ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "export_c3d", "frames"),
+    ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "export_c3d", "frames", of_net=True),
     ExportFormat(
-        "colmap", "a folder with all nodes' pictures and cameras, as COLMAP's text", "export_colmap", "pictures"
+        "colmap",
+        "a folder with all nodes' pictures and cameras, as COLMAP's text",
+        "export_colmap",
+        "pictures",
+        of_net=True,
     ),
-    ExportFormat("metashape", "the same with cameras.xml for Metashape", "export_metashape", "pictures"),
+    ExportFormat("metashape", "the same with cameras.xml for Metashape", "export_metashape", "pictures", of_net=True),
     ExportFormat(
         "parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet", "rows"
     ),

@@ -27,10 +27,7 @@ from buddyline.protocol.messages import (
     Depth,
     Message,
     NodeInfo,
-    NodeStatus,
-    Rejected,
     RelativePose,
-    SolverStatus,
     Track,
 )
 from buddyline.protocol.schemas import json_schema
@@ -40,7 +37,7 @@ from buddyline.tools.dives import Dive
 from buddyline.tools.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.extras import needed
 from buddyline.tools.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
-from buddyline.tools.health.words import reason_words
+from buddyline.tools.health.words import Sayings
 from buddyline.tools.monitor.frames import rig_outline
 from buddyline.tools.newfile import check_new, new_file, write_new
 from msgspec import UNSET
@@ -69,7 +66,7 @@ class FoxgloveTranslation:
         self._paths: dict[tuple[str, str], list[Track]] = {}
         self._frames: dict[str, deque[Candidates]] = {}
         self._camera = BaseCamera()
-        self._said: dict[str, str] = {}
+        self._sayings = Sayings()
 
     def start(self, infos: dict[str, NodeInfo], base: str | None, at_ns: int) -> Iterator[tuple[str, int, Any]]:
         """Yield the messages before the dive's first: A level at the origin. base: A's id."""
@@ -97,25 +94,10 @@ class FoxgloveTranslation:
             yield from self._pose(message)
         elif isinstance(message, Track):
             yield from self._track(message)
-        elif isinstance(message, Rejected):
-            yield from self._log(message.stamp_ns, f"pose {message.node_a}/{message.node_b}", "Info", _why(message))
-        elif isinstance(message, NodeStatus):
-            yield from self._log(message.stamp_ns, f"node {message.node}", "Warning", message.problem)
-        elif isinstance(message, SolverStatus):
-            name = f"solver {message.node_a}/{message.node_b}"
-            advice = [] if message.advice is UNSET else message.advice
-            yield from self._log(message.stamp_ns, name, "Warning", message.problem)
-            yield from self._log(
-                message.stamp_ns, f"coach {message.node_a}/{message.node_b}", "Info", ", ".join(advice)
-            )
-
-    def _log(self, stamp_ns: int, name: str, level: str, text: str) -> Iterator[tuple[str, int, Any]]:
-        """Yield a line of the log, unless the name said the same before."""
-        before, self._said[name] = self._said.get(name, ""), text
-        if text and text != before:
-            fox = self._fox
-            line = fox.Log(timestamp=self._time(stamp_ns), level=getattr(fox.LogLevel, level), name=name, message=text)
-            yield LOG, stamp_ns, line
+        for name, level, text in self._sayings.new(message):
+            fox, at = self._fox, self._time(envelope.stamp_ns)
+            line = fox.Log(timestamp=at, level=getattr(fox.LogLevel, level), name=name, message=text)
+            yield LOG, envelope.stamp_ns, line
 
     def _rig(self, info: NodeInfo) -> Any:
         """Return a node as a scene that moves with its camera: the bar, both lamps, and the edges of its view."""
@@ -369,10 +351,6 @@ class _Channels:
         count = self.topics.get(topic, 0)
         self._writer.add_message(self._ids[topic], stamp_ns, data, stamp_ns, count & 0xFFFFFFFF)
         self.topics[topic] = count + 1
-
-
-def _why(rejection: Rejected) -> str:
-    return f"no pose: {reason_words(rejection.reason)}"
 
 
 def track_of(dive: Dive, what: str | None) -> str | None:

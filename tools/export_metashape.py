@@ -6,16 +6,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
 from buddyline.tools.export_cameras import whole_folder, write_views
 
 
-def export(dive: Dive, output: Path, what: str | None = None) -> int:
+def export(dive: Dive, output: Path, _what: str | None = None) -> int:
     """Write cameras.xml and pictures into a new folder; return the number of pictures. World: east, north, up, m."""
-    if what not in (None, "net"):
-        raise BuddylineError(f"--format metashape --what {what}: it has all nodes")
     document = ElementTree.Element("document", version="1.2.0")
     chunk = ElementTree.SubElement(document, "chunk")
     sensors, cameras = (ElementTree.SubElement(chunk, name) for name in ("sensors", "cameras"))

@@ -20,17 +20,14 @@ from buddyline.protocol.messages import (
     CompressedImage,
     Depth,
     NodeInfo,
-    NodeStatus,
-    Rejected,
     RelativePose,
-    SolverStatus,
     Track,
 )
 from buddyline.tools.dives import Dive
 from buddyline.tools.enu import BaseCamera
 from buddyline.tools.export_foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, track_of
 from buddyline.tools.extras import needed
-from buddyline.tools.health.words import reason_words
+from buddyline.tools.health.words import Sayings
 from buddyline.tools.newfile import new_file
 
 
@@ -55,7 +52,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
             if envelope.topic.name in SERIES:
                 for name, values in _series(msgspec.to_builtins(envelope.message)):
                     recording.log(f"{entity}/{name}", rerun.Scalars(values))
-            drawing.take(entity, envelope.message, is_track=envelope.topic.name == track)
+            drawing.take(envelope.message, is_track=envelope.topic.name == track)
             count += 1
         recording.disconnect()
     return count
@@ -85,12 +82,12 @@ class _Drawing:
         self._camera.base = base_of(dive)
         self._camera.infos.update(dive.infos())
         self._base = self._camera.base or "a"
-        self._said: dict[str, str] = {}
+        self._sayings = Sayings()
         recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for info in dive.infos().values():
             self._rig(info)
 
-    def take(self, entity: str, message: Any, *, is_track: bool) -> None:
+    def take(self, message: Any, *, is_track: bool) -> None:
         """Draw one message. is_track: of the track that places B."""
         rr = self._rr
         if isinstance(message, NodeInfo | Depth):
@@ -109,11 +106,10 @@ class _Drawing:
             self._log(
                 f"{self._eye(message.node)}/picture/candidates", rr.Points2D(places, colors=_rgb(OTHER), radii=4.0)
             )
-        elif isinstance(message, Track | RelativePose):
-            if is_track or (isinstance(message, RelativePose) and self._track is None):
-                self._place(message)
-        else:
-            self._tell(entity, message)
+        elif is_track or (isinstance(message, RelativePose) and self._track is None):
+            self._place(message)
+        for name, _, text in self._sayings.new(message):
+            self._log(f"log/{name.replace(' ', '/')}", rr.TextLog(text))
 
     def _eye(self, node: str) -> str:
         """Return a camera's entity: A's in the world, the others in A's."""
@@ -127,21 +123,6 @@ class _Drawing:
             north_m, east_m, down_m = estimate.t_ned_m
             at_m = self._camera.position_m(estimate.node_a) + np.array((east_m, north_m, -down_m))
             self._log(f"world/trail_{estimate.node_b}", rr.Points3D([at_m], colors=_rgb(OTHER), radii=0.02))
-
-    def _tell(self, entity: str, message: Any) -> None:
-        """Write into the log why there is no pose, and what nodes and solver report when it changes."""
-        said = []
-        if isinstance(message, Rejected):
-            said.append((entity, f"no pose: {reason_words(message.reason)}"))
-        elif isinstance(message, NodeStatus | SolverStatus):
-            said.append((entity, message.problem))
-            if isinstance(message, SolverStatus):
-                advice = [] if isinstance(message.advice, msgspec.UnsetType) else message.advice
-                said.append((f"{entity}/advice", ", ".join(advice)))
-        for name, text in said:
-            if text and text != self._said.get(name):
-                self._log(f"log/{name}", self._rr.TextLog(text))
-            self._said[name] = text
 
     def _rig(self, info: NodeInfo) -> None:
         """Draw a node's bar, its lamps and its camera's view."""

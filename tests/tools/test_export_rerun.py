@@ -92,8 +92,8 @@ def test_a_recording_has_every_number_of_the_log_to_the_last_digit(rerun: Callab
     assert compared == 5 * 10
     depths = [value for _, (value,) in found["node/b/depth/depth_m"]]
     assert depths == [12.5 + k / 7 for k in range(5)]
-    assert [text for _, (text,) in found["log/pair/a/b/rejected"]] == ["no pose: more than one arrangement fits"]
-    assert [text for _, (text,) in found["log/pair/a/b/status/advice"]] == ["turn b 20 deg left"]
+    assert [text for _, (text,) in found["log/pose/a/b"]] == ["no pose: more than one arrangement fits"]
+    assert [text for _, (text,) in found["log/coach/a/b"]] == ["turn b 20 deg left"]
     for drawn in (
         "world/a Transform3D:translation",
         "world/a/b Transform3D:translation",

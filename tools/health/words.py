@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import UNDERVOLTAGE_NOW
-from buddyline.protocol.messages import NodeStatus
+from buddyline.protocol.messages import Message, NodeStatus, Rejected, SolverStatus
 from buddyline.tools.health.finding import Finding
 from msgspec import UNSET
 
@@ -53,6 +54,32 @@ LOADS: Final = {"no_pictures": "load lowered: no pictures", "half_rate": "load l
 def reason_words(reason: str) -> str:
     """Return a rejection's reason in words."""
     return REASONS.get(reason, (reason.replace("_", " "), ""))[0]
+
+
+class Sayings:
+    """What nodes and solver say, for a log of words: each speaker once, until it says something else."""
+
+    def __init__(self) -> None:
+        self._before: dict[str, str] = {}
+
+    def new(self, message: Message) -> Iterator[tuple[str, str, str]]:
+        """Yield speaker (`pose a/b`, `node a`, `solver a/b`, `coach a/b`), level (Info, Warning) and words."""
+        for speaker, level, text in _said(message):
+            if text and text != self._before.get(speaker):
+                yield speaker, level, text
+            self._before[speaker] = text
+
+
+def _said(message: Message) -> list[tuple[str, str, str]]:
+    if isinstance(message, NodeStatus):
+        return [(f"node {message.node}", "Warning", message.problem)]
+    if not isinstance(message, Rejected | SolverStatus):
+        return []
+    pair = f"{message.node_a}/{message.node_b}"
+    if isinstance(message, Rejected):
+        return [(f"pose {pair}", "Info", f"no pose: {reason_words(message.reason)}")]
+    advice = "" if message.advice is UNSET else ", ".join(message.advice)
+    return [(f"solver {pair}", "Warning", message.problem), (f"coach {pair}", "Info", advice)]
 
 
 def power_words(status: NodeStatus) -> list[str]:
