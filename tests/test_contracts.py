@@ -109,7 +109,7 @@ COMMANDS = "nothing imports the commands that simulate"
         ("tools/planted.py", "from buddyline.node.sim.world import World\n", [SIMULATOR]),
         ("solver_service/planted.py", "import buddyline.node.sim\n", [WAY, SIMULATOR]),
         ("tools/planted.py", "from buddyline.tools import simulate\n", [COMMANDS]),
-        ("tools/survey/planted.py", "from buddyline.tools.dashboard import Dashboard\n", [COMMANDS]),
+        ("tools/survey/planted.py", "from buddyline.tools.demo.dashboard import Dashboard\n", [COMMANDS]),
     ],
 )
 def test_import_linter_finds_what_breaks_a_contract(tree, plant, path, text, contracts):

@@ -15,7 +15,7 @@ from buddyline.protocol.options import above_zero
 from buddyline.protocol.security import PLAYER, ROS
 from buddyline.solver_service.choices import CHECKS, METHODS, TRACKS
 from buddyline.tools.client import add_client_arguments
-from buddyline.tools.export_formats import FORMATS
+from buddyline.tools.export.formats import FORMATS
 from buddyline.tools.pairs import add_pair_argument
 
 DIVE: Final = "one dive: its log, or each node's own"

@@ -67,6 +67,7 @@ COMMANDS: Final = (
         "demo",
         "run a hub, two simulated nodes and the solver on this machine, and watch the poses",
         ("demo", "demo --environment lake --seconds 30"),
+        "tools.demo.command",
     ),
     Command("sample", "write a small dive, to try the other commands on", ("sample", "sample dive.mcap")),
     Command(
@@ -78,11 +79,13 @@ COMMANDS: Final = (
         "init",
         "write a commented configuration of a node, a hub or a solver to start from",
         ("init node --node a --connect tls/192.168.2.1:7447", "init solver"),
+        "tools.installation.init",
     ),
     Command(
         "keys",
         "make keys and certificates, so that the hub may listen beyond this machine",
         ("keys init --hub 192.168.2.1", "keys node a", "keys solver"),
+        "tools.installation.keys",
     ),
     Command("hub", "run the hub that all others connect to", ("hub",)),
     Command("solver", "run the solver: candidates in, poses and track out", ("solver",), "solver_service.__main__"),
@@ -91,17 +94,19 @@ COMMANDS: Final = (
         "install-service",
         "write the systemd unit of node, hub or solver",
         ("install-service node --config pi.toml", "install-service hub --print"),
+        "tools.installation.install_service",
     ),
     Command(
         "setup",
         "make this Raspberry Pi a node: packages, devices, clock, address, service; says what it would do",
         ("setup pi --config a.toml", "setup pi --config a.toml --apply"),
-        "tools.setup_pi",
+        "tools.installation.setup_pi",
     ),
     Command(
         "image",
         "make a fresh card with Raspberry Pi OS into a node",
         ("image /media/me/bootfs --config a.toml --source URL --ssh-key ~/.ssh/id_ed25519.pub --gateway 192.168.2.1",),
+        "tools.installation.image",
     ),
     Command(
         "doctor",
@@ -186,6 +191,7 @@ COMMANDS: Final = (
             "tune --fit without_lamps/ > score.toml",
             "tune --fit-sigma > sigma.toml",
         ),
+        "tools.tune.command",
     ),
     Command(
         "solve",
@@ -201,6 +207,7 @@ COMMANDS: Final = (
         "export",
         "write poses, the track, all nodes or the whole log for other programs",
         ("export poses.mcap --format tum -o poses.tum",),
+        "tools.export.command",
     ),
     Command(
         "view",

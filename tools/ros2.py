@@ -18,8 +18,8 @@ from buddyline.protocol.clock import Clock, SystemClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.security import ROS
 from buddyline.tools.client import client_config
+from buddyline.tools.export.ros_messages import RosMessage, Translation, type_store
 from buddyline.tools.live import LiveClient, follow_running
-from buddyline.tools.ros_messages import RosMessage, Translation, type_store
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus

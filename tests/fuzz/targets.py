@@ -29,9 +29,9 @@ from buddyline.protocol.topics import TOPICS, Topic, key_of, topic_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.service import SolverService
 from buddyline.tools.client import ClientConfig
+from buddyline.tools.export.ros_messages import Translation, type_store
 from buddyline.tools.hub import HubConfig
 from buddyline.tools.repair import run as repair
-from buddyline.tools.ros_messages import Translation, type_store
 from hypothesis import strategies as st
 
 from tests.fuzz.samples import SOUND, STAMP_NS

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from buddyline.protocol.security import Tls
 from buddyline.protocol.zenoh_bus import ZenohBus, connect
-from buddyline.tools.authority import Authority
 from buddyline.tools.cli import main
+from buddyline.tools.installation.authority import Authority
 
 from tests.processes import free_endpoint
 

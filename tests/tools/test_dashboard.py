@@ -12,7 +12,7 @@ from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import key_of
-from buddyline.tools.dashboard import Dashboard, summary_text
+from buddyline.tools.demo.dashboard import Dashboard, summary_text
 from buddyline.tools.draw.above import ASCII_ARROWS
 from msgspec.structs import replace
 

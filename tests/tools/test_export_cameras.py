@@ -8,9 +8,9 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, NodePose
 from buddyline.protocol.messages.frame import FoxgloveTime
-from buddyline.tools import export_colmap, export_metashape
 from buddyline.tools.dives import Dive
 from buddyline.tools.evaluation.rotation import normalized, rotate
+from buddyline.tools.export import colmap, metashape
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
@@ -64,7 +64,7 @@ def expected():
 
 def test_colmap_s_text_has_cameras_and_pictures(tmp_path, dive):
     out = tmp_path / "model"
-    assert export_colmap.export(dive, out) == 2
+    assert colmap.export(dive, out) == 2
     (camera,) = [line for line in (out / "cameras.txt").read_text().splitlines() if not line.startswith("#")]
     assert camera.split()[:4] == ["1", "FULL_OPENCV", "820", "616"]
     assert [float(word) for word in camera.split()[8:]] == [0.1, 0.02, 0.003, 0.004, 0.005, 0.0, 0.0, 0.0]
@@ -76,14 +76,14 @@ def test_colmap_s_text_has_cameras_and_pictures(tmp_path, dive):
         assert (out / "images" / row[9]).read_bytes() == b"\xff\xd8"
     assert (out / "points3D.txt").exists()
     with pytest.raises(BuddylineError, match="cannot be written"):
-        export_colmap.export(dive, tmp_path / "nowhere" / "model")
+        colmap.export(dive, tmp_path / "nowhere" / "model")
     with pytest.raises(BuddylineError, match="exists"):
-        export_colmap.export(dive, out)
+        colmap.export(dive, out)
 
 
 def test_metashape_s_xml_has_the_same(tmp_path, dive):
     out = tmp_path / "model"
-    assert export_metashape.export(dive, out) == 2
+    assert metashape.export(dive, out) == 2
     root = ElementTree.parse(out / "cameras.xml").getroot()
     lens = {one.tag: float(one.text) for one in root.find(".//calibration") if one.text and one.tag != "resolution"}
     assert (lens["p1"], lens["p2"], lens["k3"]) == (0.004, 0.003, 0.005)
@@ -98,5 +98,5 @@ def test_a_dive_without_a_net_is_refused_and_leaves_nothing(tmp_path):
     with DiveLogWriter(tmp_path / "raw.mcap") as writer:
         writer.write_message(world._Node(np.random.default_rng(1), 0, world.Flaws()).info)
     with Dive([tmp_path / "raw.mcap"]) as opened, pytest.raises(BuddylineError, match="no poses of a net"):
-        export_colmap.export(opened, tmp_path / "model")
+        colmap.export(opened, tmp_path / "model")
     assert [path.name for path in tmp_path.iterdir()] == ["raw.mcap"]

@@ -187,7 +187,7 @@ def test_chosen_lights_are_named_and_a_missing_one_is_left_out(exported: dict[st
 
 def test_an_output_is_named_and_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from buddyline.tools.dives import Dive
-    from buddyline.tools.export_foxglove import export
+    from buddyline.tools.export.foxglove import export
 
     dive = write_log(tmp_path / "dive.mcap", *INFOS.values(), pose(0))
     assert main(["export", dive, "--format", "foxglove"]) == 2

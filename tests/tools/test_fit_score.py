@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 from buddyline.node.detect.score import NAMES, fitted, probability
-from buddyline.tools import fit_scenes, fit_score
 from buddyline.tools.cli import main
-from buddyline.tools.fit_score import Sample
 from buddyline.tools.progress import Progress
+from buddyline.tools.tune import scenes, score
+from buddyline.tools.tune.score import Sample
 
 
 def test_the_fit_finds_the_weights_that_made_the_lamps():
@@ -19,16 +19,16 @@ def test_the_fit_finds_the_weights_that_made_the_lamps():
     found = np.column_stack([np.ones(20000), rng.normal(size=(20000, 2))])
     lamp = rng.random(20000) < probability(found, weights)
     samples = [Sample("lake", found, lamp)]
-    fitted_weights = fit_score.fit(samples)
+    fitted_weights = score.fit(samples)
     assert fitted_weights == pytest.approx(weights, abs=0.1)
-    assert fit_score.calibration_error(samples, fitted_weights) < 0.02
-    assert fit_score.calibration_error(samples, fitted_weights + np.array([2.0, 0.0, 0.0])) > 0.1
+    assert score.calibration_error(samples, fitted_weights) < 0.02
+    assert score.calibration_error(samples, fitted_weights + np.array([2.0, 0.0, 0.0])) > 0.1
 
 
 @pytest.mark.slow
 def test_the_shipped_score_is_a_probability_in_fresh_waters():
-    samples = list(fit_score.simulated((3001, 3002), Progress("test", 1, io.StringIO())))
-    assert fit_score.calibration_error(samples, fitted()) < 0.1
+    samples = list(score.simulated((3001, 3002), Progress("test", 1, io.StringIO())))
+    assert score.calibration_error(samples, fitted()) < 0.1
     waters = {sample.source for sample in samples}
     assert len(waters) == 5
     likely = [probability(sample.found, fitted()) >= 0.5 for sample in samples]
@@ -38,10 +38,10 @@ def test_the_shipped_score_is_a_probability_in_fresh_waters():
 
 
 def test_the_command_writes_weights_with_their_provenance(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(fit_scenes, "SEEDS", range(1, 2))
-    monkeypatch.setattr(fit_scenes, "HELD_OUT", range(2, 3))
-    monkeypatch.setattr(fit_scenes, "VIEWS", 2)
-    monkeypatch.setattr(fit_scenes, "SIZES", ((410, 308),))
+    monkeypatch.setattr(scenes, "SEEDS", range(1, 2))
+    monkeypatch.setattr(scenes, "HELD_OUT", range(2, 3))
+    monkeypatch.setattr(scenes, "VIEWS", 2)
+    monkeypatch.setattr(scenes, "SIZES", ((410, 308),))
     picture = np.random.default_rng(1).integers(0, 255, (40, 60), np.uint8)
     cv2.imwrite(str(tmp_path / "stones.png"), cv2.resize(picture, None, fx=4, fy=4))
     assert main(["tune", "--fit", str(tmp_path), "--note", 'stones, "dry"']) == 0

@@ -6,10 +6,10 @@ import tomllib
 import numpy as np
 import pytest
 from buddyline.node.detect.sigma import NAMES, SIZES, Doubt, fitted
-from buddyline.tools import fit_scenes, fit_sigma
 from buddyline.tools.cli import main
-from buddyline.tools.fit_sigma import Errors, truth_of, variance_px2
 from buddyline.tools.progress import Progress
+from buddyline.tools.tune import scenes, sigma
+from buddyline.tools.tune.sigma import Errors, truth_of, variance_px2
 
 TRUE = {"model": 0.6, "halo": 1.5, "focal": 0.4, "growth": 1.8, "floor_px": 0.02, "long_px": 0.8}
 
@@ -24,14 +24,14 @@ def errors_of(sizes, seed, count=2_000):
         rng.choice([1.0, 1.1, 1.3, 1.5], count),
     )
     # Student's t, with the variance that the sizes give.
-    tails = fit_sigma.TAILS
+    tails = sigma.TAILS
     spread = variance_px2(doubt, sizes) * (tails - 2.0) / tails / (rng.chisquare(tails, count) / tails)
     return Errors("lake", doubt, (rng.normal(size=(count, 2)) ** 2).sum(axis=1) * spread)
 
 
 def test_the_fit_finds_the_sizes_that_made_the_errors():
     errors = [errors_of(TRUE, 1), errors_of(TRUE, 2)]
-    found = fit_sigma.fit(errors)
+    found = sigma.fit(errors)
     assert found == pytest.approx(TRUE, rel=0.35, abs=0.02)
     nees, beyond = truth_of([errors_of(TRUE, 3, 20_000)], found)
     assert nees == pytest.approx(1.0, abs=0.1)
@@ -41,7 +41,7 @@ def test_the_fit_finds_the_sizes_that_made_the_errors():
 
 @pytest.mark.slow
 def test_the_shipped_sigma_is_true_in_fresh_waters():
-    errors = list(fit_sigma.simulated(range(3001, 3007), Progress("test", 1, io.StringIO())))
+    errors = list(sigma.simulated(range(3001, 3007), Progress("test", 1, io.StringIO())))
     nees, beyond = truth_of(errors, fitted())
     assert 0.7 < nees < 1.4
     assert beyond < 0.05
@@ -52,10 +52,10 @@ def test_the_shipped_sigma_is_true_in_fresh_waters():
 
 
 def test_the_command_writes_sizes_with_their_provenance(monkeypatch, capsys):
-    monkeypatch.setattr(fit_scenes, "SEEDS", range(1, 2))
-    monkeypatch.setattr(fit_scenes, "HELD_OUT", range(2, 3))
-    monkeypatch.setattr(fit_scenes, "VIEWS", 2)
-    monkeypatch.setattr(fit_scenes, "SIZES", ((410, 308),))
+    monkeypatch.setattr(scenes, "SEEDS", range(1, 2))
+    monkeypatch.setattr(scenes, "HELD_OUT", range(2, 3))
+    monkeypatch.setattr(scenes, "VIEWS", 2)
+    monkeypatch.setattr(scenes, "SIZES", ((410, 308),))
     assert main(["tune", "--fit-sigma"]) == 0
     said = tomllib.loads(capsys.readouterr().out)
     assert list(said["sizes"]) == list(NAMES)

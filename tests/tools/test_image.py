@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from buddyline.tools.cli import COMMANDS, main
-from buddyline.tools.pi import PACKAGES, with_block
+from buddyline.tools.installation.pi import PACKAGES, with_block
 
 from tests.processes import REPOSITORY
 

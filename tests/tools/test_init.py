@@ -6,7 +6,7 @@ from buddyline.node.config import load_node_config
 from buddyline.solver_service.config import SolveConfig, SolverConfig, TrackConfig, load_solver_config
 from buddyline.tools.cli import main
 from buddyline.tools.hub import HubConfig, load_hub_config
-from buddyline.tools.init import HUB, SOLVER, text_of
+from buddyline.tools.installation.init import HUB, SOLVER, text_of
 
 
 def test_a_hub_and_a_solver_load_as_written_and_are_the_defaults(tmp_path):

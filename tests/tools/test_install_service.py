@@ -5,8 +5,8 @@ import shutil
 import subprocess
 
 import pytest
-from buddyline.tools import install_service
 from buddyline.tools.cli import main
+from buddyline.tools.installation import install_service
 
 CONFIG = 'node = "a"\n[camera]\nname = "{camera}"\n[sensors]\nname = "{sensors}"\n[record]\ndirectory = "{directory}"\n'
 

@@ -16,7 +16,7 @@ from buddyline.protocol.local_bus import LocalNetwork
 from buddyline.protocol.messages import Depth
 from buddyline.protocol.topics import DEPTH, NODE_STATUS, key_of
 from buddyline.tools.cli import main
-from buddyline.tools.dashboard import Dashboard
+from buddyline.tools.demo.dashboard import Dashboard
 from buddyline.tools.dives import Dive
 from buddyline.tools.live import follow
 from buddyline.tools.monitor.coverage import Coverage

@@ -14,8 +14,8 @@ from buddyline.protocol.clock import S_NS, ManualClock
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
+from buddyline.tools.export.ros_messages import RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
-from buddyline.tools.ros_messages import RosMessage, Translation, name_of, type_store
 
 from tests.processes import PATIENCE_S, free_endpoint
 from tests.tools.evaluated import INFOS, pose, track

@@ -10,7 +10,7 @@ import os
 
 import pytest
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools import pi, setup_pi
+from buddyline.tools.installation import pi, setup_pi
 
 from tests.tools.test_image import CONFIG
 

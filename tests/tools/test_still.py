@@ -5,7 +5,7 @@ import json
 import numpy as np
 from buddyline.protocol.divelog import DiveLogReader, DiveLogWriter
 from buddyline.tools.cli import main
-from buddyline.tools.still import still_parts
+from buddyline.tools.tune.still import still_parts
 
 from tests.node.rendered import lamp_picture
 from tests.tools.test_detect_command import encoded, write_dive

@@ -12,7 +12,7 @@ from buddyline.protocol.envelope import open_envelope
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.topics import key_of
 from buddyline.tools.cli import main
-from buddyline.tools.team_dashboard import TeamDashboard, team_summary_text
+from buddyline.tools.demo.team_dashboard import TeamDashboard, team_summary_text
 from msgspec.structs import replace
 
 from tests.tools.evaluated import pose, rejection

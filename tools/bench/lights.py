@@ -38,10 +38,10 @@ from buddyline.protocol.clock import S_NS, trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Blob, Expect, ExpectedLight
 from buddyline.tools.evaluation.lights import tolerance_px
-from buddyline.tools.fit_score import score_error
-from buddyline.tools.fit_sigma import BEYOND
 from buddyline.tools.measure.pictures import simulated_world
 from buddyline.tools.measure.tables import cells_of, text_table
+from buddyline.tools.tune.score import score_error
+from buddyline.tools.tune.sigma import BEYOND
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.errors import BuddylineError
 from buddyline.tools.dives import Dive
-from buddyline.tools.export_network import load_markers
+from buddyline.tools.export.network import load_markers
 from buddyline.tools.extras import needed
 from buddyline.tools.newfile import new_file
 

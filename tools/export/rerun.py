@@ -24,8 +24,8 @@ from buddyline.protocol.messages import (
     Track,
 )
 from buddyline.tools.dives import Dive
-from buddyline.tools.enu import BaseCamera
-from buddyline.tools.export_foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, track_of
+from buddyline.tools.export.enu import BaseCamera
+from buddyline.tools.export.foxglove import LAMP_M, LEFT, OTHER, RIGHT, SERIES, base_of, track_of
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import Sayings
 from buddyline.tools.newfile import new_file

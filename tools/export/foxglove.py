@@ -34,9 +34,9 @@ from buddyline.protocol.schemas import json_schema
 from buddyline.protocol.topics import TRACK, TRACK_LAG
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
 from buddyline.tools.dives import Dive
-from buddyline.tools.enu import R_ENU_NED, BaseCamera
+from buddyline.tools.export.enu import R_ENU_NED, BaseCamera
+from buddyline.tools.export.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.extras import needed
-from buddyline.tools.foxglove_layout import LOG, TRANSFORMS, WORLD, layout
 from buddyline.tools.health.words import Sayings
 from buddyline.tools.monitor.frames import rig_outline
 from buddyline.tools.newfile import check_new, new_file, write_new

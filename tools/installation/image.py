@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools import pi
+from buddyline.tools.installation import pi
 
 if TYPE_CHECKING:
     from buddyline.node.config import NodeConfig

@@ -28,8 +28,8 @@ from buddyline.protocol.messages import (
     Track,
 )
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, quat_to_matrix
-from buddyline.tools.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.estimate import range_sigma_m
+from buddyline.tools.export.enu import R_ENU_NED, BaseCamera
 from buddyline.tools.extras import needed
 from buddyline.tools.health.words import reason_words
 

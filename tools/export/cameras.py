@@ -15,9 +15,9 @@ from buddyline.protocol.messages import CompressedImage, NodeInfo, NodePose
 from buddyline.protocol.topics import IMAGE, NET_POSE
 from buddyline.tools.columns import in_order
 from buddyline.tools.dives import Dive, first_with_net
-from buddyline.tools.enu import R_ENU_NED
 from buddyline.tools.evaluation.rotation import Floats, rotate
 from buddyline.tools.evaluation.truth import PoseHistory
+from buddyline.tools.export.enu import R_ENU_NED
 from buddyline.tools.newfile import check_new
 
 PICTURES: Final = "images"

@@ -9,8 +9,8 @@ from typing import Any, Final
 from buddyline.protocol.divelog import CHUNK_NS
 from buddyline.protocol.errors import BuddylineError, MessageError
 from buddyline.tools.dives import Dive
+from buddyline.tools.export.ros_messages import Translation, type_store
 from buddyline.tools.newfile import new_file
-from buddyline.tools.ros_messages import Translation, type_store
 
 log = logging.getLogger(__name__)
 

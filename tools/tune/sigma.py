@@ -1,6 +1,6 @@
 """`buddyline tune --fit-sigma`: fit the sigma of located lights to their errors in the simulator's pictures.
 
-The pictures are those of the score's fit (fit_scenes.py), as they are, through a Bayer mosaic, or as JPEG; and those of
+The pictures are those of the score's fit (scenes.py), as they are, through a Bayer mosaic, or as JPEG; and those of
 dives with light truth, if any are given, which together count as much: another renderer's water is another water.
 Lights count that are likely, not cut by the border, and where the model of glow and core holds: sigma's other parts are
 not fitted.
@@ -25,8 +25,8 @@ from buddyline.node.detect.score import probability
 from buddyline.node.detect.sigma import NAMES, Doubt, direct_px2, long_px2
 from buddyline.node.detect.source import SourceDetector
 from buddyline.tools.evaluation.lights import tolerance_px
-from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
+from buddyline.tools.tune.scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]

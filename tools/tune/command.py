@@ -3,9 +3,9 @@
 The values are judged by the dive's light truth, if it has any. Otherwise the likely candidates of the default detector
 replace it, and the proposed values are the strictest ones that keep these candidates.
 
-With `--fit` the pictures show no lamp, and the detector's score is fitted to them and to simulated ones (fit_score.py).
+With `--fit` the pictures show no lamp, and the detector's score is fitted to them and to simulated ones (score.py).
 `--fit-sigma` fits the sigma of what the detector finds to simulated pictures, and to dives with light truth
-(fit_sigma.py).
+(sigma.py).
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ from buddyline.protocol.clock import trigger_index
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CompressedImage, LightTruth
 from buddyline.protocol.topics import IMAGE, LIGHT_TRUTH
-from buddyline.tools import fit_score, fit_sigma, losses
+from buddyline.tools import losses
 from buddyline.tools.dives import Dive
 from buddyline.tools.draw.marks import mark_candidates
 from buddyline.tools.measure.pictures import spread
 from buddyline.tools.newfile import new_folder, write_picture
 from buddyline.tools.progress import Progress
-from buddyline.tools.still import Rectangle, still_parts
+from buddyline.tools.tune import score, sigma
+from buddyline.tools.tune.still import Rectangle, still_parts
 from numpy.typing import NDArray
 
 log = logging.getLogger(__name__)
@@ -93,9 +94,9 @@ def run(args: argparse.Namespace) -> int:
     """Propose values; return 0."""
     cv2.setNumThreads(1)
     if args.fit_sigma:
-        return fit_sigma.run(args.inputs, _located(args.inputs))
+        return sigma.run(args.inputs, _located(args.inputs))
     if args.fit:
-        return fit_score.run(args.inputs, (pixels for _, pixels in _readable(_files(args.inputs))), args.note)
+        return score.run(args.inputs, (pixels for _, pixels in _readable(_files(args.inputs))), args.note)
     if not args.inputs:
         raise BuddylineError("give pictures, a folder of them or a dive log")
     if args.pictures < 1:
@@ -130,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _located(dives: Iterable[str]) -> Iterator[fit_sigma.Errors]:
+def _located(dives: Iterable[str]) -> Iterator[sigma.Errors]:
     """Yield the located lights of dives. The truth of NAME.mcap is in it, or in NAME.truth.mcap beside it."""
     for dive in dives:
         beside = Path(dive).with_suffix(".truth.mcap")
@@ -141,7 +142,7 @@ def _located(dives: Iterable[str]) -> Iterator[fit_sigma.Errors]:
         for picture in pictures:
             focal_px = picture.focal_px or focal_of(picture.pixels.shape[1])
             detector = detectors.setdefault(focal_px, SourceDetector({}, focal_px))
-            yield from fit_sigma.located(detector, picture.pixels, focal_px, picture.lights_px, fit_sigma.DIVES)
+            yield from sigma.located(detector, picture.pixels, focal_px, picture.lights_px, sigma.DIVES)
 
 
 def _true_lights(pictures: Sequence[Picture], by: str) -> list[Points] | None:

@@ -14,7 +14,7 @@ def export(dive: Dive, output: Path, what: str | None = None) -> int:
     """Write the best track, or the poses, into output, which must not exist; return the number of rows."""
     pa, pq = (needed(name, "--format parquet", "parquet") for name in ("pyarrow", "pyarrow.parquet"))
     from buddyline.tools.evaluation.logs import load
-    from buddyline.tools.export import rows_of
+    from buddyline.tools.export.command import rows_of
 
     name, names, rows = rows_of(load([str(reader.path) for reader in dive.readers]), what, dive.name)
     columns: dict[str, Any] = {field: [row.get(field, "") for row in rows] for field in names}

@@ -8,9 +8,9 @@ from typing import Final
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format. module: below buddyline.tools, with export(dive, output, what) -> number of messages or rows.
+    """A format. module: beside this one, with export(dive, output, what) -> number of messages or rows.
 
-    "": text, which tools/export.py writes to a file or to standard output. counts: what its number is of. of_net: it
+    "": text, which command.py writes to a file or to standard output. counts: what its number is of. of_net: it
     has all nodes of a net, whatever is asked for.
     """
 
@@ -25,30 +25,26 @@ FORMATS: Final = (
     ExportFormat("tum", "t x y z qx qy qz qw, for evo and others"),
     ExportFormat("csv", "a row for each sample, units in the header"),
     ExportFormat("trc", "all nodes and their lamps as markers, for motion capture programs"),
-    ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "export_c3d", "frames", of_net=True),
+    ExportFormat("c3d", "the same as C3D, which most of them read (extra `c3d`)", "c3d", "frames", of_net=True),
     ExportFormat(
         "colmap",
         "a folder with all nodes' pictures and cameras, as COLMAP's text",
-        "export_colmap",
+        "colmap",
         "pictures",
         of_net=True,
     ),
-    ExportFormat("metashape", "the same with cameras.xml for Metashape", "export_metashape", "pictures", of_net=True),
-    ExportFormat(
-        "parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "export_parquet", "rows"
-    ),
+    ExportFormat("metashape", "the same with cameras.xml for Metashape", "metashape", "pictures", of_net=True),
+    ExportFormat("parquet", "the columns of csv, typed, for pandas and others (extra `parquet`)", "parquet", "rows"),
     ExportFormat(
         "foxglove",
         "a log with scene, pictures, marks, path, series and log for Foxglove and Lichtblick, and a layout beside it",
-        "export_foxglove",
+        "foxglove",
     ),
-    ExportFormat(
-        "rerun", "a recording for rerun: nodes in space, pictures, series, log (extra `rerun`)", "export_rerun"
-    ),
+    ExportFormat("rerun", "a recording for rerun: nodes in space, pictures, series, log (extra `rerun`)", "rerun"),
     ExportFormat(
         "mcap-ros2",
         "a log for `ros2 bag play` and other programs: tf, odometry, poses, pictures, diagnostics (extra `ros2`)",
-        "export_ros2",
+        "ros2",
     ),
 )
 

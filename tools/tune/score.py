@@ -1,6 +1,6 @@
 """`buddyline tune --fit`: fit the detector's score to the simulator's pictures, and to pictures without any lamp.
 
-The simulator knows where every lamp is in its pictures (fit_scenes.py). Real pictures without lamps are added.
+The simulator knows where every lamp is in its pictures (scenes.py). Real pictures without lamps are added.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from buddyline.node.detect.score import NAMES, probability
 from buddyline.node.detect.source import SourceDetector
 from buddyline.tools.evaluation.lights import tolerance_px
-from buddyline.tools.fit_scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from buddyline.tools.progress import Progress
+from buddyline.tools.tune.scenes import FitPicture, named_fit, named_held_out, scenes, to_fit_and_held_out
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]

@@ -16,11 +16,11 @@ from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.messages import Message, NodePose, Rejected, RelativePose, SolverStatus
 from buddyline.protocol.topics import NET_POSE, NET_TRUTH, POSE, REJECTED, SOLVER_STATUS, TRUTH
+from buddyline.tools.demo.dashboard import overwritten
 from buddyline.tools.draw.above import ARROWS
 from buddyline.tools.evaluation.network import network_figures
 from buddyline.tools.live import follow
 from buddyline.tools.measure.tables import text_table
-from buddyline.tools.terminal import overwritten
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus

@@ -7,7 +7,7 @@ from pathlib import Path
 from buddyline.protocol.messages import NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat
 from buddyline.tools.dives import Dive
-from buddyline.tools.export_cameras import whole_folder, write_views
+from buddyline.tools.export.cameras import whole_folder, write_views
 
 
 def export(dive: Dive, output: Path, _what: str | None = None) -> int:

@@ -19,7 +19,7 @@ from buddyline.tools.hub import load_hub_config
 from buddyline.tools.newfile import write_new
 
 if TYPE_CHECKING:
-    from buddyline.tools.authority import Authority
+    from buddyline.tools.installation.authority import Authority
 
 PORT: Final = 7447
 DAYS: Final = 730
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Make keys and certificates; never overwrite a file."""
     needed("cryptography", "keys", "keys")
-    from buddyline.tools.authority import Authority
+    from buddyline.tools.installation.authority import Authority
 
     if args.days is not None and args.days < 1:
         raise BuddylineError(f"--days {args.days}: at least 1")
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _init(directory: Path, host: str, days: int, authority_days: int) -> list[Path]:
-    from buddyline.tools.authority import Authority
+    from buddyline.tools.installation.authority import Authority
 
     host_and_port(f"tls/{host}:{PORT}")
     authority = Authority.create(directory, authority_days)

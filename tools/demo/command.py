@@ -24,9 +24,9 @@ from buddyline.tools.draw.above import ARROWS, ASCII_ARROWS
 
 if TYPE_CHECKING:
     from buddyline.protocol.messages import Message
-    from buddyline.tools.dashboard import Dashboard
+    from buddyline.tools.demo.dashboard import Dashboard
+    from buddyline.tools.demo.team_dashboard import TeamDashboard
     from buddyline.tools.measure.children import Child
-    from buddyline.tools.team_dashboard import TeamDashboard
 
 log = logging.getLogger(__name__)
 
@@ -78,10 +78,10 @@ blinking = {blinking}
 def run(args: argparse.Namespace) -> int:
     """Run the demo until its time is over, or until it is stopped; 2 where one of its processes dies."""
     from buddyline.tools.client import ClientConfig
-    from buddyline.tools.dashboard import Dashboard, summary_text
+    from buddyline.tools.demo.dashboard import Dashboard, summary_text
+    from buddyline.tools.demo.team_dashboard import TeamDashboard, team_summary_text
     from buddyline.tools.live import open_bus
     from buddyline.tools.measure.children import end_all, free_endpoint
-    from buddyline.tools.team_dashboard import TeamDashboard, team_summary_text
 
     start_ns = time.time_ns()
     scenario = Scenario(

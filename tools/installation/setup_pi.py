@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from buddyline.protocol.errors import BuddylineError
-from buddyline.tools import install_service, pi
+from buddyline.tools.installation import install_service, pi
 
 if TYPE_CHECKING:
     from buddyline.node.config import NodeConfig

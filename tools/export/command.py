@@ -17,7 +17,7 @@ from buddyline.tools.evaluation.logs import load
 from buddyline.tools.evaluation.recorded import Recorded
 from buddyline.tools.evaluation.rotation import Floats
 from buddyline.tools.evaluation.truth import TruthTrack
-from buddyline.tools.export_formats import ExportFormat, format_of
+from buddyline.tools.export.formats import ExportFormat, format_of
 from buddyline.tools.measure.tables import csv_lines, tum_line
 from buddyline.tools.newfile import check_new, write_new
 from msgspec import UNSET
@@ -135,7 +135,7 @@ def rows_of(
 
 
 def _network_lines(args: argparse.Namespace) -> tuple[str, Iterator[str]]:
-    from buddyline.tools.export_network import network_lines
+    from buddyline.tools.export.network import network_lines
 
     if args.what not in (None, "net") or format_of(args.format).module or args.truth or args.rejected or args.pair:
         raise BuddylineError(f"--format {args.format} --what {args.what}: all nodes go as tum, csv or trc, alone")
@@ -149,7 +149,7 @@ def _export_file(args: argparse.Namespace, form: ExportFormat) -> int:
         raise BuddylineError(f"--format {form.name}: give -o FILE")
     if form.of_net and args.what not in (None, "net"):
         raise BuddylineError(f"--format {form.name} --what {args.what}: it has all nodes")
-    module = import_module(f"buddyline.tools.{form.module}")
+    module = import_module(f"buddyline.tools.export.{form.module}")
     with Dive(args.logs) as dive:
         count = module.export(dive, args.output, args.what)
     print(f"{args.output}: {count} {form.counts}", file=sys.stderr)

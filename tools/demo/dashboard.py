@@ -7,7 +7,7 @@ import statistics
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -37,7 +37,6 @@ from buddyline.tools.evaluation.tracks import TrackFigures, covered_share, track
 from buddyline.tools.evaluation.truth import TruthTrack
 from buddyline.tools.health.words import REASONS
 from buddyline.tools.live import follow
-from buddyline.tools.terminal import overwritten
 from msgspec import UNSET
 
 if TYPE_CHECKING:
@@ -309,6 +308,11 @@ class Dashboard:
                     "late": solver.late if solver else 0,
                 },
             }
+
+
+def overwritten(lines: Iterable[str]) -> str:
+    """Return lines that overwrite the last screen, line by line: a screen that is cleared first flickers."""
+    return "\x1b[H" + "\x1b[K\n".join(lines) + "\x1b[K\x1b[J"
 
 
 def summary_text(summary: dict[str, Any]) -> str:

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 from buddyline.protocol.messages import NodeInfo
 from buddyline.tools.dives import Dive
-from buddyline.tools.export_cameras import whole_folder, write_views
+from buddyline.tools.export.cameras import whole_folder, write_views
 
 
 def export(dive: Dive, output: Path, _what: str | None = None) -> int:

@@ -1,0 +1,1 @@
+"""The demo: simulated nodes, hub and solver on this machine, and their state as text."""

@@ -1,0 +1,1 @@
+"""The commands and formats that give a dive to other programs."""
