@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 SAMPLE_S: Final = 0.01
 # Longer than a swell's period, so that swell averages out. Only a well known bias allows the longer one.
-RESTED_TILT_TAU_S: Final = 6.0
+RESTED_TILT_TAU_S: Final = 5.0
 MOVING_TILT_TAU_S: Final = 3.0
 
 REST_S: Final = 3.0
@@ -95,6 +95,12 @@ def quaternion_to_matrix(q_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product of two vectors, (3,)."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[float, float, float, float]:
@@ -213,6 +219,7 @@ class VqfAttitude:
         self._last_ns = 0
         self._tilt_tau_s = MOVING_TILT_TAU_S
         self._transient_rad = 0.0
+        self._turned_rad = np.zeros(3)
         self._yaw_rad = 0.0
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
@@ -282,9 +289,15 @@ class VqfAttitude:
 
     def _advance(self, sample: ImuSample, dt_s: float) -> AttitudeEstimate | None:
         vqf = self._vqf
+        rate_radps = sample.gyro_radps - self._bias_radps - self._warmth.bias_radps
+        # A sample means the interval before it. A turn's axis moves within that, and what is seen from the turning
+        # body is as it was half a turn before (Bortz 1971; Miller 1983, with one sample an interval).
+        turned_rad = dt_s * rate_radps
+        coning_rad = cross(self._turned_rad, turned_rad) / 12
+        accel_mps2 = sample.accel_mps2 + cross(sample.accel_mps2, turned_rad / 2)
+        self._turned_rad = turned_rad
         # VQF assumes a fixed sample time; scaling the rate keeps the rotation between two samples right.
-        gyro_radps = sample.gyro_radps - self._bias_radps - self._warmth.bias_radps
-        vqf.update(gyro_radps * (dt_s / SAMPLE_S), np.asarray(sample.accel_mps2))
+        vqf.update((turned_rad + coning_rad) / SAMPLE_S, accel_mps2)
         q_level_body = vqf.getQuat6D()
         R_level_body = quaternion_to_matrix(q_level_body)
         _, bias_sigma_radps = vqf.getBiasEstimate()
@@ -295,7 +308,8 @@ class VqfAttitude:
         self._heading.predict(dt_s, float(bias_sigma_radps))
         yaw_rad = math.atan2(R_level_body[1, 0], R_level_body[0, 0])
         if sample.mag_t is not None:
-            field_t = R_level_body @ self._calibration.apply(sample.mag_t)
+            seen_t = self._calibration.apply(sample.mag_t)
+            field_t = R_level_body @ (seen_t + cross(seen_t, turned_rad / 2))
             self._heading.update(dt_s, field_t, wrap(yaw_rad - self._yaw_rad))
         self._yaw_rad = yaw_rad
         return AttitudeEstimate(

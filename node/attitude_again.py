@@ -66,13 +66,13 @@ def attitudes_again(samples: Sequence[Imu], estimator: VqfAttitude) -> list[Atti
 def _reversed(samples: Sequence[Imu], ends_ns: int) -> list[Imu]:
     """Return the samples as if time ran backward: every turn is the other way, gravity and field stay.
 
-    A sample's rate is that of the time before it, so that each takes the rate of the one after it.
+    A sample means the time before it, so that each takes what the one after it has measured.
     """
     later = [*samples[1:], samples[-1]]
     turned = []
     for sample, after in zip(reversed(samples), reversed(later), strict=True):
         x, y, z = after.gyro_radps
-        turned.append(replace(sample, stamp_ns=ends_ns - sample.stamp_ns, gyro_radps=(-x, -y, -z)))
+        turned.append(replace(after, stamp_ns=ends_ns - sample.stamp_ns, gyro_radps=(-x, -y, -z)))
     return turned
 
 

@@ -2,8 +2,8 @@
 
 Iron near the rig turns a compass by tens of degrees, often without a change of the field's strength or dip. A Kalman
 filter with two states therefore weighs the compass against the gyroscope: the angle from the gyroscope's frame to
-magnetic north, and the gyroscope's drift. A reading that contradicts strength, dip or the filter's prediction is not
-used, and the standard deviation grows meanwhile.
+magnetic north, and the gyroscope's drift. A reading that contradicts strength, dip or the filter's prediction counts
+little: iron on the rig turns the compass this way and that as the rig turns, and for long as long as it does not.
 
 A field that stays the same while the node turns is the Earth's; a field that turns with the node is the rig's. The
 former confirms what was learned at the start, and ends a disagreement that the gyroscope caused. Without a known place
@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 Vector = NDArray[np.float64]
 
-NORM_TOLERANCE: Final = 0.08
-DIP_TOLERANCE_RAD: Final = math.radians(6.0)
+# The field in a room without a magnet changes by 8 % within a metre.
+NORM_TOLERANCE: Final = 0.1
+DIP_TOLERANCE_RAD: Final = math.radians(8.0)
 GATE_SIGMAS: Final = 3.0
 
 COMPASS_SIGMA_RAD: Final = math.radians(2.0)
-COMPASS_CORRELATION_S: Final = 3.0  # tilt errors in swell correlate neighbouring readings
+# Tilt errors turn the compass, for two time constants of the tilt; iron does while the rig looks one way.
+COMPASS_CORRELATION_S: Final = 10.0
 SMOOTHING_S: Final = 0.5
 # On a turning rig a disturbance sometimes points along the Earth's field; that does not end it.
 PROBATION_S: Final = 8.0
@@ -88,8 +90,8 @@ class _Steady:
 class HeadingFilter:
     """Estimates delta: the angle, about up, from the gyroscope's level frame to the magnetic one (y north).
 
-    reference: the expected field; None learns its strength and dip. problem: why the compass is not used; "" if it
-    is used.
+    reference: the expected field; None learns its strength and dip. problem: why the compass is doubted; "" if it is
+    not.
     """
 
     def __init__(self, reference: EarthField | None = None, calibrated: bool = True) -> None:
@@ -142,8 +144,10 @@ class HeadingFilter:
         self._sound_s = 0.0 if self.problem else self._sound_s + dt_s
         if not self.problem and self._sound_s < PROBATION_S:
             self.problem = "magnetic field disturbed until just now"
-        if not self.problem:
+        if self._started:
             self._weigh(dt_s, delta_rad)
+        elif not self.problem:
+            self._start_at(delta_rad)
         doubtful = self._started and self.problem and not self._confirmed
         self._doubt_rad = abs(wrap(delta_rad - self.delta_rad)) if doubtful else 0.0
 
@@ -201,12 +205,11 @@ class HeadingFilter:
         return f"compass and gyroscope differ by {math.degrees(off_rad):.0f} deg"
 
     def _weigh(self, dt_s: float, delta_rad: float) -> None:
-        if not self._started:
-            self._start_at(delta_rad)
-            return
+        """Correct by a reading. A doubtful one has as large a standard deviation as it is off."""
         p00, p01, p11 = self._p
         off_rad = wrap(delta_rad - self.delta_rad)
-        s = p00 + COMPASS_SIGMA_RAD**2 * max(1.0, COMPASS_CORRELATION_S / dt_s)
+        sigma_rad = max(COMPASS_SIGMA_RAD, abs(off_rad)) if self.problem else COMPASS_SIGMA_RAD
+        s = p00 + sigma_rad**2 * max(1.0, COMPASS_CORRELATION_S / dt_s)
         k0, k1 = p00 / s, p01 / s
         self.delta_rad = wrap(self.delta_rad + k0 * off_rad)
         self._drift_radps += k1 * off_rad
