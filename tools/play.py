@@ -50,6 +50,10 @@ IMAGES_HZ: Final = 2.0
 AHEAD_NS: Final = 1_500_000_000
 # ... and more where a node is silent in the dive itself, because there the solver does wait.
 AHEAD_OF_SILENT_NS: Final = 2_200_000_000
+# A solver that waits for a lost sample gets one more trigger's messages after RELEASE_S, up to so far ahead: they show
+# what is missing sooner than a publisher's heartbeats, for which the solver does not wait.
+RELEASE_S: Final = 0.25
+AHEAD_AT_MOST_NS: Final = 1_800_000_000
 # A solver without outcomes for this time waits for something that the dive does not have.
 SOLVER_SILENT_S: Final = 5.0
 # After the last message: longer than a publisher's heartbeat (2 s), which tells subscribers that they have missed it.
@@ -91,7 +95,9 @@ class SolverFollower:
                 # Everything before the first frame counts as resolved.
                 self._resolved_ns = stamp_ns
             silent = min(self._sent_ns.values(), default=-1) < stamp_ns - AHEAD_NS
-            self._wait_for(stamp_ns - (AHEAD_OF_SILENT_NS if silent else AHEAD_NS), stop)
+            if not silent:
+                self._wait_for(stamp_ns - AHEAD_NS, stop, RELEASE_S)
+            self._wait_for(stamp_ns - (AHEAD_OF_SILENT_NS if silent else AHEAD_AT_MOST_NS), stop)
 
     def take_sent(self, node: str, stamp_ns: int) -> None:
         """Take the stamp of a frame that was sent."""
@@ -103,11 +109,12 @@ class SolverFollower:
         with self._changed:
             self._wait_for(min(self._sent_ns.values(), default=-1), stop)
 
-    def _wait_for(self, stamp_ns: int, stop: threading.Event) -> None:
+    def _wait_for(self, stamp_ns: int, stop: threading.Event, longest_s: float = math.inf) -> None:
+        end_s = time.monotonic() + longest_s
         while (
             self._solvers
             and self._resolved_ns < stamp_ns
-            and time.monotonic() - self._heard_s < SOLVER_SILENT_S
+            and time.monotonic() < min(self._heard_s + SOLVER_SILENT_S, end_s)
             and not stop.is_set()
         ):
             self._changed.wait(0.1)
