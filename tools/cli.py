@@ -118,6 +118,7 @@ COMMANDS: Final = (
         "calibrate",
         "calibrate camera, lights, magnetometer, gyroscope or clocks, and say whether the result is good",
         ("calibrate board -o board.pdf", "calibrate camera pictures/", "calibrate clock"),
+        "tools.calibration.command",
     ),
     Command(
         "net",
@@ -202,6 +203,7 @@ COMMANDS: Final = (
         "evaluate",
         "measure the errors of poses, track and candidates against truth",
         ("evaluate poses.mcap --truth dive.truth.mcap",),
+        "tools.evaluation.command",
     ),
     Command(
         "export",
@@ -236,6 +238,7 @@ COMMANDS: Final = (
         "artag",
         "find poses from AR tags in a dive's pictures, to compare the lights with",
         ("simulate dive.mcap --images --tags", "artag dive.mcap -o tags.mcap"),
+        "tools.tags.command",
     ),
     Command(
         "experiments",

@@ -14,8 +14,8 @@ from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.config import parse_config
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import CameraModel, NodeInfo
-from buddyline.tools import calibrate
 from buddyline.tools.calibration import camera
+from buddyline.tools.calibration import command as calibrate
 from buddyline.tools.calibration.board import Board
 from buddyline.tools.calibration.camera import BoardView, CornerFinder, coverage, distinct, draw
 from buddyline.tools.calibration.leastsquares import PoorCalibration

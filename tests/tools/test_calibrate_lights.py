@@ -16,7 +16,7 @@ from buddyline.protocol.messages import Blob, CameraModel, Candidates, NodeInfo,
 from buddyline.protocol.topics import CANDIDATES, INFO, POSE
 from buddyline.solver_service.geometry.camera import Camera
 from buddyline.solver_service.geometry.rotation import matrix_to_quat, rotation_exp
-from buddyline.tools import calibrate
+from buddyline.tools.calibration import command as calibrate
 from buddyline.tools.calibration.leastsquares import PoorCalibration
 from buddyline.tools.calibration.lights import CalibrationNoise, TapedPlace, fit
 

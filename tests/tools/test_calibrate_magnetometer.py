@@ -16,7 +16,7 @@ from buddyline.protocol.divelog import DiveLogWriter
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu
 from buddyline.protocol.topics import IMU
-from buddyline.tools import calibrate
+from buddyline.tools.calibration import command as calibrate
 from buddyline.tools.calibration.ellipsoid import coverage, fit
 from buddyline.tools.calibration.leastsquares import PoorCalibration
 
