@@ -29,9 +29,11 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
 from buddyline.solver_service.pair_core import PairCore, PairId, newer
+from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.tracking import TrackSettings
+from msgspec import UNSET
 from msgspec.structs import replace
 
 NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu
@@ -215,7 +217,10 @@ class SolverCore:
                 self.pairs[message.node_a, message.node_b].latencies_s.append((now_ns - message.stamp_ns) / S_NS)
 
     def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
-        messages = [message for pair in pairs for message in pair.settle(told_ns)]
+        messages: list[Message] = []
+        for pair in pairs:
+            pair.crowd(len(self.streams) >= CROWD)
+            messages += pair.settle(told_ns)
         if self.network is None:
             return messages
         return messages + self.network.take(newer(messages, told_ns))
@@ -248,6 +253,7 @@ class SolverCore:
             stream.add_info(message)
             self.health.saw_period(stream.node, message.trigger_period_ns)
             self.health.saw_software(stream.node, message.software)
+            self.health.saw_blink(stream.node, None if message.blink is UNSET else message.blink)
         elif isinstance(message, Candidates):
             live = receive_ns is not None and abs(receive_ns - message.stamp_ns) < LIVE_WITHIN_NS
             others_ns = [s.newest_ns for s in self.streams.values() if s is not stream and s.newest_ns is not None]
@@ -256,6 +262,7 @@ class SolverCore:
                 self.network.forget()
             if now_ns is not None:
                 self.health.saw_frame(stream.node, message.stamp_ns, now_ns)
+                self.health.saw_run(stream.node, message.boot, message.stamp_ns, now_ns)
             for pair in self._pairs_of.get(stream.node, ()):
                 pair.take(message, arrival, now_ns, live=live)
         else:

@@ -1,17 +1,36 @@
-"""Problems of the nodes that the solver sees: a node is gone or silent, or two clocks disagree."""
+"""Problems of the nodes that the solver sees: one is gone or silent, or two have one id, one code, or other clocks."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Final
 
 from buddyline.protocol import __version__
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.health import FRAMES_APART_S, stale_after_s
+from buddyline.protocol.messages import Blink
 from buddyline.protocol.topics import CANDIDATES
 
 MAX_PROCESSES: Final = 256
+# Frames of two runs of a node that come by turns so often are two nodes' of one id; it is said for TWINS_NS after that.
+TWINS: Final = 3
+TWINS_NS: Final = 10 * S_NS
 _RELEASE: Final = re.compile(r"buddyline (\d{1,4}\.\d{1,4})(?!\d)")
+
+
+@dataclass
+class Runs:
+    """The run (boot) that a node's newest frame is of, that frame's stamp, and the run before.
+
+    returns: how often the run before was back, later by stamp. now_ns: when it was last.
+    """
+
+    boot: str
+    stamp_ns: int
+    before: str | None = None
+    returns: int = 0
+    now_ns: int = 0
 
 
 class Health:
@@ -22,6 +41,8 @@ class Health:
         self._period_s: dict[str, float] = {}
         self._alive: dict[str, bool] = {}
         self._releases: dict[str, str] = {}
+        self._runs: dict[str, Runs] = {}
+        self._blinks: dict[str, Blink] = {}
 
     def saw_frame(self, node: str, stamp_ns: int, now_ns: int) -> None:
         """Note a frame of a node."""
@@ -30,6 +51,26 @@ class Health:
     def saw_period(self, node: str, trigger_period_ns: int) -> None:
         """Note a node's trigger period."""
         self._period_s[node] = trigger_period_ns / S_NS
+
+    def saw_run(self, node: str, boot: str, stamp_ns: int, now_ns: int) -> None:
+        """Note which run of a node a frame is of. A node that starts again leaves its run before for good."""
+        runs = self._runs.setdefault(node, Runs(boot, stamp_ns))
+        if stamp_ns < runs.stamp_ns:
+            return
+        if boot != runs.boot:
+            if boot == runs.before:
+                runs.returns, runs.now_ns = runs.returns + 1, now_ns
+            else:
+                runs.returns = 0
+            runs.boot, runs.before = boot, runs.boot
+        runs.stamp_ns = stamp_ns
+
+    def saw_blink(self, node: str, blink: Blink | None) -> None:
+        """Note how a node's lamp blinks, None where it does not."""
+        if blink is None:
+            self._blinks.pop(node, None)
+        else:
+            self._blinks[node] = blink
 
     def saw_software(self, node: str, software: str) -> None:
         """Note which release of Buddyline a node runs; other programs that send its messages have none."""
@@ -67,7 +108,22 @@ class Health:
                     f"frames of {first} are {abs(ahead_ns) / S_NS:.1f} s ahead of those of {second}: "
                     "do their clocks agree?"
                 )
-        return found + others
+        twins = [f"two nodes have the id {node}: give each its own" for node in nodes if self._twins(node, now_ns)]
+        return found + others + twins + self._one_code(nodes)
+
+    def _twins(self, node: str, now_ns: int) -> bool:
+        runs = self._runs.get(node)
+        return runs is not None and runs.returns >= TWINS and now_ns - runs.now_ns < TWINS_NS
+
+    def _one_code(self, nodes: tuple[str, str]) -> list[str]:
+        """Name the nodes whose lamps blink as those of one of these do."""
+        found = []
+        for node in nodes:
+            blink = self._blinks.get(node)
+            same = sorted(other for other, its in self._blinks.items() if blink is not None and _alike(its, blink))
+            if len(same) > 1:
+                found.append(f"nodes {' and '.join(same)} blink by one code: give each another `blink.code`")
+        return list(dict.fromkeys(found))
 
     def _problem_of(self, node: str, now_ns: int) -> str | None:
         if self._alive.get(node) is False:
@@ -79,6 +135,11 @@ class Health:
         if silent_s > stale_after_s(CANDIDATES, self._period_s.get(node, 0.0)):
             return f"no frame of node {node} for {silent_s:.0f} s"
         return None
+
+
+def _alike(one: Blink, other: Blink) -> bool:
+    """Whether lamps are dark in the same slots."""
+    return (one.code, one.slot_ns) == (other.code, other.slot_ns)
 
 
 def release_of(software: str) -> str | None:

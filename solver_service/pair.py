@@ -24,7 +24,7 @@ from buddyline.solver_service.geometry.trigger import TriggerReadings, read_trig
 from buddyline.solver_service.headings import HeadingOffset
 from buddyline.solver_service.prior import PosePrior
 from buddyline.solver_service.rarity import Rarity
-from buddyline.solver_service.resting import LOOK_APART, LOOKS, Resting, look_apart
+from buddyline.solver_service.resting import LOOK_APART, LOOKS, NOT_IN_VIEW, Resting, look_apart
 from buddyline.solver_service.results import view_of
 from msgspec import UNSET
 
@@ -81,11 +81,15 @@ def _batches(matched: Sequence[Matched]) -> Iterator[list[Matched]]:
 
 
 class PairSolver:
-    """Solves the triggers of one pair. alignment: gets each fix, to estimate the clock offset; None for none."""
+    """Solves the triggers of one pair.
+
+    alignment: gets each fix, to estimate the clock offset; None for none. crowded: whether there are many other pairs.
+    """
 
     def __init__(self, settings: Settings, alignment: ClockAlignment | None = None) -> None:
         self.settings = settings
         self.alignment = alignment
+        self.crowded = False
         self._prior = PosePrior()
         self._headings = HeadingOffset()
         self._rarity = Rarity()
@@ -117,8 +121,8 @@ class PairSolver:
 
     def _solve_batch(self, batch: Sequence[Matched]) -> list[Fix | NoFix]:
         # What is read does not depend on which triggers are read with it.
-        may_rest = "attitude" in self.settings.checks
-        wanted = [one for one in batch if not (may_rest and one.apart)]
+        why = {id(one): detail for one in batch if (detail := self._may_rest(one))}
+        wanted = [one for one in batch if id(one) not in why or not self._resting.rests(one.stamp_ns)]
         try:
             readings = self._read(wanted) if wanted else None
         except (ArithmeticError, ValueError) as error:
@@ -127,15 +131,21 @@ class PairSolver:
             # One trigger has absurd but finite values, such as 1e300, which make a matrix singular: solve one by one.
             return [fix for one in batch for fix in self._solve_batch([one])]
         places = {id(one): place for place, one in enumerate(wanted)}
-        found = []
+        found: list[Fix | NoFix] = []
         for one in batch:
-            if id(one) in places and readings is not None:
+            if id(one) in why and self._resting.rests(one.stamp_ns):
+                found.append(NoFix("too_few_candidates", why[id(one)]))
+            elif id(one) in places and readings is not None:
                 found.append(self._decide(one, readings, places[id(one)]))
-            elif self._resting.rests(one.stamp_ns):
-                found.append(NoFix("too_few_candidates", LOOK_APART))
             else:
                 found.append(self._look(one))
         return found
+
+    def _may_rest(self, one: Matched) -> str:
+        """Return why a trigger need not be solved where the pair rests, "" where it is solved in any case."""
+        if one.apart and "attitude" in self.settings.checks:
+            return LOOK_APART
+        return NOT_IN_VIEW if self.crowded and one.trigger % LOOKS else ""
 
     def _look(self, one: Matched) -> Fix | NoFix:
         """Solve one trigger by itself."""

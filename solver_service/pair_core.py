@@ -76,6 +76,12 @@ class PairCore:
         self._unsettled: list[Matched | Unmatched] = []
         self._settled: list[Message] = []
 
+    def crowd(self, crowded: bool) -> None:
+        """Note whether this pair is one of many."""
+        self.solver.crowded = crowded
+        if self.tracker is not None:
+            self.tracker.crowded = crowded
+
     def take(self, frame: Candidates, arrival: Arrival, receive_ns: int | None, *, live: bool) -> None:
         """Take a frame of one of the two nodes; see PairMatcher.take."""
         if arrival is Arrival.CLOCK_SET:

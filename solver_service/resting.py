@@ -1,8 +1,9 @@
-"""Which triggers of a pair are not solved: those of nodes that, by their attitudes, do not look at each other.
+"""Which triggers of a pair are not solved: those of nodes that do not have each other in view.
 
-In a team many pairs are out of each other's view: nearly half of all, where two groups face each other. Without poses
-for REST_NS, such a pair rests: only one in LOOKS of its triggers is solved. A pose, or one that only a compass
-contradicts, wakes it. So a compass that is off costs the first poses only.
+In a team many pairs are out of each other's view: nearly half of all, where two groups face each other. A pair that had
+no pose for REST_NS rests where its cameras look apart by both attitudes, and in a CROWD anyway: only one in LOOKS of
+its triggers is solved. A pose, or one that only a compass contradicts, wakes it. So a compass that is off costs the
+first poses only, and the cost of many nodes grows with the pairs that are in view.
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from buddyline.solver_service.geometry.rotation import quat_to_matrix
 
 REST_NS: Final = 5 * S_NS
 LOOKS: Final = 5
-# The detail of the triggers that are not solved; their reason is `too_few_candidates`.
+# From so many nodes on, a pair rests wherever its cameras look: it is one of ten or more.
+CROWD: Final = 5
+# The details of the triggers that are not solved; their reason is `too_few_candidates`.
 LOOK_APART: Final = "by both attitudes the cameras look apart"
+NOT_IN_VIEW: Final = "one of many pairs, which had no pose for 5 s"
 # What iron may add to both compasses together, and how many of their own sigmas count.
 IRON_RAD: Final = math.radians(30.0)
 SIGMAS: Final = 4.0

@@ -56,10 +56,15 @@ class TrackSettings:
 
 
 class PairTracker:
-    """Follows a pair. Messages up to a trigger's time enter the estimator once the trigger's outcome is known."""
+    """Follows a pair. Messages up to a trigger's time enter the estimator once the trigger's outcome is known.
+
+    crowded: whether it is one of many pairs: its live track then starts from poses alone, for in pictures of many bars
+    too many starts without a fix are possible.
+    """
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
         self._filter: TrackFilter | None = None
+        self.crowded = False
         self._past: list[str] = []
         self._streams = stream_a, stream_b
         self._settings = settings
@@ -174,6 +179,7 @@ class PairTracker:
                     self._unseen[one.trigger] = one.stamp_ns
         fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if self._filter is not None:
+            self._filter.searches = not self.crowded
             for fix in fixes:
                 self._filter.add_fix(fix)
         if "smooth" in self._settings.modes:

@@ -258,19 +258,8 @@ class NetEstimate(NetBelief):
     # Rows
 
     def rows(self, t_s: float, stamp_ns: int) -> list[NetRow]:
-        """Give the confirmed members at a time at or after the last picture's.
-
-        With a trail nothing is given yet: it is noted for `smoothed`.
-        """
-        if self.state is None or t_s < self.t_s - TOGETHER_S:
-            return []
-        while t_s - self.t_s > 1.5 * TICK_S:
-            self.step(self.t_s + TICK_S)
-        if self.trail is not None:
-            # The smoother needs the state at this very time.
-            if t_s - self.t_s > 1e-6:
-                self._go(t_s)
-            self.trail.events.append(Told.of(t_s, stamp_ns, self._present(t_s), self.state, self.covariance))
+        """Give the confirmed members at a time at or after the last picture's."""
+        if self.state is None or not self._ticks_to(t_s):
             return []
         state, P = self.state, self.covariance
         if t_s - self.t_s > 1e-6:
@@ -279,8 +268,23 @@ class NetEstimate(NetBelief):
         own = np.stack([P[block(index), block(index)][:9, :9] for index in range(len(self.members))])
         return self._rows_of(stamp_ns, self._present(t_s), state, own)
 
+    def ask(self, t_s: float, stamp_ns: int) -> None:
+        """Note that `smoothed` is to give a row of a time at or after the last picture's, and go on to there."""
+        assert self.trail is not None
+        if self.state is None or not self._ticks_to(t_s):
+            return
+        if t_s - self.t_s > 1e-6:
+            self._go(t_s)
+        self.trail.events.append(Told.of(t_s, stamp_ns, self._present(t_s), self.state, self.covariance))
+
+    def _ticks_to(self, t_s: float) -> bool:
+        """Go on to less than two ticks before a time; return whether that is not in the past."""
+        while t_s - self.t_s > 1.5 * TICK_S:
+            self.step(self.t_s + TICK_S)
+        return t_s >= self.t_s - TOGETHER_S
+
     def smoothed(self, since_s: float, until_s: float) -> list[NetRow]:
-        """Give the rows that were passed after since_s, until until_s, by all that came up to now.
+        """Give the rows that were asked for after since_s, until until_s, by all that came up to now.
 
         A member that is confirmed now was right before.
         """

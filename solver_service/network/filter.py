@@ -128,7 +128,7 @@ class NetFilter(TrackIntake):
         if not self.smooths:
             return self.main.rows(t_s, stamp_ns)
         for estimate in [self.main, *self.challengers]:
-            estimate.rows(t_s, stamp_ns)
+            estimate.ask(t_s, stamp_ns)
         if self._smoothed_s == -np.inf:
             self._smoothed_s = t_s - TOGETHER_S
         return self._smooth(t_s - LATER_S) if t_s - self._smoothed_s >= 2.0 * LATER_S else []

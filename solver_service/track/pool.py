@@ -39,14 +39,17 @@ REPLAYS: Final = 2
 
 
 class TrackPool(TrackSteps):
-    """Holds the main estimate and its challengers, and finds starts without a fix."""
+    """Holds the main estimate and its challengers, and finds starts without a fix.
+
+    restarts: whether there may be other estimates than those given. searches: whether any may start without a fix.
+    """
 
     def __init__(self, nodes: tuple[TrackNode, TrackNode], keep_s: float, clock_sigma_s: float = CLOCK_S) -> None:
         super().__init__(nodes, keep_s)
         self.clock_sigma_s = clock_sigma_s
         self.main: Estimate | None = None
         self.challengers: list[Estimate] = []
-        self.restarts = True
+        self.restarts = self.searches = True
         self._sights: deque[tuple[float, Sight]] = deque()
         self._searched_s = -np.inf
         self._fix_s = -np.inf
@@ -130,7 +133,7 @@ class TrackPool(TrackSteps):
         every_s = SEARCH_EVERY_S
         if self.main and self.main.confirmed:
             every_s = SEARCH_BESIDE_S if max(self.main.missed) > ONE_SIDED and min(self.main.missed) == 0 else math.inf
-        if not self.restarts or t_s - self._searched_s < every_s:
+        if not (self.restarts and self.searches) or t_s - self._searched_s < every_s:
             return
         if self._fix_s == -np.inf:
             self._fix_s = t_s - SEARCH_AFTER_S + 0.5

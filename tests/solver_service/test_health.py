@@ -6,11 +6,12 @@ import time
 import pytest
 from buddyline.protocol.codec import decode, encode
 from buddyline.protocol.local_bus import LocalNetwork
-from buddyline.protocol.messages import NodeInfo
+from buddyline.protocol.messages import Blink, NodeInfo
 from buddyline.protocol.topics import INFO, SOLVER_STATUS
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.service import SolverService
+from msgspec.structs import replace
 
 from tests.processes import PATIENCE_S
 from tests.solver_service.conftest import dive_messages
@@ -61,6 +62,33 @@ def test_clocks_that_disagree_are_named_with_their_difference(health, ahead_s, f
     health.saw_frame("b", 101 * S_NS + round(ahead_s * S_NS), now_ns=51 * S_NS)
     (said,) = health.problems(AB, 51200 * S_NS // 1000)
     assert said.startswith(f"frames of {first} are {abs(ahead_s):.1f} s ahead of those of {second}")
+
+
+def test_two_nodes_of_one_id_are_named_while_both_send(health):
+    """A node that starts again, and whose earlier frames come late, is one node."""
+    for k in range(8):
+        health.saw_run("a", "first", (100 + k) * S_NS, now_ns=50 * S_NS)
+    for k in range(8):
+        health.saw_run("a", "second", (110 + k) * S_NS, now_ns=50 * S_NS)
+        health.saw_run("a", "first", (109 - k) * S_NS, now_ns=50 * S_NS)
+    assert health.problems(AB, 50500 * S_NS // 1000) == []
+    for k in range(6):
+        health.saw_run("b", ("first", "second")[k % 2], (100 + k) * S_NS, now_ns=50 * S_NS)
+    assert health.problems(AB, 50500 * S_NS // 1000) == ["two nodes have the id b: give each its own"]
+    assert "two nodes" not in "".join(health.problems(AB, 70 * S_NS))
+
+
+def test_nodes_that_blink_by_one_code_are_named(health):
+    blink = Blink(code=3, lamp="left", slot_ns=S_NS // 10)
+    health.saw_blink("a", blink)
+    health.saw_blink("b", replace(blink, code=4))
+    health.saw_blink("c", replace(blink, slot_ns=S_NS // 5))
+    assert health.problems(AB, 50500 * S_NS // 1000) == []
+    health.saw_blink("b", replace(blink, lamp="right"))
+    said = "nodes a and b blink by one code: give each another `blink.code`"
+    assert health.problems(AB, 50500 * S_NS // 1000) == [said]
+    health.saw_blink("b", None)
+    assert health.problems(AB, 50500 * S_NS // 1000) == []
 
 
 def test_the_latency_of_a_link_is_no_disagreement(health):

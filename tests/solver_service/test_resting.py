@@ -15,7 +15,8 @@ from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import NoFix
 from buddyline.solver_service.geometry.observation import Sensed
-from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS, Resting, look_apart
+from buddyline.solver_service.resting import CROWD, LOOK_APART, LOOKS, NOT_IN_VIEW, REST_NS, Resting, look_apart
+from msgspec.structs import replace
 
 from tests.solver_service.scenes import IDEAL
 
@@ -63,14 +64,39 @@ def outcomes(messages: list[Message], together: int) -> dict[tuple[str, str, int
     }
 
 
-def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers() -> None:
-    plan = DivePlan(seconds=8.0)
+PLAN = DivePlan(seconds=8.0)
+
+
+@pytest.fixture(scope="module")
+def three() -> list[Message]:
+    """Of nodes a and c, which look at b."""
     world = World(Scenario(seed=3, start_ns=START_NS, more_nodes=("c",), fixed_nodes=("a",), interruptions=False))
-    messages = [
+    return [
         message
-        for _, _, message in simulation.messages(world, plan)
+        for _, _, message in simulation.messages(world, PLAN)
         if isinstance(message, NodeInfo | Candidates | Attitude | Depth)
     ]
+
+
+def test_among_many_a_pair_without_poses_rests_wherever_it_looks(three: list[Message]) -> None:
+    """Without attitudes, and one candidate in each picture; the others have not sent a picture yet."""
+    info = next(message for message in three if isinstance(message, NodeInfo))
+    others = [replace(info, node=f"x{k}") for k in range(CROWD - 2)]
+    messages = others + [
+        replace(one, blobs=one.blobs[:1]) if isinstance(one, Candidates) else one
+        for one in three
+        if not isinstance(one, Attitude) and one.node in ("a", "c")
+    ]
+    told = outcomes(messages, 40)
+    assert told == outcomes(messages, 5000)
+    resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == NOT_IN_VIEW]
+    assert 16 <= len(resting) <= 24
+    assert all(trigger % LOOKS for trigger in resting)
+    assert NOT_IN_VIEW not in outcomes(messages[1:], 5000).values()
+
+
+def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers(three: list[Message]) -> None:
+    messages = three
     told = outcomes(messages, 40)
     assert told == outcomes(messages, 5000)
     counts = {
@@ -81,4 +107,4 @@ def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers() -> None:
     assert 16 <= counts["a", "c"][LOOK_APART] <= 24
     resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == LOOK_APART]
     assert all(trigger % LOOKS for trigger in resting)
-    assert min(resting) * plan.period_ns > START_NS + REST_NS
+    assert min(resting) * PLAN.period_ns > START_NS + REST_NS

@@ -240,3 +240,17 @@ def test_fixed_nodes_whose_places_contradict_each_other_are_named() -> None:
     _, core = solved(changed(messages, "b", aside))
     assert core.network is not None
     assert core.network.problems == ["fixed nodes a and b: what they see of each other contradicts their places"]
+
+
+def test_a_fixed_node_moved_aside_is_named_though_its_sensors_cannot_tell() -> None:
+    """Nodes a and c stand side by side, and do not see each other; b sees both, and c is not where it is said to be."""
+    _, messages = dive(9, 2.5, more_nodes=("c",), fixed_nodes=("a", "c"), imu=False)
+
+    def aside(info: NodeInfo) -> NodeInfo:
+        x, y, z = info.fixed.p_m
+        return replace(info, fixed=replace(info.fixed, p_m=(x + 0.7, y + 0.7, z)))
+
+    _, core = solved(changed(messages, "c", aside))
+    assert core.network is not None
+    said = "poses of b and c contradict the network: has fixed node c moved, or is it another's bar?"
+    assert said in core.network.problems
