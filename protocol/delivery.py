@@ -171,6 +171,8 @@ class Repeats:
         if again and not self._history:
             return False
         known = self._known.setdefault(key, OrderedDict())
+        # Of too many keys, those that have been silent longest are forgotten.
+        self._known.move_to_end(key)
         number = hash(payload)
         if again and number in known:
             return False

@@ -51,6 +51,11 @@ def next_instant_ns(after_ns: int, period_ns: int) -> int:
     return (after_ns // period_ns + 1) * period_ns
 
 
+def next_after(last_ns: int, now_ns: int, late_ns: int, period_ns: int) -> int:
+    """Return the instant after the last one, at most late_ns ago; a clock that was set back is followed at once."""
+    return next_instant_ns(max(now_ns - late_ns, min(last_ns, now_ns + period_ns)), period_ns)
+
+
 class SimulatedCamera:
     """Renders what the node sees at each trigger instant."""
 
@@ -74,7 +79,7 @@ class SimulatedCamera:
 
     def next_frame(self, stop: threading.Event) -> Frame | None:
         """Wait for the next trigger instant and render it; skip instants that passed since the last call."""
-        instant_ns = next_instant_ns(max(self._clock.now_ns() - self._period_ns // 2, self._last_ns), self._period_ns)
+        instant_ns = next_after(self._last_ns, self._clock.now_ns(), self._period_ns // 2, self._period_ns)
         if self._clock.wait_until_ns(instant_ns, stop):
             return None
         self._last_ns = instant_ns
@@ -103,7 +108,7 @@ class SimulatedSensor:
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample's instant; return the sample, or None if stopped."""
-        instant_ns = next_instant_ns(max(self._clock.now_ns() - S_NS, self._last_ns), self._period_ns)
+        instant_ns = next_after(self._last_ns, self._clock.now_ns(), S_NS, self._period_ns)
         if self._clock.wait_until_ns(instant_ns, stop):
             return None
         self._last_ns = instant_ns

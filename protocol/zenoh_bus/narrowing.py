@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
 import zenoh
 from buddyline.protocol.delivery import CLOSE_S, FailureLatch
-from buddyline.protocol.rate_limit import RateLimit
+from buddyline.protocol.rate_limit import MAX_HEARD, RateLimit
 from buddyline.protocol.sequence import OWNER_CHUNKS
 from buddyline.protocol.zenoh_bus.intake import Intake
 
 LOOK_S: Final = 0.25
-# So long a client is not heard; nor is one that has just come.
+# So long a client is not heard; a node that has just come is, once it is seen.
 SHUT_OUT_S: Final = 10.0
+NEWCOMERS_S: Final = 1.0
 # Without a flood for so many looks the thread ends.
 IDLE_LOOKS: Final = 20
 
@@ -24,7 +26,8 @@ Accept = Callable[[zenoh.Sample], bool]
 class Narrowing:
     """The subscribers of a subscription: of all owners of keys, or for a time of those that do not flood.
 
-    wanted: key expressions, and what accepts their samples. declare: makes the intake of a key expression.
+    wanted: key expressions, and what accepts their samples. declare: makes the intake of a key expression. present: the
+    nodes that are on the bus.
     """
 
     def __init__(
@@ -32,9 +35,11 @@ class Narrowing:
         wanted: Sequence[tuple[str, Accept]],
         declare: Callable[[str, Accept], Intake],
         limit: RateLimit,
+        present: Callable[[], set[str]],
         failures: FailureLatch,
     ) -> None:
         self._wanted = wanted
+        self._present = present
         self._declare = declare
         self._limit = limit
         self._failures = failures
@@ -72,8 +77,7 @@ class Narrowing:
                 flooding = self._limit.flooding()
                 idle = 0 if flooding else idle + 1
                 if flooding:
-                    self._change([one for one in self._limit.owners() if one not in flooding])
-                    self._stop.wait(SHUT_OUT_S)
+                    self._shut_out(flooding)
                     self._limit.empty(flooding)
                     self._change(None)
         except Exception as error:
@@ -82,6 +86,17 @@ class Narrowing:
         finally:
             with self._lock:
                 self._thread = None
+
+    def _shut_out(self, flooding: set[str]) -> None:
+        """Hear only the others for SHUT_OUT_S, and nodes that come meanwhile."""
+        heard = [one for one in self._limit.owners() if one not in flooding]
+        self._change(heard)
+        ends_s = time.monotonic() + SHUT_OUT_S
+        while time.monotonic() < ends_s and not self._stop.wait(min(NEWCOMERS_S, SHUT_OUT_S)):
+            come = sorted(self._present() - flooding - set(heard))[:MAX_HEARD]
+            if come and len(heard) < 2 * MAX_HEARD:
+                heard += come
+                self._change(heard)
 
     def _change(self, owners: Sequence[str] | None) -> None:
         """Subscribe to what these owners say, and no longer to the rest; None: to all."""

@@ -13,6 +13,7 @@ from buddyline.protocol.delivery import CLOSE_S, Delivery, FailureLatch, Repeats
 from buddyline.protocol.rate_limit import RateLimit
 from buddyline.protocol.sequence import Gap, PublisherId, SampleSequence
 from buddyline.protocol.topics import parse_key
+from buddyline.protocol.zenoh_bus.alive import ALIVE
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
 from buddyline.protocol.zenoh_bus.narrowing import Narrowing
 from buddyline.protocol.zenoh_bus.session import RETRY_S
@@ -70,7 +71,7 @@ class ZenohSubscription:
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
         wanted = [(key_expr, accept) for key_expr, accept, _ in subscribers]
-        self._narrowing = Narrowing(wanted, self._intake, limit, failures)
+        self._narrowing = Narrowing(wanted, self._intake, limit, self._present, failures)
         # What was held goes first, in its own order.
         self._joined = True
         self._narrowing.begin(
@@ -79,6 +80,15 @@ class ZenohSubscription:
 
     def _intake(self, key_expr: str, accept: Callable[[zenoh.Sample], bool]) -> Intake:
         return Intake(key_expr, self._declare(key_expr), accept, self._failures)
+
+    def _present(self) -> set[str]:
+        """Return the owners of the keys of the nodes on the bus."""
+        try:
+            replies = list(self._session.liveliness().get(f"{ALIVE}/node/*/*", timeout=QUERY_S))
+        except zenoh.ZError:
+            return set()
+        tokens = [str(reply.ok.key_expr).split("/") for reply in replies if reply.ok is not None]
+        return {f"buddyline/node/{token[-2]}" for token in tokens}
 
     def _declare(self, key_expr: str) -> RingSubscriber:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(INTAKE)

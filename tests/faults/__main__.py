@@ -1,6 +1,6 @@
 """Inject faults into the real system and count what happened to every frame and every trigger.
 
-python -m tests.faults --times 20 [hub frozen_hub node solver hub_and_solver viewer stopped link orders]
+python -m tests.faults --times 20 [hub frozen_hub node solver hub_and_solver viewer stopped link clock orders]
 """
 
 from __future__ import annotations

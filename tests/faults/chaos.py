@@ -28,6 +28,7 @@ NAMES = ("hub", "solver", "a", "b", "recorder")
 LONGEST_S = 8.0
 PAUSE_S = 6.0
 RECOVER_S = 90.0
+LOOK_S = 2.0
 
 Undo = Callable[[], object]
 
@@ -38,7 +39,7 @@ class Chaos:
     def __init__(self, system: System, namespace: str) -> None:
         self._system = system
         self._namespace = namespace
-        # When the solver ended, and when it was started again.
+        # When the solver ended or was stopped, and when it was started or went on.
         self.away_ns: list[tuple[int, int]] = []
 
     def spawn(self, name: str) -> None:
@@ -53,8 +54,15 @@ class Chaos:
 
     def stop(self, name: str) -> Undo:
         """Stop it where it stands, for longer or shorter than the leases."""
+        stopped_ns = time.time_ns()
         self._system.freeze(name)
-        return lambda: self._system.thaw(name)
+
+        def thaw() -> None:
+            self._system.thaw(name)
+            if name == "solver":
+                self.away_ns.append((stopped_ns, time.time_ns()))
+
+        return thaw
 
     def end(self, name: str) -> Undo:
         """End it in order."""
@@ -78,19 +86,32 @@ class Chaos:
         ip("link", "set", f"{self._namespace}h", "down")
         return lambda: ip("link", "set", f"{self._namespace}h", "up")
 
-    def explain(self) -> None:
-        """Say what the processes said last, and start those again that have ended."""
-        for name, process in list(self._system.processes.items()):
-            print(
-                name, "ended" if process.ended else "", *process.lines[-6:], sep="\n    ", file=sys.stderr, flush=True
-            )
-            if process.ended:
-                self._system.processes.pop(name).end()
-                self.spawn(name)
+    def restart(self) -> int:
+        """Start those processes again that have ended by themselves, as systemd does; return how many."""
+        ended = [name for name, process in self._system.processes.items() if process.ended]
+        for name in ended:
+            print(name, "ended", *self._system.processes[name].lines[-6:], sep="\n    ", file=sys.stderr, flush=True)
+            self._system.processes.pop(name).end()
+            self.spawn(name)
+        return len(ended)
+
+    def recovers(self, since_ns: int, faults: Counter[str]) -> bool:
+        """Wait for a match; return whether there was one."""
+        assert self._system.observer is not None
+        ends_s = time.monotonic() + RECOVER_S
+        while time.monotonic() < ends_s:
+            faults["ended by themselves"] += self.restart()
+            try:
+                self._system.observer.wait_for_match(since_ns, LOOK_S)
+            except TimeoutError:
+                continue
+            return True
+        for name, process in self._system.processes.items():
+            print(name, *process.lines[-6:], sep="\n    ", file=sys.stderr, flush=True)
+        return False
 
     def do(self, seconds: float, rng: random.Random) -> tuple[Counter[str], list[float]]:
         """Let faults happen; return how often each did, and how long a match took after each round."""
-        assert self._system.observer is not None
         faults: Counter[str] = Counter()
         recovered_s: list[float] = []
         ends_s = time.monotonic() + seconds
@@ -109,11 +130,8 @@ class Chaos:
                 undo()
             print(f"{time.time() % 10_000:.3f} all are back", file=sys.stderr, flush=True)
             since_ns = time.time_ns()
-            try:
-                self._system.observer.wait_for_match(since_ns, RECOVER_S)
-            except TimeoutError:
+            if not self.recovers(since_ns, faults):
                 faults["not recovered"] += 1
-                self.explain()
                 continue
             recovered_s.append((time.time_ns() - since_ns) / S_NS)
             time.sleep(rng.uniform(0.0, PAUSE_S))
@@ -131,9 +149,9 @@ def doubled(observer: Observer) -> list[str]:
 
 
 def unreached(observer: Observer, away_ns: list[tuple[int, int]]) -> set[int]:
-    """Return the triggers whose frames all came while there was no solver: their nodes may have ended before it came.
+    """Return the triggers whose frames all came while no solver took any: their nodes may have ended before one did.
 
-    away_ns: when a solver ended, and when the next one was started; it is there with its first outcome.
+    away_ns: when a solver ended or was stopped, and when one was started or went on; its first outcome shows it.
     """
     back_ns = sorted(receive_ns for _, receive_ns in observer.outcomes)
     spans = [(from_ns, next((at_ns for at_ns in back_ns if at_ns > to_ns), to_ns)) for from_ns, to_ns in away_ns]

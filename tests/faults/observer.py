@@ -109,16 +109,20 @@ class Observer:
         for node, boot, seq in frames:
             first[node, boot] = min(seq, first.get((node, boot), seq))
         messages = [m for path in logs for m in _frames(path)]
-        ends_ns: dict[str, int] = {}
-        for m in messages:
-            ends_ns[m.node] = max(m.stamp_ns - END_NS, ends_ns.get(m.node, 0))
+        # The stamp of each node's last frame; there are later ones where its clock was set back.
+        last_ns = {m.node: m.stamp_ns for m in messages}
+
+        def may_be_unsent(m: Candidates) -> bool:
+            return last_ns[m.node] - END_NS < m.stamp_ns <= last_ns[m.node]
+
         published = set(seen) | {
-            frame_of(m)
-            for m in messages
-            if m.stamp_ns <= ends_ns[m.node] and m.seq >= first.get((m.node, m.boot), m.seq + 1)
+            frame_of(m) for m in messages if not may_be_unsent(m) and m.seq >= first.get((m.node, m.boot), m.seq + 1)
         }
-        triggers = {m.trigger for m, _ in self.frames if m.stamp_ns <= ends_ns[m.node]}
+        triggers = {m.trigger for m, _ in self.frames if not may_be_unsent(m)}
         outcomes = Counter(o.trigger for o, _ in self.outcomes)
+        # A node whose clock was set comes to a trigger again, and each time has an outcome.
+        times = Counter((m.trigger, m.node, m.boot) for m in {frame_of(m): m for m, _ in self.frames}.values())
+        due = {trigger: count for (trigger, *_), count in sorted(times.items(), key=lambda one: one[1])}
         return Tally(
             published=len(published),
             received=len(seen),
@@ -127,7 +131,7 @@ class Observer:
             disordered=_disordered(frames),
             triggers=len(triggers),
             without_outcome=sum(1 for trigger in triggers if trigger not in outcomes),
-            outcomes_doubled=sum(count - 1 for count in outcomes.values()),
+            outcomes_doubled=sum(max(count - due.get(trigger, 1), 0) for trigger, count in outcomes.items()),
             reasons=Counter(
                 o.reason if isinstance(o, Rejected) else "pose" for o, _ in self.outcomes if o.trigger in triggers
             ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import random
+import signal
 import subprocess
 import tempfile
 import time
@@ -16,6 +17,7 @@ from pathlib import Path
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.divelog import DiveLogReader
 
+from tests.faults.jumping import JUMP_S
 from tests.faults.observer import Tally
 from tests.faults.system import System
 from tests.processes import PATIENCE_S
@@ -24,6 +26,7 @@ RATE_HZ = 5.0
 BACK_S = PATIENCE_S
 CUT_S = 15.0
 FREEZE_S = 5.0
+JUMPS = (signal.SIGUSR1, signal.SIGUSR2)
 
 
 @dataclass
@@ -37,9 +40,12 @@ class FaultRow:
 
 
 @contextmanager
-def running(endpoint: str | None = None) -> Iterator[System]:
+def running(endpoint: str | None = None, node_module: str = "buddyline") -> Iterator[System]:
     """A whole system at work, observed."""
-    with tempfile.TemporaryDirectory() as directory, System(Path(directory), RATE_HZ, endpoint) as system:
+    with (
+        tempfile.TemporaryDirectory() as directory,
+        System(Path(directory), RATE_HZ, endpoint, node_module=node_module) as system,
+    ):
         system.start("hub")
         observer = system.observe()
         system.start("solver", "a", "b")
@@ -166,6 +172,20 @@ def cut_link(times: int) -> FaultRow:
     return report
 
 
+def set_clock(times: int) -> FaultRow:
+    """One node's clock is set ahead for some seconds, then back for some: it comes to many triggers twice."""
+    report = FaultRow(f"clock of one node set by {JUMP_S} s and back")
+    with running(node_module="tests.faults.jumping") as system:
+        for _, (there, back) in zip(range(times), itertools.cycle((JUMPS, JUMPS[::-1])), strict=False):
+            time.sleep(1.0)
+            system.processes["b"].send(there)
+            time.sleep(FREEZE_S)
+            system.processes["b"].send(back)
+            measure(system, report, time.time_ns())
+        report.tally = system.finish()
+    return report
+
+
 def start_orders(times: int) -> FaultRow:
     """Hub, nodes and solver in each of the six orders, 1.5 s apart."""
     report = FaultRow("six start orders")
@@ -216,5 +236,6 @@ SCENARIOS: dict[str, Callable[[int], FaultRow]] = {
     "viewer": frozen_viewer,
     "stopped": frozen_node,
     "link": cut_link,
+    "clock": set_clock,
     "orders": start_orders,
 }

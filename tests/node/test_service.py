@@ -198,7 +198,7 @@ class Settable:
         return time.time_ns() + self.shift_ns
 
 
-@pytest.mark.parametrize("step_s", [1, -1])
+@pytest.mark.parametrize("step_s", [1, -30])
 def test_a_clock_that_is_set_in_mid_dive_is_named_and_all_goes_on(tmp_path, caplog, step_s):
     config = NodeConfig(
         node="a",

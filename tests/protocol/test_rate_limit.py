@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 
@@ -177,3 +178,31 @@ def test_who_floods_is_shut_out_for_a_time_and_the_others_lose_nothing(monkeypat
         for name in "cd":
             known = node.publisher(topics.CANDIDATES, name)
             until(lambda known=known: known.put_bytes(b"{}") and inbox.payloads(known.key), 0.05)
+
+
+def test_a_node_that_comes_while_another_is_shut_out_is_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(narrowing, "SHUT_OUT_S", 3600.0)
+    monkeypatch.setattr(narrowing, "NEWCOMERS_S", 0.05)
+    monkeypatch.setattr(narrowing, "LOOK_S", 0.05)
+    monkeypatch.setattr(rate_limit, "FLOOD_MESSAGES", 1)
+    endpoint, inbox, narrowed_once = free_endpoint(), Inbox(), threading.Event()
+    change = Narrowing._change
+
+    def noted(of: Narrowing, owners: Sequence[str] | None) -> None:
+        change(of, owners)
+        narrowed_once.set()
+
+    monkeypatch.setattr(Narrowing, "_change", noted)
+    with open_hub(endpoint), run_client(endpoint) as receiver, run_client(endpoint) as node:
+        receiver.subscribe(topics.EVERYTHING, inbox, capacity=100_000)
+        with zenoh.open(config_of(client_settings(endpoint, None))) as client:
+
+            def flood() -> bool:
+                for _ in range(200):
+                    client.put(topics.DEPTH.key("c"), b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+                return narrowed_once.is_set()
+
+            until(flood, 0.0)
+        late = node.publisher(topics.CANDIDATES, "d")
+        node.declare_alive("node/d")
+        until(lambda: late.put_bytes(b"{}") and inbox.payloads(late.key), 0.05)
