@@ -50,7 +50,7 @@ _CORE_SHARE, _LEAN_SD = 0.3, 3.0
 # The sizes of sigma's other terms are in sigma.toml.
 # Radii are at least this: what shows on no ray has the radius 0.
 _LEAST_PX: Final = 0.3
-# For a light that shows only its scattered glow: share of the glow's radius.
+# For a light that shows only its scattered glow: share of the glow's radius, fitted as the growth is.
 _SCATTERED_SHARE: Final = 0.27
 # The middle of an outline that the border cuts is at least this share of its depth inside of the border, or the light
 # may be outside of the picture: then it may be anywhere within about this share of the depth.
