@@ -66,7 +66,7 @@ def main() -> int:
             made = environment(entry, python)
             # An old package may call what a newer one has deprecated, as matplotlib 3.8 does of pyparsing 3.3.
             calm = ("-W", "ignore::DeprecationWarning") if entry.endswith("lowest") else ()
-            call(made, "-m", "pytest", *calm, *words)
+            call(made, *calm, "-m", "pytest", *calm, *words)
             results[entry] = "passed"
         except subprocess.CalledProcessError as error:
             results[entry] = f"FAILED: {Path(error.cmd[0]).name} {error.cmd[-1]}"
