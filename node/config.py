@@ -165,8 +165,9 @@ class StationTagsConfig(Config, frozen=True, kw_only=True):
 
 
 class PanelConfig(Config, frozen=True, kw_only=True):
-    """[panel]: one button, lamp, buzzer, dive lights and leak probe at the Pi's pins; all optional.
+    """[panel]: one button, lamp, buzzer, dive lights and leak probe at the Pi's pins, and a display; all optional.
 
+    display: its chip, on the sensors' I2C bus.
     shutdown_command: the words of what a long hold of the button runs; [] for nothing.
     """
 
@@ -175,6 +176,8 @@ class PanelConfig(Config, frozen=True, kw_only=True):
     buzzer_pin: Pin | None = None
     lights_pin: Pin | None = None
     leak_pin: Pin | None = None
+    display: Literal["none", "ssd1306", "sh1106"] = "none"
+    display_address: Annotated[int, Meta(ge=0x3C, le=0x3D)] = 0x3C
     shutdown_command: list[str] = field(default_factory=list)
 
     @property

@@ -184,6 +184,9 @@ class NodeService(Service):
         self.spawn("bus", lambda: self._hub.run(self.stop, lambda error: self.fail("bus", error)))
         self.spawn("power", lambda: self._power.run(self.stop))
         self.spawn("panel", lambda: self._panel.run(self.stop))
+        display = self._panel.display
+        if display is not None:
+            self.spawn("display", lambda: display.run(self.stop))
         if self._blinker is not None:
             blinker = self._blinker
             self.spawn("blink", lambda: blinker.run(self.stop))

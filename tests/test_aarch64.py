@@ -22,7 +22,7 @@ SUITE, PYTHON = "bookworm", "3.11"
 # Of Raspberry Pi OS: Bookworm's and Trixie's.
 PYTHONS = ("3.11", "3.13")
 # What a node and the tools need; picamera2 comes from apt, and vqf is built from source.
-EXTRAS = ("keys", "plots", "survey", "monitor", "foxglove", "ros2", "bridge", "parquet")
+EXTRAS = ("display", "keys", "plots", "survey", "monitor", "foxglove", "ros2", "bridge", "parquet")
 
 MAIN = "import sys; from buddyline.tools.cli import main; sys.exit(main(sys.argv[1:]))"
 

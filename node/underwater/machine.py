@@ -69,7 +69,9 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class PanelState:
-    """started: lights and pictures are on. ending: the diver has asked to shut down. *_ns: begin of lamp and sound."""
+    """started: lights and pictures are on. ending: the diver has asked to shut down. words: the lamp's
+    code. *_ns: begin of lamp and sound.
+    """
 
     started: bool = True
     ending: bool = False
@@ -77,6 +79,7 @@ class PanelState:
     verdict: Verdict | None = None
     verdict_ns: int = 0
     contact: Contact = field(default_factory=Contact)
+    words: str = ""
     lamp: Pattern = STEADY
     lamp_ns: int = 0
     sound: Pattern | None = None
@@ -122,7 +125,8 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
         sees_other=given.sees_other,
         verdict=given.verdict,
     )
-    lamp = code_of(situation).lamp
+    code = code_of(situation)
+    lamp = code.lamp
     if contact.pressed_ns is not None:
         lamp = hold_at((now_ns - contact.pressed_ns) / S_NS).lamp or lamp
     sound, sound_ns = _sound(state, given, action, now_ns)
@@ -134,6 +138,7 @@ def step(state: PanelState, given: PanelInput, now_ns: int) -> tuple[PanelState,
             verdict=given.verdict,
             verdict_ns=given.verdict_ns,
             contact=contact,
+            words=code.words,
             lamp=lamp,
             lamp_ns=state.lamp_ns if lamp == state.lamp else now_ns,
             sound=sound,

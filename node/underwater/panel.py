@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from buddyline.node.config import NodeConfig
 from buddyline.node.underwater.codes import PanelAction, Verdict
+from buddyline.node.underwater.display import Display
 from buddyline.node.underwater.machine import PanelInput, PanelState, step
 from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import S_NS, Clock
@@ -39,19 +40,27 @@ LIGHTS: Final = 2
 
 
 class Panel:
-    """Runs in a thread of its own; without any pin in [panel] it does nothing.
+    """Runs in a thread of its own; without any pin or display in [panel] it does nothing.
 
-    send: takes the diver's marks. pins: gpiozero's by default.
+    send: takes the diver's marks. pins: gpiozero's by default. display: luma's by default; drawn in another thread.
     """
 
     def __init__(
-        self, config: NodeConfig, clock: Clock, send: Callable[[Message], None], pins: PanelPins | None = None
+        self,
+        config: NodeConfig,
+        clock: Clock,
+        send: Callable[[Message], None],
+        pins: PanelPins | None = None,
+        display: Display | None = None,
     ) -> None:
         self._node = config.node
         self._config = config.panel
         self._clock = clock
         self._send = send
         self._pins = pins or PanelPins(config.panel)
+        has_display = config.panel.display != "none"
+        self.display = display or (Display(config.panel, config.sensors.i2c_bus) if has_display else None)
+        self._told: list[str] = []
         self._state = PanelState()
         self._view = PanelInput(booting=True)
         self._leak = False
@@ -85,6 +94,8 @@ class Panel:
         """What is wrong, in words."""
         found = ["LEAK: water in the housing"] if self._leak else []
         found += [f"panel: {pin.name}: {pin.problem}" for pin in self._pins.all if pin.problem]
+        if self.display is not None and self.display.problem:
+            found.append(f"panel: display: {self.display.problem}")
         return found + ([f"panel: {self._refused}"] if self._refused else [])
 
     def show(self, status: NodeStatus, problems: list[str]) -> None:
@@ -97,6 +108,12 @@ class Panel:
             timeless=bool(timeless),
             sees_other=status.lights_seen is not UNSET and status.lights_seen >= LIGHTS,
         )
+        figures = [
+            text.format(value)
+            for value, text in ((status.battery_v, "{:.1f} V"), (status.temperature_degc, "{:.0f} C"))
+            if value is not UNSET
+        ]
+        self._told = [" ".join(figures), *problems]
         self._has_news = True
 
     def hear(self, received: Received) -> None:
@@ -114,7 +131,7 @@ class Panel:
 
     def run(self, stop: threading.Event) -> None:
         """Read and drive the pins until stop is set."""
-        if not self._pins.all:
+        if not self._pins.all and self.display is None:
             return
         while not stop.wait(PERIOD_S):
             self.turn(time.monotonic_ns())
@@ -149,6 +166,8 @@ class Panel:
         ):
             if pin is not None:
                 pin.write(on)
+        if self.display is not None:
+            self.display.show([self._state.words, *self._told])
         if action is not None:
             self._do(action)
 
@@ -182,5 +201,7 @@ class Panel:
         return ": ".join([f"shut down: panel.shutdown_command = {command}: exit status {done.returncode}", *said])
 
     def close(self) -> None:
-        """Free the pins: lamp and dive lights go out."""
+        """Free the pins and the display: lamp, dive lights and display go out."""
         self._pins.close()
+        if self.display is not None:
+            self.display.close()

@@ -1,6 +1,7 @@
 """The doctor: the facts it gathers from files, bus and devices, and the program as a diver runs it."""
 
 import json
+import sys
 import threading
 import time
 
@@ -239,6 +240,13 @@ def test_the_panels_pins_are_tried_and_left_dark(monkeypatch):
     factory.pin(24)._set_pull = lambda value: None  # the probe is stronger than the Pi's pull-down
     assert levels(rig.check_panel(node)) == {"panel": "problem"}
     assert rig.check_panel(NodeConfig(node="a")) == []
+
+
+def test_a_display_that_does_not_answer_is_a_problem(monkeypatch):
+    monkeypatch.setitem(sys.modules, "luma.oled", None)
+    found = rig.check_panel(NodeConfig(node="a", panel=PanelConfig(display="ssd1306")))
+    assert levels(found) == {"panel": "problem"}
+    assert "make install EXTRAS=display" in found[0].text
 
 
 def test_a_gauge_that_is_not_there_is_a_problem_and_none_is_no_finding(monkeypatch):

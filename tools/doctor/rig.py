@@ -14,6 +14,7 @@ from buddyline.node.detect import Detection, make_detector
 from buddyline.node.devices import CameraDevice, Frame, Source, open_camera, open_sensors
 from buddyline.node.pipeline import Pipeline
 from buddyline.node.power.watch import BatteryGauge
+from buddyline.node.underwater.display import Display
 from buddyline.node.underwater.pins import PanelPins
 from buddyline.protocol.clock import SystemClock
 from buddyline.protocol.errors import BuddylineError
@@ -144,9 +145,11 @@ def check_sensors(config: NodeConfig) -> list[Finding]:
 
 def check_panel(config: NodeConfig) -> list[Finding]:
     """Open each pin of the panel and read the inputs; lamp, buzzer and lights stay off."""
-    if not config.panel.pins:
+    has_display = config.panel.display != "none"
+    if not config.panel.pins and not has_display:
         return []
     pins = PanelPins(config.panel)
+    display = Display(config.panel, config.sensors.i2c_bus)
     try:
         pressed = None if pins.button is None else pins.button.read()
         leak = None if pins.leak is None else pins.leak.read()
@@ -154,8 +157,13 @@ def check_panel(config: NodeConfig) -> list[Finding]:
             if output is not None:
                 output.write(False)
         problems = [f"{pin.name}: {pin.problem}" for pin in pins.all if pin.problem]
+        if has_display:
+            display.show([f"doctor of node {config.node}"])
+            display.turn(0.0)
+            problems += [f"display: {display.problem}"] if display.problem else []
     finally:
         pins.close()
+        display.close()
     command = config.panel.shutdown_command
     absent = command[0] if command and shutil.which(command[0]) is None else ""
     return [judge.panel(config.panel.pins, problems, pressed=bool(pressed), leak=bool(leak), absent=absent)]

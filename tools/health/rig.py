@@ -137,7 +137,8 @@ def panel(pins: dict[str, int], problems: list[str], *, pressed: bool, leak: boo
         return Finding("panel", "warning", "the button is held", advice)
     if absent:
         return Finding("panel", "problem", f"shutdown_command: {absent} is not found", "name a program that is there")
-    return Finding("panel", "ok", ", ".join(f"{name.removesuffix('_pin')} GPIO {pin}" for name, pin in pins.items()))
+    found = ", ".join(f"{name.removesuffix('_pin')} GPIO {pin}" for name, pin in pins.items())
+    return Finding("panel", "ok", found or "a display")
 
 
 def imu_place(entered: CalibrationConfig | None, chips: bool) -> Finding:
