@@ -32,11 +32,12 @@ def dive(folder: Path, tether: Tether) -> None:
             system.processes.pop(name).end()
         logs = sorted(folder.glob("[ab]-*.mcap"))
         nodes, live = times(logs), arrived(folder)
-        rest(system, tether, nodes, PATIENCE_S)
+        rest(system, tether, nodes, 3.0 * PATIENCE_S)
         recorder = system.processes.pop("recorder")
         recorder.end()
         assert not missing(nodes, times([folder / "recorder.mcap"]))
-        assert "is not what the node wrote" not in "\n".join(recorder.lines)
+        # Of those that lie on deck, digests may be missing still.
+        assert "comes again" not in "\n".join(recorder.lines)
     # Slow as it was, nobody took the link for dead.
     assert not any("connecting again" in line for line in said)
     for log in logs:
