@@ -113,9 +113,12 @@ def geopackage(sheet: Sheet) -> bytes:
         ]
     with closing(sqlite3.connect(":memory:")) as base:
         base.executescript(_GPKG_TABLES)
-        systems = [(-1, "NONE", -1, "undefined"), (0, "NONE", 0, "undefined")]
-        systems += [(one, "EPSG", one, _wkt(one)) for one in dict.fromkeys((WGS_84, code))]
-        base.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?2 || ':' || ?3, ?1, ?2, ?3, ?4, NULL)", systems)
+        systems = [(-1, "NONE", "undefined"), (0, "NONE", "undefined")]
+        systems += [(one, "EPSG", _wkt(one)) for one in dict.fromkeys((WGS_84, code))]
+        listed = [
+            (f"{organization}:{number}", number, organization, number, wkt) for number, organization, wkt in systems
+        ]
+        base.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)", listed)
         for table, shape, count in (("stations", "POINT", 1), ("lines", "LINESTRING", 2)):
             own = [one for one in features if len(one[2]) == count]
             every = _all(own)[:, :2]
