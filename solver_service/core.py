@@ -2,7 +2,7 @@
 
 The live service, the offline solver, replay and tests all call `SolverCore.handle`. The triggers of a pair are
 resolved in their own order, from the pair's own data. So the same messages give the same poses in any order of arrival
-within the matching window, and with any other nodes.
+within the matching window. Other nodes change them only where there are so many that pairs rest (resting.py).
 """
 
 from __future__ import annotations

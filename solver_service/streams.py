@@ -27,6 +27,8 @@ FRAMES_TO_BELIEVE: Final = 5
 LONGEST_STEP_NS: Final = 1 * S_NS
 # A node with neither frames nor samples in this time before the newest outcome is not waited for.
 STOPPED_NS: Final = 1 * S_NS
+# A live sensor that has told nothing yet is waited for this long: a running one is heard at once, another has none.
+FIRST_WAIT_NS: Final = 1 * S_NS
 MAX_FRAME_BYTES: Final = 8 << 20
 MAX_INFOS: Final = 64
 MAX_SEQUENCE_MEMORY: Final = 512
@@ -210,12 +212,13 @@ class NodeStream:
         return end_ns
 
     def _has_stopped(self, sensor: Sensor) -> bool:
-        """Return whether a sensor has been without samples for three seconds.
+        """Return whether a sensor has been without samples for three seconds, or for one second after a live start.
 
         A live dive counts receive time, because a backlog arrives in a burst; other dives count their own time.
         """
-        own_ns = (self.newest_ns or 0) - (sensor.newest_ns or self.first_ns or 0)
-        return (sensor.missing_ns if self.live else own_ns) > SENSOR_WAIT_NS
+        if self.live:
+            return sensor.missing_ns > (FIRST_WAIT_NS if sensor.newest_ns is None else SENSOR_WAIT_NS)
+        return (self.newest_ns or 0) - (sensor.newest_ns or self.first_ns or 0) > SENSOR_WAIT_NS
 
     def _place_in_time(self, stamp_ns: int, others_ns: Iterable[int]) -> Arrival:
         if self.newest_ns is None:

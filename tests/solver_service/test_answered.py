@@ -158,7 +158,7 @@ def test_what_a_link_held_up_is_not_answered_again(player):
 
 def test_what_a_killed_solver_could_not_tell_the_next_one_tells(tmp_path, monkeypatch):
     """Its last outcomes went into a hub that was dying; of one trigger it had one frame, whose node is gone too."""
-    messages, _ = dive_messages(seconds=4.0, sensors=False, period_ns=2 * PERIOD_NS)
+    messages, _ = dive_messages(seconds=4.0, period_ns=2 * PERIOD_NS)
     frames = [one for one in messages if isinstance(one, Candidates)]
     last = max(frames, key=lambda frame: frame.stamp_ns)
     clock = ManualClock(last.stamp_ns + S_NS)

@@ -132,8 +132,7 @@ def test_the_pairs_of_one_that_is_gone_go_on_and_nothing_is_answered_twice(team)
 
 def test_one_that_stood_still_says_nothing_more_of_what_it_held(team):
     one = team.join()
-    # For its first three seconds a dive without sensors waits for them.
-    team.play(120)
+    team.play(60)
     team.tick()
     assert team.doing() == sorted(PAIRS)
     until(lambda: len(team.outcomes) == one.core.counts.total() > 0)

@@ -6,7 +6,7 @@ import pytest
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Candidates, Imu, NodeInfo
 from buddyline.solver_service.sensors import HORIZON_NS, KEPT_NS, MAX_SAMPLES, ImuWindow
-from buddyline.solver_service.streams import MAX_FRAME_BYTES, Arrival, NodeStream
+from buddyline.solver_service.streams import FIRST_WAIT_NS, MAX_FRAME_BYTES, Arrival, NodeStream
 
 STEP_NS = 10_000_000
 
@@ -83,3 +83,13 @@ def test_words_of_a_calibration_take_no_memory(dive):
     stream.add_info(msgspec.structs.replace(info, software="x" * 1_000_000))
     known, _ = stream.calibration(info.stamp_ns)
     assert known == msgspec.structs.replace(info, software="", config_sha256="", tags=msgspec.UNSET)
+
+
+def test_a_live_sensor_that_was_never_heard_is_waited_for_for_a_second(frames):
+    stream, first_ns = NodeStream("a"), frames[0].stamp_ns
+    covered = {}
+    for frame in frames:
+        stream.add_frame(frame, (), frame.stamp_ns, live=True)
+        covered[frame.stamp_ns - first_ns] = stream.sensors_cover(first_ns)
+    assert {after_ns for after_ns, done in covered.items() if not done} == {ns for ns in covered if ns <= FIRST_WAIT_NS}
+    assert any(covered.values())
