@@ -6,7 +6,7 @@ No bus, no clock, no files, no keys: the function that checks signatures is pass
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal, NamedTuple
@@ -91,6 +91,8 @@ class Checked:
     newest: dict[str, Digest] = field(default_factory=dict)
     # By boot: the numbers of the digests that are missing before that.
     absent: dict[str, set[int]] = field(default_factory=lambda: defaultdict(set))
+    # Where digests were missing when the next one came, by the node's clock: begin and end.
+    gaps: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_BOOTS))
     due: list[_Due] = field(default_factory=list)
     # By topic: the checksum of the newest stretch that was right.
     right: dict[str, str] = field(default_factory=dict)
@@ -190,6 +192,7 @@ class DigestCheck:
         elif newest is not None and digest.seq > newest.seq + 1:
             words = f"{digest.seq - newest.seq - 1} digests are missing"
             yield Discrepancy(node, "missing", newest.stamp_ns, digest.since_ns, words, digest.boot)
+            of.gaps.append((newest.stamp_ns, digest.since_ns))
             _expect_late(of, digest, newest.seq + 1)
         absent.discard(digest.seq)
         of.begins_ns = min(of.begins_ns, digest.since_ns)
@@ -285,9 +288,12 @@ def _leftover(node: str, of: Checked, topic: str, left: list[Undigested]) -> Ite
     ended = all(digest.last is not UNSET for digest in of.newest.values())
     # What is sent after the last digest was measured at most a second before.
     ends_ns = max(digest.stamp_ns for digest in of.newest.values()) - S_NS
+    # Those of a digest that never came are nobody's word, and no forgery for that.
+    gaps = of.gaps if any(of.absent.values()) else ()
     seconds: dict[tuple[int, Kind], int] = defaultdict(int)
     for one in left:
         outside = one.stamp_ns < of.begins_ns or (one.stamp_ns >= ends_ns and not ended)
+        outside = outside or any(begin_ns - S_NS <= one.stamp_ns < end_ns for begin_ns, end_ns in gaps)
         seconds[one.time_ns // S_NS, "unsigned" if outside else "altered"] += 1
     for (second, kind), count in sorted(seconds.items()):
         at_ns = second * S_NS

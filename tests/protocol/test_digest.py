@@ -222,6 +222,24 @@ def test_a_log_that_breaks_off_or_begins_late_says_so(keys: Path) -> None:
     assert {one.kind for one in findings(late, keys)} == {"missing", "unsigned"}
 
 
+def test_messages_whose_digest_never_came_are_nobodys_word_and_no_forgery(keys: Path) -> None:
+    lines = written("a", keys)
+    digests = [i for i, (key, _, _) in enumerate(lines) if key.endswith("/digest")]
+    without = [line for i, line in enumerate(lines) if i != digests[2]]
+    found = findings(without, keys)
+    assert sorted(one.kind for one in found) == ["missing", "unsigned", "unsigned"]
+    assert {one.words for one in found if one.kind == "unsigned"} == {
+        "depth: 4 that are in no digest",
+        "attitude: 4 that are in no digest",
+    }
+    # Elsewhere a message that is in no digest is one that the node did not write.
+    key, _, at_ns = lines[digests[0] - 1]
+    forged = encode(said("a", at_ns + 7, 99.0)[1])
+    assert [one.kind for one in findings([*without[:5], (key, forged, at_ns), *without[5:]], keys)].count(
+        "altered"
+    ) == 1
+
+
 def test_a_flood_fills_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_WAITING", 50)
     monkeypatch.setattr(module, "MAX_WAITING_TOGETHER", 200)
