@@ -32,6 +32,7 @@ from buddyline.solver_service.pair_core import PairCore, PairId, newer
 from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
+from buddyline.solver_service.track.problems import present
 from buddyline.solver_service.tracking import TrackSettings
 from msgspec import UNSET
 from msgspec.structs import replace
@@ -152,7 +153,7 @@ class SolverCore:
     def report(self, stamp_ns: int, receive_ns: int, bad_messages: int, problems: list[str]) -> list[SolverStatus]:
         """Return each pair's status. bad_messages: number of refused messages. problems: added to each pair's own."""
         now_ns = self._steady(receive_ns) or 0
-        problems = problems + (self.network.problems if self.network is not None else [])
+        problems = problems + present(self.network.problems if self.network is not None else [])
         unused = sorted(self.unused)
         return [
             pair.report(stamp_ns, now_ns, self.health.problems(pair.nodes, now_ns) + problems, bad_messages, unused)

@@ -19,6 +19,7 @@ from buddyline.solver_service.network.filter import NetFilter
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.streams import STOPPED_NS, NodeStream
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen
+from buddyline.solver_service.track.problems import as_ended
 from buddyline.solver_service.tracking import TrackSettings, fix_of, frame_of, same_rig, track_node_of
 from msgspec import UNSET
 
@@ -42,7 +43,7 @@ class NetTracker:
     def forget(self) -> None:
         """Start anew: a clock was set, or a rig was changed."""
         if self._filter is not None:
-            self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
+            self._note(as_ended(self._filter.problems))
             # What has not been smoothed yet is told now.
             self._left += self._rest(self._filter)
         self._filter = None

@@ -24,6 +24,7 @@ from buddyline.solver_service.results import relative_pose
 from buddyline.solver_service.sensors import attitude_at
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.clocks import Clocks
+from buddyline.solver_service.track.problems import present
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec import UNSET
 
@@ -183,7 +184,9 @@ class PairCore:
             latency_median_s=statistics.median(latencies_s) if latencies_s else UNSET,
             latency_p99_s=latencies_s[p99] if latencies_s else UNSET,
             clock_skew_s=UNSET if offset is None else offset.offset_s,
-            problem="; ".join(problems + self._disagreements(offset) + (self.tracker.problems if self.tracker else [])),
+            problem="; ".join(
+                problems + self._disagreements(offset) + present(self.tracker.problems if self.tracker else [])
+            ),
             unused=unused or UNSET,
             advice=self.advice() or UNSET,
         )

@@ -39,6 +39,7 @@ from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.problems import as_ended
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -74,7 +75,7 @@ class PairTracker:
     def forget(self) -> None:
         """Start anew: a clock was set."""
         if self._filter is not None:
-            self._note(f"{problem.removesuffix(' (ended)')} (ended)" for problem in self._filter.problems)
+            self._note(as_ended(self._filter.problems))
         self._infos: tuple[NodeInfo, NodeInfo] | None = None
         self._nodes: tuple[TrackNode, TrackNode] | None = None
         self._filter = None

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 # A problem that is not found again for so long has ended; units are checked every 2 s.
 ENDED_S: Final = 5.0
+_ENDED: Final = " (ended)"
+
+
+def as_ended(problems: Iterable[str]) -> list[str]:
+    """Return problems in words that say that they have ended."""
+    return [f"{problem.removesuffix(_ENDED)}{_ENDED}" for problem in problems]
+
+
+def present(problems: Iterable[str]) -> list[str]:
+    """Return the problems that last."""
+    return [problem for problem in problems if not problem.endswith(_ENDED)]
 
 
 class Problems:
@@ -30,4 +42,4 @@ class Problems:
 
     def texts(self) -> list[str]:
         """Return all problems; those that have ended say so."""
-        return [f"{text} (ended)" if self._now_s - last_s > ENDED_S else text for text, last_s in self._said.values()]
+        return [f"{text}{_ENDED}" if self._now_s - last_s > ENDED_S else text for text, last_s in self._said.values()]

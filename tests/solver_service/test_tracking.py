@@ -74,7 +74,10 @@ def test_a_track_goes_on_without_inertial_samples_and_says_so(inertial_dive):
     assert (off_m < 4.0 * sigma_m + 0.002).mean() > 0.98
     said = [problem for problem in core.pairs["a", "b"].tracker.problems if "inertial samples are missing" in problem]
     assert len(said) == 1
+    # It was so, and ended: the solver's status tells of what lasts.
     assert said[0].startswith("node a:")
+    assert said[0].endswith("(ended)")
+    assert not any("inertial" in status.problem for status in core.report(messages[-1].stamp_ns, 0, 0, []))
 
 
 def test_a_track_begins_with_the_first_pose_however_many_messages_come_at_once():
