@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Blob, Candidates, Mark, RelativePose
-from buddyline.tools.survey.blinks import find_blinks
+from buddyline.protocol.messages import Blob, Candidates, Mark, NodeInfo, RelativePose
+from buddyline.tools.survey.blinks import find_blinks, new_blinks
+from buddyline.tools.survey.live import LiveLegs
+from buddyline.tools.survey.readings import of_messages
+from buddyline.tools.survey.settings import AlarmSettings, SurveySettings
 from msgspec.structs import replace
 
 from tests.tools import survey_world as world
@@ -87,3 +90,29 @@ def test_lamps_that_are_hidden_at_random_mark_nothing(a_pose):
     for _ in range(10):
         spans_s = [span for _ in range(15) for span in (rng.exponential(3.0), rng.exponential(0.8))]
         assert not find_blinks(*watched(rng, a_pose, pattern(*spans_s)))
+
+
+def test_three_blinks_are_said_once_while_they_are_seen(a_pose):
+    seen, poses = watched(
+        np.random.default_rng(1), a_pose, pattern(8, 0.5, 0.5, 0.5, 0.5, 0.5, 9, 0.6, 0.6, 0.6, 0.6, 0.6, 30)
+    )
+    infos = [
+        one
+        for one in world.dive(world.line(np.random.default_rng(2), 1), np.random.default_rng(7), rest_s=1.0)
+        if isinstance(one, NodeInfo)
+    ]
+    live = LiveLegs(SurveySettings(), AlarmSettings())
+    said, stream = [], [*infos]
+    for one in seen:
+        stream += [one, *([poses[one.trigger]] if one.trigger in poses else [])]
+    for message in stream:
+        said += [(mark, message.stamp_ns) for mark in live.handle(message) if mark.kind == "point"]
+    assert [mark for mark, _ in said] == find_blinks(seen, poses)
+    assert [mark.node for mark, _ in said] == ["b", "b"]
+    for mark, now_ns in said:
+        assert now_ns - mark.stamp_ns < 6 * S_NS
+    # A dive that was recorded with these marks has each of them once, also where its log begins them a picture later.
+    recorded = [replace(mark, stamp_ns=mark.stamp_ns + PERIOD_NS) for mark, _ in said]
+    (readings,) = of_messages([*stream, *recorded])
+    assert readings.marks == recorded
+    assert new_blinks(recorded, []) == recorded

@@ -11,6 +11,7 @@ from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.messages import Candidates, Mark, RelativePose
 
 BLINKS: Final = 3
+NOTE: Final = "by three blinks"
 # How long lamps are dark, and lit between; a diver's blinks are alike within this ratio. Lamps are steady around them.
 SHORTEST_NS: Final = 220 * MS_NS
 LONGEST_NS: Final = 1200 * MS_NS
@@ -43,8 +44,18 @@ def find_blinks(seen: Iterable[Candidates], poses: Mapping[int, RelativePose]) -
             if min(between) < SHORTEST_NS or max(between) > LONGEST_NS:
                 continue
             if all(max(one) <= ALIKE * min(one) for one in (between[::2], between[1::2])):
-                marks.append(Mark(node=other, stamp_ns=part[1][0], kind="point", note="by three blinks"))
+                marks.append(Mark(node=other, stamp_ns=part[1][0], kind="point", note=NOTE))
     return marks
+
+
+def new_blinks(found: Iterable[Mark], known: Iterable[Mark]) -> list[Mark]:
+    """Return those that are not known: three blinks that are found again may begin a picture later."""
+    noted = [mark for mark in known if mark.note == NOTE]
+    return [
+        mark
+        for mark in found
+        if not any(one.node == mark.node and abs(one.stamp_ns - mark.stamp_ns) < STEADY_NS for one in noted)
+    ]
 
 
 def _stretches(

@@ -12,12 +12,23 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.envelope import Envelope, Refusals
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import Attitude, Depth, Imu, Mark, Message, NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import (
+    Attitude,
+    Candidates,
+    Depth,
+    Imu,
+    Mark,
+    Message,
+    NodeInfo,
+    Rejected,
+    RelativePose,
+)
 from buddyline.protocol.security import SURVEYOR
-from buddyline.protocol.topics import ATTITUDE, DEPTH, IMU, INFO, MARK, POSE, REJECTED
+from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, MARK, POSE, REJECTED
 from buddyline.tools.client import client_config
 from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
+from buddyline.tools.survey.blinks import new_blinks
 from buddyline.tools.survey.chain import Standing, find_standings
 from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, stop_of, time_text
 from buddyline.tools.survey.magnetism import Field, off_usual, usual_field
@@ -47,7 +58,7 @@ MARKS: Final = 2048
 # A node's usual field is known when so many more rests have it than have another one.
 WITNESSES: Final = 3
 
-_Stamped: TypeAlias = RelativePose | Rejected | Attitude | Depth | Imu
+_Stamped: TypeAlias = RelativePose | Rejected | Attitude | Candidates | Depth | Imu
 
 
 @dataclass(eq=False)
@@ -66,12 +77,14 @@ class _Pair:
 
     nodes: tuple[str, str]
     judged: list[_JudgedRest] = field(default_factory=list)
+    blinks: list[Mark] = field(default_factory=list)
     checked_ns: int = 0
 
 
 class LiveLegs:
-    """Takes messages of any number of nodes, in any order; returns the verdicts on rests, as marks of both nodes.
+    """Takes messages of any number of nodes, in any order; returns marks: verdicts on rests, points by blinks.
 
+    A verdict is a mark of both nodes; three blinks are one of the node that blinked.
     Mark of kind `leg` and name `good`: the leg carries no alarm. Of kind `alarm`: measure again; its name is the check.
     A rest is judged by what `survey legs` would say of it. Later rests may show more of an earlier one, by the usual
     magnetic field: then the mark is of an earlier leg, and its note begins with that leg's name and time.
@@ -98,7 +111,7 @@ class LiveLegs:
             if abs(message.stamp_ns - pair.checked_ns) >= CHECK_NS and set(nodes) <= set(self._infos):
                 pair.checked_ns = message.stamp_ns
                 return self._check(pair, message.stamp_ns)
-        elif isinstance(message, Attitude | Depth | Imu):
+        elif isinstance(message, Attitude | Candidates | Depth | Imu):
             self._keep(message, (message.node,))
         return []
 
@@ -121,7 +134,9 @@ class LiveLegs:
         sensed = (message for (_, ids), recent in self._recent.items() if {*ids} <= nodes for message in recent)
         (readings,) = of_messages([*(self._infos[node] for node in pair.nodes), *sensed])
         seen = sights(readings, self._settings)
-        said = []
+        # No marks went in: these are what the pictures show.
+        said = new_blinks(readings.marks, pair.blinks)
+        pair.blinks += said
         for rest in rests(readings, seen, self._settings):
             known = next((one for one in pair.judged if _same(one.rest, rest)), None)
             if known is not None and (known is not pair.judged[-1] or rest.too_short):
@@ -247,7 +262,7 @@ class Watch:
         """Subscribe."""
         follow(self._bus, INFO.key_any(), self._refusals, self._take)
         # One subscription keeps the order: no pose may close a leg before the depths that were sent before it.
-        keys = tuple(topic.key_any() for topic in (ATTITUDE, DEPTH, IMU, POSE, REJECTED, MARK))
+        keys = tuple(topic.key_any() for topic in (ATTITUDE, CANDIDATES, DEPTH, IMU, POSE, REJECTED, MARK))
         follow(self._bus, keys, self._refusals, self._take, capacity=16384, history=False)
 
     def _take(self, envelope: Envelope) -> None:
@@ -258,8 +273,8 @@ class Watch:
             log.warning("survey watch: %s: %s", envelope.key, error)
             return
         for mark in marks:
-            level = logging.INFO if mark.kind == "leg" else logging.WARNING
-            log.log(level, "%s: %s: %s", mark.node, mark.name, mark.note)
+            level = logging.WARNING if mark.kind == "alarm" else logging.INFO
+            log.log(level, "%s: %s: %s", mark.node, mark.name or mark.kind, mark.note)
             if mark.node not in self._publishers:
                 self._publishers[mark.node] = self._bus.publisher(MARK, mark.node)
             self._publishers[mark.node].put(mark)

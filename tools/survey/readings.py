@@ -24,7 +24,7 @@ from buddyline.protocol.messages import (
 from buddyline.tools.dives import open_each
 from buddyline.tools.evaluation.rotation import multiply, normalized
 from buddyline.tools.survey.averages import Floats, Ints
-from buddyline.tools.survey.blinks import find_blinks
+from buddyline.tools.survey.blinks import find_blinks, new_blinks
 from msgspec import UNSET
 
 # An attitude is interpolated between neighbours no further apart than this.
@@ -150,7 +150,7 @@ def of_messages(messages: Iterable[Message], name: str = "dive") -> list[PairRea
     for pair, of_pair in outcomes.items():
         poses = {trigger: one for trigger, one in of_pair.items() if isinstance(one, RelativePose)}
         for node in pair:
-            marks |= dict.fromkeys(find_blinks(pictures.get(node, {}).values(), poses))
+            marks |= dict.fromkeys(new_blinks(find_blinks(pictures.get(node, {}).values(), poses), marks))
     in_order = sorted(marks, key=lambda mark: mark.stamp_ns)
     found = []
     for (a, b), of_pair in outcomes.items():
