@@ -63,7 +63,7 @@ def solve_sample(python: Path) -> None:
     """Let the program solve the sample, and run the demo."""
     with tempfile.TemporaryDirectory() as folder:
         sample, solved = f"{folder}/sample.mcap", f"{folder}/solved.mcap"
-        for words in (("sample", sample), ("solve", sample, "-o", solved), ("demo", "--seconds", "8")):
+        for words in (("sample", "-o", sample), ("solve", sample, "-o", solved), ("demo", "--seconds", "8")):
             call(python, "-m", "buddyline", *words)
 
 

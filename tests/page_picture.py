@@ -19,7 +19,7 @@ def draw() -> None:
     processes, port = Processes(), free_port()
     with tempfile.TemporaryDirectory() as folder, chromium_browser() as chromium, looking(chromium, "page") as seen:
         logs = [str(Path(folder) / name) for name in ("sample.mcap", "solved.mcap")]
-        assert main(["sample", logs[0]]) == 0
+        assert main(["sample", "-o", logs[0]]) == 0
         assert main(["solve", logs[0], "-o", logs[1]]) == 0
         try:
             processes.start("view", "view", *logs, "--port", str(port))

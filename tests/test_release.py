@@ -69,7 +69,7 @@ def test_a_tag_becomes_a_release(checkout: Checkout) -> None:
         pytest.skip("the tools of a release cannot be fetched from here")
     assert done.returncode == 0, done.stdout + done.stderr
     dist = checkout.folder / "dist"
-    suffixes = {".whl", ".gz", ".json", ".md", ".txt", ".bash", ".zsh"}
+    suffixes = {".whl", ".gz", ".json", ".md", ".txt", ".bash", ".zsh", ".tcsh"}
     assert {path.suffix for path in dist.glob("buddyline-7.8.9*")} == suffixes
     names = {name.partition("/")[2] for name in tarfile.open(dist / "buddyline-7.8.9.tar.gz").getnames()}
     for name in ("docs/tutorial.md", "examples/01_solve_a_dive.py", "node/examples/pi.toml", "tools/sample.mcap"):

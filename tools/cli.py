@@ -69,7 +69,7 @@ COMMANDS: Final = (
         ("demo", "demo --environment lake --seconds 30"),
         "tools.demo.command",
     ),
-    Command("sample", "write a small dive, to try the other commands on", ("sample", "sample dive.mcap")),
+    Command("sample", "write a small dive, to try the other commands on", ("sample", "sample -o dive.mcap")),
     Command(
         "plan",
         "say how far two nodes will measure well, by camera, lights and visibility",

@@ -11,7 +11,7 @@ from buddyline.tools.newfile import write_new
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `sample`."""
     parser.add_argument(
-        "output", nargs="?", default="sample.mcap", metavar="OUT.mcap", help="must not exist yet; default: sample.mcap"
+        "-o", "--output", default="sample.mcap", metavar="OUT.mcap", help="must not exist yet; default: sample.mcap"
     )
 
 

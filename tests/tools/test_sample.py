@@ -29,6 +29,13 @@ def test_the_sample_is_solved_reported_and_right(here, capsys):
 
 def test_a_file_is_never_overwritten(here, capsys):
     (here / "sample.mcap").write_text("mine")
-    assert main(["sample"]) == 2
-    assert "exists" in capsys.readouterr().err
+    for words in (["sample"], ["sample", "-o", "sample.mcap"]):
+        assert main(words) == 2
+        assert "exists" in capsys.readouterr().err
     assert (here / "sample.mcap").read_text() == "mine"
+
+
+def test_it_is_written_where_it_is_wanted(here, capsys):
+    assert main(["sample", "-o", "dive.mcap"]) == 0
+    assert "buddyline solve dive.mcap" in capsys.readouterr().out
+    assert [path.name for path in here.iterdir()] == ["dive.mcap"]

@@ -1,0 +1,28 @@
+"""The demo's dives without processes: poses and tracks are right, and wrong ones are counted."""
+
+from dataclasses import replace
+
+from buddyline.node.sim.scenario import ENVIRONMENTS, Scenario
+from buddyline.node.sim.world import World
+
+from tests.demo_seeds import START_NS, dives, judged, swum
+
+
+def test_nothing_is_wrong_in_a_dive_of_the_demo_but_much_against_anothers_truth():
+    scenario = Scenario(environment="day_reef", seed=4, start_ns=START_NS)
+    outcomes = swum(World(scenario), 2.0)
+    dive = judged(World(scenario), outcomes)
+    assert dive.poses >= 15
+    assert set(dive.samples) == {"filter", "lag", "smooth"}
+    assert min(dive.samples.values()) >= 20
+    assert dive.wrong == 0
+    other = judged(World(replace(scenario, seed=5)), outcomes)
+    assert other.wrong_poses
+    assert all(other.wrong_samples.values())
+
+
+def test_each_seed_comes_in_one_water_first_then_in_the_others():
+    found = list(dives(1, 10, 5))
+    assert len(set(found)) == 50
+    assert {seed for seed, _ in found[:10]} == set(range(1, 11))
+    assert {environment for _, environment in found[:5]} == set(ENVIRONMENTS)
