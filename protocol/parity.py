@@ -137,8 +137,10 @@ def _combine(coefficients: Bytes, blocks: Bytes) -> Bytes:
     """Return the product of a matrix (m, n) with blocks (n, block size)."""
     out = np.zeros((len(coefficients), blocks.shape[1]), np.uint8)
     for column, block in zip(coefficients.T, blocks, strict=True):
+        content = block.tobytes()
         for row, factor in enumerate(column):
-            out[row] ^= _PRODUCT[factor][block]
+            # A table look-up of bytes: four times as fast as numpy's.
+            out[row] ^= np.frombuffer(content.translate(_PRODUCT[factor].data), np.uint8)
     return out
 
 
