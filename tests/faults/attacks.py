@@ -85,7 +85,7 @@ def gaps(session: zenoh.Session) -> Iterator[None]:
 def queries(session: zenoh.Session) -> Iterator[None]:
     """Ask for everything that is held, and do not wait for the answers."""
     while True:
-        session.get("buddyline/**/@adv/**", lambda reply: None)
+        session.get("buddyline/**/@adv/**", lambda reply: None, accept_replies=zenoh.ReplyKeyExpr.ANY)
         yield
         time.sleep(0.001)
 

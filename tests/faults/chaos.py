@@ -23,11 +23,12 @@ from buddyline.protocol.messages import Rejected
 from tests.faults.observer import Observer, Tally
 from tests.faults.scenarios import RATE_HZ, ip, namespace
 from tests.faults.system import System
+from tests.processes import PATIENCE_S
 
 NAMES = ("hub", "solver", "a", "b", "recorder")
 LONGEST_S = 8.0
 PAUSE_S = 6.0
-RECOVER_S = 90.0
+RECOVER_S = PATIENCE_S
 LOOK_S = 2.0
 
 Undo = Callable[[], object]

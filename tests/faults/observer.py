@@ -20,7 +20,7 @@ from buddyline.tools.live import follow, open_bus_within
 END_NS = S_NS
 CONNECT_S = 20.0
 # The longest wait for the outcomes of the last frames.
-SETTLE_S = 30.0
+SETTLE_S = 60.0
 
 Frame = tuple[str, str, int]  # node, boot, seq
 Outcome = Rejected | RelativePose

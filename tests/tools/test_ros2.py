@@ -16,6 +16,7 @@ from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.export.ros_messages import RosMessage, Translation, name_of, type_store
 from buddyline.tools.ros2 import RosGraph, attachment, dds_type
+from msgspec.structs import replace
 
 from tests.processes import PATIENCE_S, free_endpoint
 from tests.tools.evaluated import INFOS, pose, track
@@ -60,6 +61,16 @@ def test_depth_is_height_under_the_surface(store: Any) -> None:
     assert value.pose.pose.position.z == -12.5
     assert value.pose.covariance[14] == pytest.approx(0.02**2)
     assert value.pose.covariance[0] == 1e6
+
+
+def test_an_absurd_sigma_gives_a_finite_variance(store: Any) -> None:
+    absurd = (
+        replace(depth("a", at(0), 12.5), sigma_m=1e308),
+        replace(attitude("a", at(0), EAST), sigma_rad=(1e308,) * 3),
+    )
+    messages = translated(store, *absurd)
+    assert np.isfinite(of(messages, "/buddyline/a/depth").pose.covariance).all()
+    assert np.isfinite(of(messages, "/buddyline/a/attitude").orientation_covariance).all()
 
 
 def test_a_pose_is_published_unchanged_with_its_covariance(store: Any) -> None:

@@ -42,6 +42,8 @@ TRACK_SILENT_NS: Final = S_NS
 R_FRD_FLU: Final = np.diag([1.0, -1.0, -1.0])
 # Variance of a field that was not measured: large, so that filters ignore the field.
 UNKNOWN_VARIANCE: Final = 1e6
+# A greater one has no finite square.
+MOST_SIGMA: Final = 1e150
 
 POSE_TYPE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY_TYPE: Final = "nav_msgs/msg/Odometry"
@@ -177,7 +179,7 @@ class Translation:
             min_range=MIN_RANGE_M,
             max_range=MAX_RANGE_M,
             range=estimate.range_m,
-            variance=range_sigma_m(estimate) ** 2,
+            variance=min(range_sigma_m(estimate), MOST_SIGMA) ** 2,
         )
         return RosMessage(f"/buddyline/{a}/{b}/range", RANGE_TYPE, value)
 
@@ -189,7 +191,7 @@ class Translation:
             IMU_TYPE,
             header=self._header(attitude.stamp_ns, f"{name_of(attitude.node)}_body"),
             orientation=self._quaternion(R_enu_flu),
-            orientation_covariance=np.diag(np.array(attitude.sigma_rad) ** 2).ravel(),
+            orientation_covariance=np.diag(np.minimum(attitude.sigma_rad, MOST_SIGMA) ** 2).ravel(),
             # sensor_msgs/Imu: -1 means that a quantity is not given.
             angular_velocity=nothing,
             angular_velocity_covariance=unknown,
@@ -207,7 +209,7 @@ class Translation:
 
     def _depth(self, depth: Depth) -> RosMessage:
         variances = np.full(6, UNKNOWN_VARIANCE)
-        variances[2] = depth.sigma_m**2
+        variances[2] = min(depth.sigma_m, MOST_SIGMA) ** 2
         value = self._posed(depth.stamp_ns, MAP, (0.0, 0.0, -depth.depth_m), np.eye(3), np.diag(variances).ravel())
         return RosMessage(f"/buddyline/{name_of(depth.node)}/depth", POSE_TYPE, value)
 
