@@ -1,5 +1,7 @@
 """What the divers should do for a fix or a better one, in words: from where they last were, and from their lamps.
 
+Where they last were is not known before the first fix; then what they see says it (`first_fix`).
+
 Angles are those of a node's camera: right is clockwise seen from above, for a camera that is upright.
 """
 
@@ -13,13 +15,9 @@ from typing import Final
 import numpy as np
 from buddyline.protocol.health import TRACK_SIGMA_SHARE
 from buddyline.protocol.messages import NodeInfo, RelativePose, Track
+from buddyline.solver_service.first_fix import STEP_M, WELL_INSIDE, NodeLook, advise_first, turn_words
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix
 
-# A light this share of the half field of view off the axis is well in the picture.
-WELL_INSIDE: Final = 0.8
-# Smaller turns are not worth a word; a diver turns in steps, and swims in steps.
-STEP_DEG: Final = 5
-STEP_M: Final = 0.5
 # An older place, or a place worse than this share of the range, tells no direction.
 OLD_S: Final = 20.0
 VAGUE_SHARE: Final = 0.2
@@ -59,6 +57,11 @@ class LastPlace:
         """Distance from A to B."""
         return float(np.linalg.norm(self.t_m))
 
+    @property
+    def tells(self) -> bool:
+        """Whether it is new and certain enough to tell a direction."""
+        return self.age_s <= OLD_S and self.sigma_m <= VAGUE_SHARE * self.range_m
+
     def lights(self, info_a: NodeInfo, info_b: NodeInfo) -> tuple[Floats, Floats]:
         """Return B's lights in A's present camera frame, and A's lights in B's, (2, 3) each."""
         turn_a, turn_b = self.turned or (np.eye(3), np.eye(3))
@@ -69,14 +72,20 @@ class LastPlace:
         return in_a, in_b
 
 
-def advise(infos: Sequence[NodeInfo], place: LastPlace | None, dark: Iterable[tuple[int, int]] = ()) -> list[str]:
+def advise(
+    infos: Sequence[NodeInfo],
+    place: LastPlace | None,
+    dark: Iterable[tuple[int, int]] = (),
+    looks: Sequence[NodeLook] = (),
+) -> list[str]:
     """Return what to do, such as "turn b 20 deg left"; empty where all is well, or nothing is known.
 
-    infos: of A and B. dark: lamps that are dark, as node (0: A) and light (0: left).
+    infos: of A and B. dark: lamps that are dark, as node (0: A) and light (0: left). looks: of A and B, for where
+    no place tells a direction; empty where they say nothing.
     """
     said = [f"{('left', 'right')[light]} lamp of {infos[node].node} is dark" for node, light in dark]
-    if place is None or place.age_s > OLD_S or place.sigma_m > VAGUE_SHARE * place.range_m:
-        return said
+    if place is None or not place.tells:
+        return said + (advise_first(infos, looks) if looks else [])
     seen = place.lights(infos[0], infos[1])
     turns = [f"turn {info.node} {words}" for info, of in zip(infos, seen, strict=True) if (words := _turn(info, of))]
     return said + (turns or _move(infos, place, seen))
@@ -109,15 +118,8 @@ def _turn(info: NodeInfo, lights_m: Floats) -> str:
     half_rad = math.atan(info.width_px / 2 / camera.fx_px), math.atan(info.height_px / 2 / camera.fy_px)
     right_rad = np.arctan2(lights_m[:, 0], lights_m[:, 2])
     down_rad = np.arctan2(lights_m[:, 1], np.hypot(lights_m[:, 0], lights_m[:, 2]))
-    words = []
-    for angles_rad, limit_rad, (plus, minus) in (
-        (right_rad, half_rad[0], ("right", "left")),
-        (down_rad, half_rad[1], ("down", "up")),
-    ):
-        if np.abs(angles_rad).max() <= WELL_INSIDE * limit_rad:
-            continue
-        middle_deg = math.degrees(float(np.angle(np.exp(1j * angles_rad).sum())))
-        rounded = STEP_DEG * round(abs(middle_deg) / STEP_DEG)
-        if rounded:
-            words.append(f"{rounded} deg {plus if middle_deg > 0 else minus}")
-    return " and ".join(words)
+    turn_rad = [0.0, 0.0]
+    for k, (angles_rad, limit_rad) in enumerate(((right_rad, half_rad[0]), (down_rad, half_rad[1]))):
+        if np.abs(angles_rad).max() > WELL_INSIDE * limit_rad:
+            turn_rad[k] = float(np.angle(np.exp(1j * angles_rad).sum()))
+    return turn_words(*turn_rad)

@@ -29,7 +29,6 @@ from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.health import Health
 from buddyline.solver_service.networking import NetTracker
 from buddyline.solver_service.pair_core import PairCore, PairId, newer
-from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import Arrival, NodeStream
 from buddyline.solver_service.track.problems import present
@@ -220,7 +219,7 @@ class SolverCore:
     def _settled(self, pairs: Iterable[PairCore], told_ns: int = -1) -> list[Message]:
         messages: list[Message] = []
         for pair in pairs:
-            pair.crowd(len(self.streams) >= CROWD)
+            pair.crowd(len(self.streams))
             messages += pair.settle(told_ns)
         if self.network is None:
             return messages

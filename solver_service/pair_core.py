@@ -16,10 +16,12 @@ from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected,
 from buddyline.protocol.topics import EXPECT, POSE, REJECTED, SOLVER_STATUS, TRACK, TRACK_LAG
 from buddyline.solver_service.alignment import ClockAlignment, ClockOffset
 from buddyline.solver_service.coach import LastPlace, advise
+from buddyline.solver_service.first_fix import look_of
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix
 from buddyline.solver_service.geometry.trigger import NoFix, Settings
 from buddyline.solver_service.matcher import PairMatcher, Unmatched
 from buddyline.solver_service.pair import Matched, PairSolver
+from buddyline.solver_service.resting import CROWD
 from buddyline.solver_service.results import relative_pose
 from buddyline.solver_service.sensors import attitude_at
 from buddyline.solver_service.streams import Arrival, NodeStream
@@ -74,11 +76,13 @@ class PairCore:
         self._last: RelativePose | Track | None = None
         self._offset: ClockOffset | None = None
         self._aligned_ns: int | None = None
+        self._alone = True
         self._unsettled: list[Matched | Unmatched] = []
         self._settled: list[Message] = []
 
-    def crowd(self, crowded: bool) -> None:
-        """Note whether this pair is one of many."""
+    def crowd(self, nodes: int) -> None:
+        """Note how many nodes there are: this pair may be the only one, or one of many."""
+        self._alone, crowded = nodes == 2, nodes >= CROWD
         self.solver.crowded = crowded
         if self.tracker is not None:
             self.tracker.crowded = crowded
@@ -195,7 +199,8 @@ class PairCore:
         """Return what the divers should do for a fix or a better one, by the newest data of both nodes."""
         now_ns = max((stream.newest_ns or 0 for stream in self.streams), default=0)
         known = [stream.calibration(now_ns) for stream in self.streams]
-        infos = [each[0] for each in known if each is not None]
+        rigs = [each for each in known if each is not None]
+        infos = [info for info, _ in rigs]
         if len(infos) < 2:
             return []
         last, place = self._last, None
@@ -207,7 +212,11 @@ class PairCore:
             has_fix = self._posed_ns is not None and now_ns - self._posed_ns < NO_POSE_S * S_NS
             why = "" if has_fix else next((reason for reason, _ in self._why.most_common(1)), "unmatched")
             place = LastPlace.of(last, max(now_ns - last.stamp_ns, 0) / S_NS, why, both)
-        return advise(infos, place, self.tracker.dark_lamps() if self.tracker is not None else ())
+        dark = self.tracker.dark_lamps() if self.tracker is not None else ()
+        # Where there are more nodes, a light that is seen may be a third one's.
+        needed = self._alone and (place is None or not place.tells) and all(s.newest_ns for s in self.streams)
+        looks = [look_of(stream, *rig) for stream, rig in zip(self.streams, rigs, strict=True)] if needed else ()
+        return advise(infos, place, dark, looks)
 
     def _turned(self, stream: NodeStream, info: NodeInfo, since_ns: int) -> Floats | None:
         """Return R_then_now of a node's camera by its attitude sensor, whose slow error cancels; None without one."""

@@ -1,7 +1,8 @@
-"""The coach: how often its words, followed, give a fix within 5 s, in simulated dives that have lost it.
+"""The coach: how often its words, followed, give a fix within 5 s, in simulated dives that have lost it or had none.
 
-One diver or both turn away, or B drifts off, until no trigger has given a pose for two seconds. Then each diver does
-what the solver's status says, as it comes once a second: half a second to react, 45 degrees and 0.5 m a second.
+One diver or both turn away, or B drifts off, until no trigger has given a pose for two seconds; or they begin so that
+not both see both lamps. Then each diver does what the solver's status says, as it comes once a second, from half a
+second after it: 45 degrees and 0.5 m a second. An amount counts from where the diver was when it came.
 """
 
 from __future__ import annotations
@@ -28,7 +29,12 @@ from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.tracking import TrackSettings
 from buddyline.tools.measure.tables import text_table
 
-CASES: Final = ("one turns away", "both turn away", "one looks up or down", "B drifts off")
+CASES: Final = (
+    *("one turns away", "both turn away", "one looks up or down", "B drifts off"),
+    *("never: a lamp beyond each border", "never: one looks away", "never: one looks up or down"),
+    *("never: both look away", "never: too far", "never: too near"),
+)
+NEVER: Final = "never: "
 WATERS: Final[tuple[Environment, ...]] = ("cavern", "night_reef", "lake", "basin")
 START_NS: Final = 1_764_000_000 * S_NS
 TICK_NS: Final = S_NS // 10
@@ -39,6 +45,9 @@ WITHIN_S: Final = 5.0
 SETTLE_S: Final = 8.0
 # A dive that has not found its fix, or not lost it, by then does not count.
 LOSE_WITHIN_S: Final = 40.0
+# So long divers that never had a fix are watched before the first words count.
+WATCHED_S: Final = 2.0
+TRIES: Final = 40
 REACTION_S: Final = 0.5
 TURN_DEGPS: Final = 45.0
 SWIM_MPS: Final = 0.5
@@ -50,6 +59,7 @@ RAMP_S: Final = 0.4
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the benchmark's arguments."""
+    parser.add_argument("--case", choices=CASES, action="append", help="may be given again; default: all")
     parser.add_argument("--dives", type=int, default=20, help="of each case; default: 20")
     parser.add_argument("--no-imu", action="store_true", help="nodes have attitude and depth, no inertial samples")
     parser.add_argument("--seed", type=int, default=1, help="default: 1")
@@ -58,13 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 class Steering(NodesMotion):
     """A motion, and what the divers add to it: A's turn right and down, B's turn right and down, B's way away from A.
 
-    rates (5,): of what is added, deg/s and m/s. They change as smoothly as divers can change them.
+    begin (5,): what is added from the start on. rates (5,): of what is added, deg/s and m/s. They change as smoothly as
+    divers can change them.
     """
 
-    def __init__(self, base: NodesMotion) -> None:
+    def __init__(self, base: NodesMotion, begin: Vector | None = None) -> None:
         self._base = base
         self._until_s = 0.0
-        self._pieces = [(0.0, np.zeros(5), np.zeros(5), np.zeros(5))]
+        self._pieces = [(0.0, np.zeros(5) if begin is None else begin, np.zeros(5), np.zeros(5))]
         self.rates = np.zeros(5)
 
     def steer(self, wanted: Vector) -> None:
@@ -98,9 +109,9 @@ class Steering(NodesMotion):
 class SteeredDive:
     """A simulated dive that goes on tick by tick, with the solver that sees it."""
 
-    def __init__(self, environment: Environment, seed: int, *, imu: bool) -> None:
+    def __init__(self, environment: Environment, seed: int, *, imu: bool, begin: Vector | None = None) -> None:
         scenario = Scenario(environment=environment, seed=seed, start_ns=START_NS, interruptions=False)
-        self.motion = Steering(PairMotion(scenario))
+        self.motion = Steering(PairMotion(scenario), begin)
         self._world, self._imu, self._seq = World(scenario, self.motion), imu, 0
         settings = TrackSettings(modes=frozenset(("filter",)), rate_hz=20.0)
         self._core = SolverCore(SolveConfig().settings("bench"), [("a", "b")], track=settings)
@@ -170,10 +181,48 @@ def losing(case: str, rng: np.random.Generator) -> Callable[[float], Vector]:
     return lambda since_s: rates if since_s < lasts_s else np.zeros(5)
 
 
-def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> float | None:
-    """Return the time from the first words to a fix, s; inf if there were none in time, None if no fix was lost."""
-    dive, rng = SteeredDive(environment, seed, imu=imu), np.random.default_rng(seed)
-    still = np.zeros(5)
+def lamps_in_view(environment: Environment, seed: int, begin: Vector) -> list[int]:
+    """Return how many lamps each node sees at the start of a dive that begins so."""
+    scenario = Scenario(environment=environment, seed=seed, start_ns=START_NS, interruptions=False)
+    world = World(scenario, Steering(PairMotion(scenario), begin))
+    return [sum(lamp.visible for lamp in world.light_truth(node, START_NS, 0).lights) for node in "ab"]
+
+
+def beginning(environment: Environment, case: str, seed: int, rng: np.random.Generator) -> Vector | None:
+    """Return how divers stand that have no fix yet; None if this dive has no such beginning."""
+    one, side = int(rng.integers(2)), rng.choice((-1.0, 1.0), 2)
+    for k in range(TRIES):
+        begin = np.zeros(5)
+        if case.endswith("border"):
+            begin[[0, 2]] = side * k
+        elif case.endswith("one looks away"):
+            begin[2 * one] = side[0] * rng.uniform(40.0, 120.0)
+        elif case.endswith("down"):
+            begin[2 * one + 1] = side[0] * rng.uniform(35.0, 60.0)
+        elif case.endswith("both look away"):
+            begin[[0, 2]] = side * rng.uniform(40.0, 120.0, 2)
+        elif case.endswith("far"):
+            begin[4] = float(k)
+        else:
+            begin[4] = -k / TRIES
+        seen = lamps_in_view(environment, seed, begin)
+        if seen == [1, 1] if case.endswith("border") else max(seen) < 2 if case.endswith("near") else min(seen) < 2:
+            return begin
+    return None
+
+
+def lose(environment: Environment, case: str, seed: int, *, imu: bool) -> SteeredDive | None:
+    """Return a dive that has lost its fix, or never had one; None where the case does not come about."""
+    rng, still = np.random.default_rng(seed), np.zeros(5)
+    if case.startswith(NEVER):
+        begin = beginning(environment, case, seed, rng)
+        if begin is None:
+            return None
+        dive = SteeredDive(environment, seed, imu=imu, begin=begin)
+        while dive.t_s < WATCHED_S:
+            dive.tick(still)
+        return dive if dive.posed_ns == START_NS else None
+    dive = SteeredDive(environment, seed, imu=imu)
     while dive.t_s < SETTLE_S or dive.without_s() > 0.3:
         dive.tick(still)
         if dive.t_s > LOSE_WITHIN_S:
@@ -183,19 +232,27 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
         dive.tick(lost(dive.t_s - began_s))
         if dive.t_s > began_s + LOSE_WITHIN_S:
             return None
-    told_s, asked = dive.t_s, np.zeros(5)
+    return dive
+
+
+def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> float | None:
+    """Return the time from the first words to a fix, s; inf if there were none in time, None if no fix was missing."""
+    dive = lose(environment, case, seed, imu=imu)
+    if dive is None:
+        return None
+    told_s, asked, heard = dive.t_s, np.zeros(5), np.zeros(5)
     heard_s = told_s - 1.0
     while dive.without_s() > 0.05:
         if dive.t_s - told_s > WITHIN_S - TICK_S / 2:
             return math.inf
-        if dive.t_s - heard_s > 1.0 - TICK_S / 2 and not asked.any():
-            asked, heard_s = asked_for(dive.advice()), dive.t_s
-        if dive.t_s - heard_s < REACTION_S:
-            dive.tick(still)
-            continue
+        if dive.t_s - heard_s > 1.0 - TICK_S / 2:
+            heard, heard_s = asked_for(dive.advice()), dive.t_s
+        if heard.any() and dive.t_s - heard_s > REACTION_S - TICK_S / 2:
+            asked, heard = heard, np.zeros(5)
         # The rate falls toward the end, so that it is reached without going too far.
         dive.tick(np.clip(asked / RAMP_S, -MOST, MOST))
-        asked = asked - dive.motion.rates * TICK_S
+        for still_to_do in (asked, heard):
+            np.subtract(still_to_do, dive.motion.rates * TICK_S, out=still_to_do, where=still_to_do != 0.0)
         asked[np.abs(asked) < (1.0, 1.0, 1.0, 1.0, 0.05)] = 0.0
     return dive.t_s - told_s
 
@@ -203,7 +260,7 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """Return, of each case, the times to a fix and the share within 5 s."""
     found: dict[str, Any] = {}
-    for case in CASES:
+    for case in args.case or CASES:
         times_s = [
             follow(WATERS[k % len(WATERS)], case, 1000 * args.seed + k, imu=not args.no_imu) for k in range(args.dives)
         ]

@@ -1,0 +1,316 @@
+"""What the divers should do for a fix where none tells how they stand: from what each camera sees and where it looks.
+
+Directions are pairs of angles, rad: to the right and down. With an attitude sensor they are from north and from the
+horizon, without one from the camera's present axis.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from buddyline.protocol.clock import S_NS
+from buddyline.protocol.messages import Candidates, NodeInfo
+from buddyline.solver_service.geometry.rig import NOMINAL_R_BODY_CAMERA, Rig
+from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix
+from buddyline.solver_service.sensors import attitude_at
+from buddyline.solver_service.streams import NodeStream
+from msgspec import UNSET
+
+# A light this share of the half field of view off the axis is well in the picture.
+WELL_INSIDE: Final = 0.8
+# Smaller turns are not worth a word; a diver turns in steps, and swims in steps.
+STEP_DEG: Final = 5
+STEP_M: Final = 0.5
+# So long a light that has left the picture is remembered; without an attitude sensor, and in the picture, this long.
+REMEMBERED_NS: Final = 3 * S_NS
+NOW_NS: Final = S_NS // 2
+# Of the newest frames about ten a second are looked at, and in each the likeliest candidates.
+FRAME_STEP_NS: Final = S_NS // 12
+BLOBS: Final = 12
+LIKELY: Final = 0.3
+# A lamp stays where it is, but for the divers' own motion; others' noise does not.
+STAYS_RAD: Final = math.radians(2.0)
+STAYS_RADPS: Final = math.radians(6.0)
+STAYING_SHARE: Final = 0.6
+# A bar is about level: it rises less than it reaches to the side.
+STEEPEST: Final = 1.0
+# By both compasses a node looks at the other to within this; further off it sees someone else's lamp.
+ASTRAY_RAD: Final = math.radians(12.0)
+# By more than this the two views tell on which side the other lamp must be.
+SIDE_RAD: Final = math.radians(8.0)
+# A lamp that looks larger than this, by its radius, is near.
+NEAR_RAD: Final = 0.012
+# More candidates than this hide the lamps.
+CROWD: Final = 20
+# Where a search has looked in this time is not searched again.
+SEARCHED_NS: Final = 20 * S_NS
+SEARCH_STEP_NS: Final = S_NS // 4
+LEVEL_RAD: Final = math.radians(25.0)
+# The search goes on by this much beyond the next direction, so that the divers need not stop and listen.
+ONWARD_RAD: Final = math.radians(20.0)
+GRID_RAD: Final = np.radians(np.arange(0.0, 360.0, 5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class NodeLook:
+    """What one node sees, and where it looks.
+
+    lights (n, 3), n <= 2: directions of what may be the other's lamps, and their radii, rad. axis (2,): of the camera.
+    half_rad (2,): half of its field of view. oriented: whether directions are from north and the horizon.
+    shown: median number of candidates. path (m, 3): its axis before, with the times, s.
+    """
+
+    lights: Floats
+    axis: Floats
+    half_rad: Floats
+    oriented: bool
+    shown: float
+    path: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def middle(self) -> Floats:
+        """The middle (2,) of the lights."""
+        turns = np.array([wrap(self.lights[:, 0] - self.lights[0, 0]), self.lights[:, 1]])
+        middle: Floats = turns.mean(axis=1) + np.array((self.lights[0, 0], 0.0))
+        return middle
+
+    @property
+    def apart_rad(self) -> float:
+        """How far two lights are apart."""
+        return math.hypot(float(wrap(self.lights[1, 0] - self.lights[0, 0])), float(np.diff(self.lights[:, 1])[0]))
+
+
+def wrap(angle_rad: Floats) -> Floats:
+    """Bring angles into -pi to pi."""
+    wrapped: Floats = (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+    return wrapped
+
+
+def look_of(stream: NodeStream, info: NodeInfo, rig: Rig) -> NodeLook:
+    """Return what a node sees and where it looks, by its newest frames and attitudes."""
+    newest_ns = stream.newest_ns or 0
+    oriented = attitude_at(stream.attitude, stream.attitude.newest_ns or 0) is not None
+    frames: list[Candidates] = []
+    for frame in reversed(stream.frames.between(newest_ns - (REMEMBERED_NS if oriented else NOW_NS), newest_ns)):
+        if not frames or frames[-1].stamp_ns - frame.stamp_ns >= FRAME_STEP_NS:
+            frames.append(frame)
+    seen = [_directions(stream, frame, rig, oriented) for frame in frames]
+    now_ns = stream.attitude.newest_ns or newest_ns
+    camera = info.camera
+    half_rad = np.array((math.atan(info.width_px / 2 / camera.fx_px), math.atan(info.height_px / 2 / camera.fy_px)))
+    axis = _angles(_R_level_camera(stream, now_ns, rig, oriented)[:, 2])
+    lights = _bar(_steady(seen, [(newest_ns - frame.stamp_ns) / S_NS for frame in frames], axis, half_rad))
+    shown = statistics.median([len(frame.blobs) + frame.truncated for frame in frames]) if frames else 0.0
+    return NodeLook(lights, axis, half_rad, oriented, shown, _path(stream, rig) if oriented else np.zeros((0, 3)))
+
+
+def advise_first(infos: Sequence[NodeInfo], looks: Sequence[NodeLook]) -> list[str]:
+    """Return what A and B should do; empty where nothing that they see says what is missing."""
+    names = [info.node for info in infos]
+    said = [
+        f"{name} sees {look.shown:.0f} lights: cover other lamps, keep away from silt"
+        for name, look in zip(names, looks, strict=True)
+        if look.shown > CROWD
+    ]
+    lengths_m = [math.dist(info.light_left_m, info.light_right_m) for info in infos]
+    goals = [_goal(looks[k], looks[1 - k], lengths_m[1 - k] / lengths_m[k]) for k in range(2)]
+    if goals[0] is None and goals[1] is None:
+        return said + _search(names, looks)
+    turns = [
+        f"turn {name} {words}"
+        for name, look, goal in zip(names, looks, goals, strict=True)
+        if goal is not None and (words := _turn(look, goal))
+    ]
+    return said + (turns or _distance(names, looks, lengths_m))
+
+
+def turn_words(right_rad: float, down_rad: float) -> str:
+    """Return a turn in steps, such as "20 deg left and 10 deg up"; "" for none."""
+    words = []
+    for angle_rad, (plus, minus) in ((right_rad, ("right", "left")), (down_rad, ("down", "up"))):
+        rounded = STEP_DEG * round(abs(math.degrees(angle_rad)) / STEP_DEG)
+        if rounded:
+            words.append(f"{rounded} deg {plus if angle_rad > 0 else minus}")
+    return " and ".join(words)
+
+
+def _R_level_camera(stream: NodeStream, stamp_ns: int, rig: Rig, oriented: bool) -> Floats:
+    found = attitude_at(stream.attitude, stamp_ns) if oriented else None
+    R: Floats = NOMINAL_R_BODY_CAMERA if found is None else quat_to_matrix(found[0]) @ rig.R_body_camera
+    return R
+
+
+def _angles(directions: Floats) -> Floats:
+    """Return the angles (..., 2) of directions (..., 3)."""
+    north, east, down = np.moveaxis(directions, -1, 0)
+    angles: Floats = np.stack((np.arctan2(east, north), np.arctan2(down, np.hypot(north, east))), axis=-1)
+    return angles
+
+
+def _directions(stream: NodeStream, frame: Candidates, rig: Rig, oriented: bool) -> Floats:
+    """Return the directions and radii (n, 3) of a frame's likeliest candidates; none if its attitude is not known."""
+    likely = [blob for blob in frame.blobs if blob.score is UNSET or blob.score >= LIKELY][:BLOBS]
+    if not likely or (oriented and attitude_at(stream.attitude, frame.stamp_ns) is None):
+        return np.zeros((0, 3))
+    bearings = rig.camera.bearings(np.array([(blob.u_px, blob.v_px) for blob in likely]))
+    radii_rad = np.sqrt([blob.area_px / math.pi for blob in likely]) / rig.camera.fx_px
+    angles = _angles(bearings @ _R_level_camera(stream, frame.stamp_ns, rig, oriented).T)
+    return np.column_stack((angles, radii_rad))[np.isfinite(bearings).all(axis=1)]
+
+
+def _steady(seen: list[Floats], ages_s: list[float], axis: Floats, half_rad: Floats) -> list[Floats]:
+    """Return the lights (3,) that most of four neighbouring frames agree on, the newest first.
+
+    seen: directions and radii in each frame, the newest first. Of what should be in the picture now only the
+    present counts.
+    """
+    steady: list[Floats] = []
+    for k, directions in enumerate(seen):
+        beside = [j for j in range(max(k - 2, 0), min(k + 3, len(seen))) if j != k]
+        for one in directions:
+            inside = bool((np.abs(_between(one, axis)) < 0.9 * half_rad).all())
+            known = any(_near(one, np.array([other]), ages_s[k]) for other in steady)
+            if known or (inside and ages_s[k] > NOW_NS / S_NS):
+                continue
+            agree = sum(_near(one, seen[j], abs(ages_s[j] - ages_s[k])) for j in beside)
+            if agree >= max(STAYING_SHARE * len(beside), 2):
+                steady.append(one)
+    return steady
+
+
+def _between(one: Floats, other: Floats) -> Floats:
+    """Return the turn (2,) from another direction to this one; more columns do not count."""
+    turn: Floats = np.array((float(wrap(one[0] - other[0])), float(one[1] - other[1])))
+    return turn
+
+
+def _near(one: Floats, others: Floats, apart_s: float) -> bool:
+    """Return whether one of others (n, 3) may be the same light, apart_s before or after."""
+    off_rad = np.hypot(wrap(others[:, 0] - one[0]) * math.cos(one[1]), others[:, 1] - one[1])
+    return bool((off_rad < STAYS_RAD + STAYS_RADPS * apart_s).any())
+
+
+def _bar(lights: list[Floats]) -> Floats:
+    """Return the two (2, 3) of several lights that stand most level beside each other; of two, both."""
+    if len(lights) < 3:
+        return np.array(lights).reshape(-1, 3)
+
+    def steepness(pair: tuple[Floats, Floats]) -> float:
+        right_rad, down_rad = np.abs(_between(*pair)).tolist()
+        return float(down_rad / max(right_rad, 1e-6))
+
+    pairs = [(one, other) for at, one in enumerate(lights) for other in lights[:at]]
+    best = min(pairs, key=steepness)
+    return np.array(best) if steepness(best) < STEEPEST else np.array(lights[:1])
+
+
+def _path(stream: NodeStream, rig: Rig) -> Floats:
+    """Return where a camera has looked lately: rows of right, down and time, s."""
+    newest_ns = stream.attitude.newest_ns or 0
+    rows: list[tuple[float, float, float]] = []
+    for sample in reversed(stream.attitude.between(newest_ns - SEARCHED_NS, newest_ns)):
+        at_s = sample.stamp_ns / S_NS
+        if not rows or rows[-1][2] - at_s >= SEARCH_STEP_NS / S_NS:
+            right_rad, down_rad = _angles(quat_to_matrix(np.array(sample.q_ned_body_xyzw)) @ rig.R_body_camera[:, 2])
+            rows.append((float(right_rad), float(down_rad), at_s))
+    return np.array(rows).reshape(-1, 3)
+
+
+def _goal(look: NodeLook, other: NodeLook, size: float) -> Floats | None:
+    """Return the directions (n, 2) in which the other's lamps, or its camera, must be; None where nothing says it.
+
+    size: length of the other's bar over that of this node's own.
+    """
+    if len(look.lights) == 2:
+        return look.lights[:, :2]
+    facing = None
+    if look.oriented and other.oriented and len(other.lights):
+        facing = other.middle * (1.0, -1.0) + np.array((math.pi, 0.0))
+    if len(look.lights) == 0:
+        return None if facing is None else facing[None]
+    light = look.lights[0, :2]
+    off_rad = _between(light, look.axis)
+    missed_rad = None if facing is None else _between(facing, light)
+    known = len(other.lights) == 2
+    apart_rad = other.apart_rad * size if known else WELL_INSIDE * float(look.half_rad[0])
+    if known and missed_rad is not None and float(np.abs(missed_rad).max()) > ASTRAY_RAD + apart_rad / 2:
+        # What it sees is a stranger's lamp.
+        return None if facing is None else facing[None]
+    side = off_rad[0]
+    if missed_rad is not None and (known or abs(missed_rad[0]) > SIDE_RAD):
+        side = missed_rad[0]
+    elif float(np.abs(off_rad / look.half_rad).max()) < 0.5:
+        # Nothing tells on which side the other lamp is.
+        return light[None]
+    lamps: Floats = light + np.array(((0.0, 0.0), (math.copysign(apart_rad, side), 0.0)))
+    return lamps
+
+
+def _turn(look: NodeLook, goal: Floats) -> str:
+    """Return the turn to the middle of a goal (n, 2); "" if all of it is well in the picture."""
+    offs = np.array([_between(one, look.axis) for one in goal])
+    inside = np.abs(offs).max(axis=0) <= WELL_INSIDE * look.half_rad
+    right_rad, down_rad = np.where(inside, 0.0, offs.mean(axis=0)).tolist()
+    return turn_words(right_rad, down_rad)
+
+
+def _distance(names: list[str], looks: Sequence[NodeLook], lengths_m: list[float]) -> list[str]:
+    """Return what nodes should do that look at each other: lights too far apart for the picture, or too faint."""
+    nearer_m, ranges_m = 0.0, []
+    for look, length_m in zip(looks, reversed(lengths_m), strict=True):
+        if len(look.lights) == 2:
+            range_m = length_m / 2 / math.tan(max(look.apart_rad, 1e-3) / 2)
+            ranges_m.append(range_m)
+            nearer_m = max(nearer_m, length_m / 2 / math.tan(WELL_INSIDE * float(look.half_rad[0])) - range_m)
+    if nearer_m > 0.0:
+        return [f"move {math.ceil(nearer_m / STEP_M) * STEP_M:.1f} m apart"]
+    if all(len(look.lights) == 1 and look.lights[0, 2] > NEAR_RAD for look in looks):
+        return [f"move {2 * STEP_M:.1f} m apart"]
+    few = [k for k in range(2) if len(looks[k].lights) < 2]
+    words = [f"{names[k]} sees {('no lamp', 'one lamp')[len(looks[k].lights)]} of {names[1 - k]}" for k in few]
+    step_m = round(0.25 * min(ranges_m) / STEP_M) * STEP_M if ranges_m else 2 * STEP_M
+    return [*words, f"come {max(step_m, STEP_M):.1f} m closer"] if few else []
+
+
+def _search(names: list[str], looks: Sequence[NodeLook]) -> list[str]:
+    """Return where two nodes should look that see nothing of each other.
+
+    By their compasses they are turned face to face, whatever lies between them, then on together.
+    """
+    words = [f"{names[0]} and {names[1]} do not see each other"]
+    blind = [name for name, look in zip(names, looks, strict=True) if not look.oriented]
+    if blind:
+        return [*words, f"turn {blind[0]} slowly left"]
+    a, b = looks
+    turns = np.array([wrap(GRID_RAD - a.axis[0]), wrap(GRID_RAD + math.pi - b.axis[0])])
+    cost = np.abs(turns).max(axis=0) + np.where(_searched(a, b), 2.0 * math.pi, 0.0)
+    right = turns[:, int(np.argmin(cost))]
+    if right[0] * right[1] > 0.0:
+        right = right + math.copysign(ONWARD_RAD, right[0])
+    for name, look, angle_rad in zip(names, looks, right.tolist(), strict=True):
+        down_rad = -float(look.axis[1]) if abs(look.axis[1]) > LEVEL_RAD else 0.0
+        if turn := turn_words(angle_rad, down_rad):
+            words.append(f"turn {name} {turn}")
+    return words
+
+
+def _searched(a: NodeLook, b: NodeLook) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return, of each direction from A to B on the grid, whether both have looked along it lately."""
+    if len(a.path) < 1 or len(b.path) < 1:
+        return np.zeros(len(GRID_RAD), bool)
+    # Rows are the newest first; a heading is unwrapped before it is taken between samples.
+    later = b.path[::-1]
+    of_b = [
+        np.interp(a.path[:, 2], later[:, 2], np.unwrap(later[:, 0])),
+        np.interp(a.path[:, 2], later[:, 2], later[:, 1]),
+    ]
+    along = np.abs(wrap(GRID_RAD[:, None] - a.path[:, 0])) < WELL_INSIDE * a.half_rad[0]
+    back = np.abs(wrap(GRID_RAD[:, None] + math.pi - of_b[0])) < WELL_INSIDE * b.half_rad[0]
+    level = (np.abs(a.path[:, 1]) < LEVEL_RAD) & (np.abs(of_b[1]) < LEVEL_RAD)
+    searched: np.ndarray[tuple[int], np.dtype[np.bool_]] = (along & back & level).any(axis=1)
+    return searched
