@@ -168,9 +168,13 @@ class Bus(ABC):
         Without a connection to the hub no name counts as alive.
         """
 
-    @abstractmethod
     def is_alive(self, name: str) -> bool:
         """Return whether another process on this bus has declared name."""
+        return check_alive_name(name) in self.others_alive(name)
+
+    @abstractmethod
+    def others_alive(self, name: str = "**") -> set[str]:
+        """Return the names, all or this one, that other processes have declared, as the hub knows them now."""
 
     @abstractmethod
     def withdraw_alive(self, name: str) -> None:

@@ -243,11 +243,10 @@ class LocalBus(Bus):
             self._subscriptions.append(watch)
         return watch
 
-    def is_alive(self, name: str) -> bool:
-        """Return whether another client of this network has declared name."""
-        check_alive_name(name)
+    def others_alive(self, name: str = "**") -> set[str]:
+        """Return the names, all or this one, that other clients of this network have declared."""
         with self._network.lock:
-            return any(name == other and bus is not self for other, bus in self._network.alive)
+            return {other for other, bus in self._network.alive if name in ("**", other) and bus is not self}
 
     def _leave(self) -> None:
         with self._network.lock:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
+import msgspec
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Message, Rejected, RelativePose
 
@@ -20,20 +21,36 @@ HANDED_OVER_NS: Final = 2 * S_NS
 THIS_DIVE_NS: Final = 600 * S_NS
 
 
-def is_in_order(outcome: Outcome) -> bool:
-    """Return whether an outcome shows that all earlier triggers were answered; one that came `late` does not."""
-    return not (isinstance(outcome, Rejected) and outcome.reason == "late")
+class Answer(msgspec.Struct, frozen=True):
+    """What counts of an outcome that has been published. reason: "" for a pose."""
+
+    node_a: str
+    node_b: str
+    trigger: int
+    stamp_ns: int
+    reason: str = ""
+
+    @property
+    def in_order(self) -> bool:
+        """Whether it shows that all earlier triggers were answered; one that came `late` does not."""
+        return self.reason != "late"
+
+
+def answer_of(outcome: Outcome) -> Answer:
+    """Return what counts of an outcome."""
+    reason = outcome.reason if isinstance(outcome, Rejected) else ""
+    return Answer(outcome.node_a, outcome.node_b, outcome.trigger, outcome.stamp_ns, reason)
 
 
 class Answered:
     """Withholds outcomes that were published before, for all pairs. said: the last published outcomes of each pair."""
 
-    def __init__(self, said: Iterable[Outcome] = ()) -> None:
-        self._said: dict[tuple[str, str], list[Outcome]] = {}
+    def __init__(self, said: Iterable[Answer] = ()) -> None:
+        self._said: dict[tuple[str, str], list[Answer]] = {}
         self._pairs: dict[tuple[str, str], AnsweredPair] = {}
         self.know(said)
 
-    def know(self, said: Iterable[Outcome]) -> None:
+    def know(self, said: Iterable[Answer]) -> None:
         """Take the last outcomes that were published before."""
         for outcome in said:
             self._said.setdefault((outcome.node_a, outcome.node_b), []).append(outcome)
@@ -58,7 +75,7 @@ class Answered:
         """Note a frame that was sent after this solver joined; return withheld outcomes to publish now."""
         return [outcome for nodes in pairs for outcome in self.pair(nodes).saw_new_frame(trigger, stamp_ns)]
 
-    def take_over(self, nodes: tuple[str, str], said: Iterable[Outcome]) -> int:
+    def take_over(self, nodes: tuple[str, str], said: Iterable[Answer]) -> int:
         """Go on with a pair that another solver had; return the time of that one's last answer, 0 for none."""
         pair = self._pairs[nodes] = AnsweredPair(said, taken_over=True)
         return pair.up_to_ns
@@ -79,14 +96,14 @@ class AnsweredPair:
     frames of the last seconds that it has answered may still come. up_to_ns: the time of the last answer, 0 for none.
     """
 
-    def __init__(self, said: Iterable[Outcome] = (), *, taken_over: bool = False) -> None:
+    def __init__(self, said: Iterable[Answer] = (), *, taken_over: bool = False) -> None:
         self._taken_over = taken_over
         said = list(said)
-        in_order = [one for one in said if is_in_order(one)]
+        in_order = [one for one in said if one.in_order]
         self._up_to: int | None = max((one.trigger for one in in_order), default=None)
         self.up_to_ns = max((one.stamp_ns for one in in_order), default=0)
         # An outcome that came `late` says nothing of other triggers.
-        self._late = {one.trigger for one in said if not is_in_order(one)}
+        self._late = {one.trigger for one in said if not one.in_order}
         self._withheld: deque[Outcome] = deque(maxlen=MAX_WITHHELD)
 
     def answers(self, trigger: int) -> bool:

@@ -12,15 +12,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+import msgspec
 from buddyline.protocol.bus import CACHE_S
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
-from buddyline.protocol.envelope import Envelope, open_envelope
-from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message
 from buddyline.protocol.statusfile import runtime_directory
-from buddyline.protocol.topics import key_of
-from buddyline.solver_service.answered import Outcome, is_in_order
+from buddyline.protocol.topics import POSE, REJECTED, key_of, parse_key
+from buddyline.solver_service.answered import Answer, Outcome, answer_of
 
 log = logging.getLogger(__name__)
 
@@ -39,12 +38,12 @@ KEPT_S: Final = 600.0
 class Noted:
     """What earlier solvers at this hub have received and said.
 
-    said: outcomes, in their order. recent: those of the last minute, as they were published. frames: node, trigger and
-    stamp of the frames of the last minute.
+    said: answers, in their order. recent: key and payload of the outcomes of the last minute, as they were published.
+    frames: node, trigger and stamp of the frames of the last minute.
     """
 
-    said: list[Outcome] = field(default_factory=list)
-    recent: list[Envelope] = field(default_factory=list)
+    said: list[Answer] = field(default_factory=list)
+    recent: list[tuple[str, bytes]] = field(default_factory=list)
     frames: list[tuple[str, int, int]] = field(default_factory=list)
 
 
@@ -61,6 +60,7 @@ class Journal:
         self._common = path
         self.path = path.with_name(f"{path.name}.{instance}") if instance else path
         self._last: dict[tuple[str, str], bytes] = {}
+        self._decoder = msgspec.json.Decoder(Answer)
         self._file: int | None = None
         self._bytes = 0
         self._failed = False
@@ -72,11 +72,15 @@ class Journal:
         name = re.sub(r"[^A-Za-z0-9]+", "-", f"{endpoint} {namespace}").strip("-")
         return None if directory is None else cls(directory / f"solver-{name}.answered", instance)
 
-    def read(self, now_ns: int) -> Noted:
-        """Return what is noted; a line that was cut off is left out. now_ns: wall clock."""
+    def read(self, now_ns: int, pairs: Iterable[tuple[str, str]] | None = None) -> Noted:
+        """Return what is noted, of these pairs if given; a line that was cut off is left out. now_ns: wall clock."""
+        wanted = None if pairs is None else {topic.key(*pair).encode() for pair in pairs for topic in (POSE, REJECTED)}
         past = Noted()
+        recent: list[tuple[int, str, bytes]] = []
         for line in self._lines():
             key, _, payload = line.partition(b" ")
+            if wanted is not None and key not in wanted:
+                continue
             if key == FRAME:
                 words = payload.split()
                 if len(words) == FRAME_WORDS and words[-1] == END and all(word.isdigit() for word in words[1:3]):
@@ -84,17 +88,21 @@ class Journal:
                     past.frames += [frame] * (abs(now_ns - frame[2]) < CACHE_S * S_NS)
                 continue
             try:
-                noted = open_envelope(key.decode("ascii", "replace"), payload)
-            except MessageError:
+                one = self._decoder.decode(payload)
+            except msgspec.DecodeError:
                 continue
-            if isinstance(noted.message, Outcome):
-                past.said.append(noted.message)
-                past.recent += [noted] * (abs(now_ns - noted.stamp_ns) < CACHE_S * S_NS)
-                if is_in_order(noted.message):
-                    self._last[noted.message.node_a, noted.message.node_b] = line + b"\n"
+            named = key.decode("ascii", "replace")
+            if (parsed := parse_key(named)) is None or parsed[0] not in (POSE, REJECTED):
+                continue
+            past.said.append(one)
+            if abs(now_ns - one.stamp_ns) < CACHE_S * S_NS:
+                recent.append((one.stamp_ns, named, payload))
+            if one.in_order:
+                self._last[one.node_a, one.node_b] = line + b"\n"
         if self.path != self._common:
             past.said.sort(key=lambda one: one.stamp_ns)
-            past.recent.sort(key=lambda one: one.stamp_ns)
+            recent.sort(key=lambda each: each[0])
+        past.recent = [each[1:] for each in recent]
         return past
 
     def _lines(self) -> Iterator[bytes]:
@@ -114,7 +122,7 @@ class Journal:
         if lines:
             self._write(b"".join(lines))
         for message, line in zip(outcomes, lines, strict=True):
-            if is_in_order(message):
+            if answer_of(message).in_order:
                 self._last[message.node_a, message.node_b] = line
 
     def add_frame(self, frame: Candidates) -> None:

@@ -11,19 +11,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from buddyline.protocol.clock import Clock, SystemClock
-from buddyline.protocol.envelope import Envelope, Refusals
+from buddyline.protocol.envelope import Refusals
 from buddyline.protocol.errors import MessageError
 from buddyline.protocol.messages import Candidates, Message, Rejected
 from buddyline.protocol.security import PLAYER
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import ATTITUDE, CANDIDATES, DEPTH, IMU, INFO, NET_POSE, POSE, REJECTED, Topic, key_of
-from buddyline.solver_service.answered import THIS_DIVE_NS, Answered, Outcome, is_in_order
+from buddyline.protocol.topics import (
+    ATTITUDE,
+    CANDIDATES,
+    DEPTH,
+    IMU,
+    INFO,
+    NET_POSE,
+    POSE,
+    REJECTED,
+    Topic,
+    key_of,
+    parse_key,
+)
+from buddyline.solver_service.answered import THIS_DIVE_NS, Answer, Answered, Outcome, answer_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.journal import Journal, Noted
 from buddyline.solver_service.pair_core import PUBLISHED, PUBLISHED_FOR_NODES, PairId
-from buddyline.solver_service.shared_work import SharedWork
+from buddyline.solver_service.shared_work import CLAIM_S, SharedWork
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher, Received
@@ -31,9 +43,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
-# The core gets the time at this interval; every fourth time the status is published.
+# The core gets the time, and the status is published, at these intervals.
 TICK_S: Final = 0.25
-TICKS_A_STATUS: Final = 4
+STATUS_S: Final = 1.0
 MAX_ALIVE_NAME: Final = 64
 WAIT_S: Final = 1.0
 # Within this time the nodes have connected again, sent what was missed, and the solver has waited for all.
@@ -62,6 +74,8 @@ class SolverService(Service):
         self._declared: set[PairId] = set()
         self._refused = ""
         self._news = False
+        # Set where the work may have to be shared anew.
+        self._wake = threading.Event()
         self._handled = 0
         self._answered = Answered()
         self._work = SharedWork(self.core, self._answered) if config.share else None
@@ -106,12 +120,15 @@ class SolverService(Service):
                 nodes = [node for pair in self.config.chosen or () for node in pair]
                 bus.declare_alive(f"solver/{'_'.join(dict.fromkeys(nodes))[:MAX_ALIVE_NAME] or 'any'}")
             log.info("solver: connected to %s", self.config.connect)
-            ticks = 0
-            while not self.stop.wait(TICK_S):
-                ticks += 1
-                self.tick(ticks % TICKS_A_STATUS == 0)
-                if ticks % TICKS_A_STATUS == 0:
+            told_s = time.monotonic()
+            while not self.stop.is_set():
+                self._wake.wait(CLAIM_S if self._work is not None and self._work.sharing.waits else TICK_S)
+                self._wake.clear()
+                status_due = time.monotonic() - told_s >= STATUS_S
+                if status_due:
+                    told_s = time.monotonic()
                     self.heartbeat()
+                self.tick(status_due)
             if self._work is None or self._work.sharing.alone:
                 with self._lock:
                     self._publish(self.core.flush())
@@ -153,13 +170,20 @@ class SolverService(Service):
             self._shown = work.declare(bus, self._shown)
         if not begin:
             return
-        past, said = self._read_past(bus)
+        alive = bus.others_alive()
+        if bus.hub != hub:
+            work.sharing.cut_off = True
+            return
+        begin = work.sharing.unheld(begin, alive)
+        past, said = self._read_past(bus, [(task[0], task[1]) for task in begin if task])
         for task in begin:
             with self._turn():
-                self._repeat([one for one in past.recent if one.ids == task])
                 found = work.begin(task, said, self.clock.now_ns())
                 self._declare()
                 self._publish(found)
+        # Last, because it takes longer than all else, and helps only those who had lost the hub.
+        with self._turn():
+            self._repeat(past.recent)
         log.info("solver: takes up %s", ", ".join("/".join(task) or "the network" for task in begin))
 
     def _hear(self, received: Received) -> None:
@@ -225,6 +249,7 @@ class SolverService(Service):
             self._news |= self.core.health.saw_process(name, alive)
             if self._work is not None:
                 self._work.sharing.saw(name, alive)
+                self._wake.set()
 
     def report(self) -> None:
         """Publish each pair's status."""
@@ -306,11 +331,12 @@ class SolverService(Service):
                 self._owed.pop(((message.node_a, message.node_b), message.trigger), None)
         self.core.saw_published(unsaid, self.clock.now_ns())
 
-    def _repeat(self, published: Iterable[Envelope]) -> None:
+    def _repeat(self, published: Iterable[tuple[str, bytes]]) -> None:
         """Publish an earlier solver's last outcomes again, for those who have missed them: it answers nobody now."""
-        for one in published:
-            self._publisher_of(one.topic, *one.ids)
-            self._publishers[one.key].repeat(one.payload)
+        for key, payload in published:
+            if key not in self._publishers and (parsed := parse_key(key)) is not None:
+                self._publisher_of(parsed[0], *parsed[1])
+            self._publishers[key].repeat(payload)
 
     def _expect_again(self, past: Noted) -> None:
         """Note of which triggers an earlier solver has received a frame and said nothing.
@@ -338,9 +364,9 @@ class SolverService(Service):
         for pair, trigger in owed:
             self._answered.pair(pair).give_up(trigger)
 
-    def _read_past(self, bus: Bus) -> tuple[Noted, list[Outcome]]:
-        """Return what the journals know, and the outcomes of all solvers so far."""
-        past = self._journal.read(self.clock.now_ns()) if self._journal is not None else Noted()
+    def _read_past(self, bus: Bus, pairs: Iterable[PairId] | None = None) -> tuple[Noted, list[Answer]]:
+        """Return what the journals know, of these pairs if given, and the last answers of all solvers so far."""
+        past = self._journal.read(self.clock.now_ns(), pairs) if self._journal is not None else Noted()
         return past, _said_of(_held_by(bus), past.said)
 
 
@@ -349,10 +375,10 @@ def _pulse(work: SharedWork, stop: threading.Event) -> None:
         work.pulse()
 
 
-def _said_of(held: Iterable[Outcome], noted: Iterable[Outcome]) -> list[Outcome]:
+def _said_of(held: Iterable[Answer], noted: Iterable[Answer]) -> list[Answer]:
     """Return each pair's last outcomes by the journal, or as the hub holds them if the journal does not know those."""
     by_journal, by_hub = _by_pair(noted), _by_pair(held)
-    said: list[Outcome] = []
+    said: list[Answer] = []
     for pair in {**by_journal, **by_hub}:
         of_journal, of_hub = by_journal.get(pair, []), by_hub.get(pair, [])
         known = {(one.trigger, one.stamp_ns) for one in of_journal}
@@ -360,20 +386,20 @@ def _said_of(held: Iterable[Outcome], noted: Iterable[Outcome]) -> list[Outcome]
             said += of_hub
         else:
             # What the journal has beyond the hub was published too, and is published again.
-            said += [one for one in of_journal if is_in_order(one)][-1:]
-            said += [one for one in of_journal if not is_in_order(one)]
+            said += [one for one in of_journal if one.in_order][-1:]
+            said += [one for one in of_journal if not one.in_order]
     return said
 
 
-def _by_pair(outcomes: Iterable[Outcome]) -> dict[PairId, list[Outcome]]:
-    found: dict[PairId, list[Outcome]] = {}
+def _by_pair(outcomes: Iterable[Answer]) -> dict[PairId, list[Answer]]:
+    found: dict[PairId, list[Answer]] = {}
     for one in outcomes:
         found.setdefault((one.node_a, one.node_b), []).append(one)
     return found
 
 
-def _held_by(bus: Bus) -> list[Outcome]:
+def _held_by(bus: Bus) -> list[Answer]:
     """Return the last outcome of each pair that earlier solvers have published, as kept by the hub."""
     refusals = Refusals("solver, of what the hub holds")
     held = [refusals.open(received) for topic in (POSE, REJECTED) for received in bus.newest(topic)]
-    return [one.message for one in held if one and isinstance(one.message, Outcome)]
+    return [answer_of(one.message) for one in held if one and isinstance(one.message, Outcome)]

@@ -6,14 +6,15 @@ by the journals. Nothing is left out: the frames of the last minute are in the w
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import Message, Rejected
-from buddyline.solver_service.answered import HANDED_OVER_NS, Answered, Outcome
+from buddyline.protocol.messages import Message
+from buddyline.solver_service.answered import HANDED_OVER_NS, Answer, Answered
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.pair_core import PairId
 from buddyline.solver_service.sharing import NETWORK, Sharing, Task
@@ -23,20 +24,15 @@ if TYPE_CHECKING:
 
 # A solver that joins, or comes back to the hub, first hears for so long who else is there.
 SETTLE_S: Final = 0.5
+# From a claim to the start: what the one before has said last is still under way. A new one, which some of the others
+# may not see yet, waits longer.
+CLAIM_S: Final = 0.1
+NEW_CLAIM_S: Final = 0.25
+NEW_S: Final = 2.0
 # One that stood still for so long may have lost its tasks: the hub gives a silent client up after three seconds.
 FROZEN_S: Final = 2.5
 
 TWICE: Final = "another solver on this hub does not share the work, and triggers are answered twice"
-
-
-class Answer(msgspec.Struct):
-    """What counts of an outcome that another solver has published. reason: "" for a pose."""
-
-    node_a: str
-    node_b: str
-    trigger: int
-    stamp_ns: int
-    reason: str = ""
 
 
 class SharedWork:
@@ -53,6 +49,7 @@ class SharedWork:
         self._pulse_s = now_s()
         self._stood_still = False
         self._settled_s = self._pulse_s + SETTLE_S
+        self._planned_s = -math.inf
         self._hub: str | None = None
         self._shown: set[str] = set()
         self._heard: dict[PairId, Answer] = {}
@@ -83,7 +80,7 @@ class SharedWork:
             one = self._decoder.decode(payload)
         except msgspec.DecodeError as error:
             raise MessageError(str(error)) from error
-        if one.reason != "late":
+        if one.in_order:
             self._heard[one.node_a, one.node_b] = one
         return self._core.network is not None and (one.node_a, one.node_b) not in self._core.pairs
 
@@ -91,13 +88,15 @@ class SharedWork:
         """Let tasks go; return those to begin now, by `begin`. hub: the hub's id; None while there is none."""
         now_s = self._now_s()
         self.pulse()
-        if hub is None or hub != self._hub or self._stood_still:
+        if hub is None or hub != self._hub or self._stood_still or self.sharing.cut_off:
             # The others could not see this solver, or it could not see them.
             self._settled_s = now_s + SETTLE_S
             self._release(self.sharing.let_go())
         self._hub, self._stood_still = hub, False
-        if now_s < self._settled_s:
+        pause_s = CLAIM_S if now_s > self._settled_s + NEW_S else NEW_CLAIM_S
+        if now_s < max(self._settled_s, self._planned_s + pause_s):
             return []
+        self._planned_s = now_s
         plan = self.sharing.plan([*self._core.possible_pairs(), NETWORK])
         self._release(plan.release)
         self._shown |= {self.sharing.name, *map(self.sharing.task_name, plan.claim)}
@@ -112,7 +111,7 @@ class SharedWork:
             bus.declare_alive(name)
         return wanted
 
-    def begin(self, task: Task, said: Iterable[Outcome], receive_ns: int) -> Sequence[Message]:
+    def begin(self, task: Task, said: Iterable[Answer], receive_ns: int) -> Sequence[Message]:
         """Take up a task; return what is to be published. said: the last answers that hub or journals know."""
         if task not in self.sharing.begun:
             return []
@@ -122,13 +121,7 @@ class SharedWork:
         node_a, node_b = task
         known = [one for one in said if (one.node_a, one.node_b) == task]
         heard = self._heard.get((node_a, node_b))
-        if heard is not None:
-            # Only pair, trigger and time count: any reason will do that is not `late`.
-            known.append(
-                Rejected(
-                    node_a=node_a, node_b=node_b, stamp_ns=heard.stamp_ns, trigger=heard.trigger, reason="ambiguous"
-                )
-            )
+        known += [] if heard is None else [heard]
         said_ns = self._answered.take_over((node_a, node_b), known)
         return self._core.adopt((node_a, node_b), max(said_ns - HANDED_OVER_NS, 0), said_ns, receive_ns)
 

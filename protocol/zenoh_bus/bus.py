@@ -268,12 +268,12 @@ class ZenohBus(Bus):
             self._subscriptions.append(watch)
         return watch
 
-    def is_alive(self, name: str) -> bool:
-        """Return whether another process on this bus has declared name."""
-        replies = self._session.liveliness().get(f"{ALIVE}/{check_alive_name(name)}/*", timeout=QUERY_S)
+    def others_alive(self, name: str = "**") -> set[str]:
+        """Return the names, all or this one, that other processes have declared, as the hub knows them now."""
+        replies = self._session.liveliness().get(f"{ALIVE}/{name}/*", timeout=QUERY_S)
+        tokens = [str(reply.ok.key_expr).removeprefix(f"{ALIVE}/") for reply in replies if reply.ok is not None]
         own = str(self._session.zid())
-        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-        return any(not key.endswith(f"/{own}") for key in keys)
+        return {alive for alive, _, process in (token.rpartition("/") for token in tokens) if process != own}
 
     def close(self) -> None:
         """Close publishers and subscriptions and leave the bus; a second call does nothing."""

@@ -10,7 +10,7 @@ from buddyline.protocol.local_bus import LocalNetwork, LocalPublisher
 from buddyline.protocol.messages import Candidates, Rejected
 from buddyline.protocol.topics import key_of, parse_key
 from buddyline.solver_service import service as service_module
-from buddyline.solver_service.answered import Answered, AnsweredPair
+from buddyline.solver_service.answered import Answered, AnsweredPair, answer_of
 from buddyline.solver_service.config import SolverConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
@@ -40,40 +40,40 @@ def test_the_first_solver_says_everything():
 
 
 def test_what_was_said_is_not_said_again_and_what_was_not_is():
-    answered = AnsweredPair([outcome(3), outcome(7)])
+    answered = AnsweredPair(map(answer_of, [outcome(3), outcome(7)]))
     assert unsaid(answered, range(12)) == [8, 9, 10, 11]
     assert answered.saw_new_frame(12, 12) == []
     assert unsaid(answered, [5, 12]) == [12]
 
 
 def test_a_late_rejection_out_of_a_clock_that_is_ahead_says_nothing_of_the_others():
-    answered = AnsweredPair([outcome(7), outcome(10**6, "late")])
+    answered = AnsweredPair(map(answer_of, [outcome(7), outcome(10**6, "late")]))
     assert unsaid(answered, range(10)) == [8, 9]
 
 
 def test_another_dive_is_no_answered_one():
     """Its frames came before the solver did, and those that come now have triggers that were answered."""
-    answered = AnsweredPair([outcome(100)])
+    answered = AnsweredPair(map(answer_of, [outcome(100)]))
     assert unsaid(answered, [1, 2]) == []
     assert triggers(answered.saw_new_frame(3, 3)) == [1, 2]
     assert unsaid(answered, [3]) == [3]
 
 
 def test_what_was_said_for_certain_stays_so_when_another_dive_begins():
-    answered = AnsweredPair([outcome(7)])
+    answered = AnsweredPair(map(answer_of, [outcome(7)]))
     assert unsaid(answered, [6, 8]) == [8]
     assert answered.saw_new_frame(2, 2) == []
     assert unsaid(answered, [2]) == [2]
 
 
 def test_pairs_are_answered_each_for_itself():
-    answered = Answered([outcome(7)])
+    answered = Answered(map(answer_of, [outcome(7)]))
     other = Rejected(node_a="a", node_b="c", stamp_ns=5, trigger=5, reason="unmatched")
     status = SolverCore(Settings(), [("a", "b")]).report(0, 0, 0, [])
     assert answered.unsaid([outcome(5), other, *status, outcome(8)]) == [other, *status, outcome(8)]
     # A frame of a is over only where all of its pairs have had it.
     now_ns = 10**18
-    answered = Answered([replace(outcome(7), stamp_ns=now_ns)])
+    answered = Answered(map(answer_of, [replace(outcome(7), stamp_ns=now_ns)]))
     assert answered.is_over([("a", "b")], now_ns - 60 * S_NS, now_ns)
     assert not answered.is_over([("a", "b"), ("a", "c")], now_ns - 60 * S_NS, now_ns)
 
@@ -82,8 +82,8 @@ def test_of_a_live_dive_only_the_last_moments_are_solved_again():
     now_ns = 10**18
     said = Rejected(node_a="a", node_b="b", stamp_ns=now_ns - 20 * S_NS, trigger=7, reason="ambiguous")
     for age_s, over in ((60, True), (31, True), (29, False), (20, False), (1, False)):
-        assert AnsweredPair([said]).is_over(now_ns - age_s * S_NS, now_ns) is over
-        assert not AnsweredPair([said]).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
+        assert AnsweredPair(map(answer_of, [said])).is_over(now_ns - age_s * S_NS, now_ns) is over
+        assert not AnsweredPair(map(answer_of, [said])).is_over(now_ns - age_s * S_NS, now_ns + 3600 * S_NS)
         assert not AnsweredPair().is_over(now_ns - age_s * S_NS, now_ns)
 
 
@@ -147,7 +147,7 @@ def test_what_a_link_held_up_is_not_answered_again(player):
         service.attach(bus)
         service.watch("player", player)
         said = Rejected(node_a="a", node_b="b", stamp_ns=last.stamp_ns, trigger=last.trigger, reason="unmatched")
-        service._answered = Answered([said])
+        service._answered = Answered(map(answer_of, [said]))
         for message in messages:
             clock.set_ns(clock.now_ns() + 1)
             service.receive(Received(key_of(message), encode(message), clock.now_ns(), ""))

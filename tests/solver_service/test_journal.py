@@ -3,8 +3,9 @@
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.codec import encode
 from buddyline.protocol.messages import Candidates, Rejected
+from buddyline.protocol.topics import key_of
 from buddyline.solver_service import journal
-from buddyline.solver_service.answered import Answered
+from buddyline.solver_service.answered import Answered, answer_of
 from buddyline.solver_service.journal import Journal
 from buddyline.solver_service.service import _said_of
 
@@ -50,9 +51,19 @@ def test_outcomes_of_the_last_minute_and_frames_are_read_back_as_they_were(tmp_p
         one.add_frame(each)
     one.add(said[2:])
     past = Journal(path).read(NOW_NS)
-    assert past.said == said
-    assert [one.payload for one in past.recent] == [encode(one) for one in said[1:]]
+    assert past.said == [answer_of(one) for one in said]
+    assert past.recent == [(key_of(one), encode(one)) for one in said[1:]]
     assert past.frames == [("a", k, frame(k).stamp_ns) for k in (2, 3)]
+
+
+def test_one_that_takes_over_a_pair_reads_of_no_other(tmp_path):
+    path = tmp_path / "solver.answered"
+    one = Journal(path)
+    one.add([outcome(3), outcome(4, ("a", "c"))])
+    one.add_frame(frame(3))
+    past = Journal(path).read(NOW_NS, [("a", "c")])
+    assert past.said == [answer_of(outcome(4, ("a", "c")))]
+    assert past.frames == []
 
 
 def test_a_line_that_was_cut_off_is_left_out(tmp_path):
@@ -88,10 +99,13 @@ def test_what_it_says_is_not_answered_again(tmp_path):
 
 
 def test_the_journal_goes_on_from_what_the_hub_holds_unless_that_is_another_solvers():
-    noted = [outcome(5), outcome(6), outcome(7)]
-    assert _said_of([outcome(6), outcome(4)], noted) == [outcome(7)]
-    assert _said_of([outcome(9), outcome(8)], noted) == [outcome(9), outcome(8)]
-    assert _said_of([outcome(9, ("a", "c"))], noted) == [outcome(7), outcome(9, ("a", "c"))]
+    def answer(trigger, pair=("a", "b")):
+        return answer_of(outcome(trigger, pair))
+
+    noted = [answer(5), answer(6), answer(7)]
+    assert _said_of([answer(6), answer(4)], noted) == [answer(7)]
+    assert _said_of([answer(9), answer(8)], noted) == [answer(9), answer(8)]
+    assert _said_of([answer(9, ("a", "c"))], noted) == [answer(7), answer(9, ("a", "c"))]
 
 
 def test_a_place_that_cannot_be_written_is_said_once(tmp_path, caplog):

@@ -110,3 +110,34 @@ def test_a_solver_that_does_not_share_is_noted() -> None:
     assert one.strangers == {"solver/any"}
     one.saw("solver/any", False)
     assert not one.strangers
+
+
+def test_what_another_has_claimed_by_the_hub_is_not_begun_yet() -> None:
+    one = Sharing("1" * 16)
+    tasks: list[Task] = [("a", "b"), ("a", "c"), NETWORK]
+    one.plan(tasks)
+    begin = one.plan(tasks).begin
+    assert set(begin) == set(tasks)
+    other = Sharing("2" * 16)
+    assert one.unheld(begin, {other.name, other.task_name(("a", "c")), other.task_name(NETWORK), "node/a"}) == [
+        ("a", "b")
+    ]
+    # It is tried again.
+    assert one.begun == {("a", "b")}
+    assert one.waits
+    assert set(one.plan(tasks).begin) == {("a", "c"), NETWORK}
+
+
+def test_a_solver_to_which_nothing_is_alive_any_more_was_cut_off() -> None:
+    one = Sharing("1" * 16)
+    for name in ("node/a", "node/b", "solver/share/" + "2" * 16):
+        one.saw(name, True)
+    one.saw(one.name, True)
+    one.saw("solver/share/" + "2" * 16, False)
+    one.saw("node/a", False)
+    assert not one.cut_off
+    one.saw("node/b", False)
+    assert one.cut_off
+    one.saw("node/b", True)
+    one.let_go()
+    assert not one.cut_off
