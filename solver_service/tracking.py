@@ -28,7 +28,7 @@ from buddyline.protocol.messages import (
 from buddyline.solver_service.geometry.observation import View
 from buddyline.solver_service.geometry.rig import Rig
 from buddyline.solver_service.geometry.rotation import Floats, quat_to_matrix, rotation_exp
-from buddyline.solver_service.resting import LOOK_APART, LOOKS
+from buddyline.solver_service.resting import LOOK_APART, LOOKS, REST_NS
 from buddyline.solver_service.results import view_of
 from buddyline.solver_service.sensors import KEPT_NS
 from buddyline.solver_service.streams import NodeStream
@@ -60,7 +60,7 @@ class PairTracker:
     """Follows a pair. Messages up to a trigger's time enter the estimator once the trigger's outcome is known.
 
     crowded: whether it is one of many pairs: its live track then starts from poses alone, for in pictures of many bars
-    too many starts without a fix are possible.
+    too many starts without a fix are possible. So nothing is fed to it while there is neither a pose nor a track.
     """
 
     def __init__(self, stream_a: NodeStream, stream_b: NodeStream, settings: TrackSettings) -> None:
@@ -86,7 +86,8 @@ class PairTracker:
         self._taken_ns = -1
         self._told_ns = -1
         self._settled_ns = -1
-        self._oriented = False
+        self._oriented = self._idle = False
+        self._fixed_ns = -REST_NS
         self._clock: tuple[float, float] | None = None
         # Whether there was a pose; whether the nodes look apart and never had one; the triggers of then, with stamps.
         self._posed = self._rests = False
@@ -157,6 +158,12 @@ class PairTracker:
         if known[0] is None or known[1] is None:
             return []
         infos = known[0][0], known[1][0]
+        fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
+        if fixes:
+            self._fixed_ns = max(fix.stamp_ns for fix in fixes)
+        elif self.crowded and min(stamps_ns) - self._fixed_ns > REST_NS and not self._follows():
+            self._idle = True
+            return []
         messages: list[Message] = []
         if self._infos is not None and not all(map(same_rig, infos, self._infos)):
             # The track of the old rigs ends here.
@@ -169,6 +176,11 @@ class PairTracker:
             # However many outcomes come at once, the track begins with the first of them.
             self._first_ns = self._told_ns = min(stamps_ns)
             self._taken_ns = self._first_ns - S_NS
+        if self._idle:
+            # What came since has nothing to be told of.
+            self._taken_ns = max(self._taken_ns, min(stamps_ns) - S_NS)
+            self._told_ns = max(self._told_ns, min(stamps_ns))
+            self._idle = False
         self._settled_ns = max(self._settled_ns, *stamps_ns)
         for one in outcomes:
             self._posed |= isinstance(one, RelativePose)
@@ -178,7 +190,6 @@ class PairTracker:
                 self._rests = apart or (self._rests and one.trigger % LOOKS == 0)
                 if self._rests:
                     self._unseen[one.trigger] = one.stamp_ns
-        fixes = [fix_of(one) for one in outcomes if isinstance(one, RelativePose)]
         if self._filter is not None:
             self._filter.searches = not self.crowded
             for fix in fixes:
@@ -186,6 +197,11 @@ class PairTracker:
         if "smooth" in self._settings.modes:
             self._fixes += fixes
         return messages + self._advance(self._frontier_ns())
+
+    def _follows(self) -> bool:
+        """Whether an outcome without a pose tells anything: there is an estimate, or the whole dive is kept."""
+        followed = self._filter is not None and (self._filter.main is not None or bool(self._filter.challengers))
+        return followed or "smooth" in self._settings.modes
 
     def finish(self) -> Iterable[Message]:
         """Take what is left, and return what the end of the dive tells: the rest of the live tracks, the smooth one.
@@ -228,7 +244,7 @@ class PairTracker:
         return min(stream.complete_ns(self._settled_ns) for stream in self._streams)
 
     def _advance(self, to_ns: int) -> list[Message]:
-        if to_ns <= self._taken_ns:
+        if to_ns <= self._taken_ns or self._idle:
             return []
         for node, stream in enumerate(self._streams):
             piece = self._piece(stream, node, self._taken_ns + 1, to_ns)

@@ -270,7 +270,8 @@ class ZenohBus(Bus):
 
     def others_alive(self, name: str = "**") -> set[str]:
         """Return the names, all or this one, that other processes have declared, as the hub knows them now."""
-        replies = self._session.liveliness().get(f"{ALIVE}/{name}/*", timeout=QUERY_S)
+        tokens_of = f"{ALIVE}/**" if name == "**" else f"{ALIVE}/{check_alive_name(name)}/*"
+        replies = self._session.liveliness().get(tokens_of, timeout=QUERY_S)
         tokens = [str(reply.ok.key_expr).removeprefix(f"{ALIVE}/") for reply in replies if reply.ok is not None]
         own = str(self._session.zid())
         return {alive for alive, _, process in (token.rpartition("/") for token in tokens) if process != own}

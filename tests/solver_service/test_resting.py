@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from buddyline.node.sim import dive as simulation
+from buddyline.node.sim.rotation import from_euler
 from buddyline.node.sim.scenario import DivePlan, Scenario
+from buddyline.node.sim.team import TeamMotion
+from buddyline.node.sim.trajectory import Placement
 from buddyline.node.sim.world import World
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.messages import Attitude, Candidates, Depth, Message, NodeInfo, Rejected, RelativePose
+from buddyline.solver_service import core
 from buddyline.solver_service.config import SolveConfig
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.fix import NoFix
@@ -52,11 +58,11 @@ def test_a_pair_rests_until_something_may_be_a_pose() -> None:
 
 
 def outcomes(messages: list[Message], together: int) -> dict[tuple[str, str, int], str]:
-    core = SolverCore(SolveConfig().settings("test"))
+    solver = SolverCore(SolveConfig().settings("test"))
     found: list[Message] = []
     for start in range(0, len(messages), together):
-        found += core.handle_many(messages[start : start + together])
-    found += core.flush()
+        found += solver.handle_many(messages[start : start + together])
+    found += solver.flush()
     return {
         (one.node_a, one.node_b, one.trigger): one.detail if isinstance(one, Rejected) else "solved"
         for one in found
@@ -108,3 +114,47 @@ def test_a_team_solves_pairs_that_look_apart_once_in_five_triggers(three: list[M
     resting = [trigger for (a, b, trigger), why in told.items() if (a, b) == ("a", "c") and why == LOOK_APART]
     assert all(trigger % LOOKS for trigger in resting)
     assert min(resting) * PLAN.period_ns > START_NS + REST_NS
+
+
+def in_ring(node: int, t_s: float) -> Placement:
+    """Six that look across a ring of 7 m, which turns."""
+    at = node * math.pi / 3.0 + 0.1 * t_s
+    outwards = np.array((math.cos(at), math.sin(at), 0.0))
+    return Placement(from_euler(0.0, 0.05 * math.sin(t_s), at + math.pi), 3.5 * outwards + (0.0, 0.0, 10.0))
+
+
+def in_line(node: int, t_s: float) -> Placement:
+    """Eight in a line, by twos face to face; every second one turns round, to the one behind, and back."""
+    turned = math.pi * (node % 2 == 0 and node > 0 and 3.0 < t_s < 6.0)
+    yaw = (0.0, math.pi)[node % 2] + turned
+    return Placement(from_euler(0.0, 0.0, yaw), np.array((3.0 * node, 0.15 * (-1) ** node * math.sin(t_s), 10.0)))
+
+
+def face_each_other(one: Placement, other: Placement) -> bool:
+    across_m = other.position_ned_m - one.position_ned_m
+    looks = one.R_ned_body[:, 0] @ across_m, other.R_ned_body[:, 0] @ -across_m
+    return min(looks) > math.cos(math.radians(22.0)) * float(np.linalg.norm(across_m))
+
+
+@pytest.mark.parametrize(("placed", "nodes"), [(in_ring, "abcdef"), (in_line, "abcdefgh")])
+def test_in_a_crowd_of_another_shape_no_pair_in_view_is_lost(
+    placed: Callable[[int, float], Placement], nodes: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(TeamMotion, "_placement", lambda _, node, t_s: placed(node, t_s))
+    world = World(Scenario(seed=7, start_ns=START_NS, more_nodes=tuple(nodes[2:]), false_lights=1))
+    plan = DivePlan(seconds=10.0, rate_hz=2.0)
+    sent = (one for _, _, one in simulation.messages(world, plan))
+    told = [one for one in sent if isinstance(one, NodeInfo | Candidates | Attitude | Depth)]
+    rested = outcomes(told, 5000)
+    monkeypatch.setattr(core, "CROWD", 99)
+    awake = outcomes(told, 5000)
+
+    def in_view(a: str, b: str, trigger: int) -> bool:
+        t_s = (trigger * plan.period_ns - START_NS) / S_NS
+        return face_each_other(placed(nodes.index(a), t_s), placed(nodes.index(b), t_s))
+
+    posed = {which for which, why in awake.items() if why == "solved" and in_view(*which)}
+    assert len(posed) > 20
+    assert {which: rested[which] for which in posed if rested[which] != "solved"} == {}
+    # In the ring the bars of others look like the one sought, so that no pair rests.
+    assert (sum(why in (NOT_IN_VIEW, LOOK_APART) for why in rested.values()) > 10) is (placed is in_line)

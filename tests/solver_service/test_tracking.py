@@ -5,28 +5,34 @@ import random
 import numpy as np
 import pytest
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, RelativePose, Track
+from buddyline.protocol.messages import Candidates, Depth, Imu, NodeInfo, Rejected, RelativePose, Track
 from buddyline.protocol.topics import TRACK, TRACK_LAG, key_of
+from buddyline.solver_service import core
 from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
-from buddyline.solver_service.tracking import TrackSettings
+from buddyline.solver_service.streams import NodeStream
+from buddyline.solver_service.tracking import PairTracker, TrackSettings
 from msgspec.structs import replace
 
 from tests.solver_service.conftest import dive_messages
 
 
 def tracks_of(messages, *modes, rate_hz=20.0, receive=False):
-    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(modes), rate_hz))
+    solver = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(modes), rate_hz))
     results = []
     for message in messages:
-        results += core.handle(message, message.stamp_ns + S_NS // 50 if receive else None)
-    results += core.flush()
-    return [one for one in results if isinstance(one, Track)], core
+        results += solver.handle(message, message.stamp_ns + S_NS // 50 if receive else None)
+    results += solver.flush()
+    return [one for one in results if isinstance(one, Track)], solver
 
 
 @pytest.fixture(scope="module")
 def inertial_dive():
     return dive_messages(seconds=12.0, imu=True)
+
+
+def rejected(stamp_ns):
+    return Rejected(node_a="a", node_b="b", stamp_ns=stamp_ns, trigger=stamp_ns, reason="ambiguous", detail="")
 
 
 def errors_m(tracks, world):
@@ -131,6 +137,27 @@ def test_without_a_pose_there_is_no_track():
     assert tracks_of(blind, "filter", "lag", "smooth")[0] == []
 
 
+@pytest.mark.parametrize("crowded", [False, True])
+def test_one_of_many_pairs_has_no_track_before_its_first_pose(crowded):
+    """Alone, lights and attitudes start a track; among many, whose bars are in every picture, only poses do."""
+    messages, _ = dive_messages(seconds=9.0, imu=True)
+    streams = {node: NodeStream(node) for node in "ab"}
+    tracker = PairTracker(streams["a"], streams["b"], TrackSettings(frozenset(("filter",))))
+    tracker.crowded = crowded
+    stamps_ns = []
+    for message in messages:
+        stream = streams[message.node]
+        if isinstance(message, NodeInfo):
+            stream.add_info(message)
+        elif isinstance(message, Candidates):
+            stream.add_frame(message, (), None)
+            stamps_ns += [message.stamp_ns] * (message.node == "a")
+        else:
+            stream.add_sample(message)
+    found = [tracker.take([rejected(ns)]) for ns in stamps_ns]
+    assert any(found) is not crowded
+
+
 def test_a_track_goes_on_after_absurd_values(inertial_dive):
     messages, _ = inertial_dive
     half = len(messages) // 2
@@ -154,3 +181,14 @@ def test_a_changed_calibration_ends_one_track_and_begins_another(inertial_dive):
     assert len(before) > 80
     assert len(after) > 80
     assert np.median(errors_m(tracks, world)) < 0.05
+
+
+def test_a_track_of_one_of_many_pairs_begins_with_the_pose_after_a_rest(inertial_dive, monkeypatch):
+    monkeypatch.setattr(core, "CROWD", 2)
+    messages = [m for m in inertial_dive[0] if m.stamp_ns < inertial_dive[0][0].stamp_ns + 9 * S_NS]
+    start_ns = messages[0].stamp_ns + 6 * S_NS
+    blind = [replace(m, blobs=[]) if isinstance(m, Candidates) and m.stamp_ns < start_ns else m for m in messages]
+    tracks, _ = tracks_of(blind, "filter")
+    assert start_ns <= tracks[0].stamp_ns < start_ns + S_NS
+    assert len(tracks) > 35
+    assert max(errors_m(tracks[20:], inertial_dive[1])) < 0.15
