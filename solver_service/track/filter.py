@@ -37,6 +37,9 @@ TOLD: Final = 12
 # So many fixes must agree with a start from one of them, to confirm it, and to replace a confirmed track by it.
 FIXES_TO_CONFIRM: Final = 2
 FIXES_TO_REPLACE: Final = 3
+# So many fixes on end that contradict a track, and so many of those that agreed, are enough for it not to be told live.
+FIXES_TO_DOUBT: Final = 2
+SHARE_TO_DOUBT: Final = 0.2
 # A rival that began so much later than the best is younger.
 LATE_S: Final = 0.1
 # A confirmed track ends when no light was used for so long, and its position's sigma exceeds this share of the range,
@@ -108,7 +111,7 @@ class TrackFilter(TrackPool):
         None where there is no such track, or it ends before.
         """
         main = self.main
-        if main is None or not main.confirmed or self.clocks_apart() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
+        if main is None or not main.confirmed or self.doubted() or not 0.0 <= t_s - main.t_s < BRIDGED_S:
             return None
         if t_s <= main.t_s:
             return main.state, main.covariance, main.rates_radps
@@ -116,21 +119,27 @@ class TrackFilter(TrackPool):
         state, P = self._predict(main, t_s, parts=parts)
         return state, P, np.stack((parts[0].rate_radps, parts[1].rate_radps))
 
-    def clocks_apart(self) -> bool:
-        """Whether the clocks prove further apart than a live track bears, or did lately; `problems` says so then.
+    def doubted(self) -> bool:
+        """Whether a live track is not to be told; `problems` says why.
 
-        A track that starts anew believes in its clocks anew.
+        Its clocks prove further apart than it bears, or did lately, or the last fixes contradict it: its first updates
+        were then far from linear. A track that starts anew believes in its clocks anew.
         """
-        if self.main is None:
+        main = self.main
+        if main is None:
             return False
         # A pair at rest tells little of its clocks, and less than it believes.
-        sigma_s = math.sqrt(self.main.covariance[CLOCK, CLOCK])
-        if abs(self.main.state.clock_s) > max(FAR_CLOCK_S, FAR_SIGMAS * sigma_s):
-            self._apart_s = self.main.t_s
-        apart = self.main.t_s - self._apart_s < APART_S
+        if abs(main.state.clock_s) > max(FAR_CLOCK_S, FAR_SIGMAS * math.sqrt(main.covariance[CLOCK, CLOCK])):
+            self._apart_s = main.t_s
+        apart = main.t_s - self._apart_s < APART_S
+        # With a dark lamp there may be no fix but another's for minutes.
+        lately = main.t_s - self._fix_s < APART_S
+        contradicted = lately and main.contradicted >= max(FIXES_TO_DOUBT, SHARE_TO_DOUBT * main.agreed)
         if apart:
-            self._problems.report(f"{self.both}: their clocks are far apart: no live track", self.main.t_s)
-        return apart
+            self._problems.report(f"{self.both}: their clocks are far apart: no live track", main.t_s)
+        if contradicted:
+            self._problems.report(f"{self.both}: poses contradict the live track", main.t_s)
+        return apart or contradicted
 
     def _take_sight(self, t_s: float, sight: Sight) -> None:
         self._check_units(t_s)
@@ -161,6 +170,9 @@ class TrackFilter(TrackPool):
                 agreed = True
                 estimate.agreed_s = t_s
                 estimate.agreed += 1
+                estimate.contradicted = 0
+            else:
+                estimate.contradicted += 1
         if agreed:
             return
         started = self._start(t_s, fix)
@@ -324,7 +336,7 @@ class TrackFilter(TrackPool):
         if self.main is None or not self.main.confirmed or t_s < self.main.t_s:
             return None
         main = self.main
-        if self.clocks_apart():
+        if self.doubted():
             return None
         while t_s - main.t_s > 1.5 * TICK_S:
             self._step(main, main.t_s + TICK_S, None)

@@ -36,7 +36,7 @@ class TrackLag:
 
     def _rows(self, lag_s: float, every_s: float) -> list[TrackRow]:
         main = self._track.main
-        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.clocks_apart():
+        if main is None or not main.confirmed or len(main.steps) < 2 or not self._due or self._track.doubted():
             return []
         ready_s = main.t_s - lag_s
         ready = [stamp for stamp in self._due if self._track.between(stamp) <= ready_s]
