@@ -9,12 +9,14 @@ from typing import Final
 
 from buddyline.tools.survey.averages import Floats
 from buddyline.tools.survey.old.writing import (
+    SVX,
+    TH,
+    InForce,
+    Written,
     quoted,
     svx_of,
-    svx_passage,
     svx_system,
     th_of,
-    th_passage,
     therion_person,
 )
 from buddyline.tools.survey.sheet import Reading, Sheet
@@ -47,7 +49,7 @@ class Language:
 
     def data(self, sheet: Sheet, readings: Iterable[Reading], by_clino: Callable[[Reading], bool]) -> Iterator[str]:
         """Yield every leg's row, after the standard deviations and column names if they have changed."""
-        state: dict[str, str] = {}
+        state = InForce()
         for as_read in readings:
             reading = as_read if self.corrects else corrected(as_read)
             clino = by_clino(reading)
@@ -62,24 +64,12 @@ class Language:
             if abs(reading.scale - 1) > 1e-6 or f"{self.command}calibrate {self.tape}" in state:
                 now[f"{self.command}calibrate {self.tape}"] = f"0 {reading.scale:.6f}"
             now[self.normal if clino else self.diving] = ""
-            for name, value in now.items():
-                if state.get(name) != value:
-                    yield f"{name} {value}".rstrip()
-            state |= now
-            state.pop(self.diving if clino else self.normal, None)
+            yield from state.lines(now, f"{self.command}data")
             rise = [reading.clino_deg] if clino else [reading.depth_from_m, reading.depth_to_m]
             numbers = [f"{value:+.3f}" if clino else f"{value:.4f}" for value in rise]
             angles = [self._angle(angle) for angle in (reading.compass_deg, reading.back_deg)]
-            leg = reading.leg
-            row = [
-                leg.from_,
-                leg.to,
-                f"{reading.distance_m:.4f}",
-                *angles,
-                *numbers,
-                f"{self.comment} {reading.remark}",
-            ]
-            yield self.gap.join(row)
+            ends, remark = (reading.leg.from_, reading.leg.to), f"{self.comment} {reading.remark}"
+            yield self.gap.join([*ends, f"{reading.distance_m:.4f}", *angles, *numbers, remark])
 
     def _sds(self, reading: Reading, clino: bool) -> dict[str, str]:
         line, distance_m = reading.line, reading.distance_m
@@ -123,17 +113,7 @@ def corrected(reading: Reading) -> Reading:
         None if read is None else read - off
         for read, off in zip((reading.compass_deg, reading.back_deg), reading.off_deg, strict=True)
     )
-    read = [f"{reading.leg.distance_m:.3f} m"]
-    read += [f"{angle:.2f}" for angle in (reading.compass_deg, reading.back_deg) if angle is not None]
-    return replace(
-        reading,
-        compass_deg=fore,
-        back_deg=back,
-        distance_m=reading.distance_m * reading.scale,
-        off_deg=(0.0, 0.0),
-        scale=1.0,
-        remark=f"corrected, read {' '.join(read)}; {reading.remark}",
-    )
+    return _reread(reading, "corrected", reading.distance_m * reading.scale, fore, back)
 
 
 def _adjusted(sheet: Sheet, reading: Reading) -> Reading:
@@ -141,19 +121,26 @@ def _adjusted(sheet: Sheet, reading: Reading) -> Reading:
     leg = reading.leg
     start, end = (sheet.adjusted.positions[name].position_m for name in (leg.from_, leg.to))
     east_m, north_m, up_m = (end - start).tolist()
-    fore_deg = math.degrees(math.atan2(east_m, north_m)) - reading.turn_deg
+    ahead_deg = math.degrees(math.atan2(east_m, north_m)) - reading.turn_deg
     distance_m = math.hypot(east_m, north_m, up_m)
-    read = [f"{leg.distance_m:.3f} m"]
+    fore = None if reading.compass_deg is None else ahead_deg
+    back = None if reading.back_deg is None else ahead_deg + 180
+    changed = replace(reading, clino_deg=math.degrees(math.asin(up_m / distance_m)))
+    return _reread(changed, "adjusted", distance_m, fore, back)
+
+
+def _reread(reading: Reading, how: str, distance_m: float, fore: float | None, back: float | None) -> Reading:
+    """Return a reading with another distance and other angles that need no correction, and in its remark the read."""
+    read = [f"{reading.leg.distance_m:.3f} m"]
     read += [f"{angle:.2f}" for angle in (reading.compass_deg, reading.back_deg) if angle is not None]
     return replace(
         reading,
         distance_m=distance_m,
-        compass_deg=fore_deg if reading.compass_deg is not None else None,
-        back_deg=fore_deg + 180 if reading.back_deg is not None else None,
-        clino_deg=math.degrees(math.asin(up_m / distance_m)),
+        compass_deg=fore,
+        back_deg=back,
         off_deg=(0.0, 0.0),
         scale=1.0,
-        remark=f"adjusted, read {' '.join(read)}; {reading.remark}",
+        remark=f"{how}, read {' '.join(read)}; {reading.remark}",
     )
 
 
@@ -182,7 +169,7 @@ def svx(sheet: Sheet, style: str = "auto") -> str:
         "*units compass backcompass clino degrees",
         "*sd position 0.001 metres ; how well a node is held is in each leg's own",
         *SURVEX.data(sheet, map(sheet.renamed, sheet.readings), by_clino),
-        *(row for sections in sheet.passages for row in svx_passage(sections, sheet.local)),
+        *(row for sections in sheet.passages for row in SVX.sections(sections, sheet.local)),
     ]
     return _svx_file(sheet, body)
 
@@ -234,15 +221,19 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
 
 def _svx_olds(sheet: Sheet, grid: str) -> Iterator[str]:
     """Yield the old surveys as they were read, each in a block of its own, and what joins them to this one."""
-    name_of: dict[str, str] = {}
-    for number, old in enumerate(sheet.olds):
-        written = svx_of(old, grid)
+    olds = [svx_of(old, grid) for old in sheet.olds]
+    for number, written in enumerate(olds):
         if not grid and not number:
-            yield from svx_system(old)
+            yield from svx_system(sheet.olds[0])
         yield from ["*begin", *written.lines, "*end"]
-        name_of |= {station: written.name(station) for station in old.stations}
+    yield from _joints(sheet, olds, "*equate", lambda name: f"{sheet.name}.{sheet.local(name)}")
+
+
+def _joints(sheet: Sheet, olds: list[Written], equate: str, own: Callable[[str], str]) -> Iterator[str]:
+    """Yield what joins old surveys to this one. own: the name that the file has for a station of this one."""
+    name_of = {name: one.name(name) for old, one in zip(sheet.olds, olds, strict=True) for name in old.stations}
     for same in sheet.joints:
-        yield f"*equate {' '.join(name_of.get(name, f'{sheet.name}.{sheet.local(name)}') for name in same)}"
+        yield f"{equate} {' '.join(name_of.get(name) or own(name) for name in same)}"
 
 
 def th(sheet: Sheet, style: str = "auto") -> str:
@@ -272,7 +263,7 @@ def th(sheet: Sheet, style: str = "auto") -> str:
         "units compass clino degrees",
         "calibrate depth 0 -1",
         *THERION.data(sheet, readings, lambda reading: reading.by_clino),
-        *(row for sections in sheet.passages for row in th_passage(sections, sheet.local)),
+        *(row for sections in sheet.passages for row in TH.sections(sections, sheet.local)),
     ]
     head = ["encoding utf-8", f"# {sheet.why}", f"survey {sheet.name} -title {quoted(sheet.title)}", "  centreline"]
     body = [*head, *(f"    {row}" for row in rows), "  endcentreline", "endsurvey"]
@@ -280,10 +271,7 @@ def th(sheet: Sheet, style: str = "auto") -> str:
 
 
 def _th_olds(sheet: Sheet, grid: str) -> Iterator[str]:
-    name_of: dict[str, str] = {}
-    for old in sheet.olds:
-        written = th_of(old, grid)
+    olds = [th_of(old, grid) for old in sheet.olds]
+    for written in olds:
         yield from written.lines
-        name_of |= {station: written.name(station) for station in old.stations}
-    for same in sheet.joints:
-        yield f"equate {' '.join(name_of.get(name, f'{sheet.local(name)}@{sheet.name}') for name in same)}"
+    yield from _joints(sheet, olds, "equate", lambda name: f"{sheet.local(name)}@{sheet.name}")

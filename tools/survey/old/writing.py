@@ -187,6 +187,69 @@ def _dotted(where: tuple[SurveyPath, str]) -> str:
     return ".".join([*where[0], where[1]])
 
 
+class InForce(dict[str, str]):
+    """Commands of a file that hold until they are given again, with their values."""
+
+    def lines(self, now: Mapping[str, str], data: str) -> list[str]:
+        """Return the commands that are not in force as in `now`, and put them into force.
+
+        Of the commands that begin with `data` one alone is in force.
+        """
+        new = [f"{name} {value}".rstrip() for name, value in now.items() if self.get(name) != value]
+        for name in [name for name in self if name.startswith(data) and name not in now]:
+            del self[name]
+        self.update(now)
+        return new
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """How a language says the same. command, comment: their first characters; gap: between columns.
+
+    taken: a shot as the language takes it, by the map's turn (degrees). north: the commands that say from where its
+    bearings are. nameless: an end without a name.
+    """
+
+    command: str
+    comment: str
+    gap: str
+    passage: str
+    flags: frozenset[str]
+    sigmas: Sequence[str]
+    taken: Callable[[OldShot, float], OldShot]
+    north: Callable[[OldShot, Mapping[str, str], float], dict[str, str]]
+    nameless: Callable[[OldShot], str]
+
+    def shots(self, block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
+        """Yield the shots and passages of one survey of the hierarchy, without those inside."""
+        in_force, flags, c = InForce(), frozenset[str](), self.command
+        for shot in (self.taken(one, turn_deg) for one in block.shots):
+            stated = [name for name in shot.sigmas if name in self.sigmas]
+            stated += [name for name in self.sigmas if f"{c}sd {name}" in in_force and name not in stated]
+            now = {f"{c}sd {name}": f"{shot.sigma(name):.5f} {UNITS[name]}" for name in stated}
+            if shot.when is not None:
+                now[f"{c}date"] = f"{shot.when:%Y.%m.%d}"
+            now |= self.north(shot, in_force, turn_deg)
+            row = _columns(shot)
+            now[f"{c}data {' '.join([_style(shot), 'from', 'to', *row])}"] = ""
+            yield from in_force.lines(now, f"{c}data")
+            known = shot.flags & self.flags
+            if known != flags:
+                words = [*sorted(known - flags), *(f"not {flag}" for flag in sorted(flags - known))]
+                yield f"{c}flags {' '.join(words)}"
+            flags = known
+            ends = [names.local(name, block.path) if name else self.nameless(shot) for name in (shot.start, shot.end)]
+            yield self.gap.join([*ends, *row.values(), f"{self.comment} {remark_of(shot)}"])
+        for passage in block.passages:
+            yield from self.sections(passage.sections, lambda name: names.local(name, block.path))
+
+    def sections(self, sections: Sequence[CrossSection], name: Callable[[StationName], str]) -> Iterator[str]:
+        """Yield cross-sections of one passage. name: gives a station's name in the file."""
+        yield f"{self.command}data {self.passage} station left right up down"
+        for one in sections:
+            yield self.gap.join([name(one.station), *(_number(side, 3) for side in one.sides_m)])
+
+
 def _svx_block(survey: OldSurvey, block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
     notes = survey.surveys.get(block.path)
     if notes is not None:
@@ -194,33 +257,7 @@ def _svx_block(survey: OldSurvey, block: _Block, names: _Names, turn_deg: float)
         yield from (f"*team {quoted(person)}" for person in notes.team)
         yield from (f"*instrument {kind} {quoted(what)}" for kind, what in notes.instruments)
         yield from (f"; {note}" for note in notes.notes)
-    state: dict[str, str] = {}
-    flags: frozenset[str] = frozenset()
-    for shot in (_on_the_map(one, turn_deg) for one in block.shots):
-        now = {f"*sd {name}": f"{shot.sigma(name):.5f} {UNITS[name]}" for name in shot.sigmas if name in SIGMAS}
-        now |= {
-            f"*sd {name}": f"{SIGMAS[name]:.5f} {UNITS[name]}"
-            for name in SIGMAS
-            if f"*sd {name}" in state and f"*sd {name}" not in now
-        }
-        if shot.when is not None:
-            now["*date"] = f"{shot.when:%Y.%m.%d}"
-        if shot.style not in ("cartesian", "nosurvey", "distance"):
-            now |= _svx_north(shot, state, turn_deg)
-        row = _columns(shot)
-        now[f"*data {' '.join([_style(shot), 'from', 'to', *row])}"] = ""
-        for name, value in now.items():
-            if state.get(name) != value:
-                yield f"{name} {value}".rstrip()
-        state = {name: value for name, value in (state | now).items() if not name.startswith("*data") or name in now}
-        known = shot.flags & {"surface", "duplicate", "splay"}
-        if known != flags:
-            words = [*sorted(known - flags), *(f"not {flag}" for flag in sorted(flags - known))]
-            yield f"*flags {' '.join(words)}"
-        flags = known
-        ends = [_svx_end(name, shot, block.path, names) for name in (shot.start, shot.end)]
-        yield "\t".join([*ends, *row.values(), f"; {remark_of(shot)}"])
-    yield from _svx_passages(block, names)
+    yield from SVX.shots(block, names, turn_deg)
     for name, inner in block.inside.items():
         yield f"*begin {name}"
         yield from _svx_block(survey, inner, names, turn_deg)
@@ -238,14 +275,14 @@ def _on_the_map(shot: OldShot, turn_deg: float) -> OldShot:
     return replace(shot, vector_m=vector_m, north=North())
 
 
-def _svx_end(name: StationName, shot: OldShot, path: SurveyPath, names: _Names) -> str:
-    if name:
-        return names.local(name, path)
+def _svx_nameless(shot: OldShot) -> str:
     return "..." if "splay" not in shot.flags else ".." if "wall" in shot.flags else "."
 
 
 def _svx_north(shot: OldShot, state: Mapping[str, str], turn_deg: float) -> dict[str, str]:
     north = shot.north
+    if shot.style in ("cartesian", "nosurvey", "distance"):
+        return {}
     if north.kind == "model" and north.at is not None:
         system, *xyz = north.at
         now = {"*cs": survex_system(system)} if system else {}
@@ -255,25 +292,6 @@ def _svx_north(shot: OldShot, state: Mapping[str, str], turn_deg: float) -> dict
     if value_deg or "*declination" in state:
         return {"*declination": f"{value_deg + 0.0:.4f} degrees"}
     return {}
-
-
-def _svx_passages(block: _Block, names: _Names) -> Iterator[str]:
-    for passage in block.passages:
-        yield from svx_passage(passage.sections, lambda name: names.local(name, block.path))
-
-
-def svx_passage(sections: Sequence[CrossSection], name: Callable[[StationName], str]) -> Iterator[str]:
-    """Yield cross-sections of one passage for Survex. name: gives a station's name there."""
-    yield "*data passage station left right up down"
-    for one in sections:
-        yield "\t".join([name(one.station), *(_number(side, 3) for side in one.sides_m)])
-
-
-def th_passage(sections: Sequence[CrossSection], name: Callable[[StationName], str]) -> Iterator[str]:
-    """Yield cross-sections of one passage for Therion. name: gives a station's name there."""
-    yield "data dimensions station left right up down"
-    for one in sections:
-        yield " ".join([name(one.station), *(_number(side, 3) for side in one.sides_m)])
 
 
 def remark_of(shot: OldShot) -> str:
@@ -322,7 +340,7 @@ def _at(where: tuple[SurveyPath, str]) -> str:
 def _th_block(survey: OldSurvey, block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
     gap = "  " * len(block.path)
     notes = survey.surveys.get(block.path)
-    rows = list(_th_rows(block, names, turn_deg))
+    rows = list(TH.shots(block, names, turn_deg))
     if notes is not None:
         head = [f"team {therion_person(person)}" for person in notes.team if person]
         head += [f"# {note}" for note in notes.notes]
@@ -338,7 +356,7 @@ def _th_block(survey: OldSurvey, block: _Block, names: _Names, turn_deg: float) 
         yield f"{gap}endsurvey {name}"
 
 
-def _for_therion(shot: OldShot) -> OldShot:
+def _for_therion(shot: OldShot, _turn_deg: float) -> OldShot:
     """Return a shot that Therion takes: it has no level sights, and none without a clino or beyond the vertical."""
     if shot.clino_word == "level" or (shot.style == "normal" and shot.clino_deg is shot.back_clino_deg is None):
         shot = replace(shot, clino_deg=None if shot.clino_word in ("up", "down") else 0.0, clino_word=_plumb(shot))
@@ -356,41 +374,26 @@ def _plumb(shot: OldShot) -> Literal["", "up", "down"]:
     return "" if shot.clino_word == "level" else shot.clino_word
 
 
-def _th_rows(block: _Block, names: _Names, turn_deg: float) -> Iterator[str]:
-    state: dict[str, str] = {}
-    flags: frozenset[str] = frozenset()
-    for shot in map(_for_therion, block.shots):
-        now = {f"sd {name}": f"{shot.sigma(name):.5f} {UNITS[name]}" for name in shot.sigmas if name in _TH_SIGMAS}
-        now |= {
-            key: f"{SIGMAS[key[3:]]:.5f} {UNITS[key[3:]]}" for key in state if key.startswith("sd ") and key not in now
-        }
-        if shot.when is not None:
-            now["date"] = f"{shot.when:%Y.%m.%d}"
-        if shot.style not in ("nosurvey", "distance") and shot.north.kind != "model":
-            # Therion itself turns from true north to the grid's.
-            value_deg = shot.north.value_deg + (turn_deg if shot.north.kind == "grid" else 0.0)
-            if value_deg or turn_deg or "declination" in state:
-                now["declination"] = f"{value_deg + 0.0:.4f} degrees"
-        row = _columns(shot)
-        now[f"data {' '.join([_style(shot), 'from', 'to', *row])}"] = ""
-        for name, value in now.items():
-            if state.get(name) != value:
-                yield f"{name} {value}".rstrip()
-        state = {name: value for name, value in (state | now).items() if not name.startswith("data") or name in now}
-        known = shot.flags & {"surface", "duplicate", "splay", "approximate"}
-        if known != flags:
-            words = [*sorted(known - flags), *(f"not {flag}" for flag in sorted(flags - known))]
-            yield f"flags {' '.join(words)}"
-        flags = known
-        ends = [
-            names.local(name, block.path) if name else "-" if "wall" in shot.flags else "."
-            for name in (shot.start, shot.end)
-        ]
-        yield " ".join([*ends, *row.values(), f"# {remark_of(shot)}"])
-    for passage in block.passages:
-        yield from th_passage(passage.sections, lambda name: names.local(name, block.path))
+def _th_north(shot: OldShot, state: Mapping[str, str], turn_deg: float) -> dict[str, str]:
+    if shot.style in ("nosurvey", "distance") or shot.north.kind == "model":
+        return {}
+    # Therion itself turns from true north to the grid's.
+    value_deg = shot.north.value_deg + (turn_deg if shot.north.kind == "grid" else 0.0)
+    if value_deg or turn_deg or "declination" in state:
+        return {"declination": f"{value_deg + 0.0:.4f} degrees"}
+    return {}
 
 
-_TH_SIGMAS: Final = frozenset(
-    ("position", "tape", "dx", "dy", "dz", "depth", "compass", "backcompass", "clino", "backclino")
+_FLAGS: Final = frozenset(("surface", "duplicate", "splay"))
+SVX: Final = _Dialect("*", ";", "\t", "passage", _FLAGS, list(SIGMAS), _on_the_map, _svx_north, _svx_nameless)
+TH: Final = _Dialect(
+    command="",
+    comment="#",
+    gap=" ",
+    passage="dimensions",
+    flags=_FLAGS | {"approximate"},
+    sigmas=[name for name in SIGMAS if name not in ("level", "plumb")],
+    taken=_for_therion,
+    north=_th_north,
+    nameless=lambda shot: "-" if "wall" in shot.flags else ".",
 )
