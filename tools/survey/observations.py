@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from buddyline.tools.survey.averages import Floats, Ints
@@ -15,17 +15,7 @@ from buddyline.tools.survey.normal import Normal
 # distance, azimuth, inclination: of the line from start to end. east, north, up: of station `start`. rise: of end over
 # start. angle, number: of the instruments' unknowns alone.
 Kind: TypeAlias = Literal["distance", "azimuth", "inclination", "rise", "east", "north", "up", "angle", "number"]
-KINDS: Final[tuple[Kind, ...]] = (
-    "distance",
-    "azimuth",
-    "inclination",
-    "rise",
-    "east",
-    "north",
-    "up",
-    "angle",
-    "number",
-)
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 DISTANCE, _AZIMUTH, _INCLINATION, _RISE, _EAST, _NORTH, _UP, _ANGLE, _NUMBER = range(len(KINDS))
 ANGLES: Final = (_AZIMUTH, _INCLINATION, _ANGLE)
 # An iteration that moves nothing by more than this (m, rad) is the last.

@@ -19,7 +19,11 @@ CLEAR_M: Final = 0.3
 
 
 def place_all(
-    project: Project, legs: Sequence[Leg], ends: Sequence[tuple[str, str]], turns_rad: Sequence[float], fixed: Fixed
+    project: Project,
+    legs: Sequence[Leg],
+    ends: Sequence[tuple[str, str]],
+    turns_rad: Sequence[float],
+    fixed: dict[str, Floats],
 ) -> tuple[dict[str, Floats], list[str], tuple[str, str] | None]:
     """Return places of stations (east, north, up, m), why a leg has none ("": it has), and the line that gives north.
 
@@ -48,9 +52,7 @@ def place_all(
             placed[other] = placed[start] + (0.0, run_m, rise_m)
     mirrored = along is not None
     while (found := _trilaterated(placed, ranges, mirrored=mirrored)) is not None:
-        name, place_m = found
-        mirrored = mirrored and len(placed) < 3
-        placed[name] = place_m
+        name, placed[name] = found
         mirrored = False
         _walk(placed, touching, deque([name]))
     why = []
@@ -59,9 +61,6 @@ def place_all(
         lost_by = "not connected to a fixed point" if step_m is not None else _no_direction(leg)
         why.append(lost_by if lost else "")
     return placed, why, along
-
-
-Fixed = dict[str, Floats]
 
 
 def _no_direction(leg: Leg) -> str:

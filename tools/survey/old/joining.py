@@ -16,7 +16,7 @@ from buddyline.tools.survey.old.model import LEAST_M, North, OldShot, OldSurvey,
 from buddyline.tools.survey.old.readers import read_old
 from buddyline.tools.survey.old.systems import DEGREES, crs_of, map_system, moved
 from buddyline.tools.survey.project import STATION_NAME, FixedPoint, Leg, Project, Station
-from msgspec import UNSET, UnsetType, structs
+from msgspec import UNSET, structs
 
 # 1 sd of an angle that nothing tells, degrees.
 ANY_DEG: Final = 180.0
@@ -193,55 +193,50 @@ def leg_of(shot: OldShot) -> Leg:
     """Return a shot as a leg of the adjustment."""
     if shot.depths_m is not None:
         sigma_m = shot.sigma("depth")
-        return Leg(
-            from_=shot.start,
-            to=shot.end,
-            from_node="",
-            to_node="",
-            dive=0,
-            start_ns=0,
-            end_ns=0,
-            distance_m=shot.tape_m,
-            distance_sigma_m=shot.sigma("tape"),
+        return _leg(
+            shot,
+            shot.tape_m,
+            shot.sigma("tape"),
             depth_from_m=shot.depths_m[0],
             depth_from_sigma_m=sigma_m,
             depth_to_m=shot.depths_m[1],
             depth_to_sigma_m=sigma_m,
             turn_deg=0.0,
-            fixes=0,
-            note=shot.place,
         )
     distance_m, azimuth_deg, slope_deg = shot.polar
     along_m, aside_m, across_m = shot.polar_sigmas
     distance_m = max(distance_m, LEAST_M)
     # As angles; of a plumbed leg the azimuth's sd is large, and its effect on the map the stated one.
     run_m = distance_m * abs(math.cos(math.radians(slope_deg)))
-    start_ns = 0
-    if shot.when is not None:
-        start_ns = int(datetime(shot.when.year, shot.when.month, shot.when.day, 12, tzinfo=UTC).timestamp()) * S_NS
-    turn: float | UnsetType = UNSET
-    declination: float | UnsetType = UNSET
     north = shot.north
-    if north.kind == "grid":
-        turn = north.value_deg
-    elif north.kind == "true" or shot.when is None:
-        declination = north.value_deg
+    stated = north.kind != "model" or shot.when is None
+    return _leg(
+        shot,
+        distance_m,
+        along_m,
+        azimuth_deg=azimuth_deg,
+        azimuth_sigma_deg=math.degrees(aside_m / run_m) if run_m else ANY_DEG,
+        inclination_deg=slope_deg,
+        inclination_sigma_deg=math.degrees(across_m / distance_m),
+        **({"turn_deg" if north.kind == "grid" else "declination_deg": north.value_deg} if stated else {}),
+    )
+
+
+def _leg(shot: OldShot, distance_m: float, sigma_m: float, **readings: float) -> Leg:
+    """Return a leg without nodes and fixes, at noon of its day where that is known since 1970."""
+    noon = None if shot.when is None else datetime(shot.when.year, shot.when.month, shot.when.day, 12, tzinfo=UTC)
+    start_ns = 0 if noon is None else max(int(noon.timestamp()) * S_NS, 0)
     return Leg(
         from_=shot.start,
         to=shot.end,
         from_node="",
         to_node="",
         dive=0,
-        start_ns=max(start_ns, 0),
-        end_ns=max(start_ns, 0),
+        start_ns=start_ns,
+        end_ns=start_ns,
         distance_m=distance_m,
-        distance_sigma_m=along_m,
-        azimuth_deg=azimuth_deg,
-        azimuth_sigma_deg=math.degrees(aside_m / run_m) if run_m else ANY_DEG,
-        inclination_deg=slope_deg,
-        inclination_sigma_deg=math.degrees(across_m / distance_m),
-        turn_deg=turn,
-        declination_deg=declination,
+        distance_sigma_m=sigma_m,
         fixes=0,
         note=f"{shot.place} {shot.note}".strip(),
+        **readings,
     )

@@ -166,11 +166,21 @@ def is_number(word: str) -> bool:
     return True
 
 
+def with_inferred(settings: RowSettings, words: Sequence[str], line: SourceLine) -> RowSettings:
+    """Return settings after `infer WHAT on|off`."""
+    if len(words) != 2 or words[1].lower() not in ("on", "off"):
+        raise line.error(f"infer: {' '.join(words)!r} is not WHAT on, or WHAT off")
+    what = frozenset((words[0].lower(),))
+    on = words[1].lower() == "on"
+    return replace(settings, inferred=settings.inferred | what if on else settings.inferred - what)
+
+
 # Commands that both languages have, to what they change.
 CHANGES: Final[Mapping[str, Callable[[RowSettings, Sequence[str], SourceLine], RowSettings]]] = {
     "units": with_units,
     "calibrate": with_calibration,
     "sd": with_sigmas,
+    "infer": with_inferred,
 }
 
 
@@ -186,15 +196,6 @@ def with_flags(settings: RowSettings, words: Sequence[str], known: Mapping[str, 
         flags = flags | {known[word]} if on else flags - {known[word]}
         on = True
     return replace(settings, flags=frozenset(flags))
-
-
-def with_inferred(settings: RowSettings, words: Sequence[str], line: SourceLine) -> RowSettings:
-    """Return settings after `infer WHAT on|off`."""
-    if len(words) != 2 or words[1].lower() not in ("on", "off"):
-        raise line.error(f"infer: {' '.join(words)!r} is not WHAT on, or WHAT off")
-    what = frozenset((words[0].lower(),))
-    on = words[1].lower() == "on"
-    return replace(settings, inferred=settings.inferred | what if on else settings.inferred - what)
 
 
 def sigmas_of_fix(stated: Sequence[float]) -> tuple[float, float, float]:

@@ -19,7 +19,6 @@ from buddyline.tools.survey.old.row_settings import (
     factor_of,
     sigmas_of_fix,
     with_flags,
-    with_inferred,
 )
 from buddyline.tools.survey.old.source import DEEPEST, SourceLine, beside, lines_of
 
@@ -241,9 +240,6 @@ class SvxReader:
 
     def _do_flags(self, words: list[str], line: SourceLine) -> None:
         self._take(with_flags(self._scope.settings, words, FLAGS, line))
-
-    def _do_infer(self, words: list[str], line: SourceLine) -> None:
-        self._take(with_inferred(self._scope.settings, words, line))
 
     def _do_equate(self, words: list[str], line: SourceLine) -> None:
         if len(words) < 2:

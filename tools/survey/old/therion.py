@@ -19,7 +19,6 @@ from buddyline.tools.survey.old.row_settings import (
     factor_of,
     sigmas_of_fix,
     with_flags,
-    with_inferred,
 )
 from buddyline.tools.survey.old.source import DEEPEST, SourceLine, beside, lines_of
 
@@ -193,8 +192,6 @@ class ThReader:
             now.settings = replace(settings, north=replace(settings.north, kind="grid", value_deg=-value))
         elif name == "flags":
             now.settings = with_flags(settings, rest, FLAGS, line)
-        elif name == "infer":
-            now.settings = with_inferred(settings, rest, line)
         elif name == "cs":
             now.system = " ".join(rest)
         elif name == "fix":
