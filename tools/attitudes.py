@@ -28,9 +28,9 @@ def again(dive: Dive, given: Sequence[str], nodes: Sequence[str]) -> list[Envelo
     """
     configs = _recorded(dive) | _given(given)
     samples: dict[str, list[Imu]] = defaultdict(list)
-    for envelope in dive.messages(IMU.name, doing="attitudes"):
-        if isinstance(envelope.message, Imu) and envelope.message.node in nodes:
-            samples[envelope.message.node].append(envelope.message)
+    for one in dive.all_of(IMU, Imu, doing="attitudes"):
+        if one.node in nodes:
+            samples[one.node].append(one)
     for node in configs:
         if node in nodes and node not in samples:
             log.warning("%s: no inertial samples of node %s: its attitudes stay as they are", dive.name, node)

@@ -80,11 +80,7 @@ def beacon_curves(dive: Dive, nodes: Sequence[str]) -> list[BeaconCurve]:
     """Return the clocks of all nodes but the first, as far as beacons tell them."""
     if not dive.nodes(CLOCK.name):
         return []
-    beacons = [
-        envelope.message
-        for envelope in dive.messages(CLOCK.name)
-        if isinstance(envelope.message, ClockBeacon) and envelope.message.node in nodes
-    ]
+    beacons = [one for one in dive.all_of(CLOCK, ClockBeacon) if one.node in nodes]
     span_ns = dive.start_ns, dive.end_ns
     curves = (beacon_curve(beacons, nodes[0], node, span_ns) for node in nodes[1:])
     return [found for found in curves if found is not None]

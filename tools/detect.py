@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import msgspec
-from buddyline.node.choices import DETECTORS
 from buddyline.node.detect import Detection, make_detector
 from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
@@ -32,7 +31,6 @@ from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
 
-DEFAULT_METHOD = DETECTORS[0]
 FOLDER_PERIOD_NS = 100_000_000
 # Topics that are copied: all but earlier candidates and the solver's results.
 DERIVED_FROM = tuple(topic.name for topic in TOPICS if not topic.solved and topic is not CANDIDATES)

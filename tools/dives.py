@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 from buddyline.protocol.clock import S_NS
@@ -23,14 +23,16 @@ from buddyline.protocol.config import ConfigError
 from buddyline.protocol.divelog import DiveLogReader
 from buddyline.protocol.envelope import Envelope, Refusals, read_message
 from buddyline.protocol.errors import BuddylineError, MessageError
-from buddyline.protocol.messages import NodeInfo, Rejected, RelativePose
+from buddyline.protocol.messages import Message, NodeInfo, Rejected, RelativePose
 from buddyline.protocol.pictures import with_pictures
-from buddyline.protocol.topics import INFO, NET_POSE, TOPICS, parse_key
+from buddyline.protocol.topics import INFO, NET_POSE, TOPICS, Topic, parse_key
 from buddyline.tools import losses
 from buddyline.tools.clock_sets import ClockSets
 from buddyline.tools.progress import Progress
 
 log = logging.getLogger(__name__)
+
+M = TypeVar("M", bound=Message)
 
 _NAMES: Final = frozenset(topic.name for topic in TOPICS)
 _OUTCOMES: Final = (RelativePose, Rejected)
@@ -151,6 +153,12 @@ class Dive:
             for envelope in self._first_outcomes(topic_names, since_ns):
                 progress.show((envelope.time_ns - self.start_ns) / S_NS)
                 yield envelope
+
+    def all_of(self, topic: Topic, kind: type[M], *, doing: str = "") -> Iterator[M]:
+        """Yield the messages of one topic, as of their type."""
+        for envelope in self.messages(topic.name, doing=doing):
+            if isinstance(envelope.message, kind):
+                yield envelope.message
 
     def _first_outcomes(self, topic_names: Iterable[str], since_ns: int | None) -> Iterator[Envelope]:
         reading = _Pass()

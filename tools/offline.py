@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from buddyline.node.choices import DETECTORS
 from buddyline.protocol.errors import BuddylineError
-from buddyline.protocol.messages import (
-    Candidates,
-    CompressedImage,
-    Message,
-    NodeInfo,
-    Rejected,
-    RelativePose,
-    Track,
-)
+from buddyline.protocol.messages import Candidates, Message, NodeInfo, Rejected, RelativePose, Track
 from buddyline.solver_service.choices import CHECKS
 from buddyline.solver_service.clock_curve import ClockCurve
 from buddyline.solver_service.config import SolveConfig, track_settings
@@ -32,7 +25,7 @@ from buddyline.tools.columns import (
     track_columns,
 )
 from buddyline.tools.dives import Dive
-from buddyline.tools.solve import solved
+from buddyline.tools.solve import is_replaced, messages_of, solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +93,16 @@ def solve_logs(
     detector. clock_offset_s: None for what the nodes' beacons tell. The others as in solve_messages.
     """
     with Dive([Path(log) for log in logs]) as dive:
-        found = list(_messages(dive, environment, dict(infos or {})))
+        given = dict(infos or {})
+        envelopes = messages_of(
+            dive,
+            dive.infos() | given,
+            *dive.nodes(),
+            detector=DETECTORS[0],
+            environment=environment,
+            doing="",
+        )
+        found = [*given.values(), *(one.message for one in envelopes if not is_replaced(one.message, given))]
         chosen = _pair(sorted({message.node for message in found if isinstance(message, Candidates)}), pair)
         return solve_messages(
             found,
@@ -111,25 +113,6 @@ def solve_logs(
             track=track,
             track_hz=track_hz,
         )
-
-
-def _messages(dive: Dive, environment: str, infos: dict[str, NodeInfo]) -> Iterator[Message]:
-    yield from infos.values()
-    raw = set(dive.nodes("image")) - set(dive.nodes("candidates"))
-    detector = None
-    if raw:
-        from buddyline.tools.detect import DEFAULT_METHOD, DiveDetector, recorded_masks
-
-        detector = DiveDetector(DEFAULT_METHOD, environment, dive.infos() | infos, recorded_masks(dive))
-    topics = ("info", "candidates", "imu", "attitude", "depth", *(("image",) if raw else ()))
-    for envelope in dive.messages(*topics):
-        message = envelope.message
-        if isinstance(message, CompressedImage):
-            found = detector.candidates(envelope) if detector is not None and envelope.node in raw else None
-            if found is not None:
-                yield found.message
-        elif not (isinstance(message, NodeInfo) and message.node in infos):
-            yield message
 
 
 def _pair(present: list[str], wanted: Pair | None) -> Pair:

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
                 envelopes = in_place_of(envelopes, attitudes)
             while together := list(islice(envelopes, TOGETHER)):
-                sound = [envelope for envelope in together if not _is_replaced(envelope.message, replaced)]
+                sound = [envelope for envelope in together if not is_replaced(envelope.message, replaced)]
                 for envelope in sound:
                     writer.write(envelope.key, envelope.payload, envelope.time_ns, envelope.stamp_ns)
                 _write(writer, core.handle_many(envelope.message for envelope in sound), tracks)
@@ -108,7 +108,8 @@ def _attitudes(dive: Dive, args: argparse.Namespace, nodes: list[str]) -> list[E
     return again(dive, args.attitude_again, nodes)
 
 
-def _is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:
+def is_replaced(message: Message, replaced: Mapping[str, NodeInfo]) -> bool:
+    """Tell whether a message is a calibration in place of which another one was given."""
     return isinstance(message, NodeInfo) and message.node in replaced
 
 

@@ -11,6 +11,7 @@ from buddyline.node.drivers.stored import decode_picture, picture_files
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Candidates, CompressedImage, Imu, NodeInfo, RelativePose
+from buddyline.protocol.topics import IMU
 from buddyline.solver_service.geometry.rotation import quat_to_matrix
 from buddyline.tools.calibration.leastsquares import Floats
 from buddyline.tools.calibration.lights import TapedPlace
@@ -44,16 +45,11 @@ def _dive_pictures(path: Path, node: str | None) -> Iterator[tuple[str, NDArray[
 
 def inertial(paths: list[str], node: str | None) -> tuple[str, Floats, Floats]:
     """Return the node's id, its magnetometer's readings (n, 3), T, and its accelerometer's (n, 3), m/s^2."""
-    mags, accels = [], []
-    with Dive(paths) as dive:
-        wanted = _one_node(dive, node, "imu")
-        for envelope in dive.messages("imu"):
-            message = envelope.message
-            if isinstance(message, Imu) and message.node == wanted and message.mag_t is not UNSET:
-                mags.append(message.mag_t)
-                accels.append(message.accel_mps2)
-        if not mags:
-            raise BuddylineError(f"{dive.name}: no magnetometer readings of node {wanted}")
+    wanted, samples = inertial_samples(paths, node)
+    readings = [(one.mag_t, one.accel_mps2) for one in samples if one.mag_t is not UNSET]
+    if not readings:
+        raise BuddylineError(f"{', '.join(paths)}: no magnetometer readings of node {wanted}")
+    mags, accels = zip(*readings, strict=True)
     return wanted, np.array(mags), np.array(accels)
 
 
@@ -61,11 +57,7 @@ def inertial_samples(paths: list[str], node: str | None) -> tuple[str, list[Imu]
     """Return the node's id, and its inertial samples in order of time."""
     with Dive(paths) as dive:
         wanted = _one_node(dive, node, "imu")
-        found = [
-            envelope.message
-            for envelope in dive.messages("imu", doing="calibrate gyroscope")
-            if isinstance(envelope.message, Imu) and envelope.message.node == wanted
-        ]
+        found = [one for one in dive.all_of(IMU, Imu, doing="calibrate") if one.node == wanted]
     return wanted, sorted(found, key=lambda one: one.stamp_ns)
 
 

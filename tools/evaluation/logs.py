@@ -42,6 +42,14 @@ _RESULTS: Final = (POSE, REJECTED)
 # Used where a log has no results of the solver: poses from tags are evaluated in the same way.
 _TAGS: Final = (ARTAG,)
 _TRACKS: Final = (TRACK, TRACK_LAG)
+# The list of Recorded that has the messages of a type.
+_LISTS: Final = {
+    RelativePose: "poses",
+    Rejected: "rejected",
+    Track: "tracks",
+    Candidates: "candidates",
+    LightTruth: "light_truths",
+}
 _TRUTHS: Final = (TRUTH, LIGHT_TRUTH, NET_TRUTH)
 
 
@@ -82,24 +90,14 @@ def _take(recorded: Recorded, ids: tuple[str, ...], message: Message) -> None:
     elif isinstance(message, NodePose):
         if message.node == nodes[0]:
             recorded.ned_truths_a.append(message)
-    elif len(ids) == 2 and ids != nodes:
+    elif ids != nodes if len(ids) == 2 else ids[0] not in nodes:
         return
-    elif isinstance(message, Track):
-        recorded.tracks.append(message)
-    elif isinstance(message, RelativePose):
-        recorded.poses.append(message)
-    elif isinstance(message, Rejected):
-        recorded.rejected.append(message)
-    elif getattr(message, "node", None) not in nodes:
-        return
-    elif isinstance(message, Candidates):
-        recorded.candidates.append(message)
-    elif isinstance(message, LightTruth):
-        recorded.light_truths.append(message)
-    elif isinstance(message, Attitude) and message.node == nodes[0]:
-        recorded.attitudes_a.append(message)
+    elif isinstance(message, Attitude):
+        recorded.attitudes_a += [message] if message.node == nodes[0] else []
     elif isinstance(message, NodeInfo):
         recorded.infos.setdefault(message.node, message)
+    else:
+        getattr(recorded, _LISTS[type(message)]).append(message)
 
 
 def load(paths: Sequence[str], truth_paths: Sequence[str] = (), pair: Pair | None = None) -> Recorded:

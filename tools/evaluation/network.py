@@ -118,13 +118,8 @@ def load_network(paths: Sequence[str], truth_paths: Sequence[str]) -> tuple[list
     with ExitStack() as stack:
         logs, truth_logs = open_each(paths, stack), open_each(truth_paths, stack)
         solved = first_with_net(logs)
-        poses = [one.message for one in solved.messages(NET_POSE.name) if isinstance(one.message, NodePose)]
-        truths = [
-            one.message
-            for log in [*truth_logs, *logs]
-            for one in log.messages(NET_TRUTH.name)
-            if isinstance(one.message, NodePose)
-        ]
+        poses = list(solved.all_of(NET_POSE, NodePose))
+        truths = [one for log in [*truth_logs, *logs] for one in log.all_of(NET_TRUTH, NodePose)]
     if not truths:
         named = ", ".join([*paths, *truth_paths])
         raise BuddylineError(f"{named}: no truth of the net's nodes; name its log with --truth T.mcap")

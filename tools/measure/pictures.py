@@ -24,9 +24,8 @@ Item = TypeVar("Item")
 def stored_pictures(path: Path | str) -> Iterator[NDArray[np.uint8]]:
     """Yield the pictures of a dive, in its order."""
     with Dive([Path(path)]) as dive:
-        for envelope in dive.messages(IMAGE.name):
-            if isinstance(envelope.message, CompressedImage):
-                yield decode_picture(envelope.message.data, f"{path}: picture at {envelope.message.stamp_ns}")
+        for picture in dive.all_of(IMAGE, CompressedImage):
+            yield decode_picture(picture.data, f"{path}: picture at {picture.stamp_ns}")
 
 
 def simulated_world(environment: str, seed: int, width_px: int = 0, height_px: int = 0, other_lamps: int = 1) -> World:

@@ -41,11 +41,12 @@ def find_standings(stops: list[Stop], procedure: Procedure, first: str, taken: I
     """Return the stations of both nodes at each stop.
 
     Stations without a mark get the free numbers in order; a later mark by such a number means that station.
-    first: the node at the first station.
+    first: the node at the first station; the pair's first, if it is none of them.
     """
     if not stops:
         return []
     nodes = list(stops[0].depth_m)
+    first = first if first in nodes else nodes[0]
     in_use = set(taken)
     # Order of arrival at the present station: 0 and 1 at the beginning, later the stop's number plus one.
     arrived = {node: int(node != first) for node in nodes}

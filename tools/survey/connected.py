@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -16,7 +15,7 @@ from buddyline.tools.survey.averages import Floats, wrap
 from buddyline.tools.survey.gauges import tides_of
 from buddyline.tools.survey.geodesy import Grid, leg_date
 from buddyline.tools.survey.lines import ABSOLUTE_DEPTH_SIGMA_M, Line, Measures, line_of, measures_of, slopes_of
-from buddyline.tools.survey.observations import Observations, Solution
+from buddyline.tools.survey.observations import Solution
 from buddyline.tools.survey.placing import place_all, step_m_of
 from buddyline.tools.survey.project import Leg, Project
 from msgspec import UNSET, structs
@@ -170,18 +169,6 @@ class Survey:
         if not set(names) <= set(first_m):
             # Without the observation a station hangs on nothing; as before it is a place to begin with.
             first_m = self.first_m | first_m
-        observations = self._assemble(legs, ends, names, change.drops)
-        start_m = np.array([first_m[name] for name in names]) - self.origin_m
-        return observations.adjust(start_m, linear=linear)
-
-    def _assemble(
-        self,
-        legs: Sequence[Leg],
-        ends: list[tuple[str, str]],
-        names: list[str],
-        drops: frozenset[tuple[int, str]],
-    ) -> Observations:
-        steps = [step_m_of(leg, turn_rad) for leg, turn_rad in zip(legs, self.turns_rad, strict=True)]
         of = assemble(
             self.project,
             self.legs,
@@ -194,11 +181,12 @@ class Survey:
             self.origin_m,
             self.north_along,
         )
+        steps = [step_m_of(leg, turn_rad) for leg, turn_rad in zip(legs, self.turns_rad, strict=True)]
         of.vectors_m = np.array([NOWHERE if step_m is None else step_m for step_m in steps]).reshape(-1, 3)
-        for row, key in enumerate(zip(of.leg, of.what, strict=True) if drops else ()):
-            if key in drops:
+        for row, key in enumerate(zip(of.leg, of.what, strict=True) if change.drops else ()):
+            if key in change.drops:
                 of.sigma[row] *= DROPPED
-        return of
+        return of.adjust(np.array([first_m[name] for name in names]) - self.origin_m, linear=linear)
 
     def corrected(self, solution: Solution) -> list[Line]:
         """Return the legs between stations with what the instruments add taken off."""

@@ -191,9 +191,8 @@ class _Chain:
             stop_of(rest, shot, stations, tagged)
             for rest, shot, stations, tagged in zip(self.found, shots, self.named, self.tagged, strict=True)
         ]
-        first = settings.first if settings.first in readings.nodes else readings.nodes[0]
         taken = {name for leg in out.legs for name in (leg.from_, leg.to)}
-        self.standings = find_standings(stops, settings.procedure, first, taken)
+        self.standings = find_standings(stops, settings.procedure, settings.first, taken)
         legs = []
         for rest, shot, standing, stations in zip(self.found, shots, self.standings, self.named, strict=True):
             leg = self._leg(shot, standing.station, standing.rear)
@@ -226,8 +225,7 @@ class _Chain:
                     out.add_problem(
                         f"rest at {when}: node {mark.node} is at {before} and at {mark.name}; {mark.name} counts"
                     )
-                named[at][mark.node] = mark.name
-                self.tagged[at] = self.tagged[at] - {mark.node} | ({mark.node} if mark.tag is not UNSET else set())
+                note_name(mark, named[at], self.tagged[at])
                 self.placed.append(mark)
                 earlier = out.numbered.get(mark.name, self.dive)
                 if earlier != self.dive and mark.name not in joined:
@@ -279,6 +277,12 @@ class _Chain:
         leg = replace(one_leg(shot, station, rear, self.usual), dive=self.dive, disturbed=bad)
         leg = replace(leg, alarms=alarms.of_leg(leg, shot, self.usual, self.limits))
         return replace(leg, grade=alarms.grade(leg))
+
+
+def note_name(mark: Mark, stations: dict[str, str], tagged: set[str]) -> None:
+    """Note the station of a mark's node at a rest, and whether a tag says it."""
+    stations[mark.node] = mark.name
+    (tagged.discard if mark.tag is UNSET else tagged.add)(mark.node)
 
 
 def stop_of(rest: Rest, shot: Shot, stations: dict[str, str], tagged: set[str]) -> Stop:

@@ -30,7 +30,7 @@ from buddyline.tools.live import LiveClient, follow
 from buddyline.tools.survey import alarms
 from buddyline.tools.survey.blinks import new_blinks
 from buddyline.tools.survey.chain import Standing, find_standings
-from buddyline.tools.survey.derive import doubt_of, one_leg, rest_of, stop_of, time_text
+from buddyline.tools.survey.derive import doubt_of, note_name, one_leg, rest_of, stop_of, time_text
 from buddyline.tools.survey.magnetism import Field, off_usual, usual_field
 from buddyline.tools.survey.project import STATION_NAME, Leg
 from buddyline.tools.survey.readings import of_messages
@@ -213,15 +213,13 @@ class LiveLegs:
         for mark in sorted(self._marks, key=lambda one: one.tag is UNSET):
             at = rest_of(mark, [one.rest for one in legs])
             if at is not None and mark.node in pair.nodes:
-                named[at][mark.node] = mark.name
-                tagged[at] = tagged[at] - {mark.node} | ({mark.node} if mark.tag is not UNSET else set())
+                note_name(mark, named[at], tagged[at])
         stops = [
             stop_of(one.rest, one.shot, stations, read)
             for one, stations, read in zip(legs, named, tagged, strict=True)
             if one.shot is not None
         ]
-        first = self._settings.first if self._settings.first in pair.nodes else pair.nodes[0]
-        standings = find_standings(stops, self._settings.procedure, first)
+        standings = find_standings(stops, self._settings.procedure, self._settings.first)
         lost = {id(pair.judged[i]) for i in range(1, len(pair.judged)) if pair.judged[i - 1].shot is None}
         return {
             id(one): (standing, doubt_of(standing.problem, stations, after_lost=id(one) in lost))

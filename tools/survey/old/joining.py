@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from buddyline.protocol.clock import S_NS
 from buddyline.protocol.config import ConfigError
@@ -222,7 +222,7 @@ def leg_of(shot: OldShot) -> Leg:
     )
 
 
-def _leg(shot: OldShot, distance_m: float, sigma_m: float, **readings: float) -> Leg:
+def _leg(shot: OldShot, distance_m: float, sigma_m: float, **readings: Any) -> Leg:
     """Return a leg without nodes and fixes, at noon of its day where that is known since 1970."""
     noon = None if shot.when is None else datetime(shot.when.year, shot.when.month, shot.when.day, 12, tzinfo=UTC)
     start_ns = 0 if noon is None else max(int(noon.timestamp()) * S_NS, 0)
