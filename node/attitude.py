@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -52,6 +52,8 @@ SWELL_SIGMA_RAD: Final = math.radians(0.5)
 RESTED_TILT_SIGMA_RAD: Final = math.radians(1.0)
 MOVING_TILT_SIGMA_RAD: Final = math.radians(6.0)
 
+Triple = tuple[float, float, float]
+
 R_NED_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -85,22 +87,31 @@ class AttitudeEstimator(Protocol):
         ...
 
 
-def quaternion_to_matrix(q_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrix, (3, 3), of a unit quaternion in VQF's order w, x, y, z."""
+def rows_of(q_wxyz: NDArray[np.float64]) -> tuple[Triple, Triple, Triple]:
+    """Return the rows of the rotation matrix of a unit quaternion in VQF's order w, x, y, z."""
     w, x, y, z = q_wxyz.tolist()
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
 
 
-def cross(a: Vector, b: Vector) -> Vector:
-    """Return the cross product of two vectors, (3,)."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+def quaternion_to_matrix(q_wxyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation matrix, (3, 3), of a unit quaternion in VQF's order w, x, y, z."""
+    return np.array(rows_of(q_wxyz))
+
+
+def cross(a: Sequence[float], b: Sequence[float]) -> Triple:
+    """Return the cross product of two vectors."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+def seen_before(vector: Sequence[float], turned_rad: Sequence[float]) -> Triple:
+    """Return how a body saw a vector half a turn before: what it sees now, plus its cross product with that half."""
+    (x, y, z), (cx, cy, cz) = vector, cross(vector, turned_rad)
+    return x + cx / 2, y + cy / 2, z + cz / 2
 
 
 def ned_of_enu(q_enu_body_wxyz: NDArray[np.float64], turn_rad: float) -> tuple[float, float, float, float]:
@@ -219,7 +230,7 @@ class VqfAttitude:
         self._last_ns = 0
         self._tilt_tau_s = MOVING_TILT_TAU_S
         self._transient_rad = 0.0
-        self._turned_rad = np.zeros(3)
+        self._turned_rad: Sequence[float] = (0.0, 0.0, 0.0)
         self._yaw_rad = 0.0
 
     def update(self, sample: ImuSample) -> AttitudeEstimate | None:
@@ -288,28 +299,29 @@ class VqfAttitude:
         self._heading.widen(turned_rad)
 
     def _advance(self, sample: ImuSample, dt_s: float) -> AttitudeEstimate | None:
+        # Plain numbers: for three of them, numpy takes twice the time.
         vqf = self._vqf
         rate_radps = sample.gyro_radps - self._bias_radps - self._warmth.bias_radps
         # A sample means the interval before it. A turn's axis moves within that, and what is seen from the turning
         # body is as it was half a turn before (Bortz 1971; Miller 1983, with one sample an interval).
-        turned_rad = dt_s * rate_radps
-        coning_rad = cross(self._turned_rad, turned_rad) / 12
-        accel_mps2 = sample.accel_mps2 + cross(sample.accel_mps2, turned_rad / 2)
+        tx, ty, tz = turned_rad = (dt_s * rate_radps).tolist()
+        cx, cy, cz = cross(self._turned_rad, turned_rad)
         self._turned_rad = turned_rad
         # VQF assumes a fixed sample time; scaling the rate keeps the rotation between two samples right.
-        vqf.update((turned_rad + coning_rad) / SAMPLE_S, accel_mps2)
+        scaled_radps = (tx + cx / 12) / SAMPLE_S, (ty + cy / 12) / SAMPLE_S, (tz + cz / 12) / SAMPLE_S
+        vqf.update(np.array(scaled_radps), np.array(seen_before(sample.accel_mps2.tolist(), turned_rad)))
         q_level_body = vqf.getQuat6D()
-        R_level_body = quaternion_to_matrix(q_level_body)
-        _, bias_sigma_radps = vqf.getBiasEstimate()
+        R_level_body = rows_of(q_level_body)
+        bias_sigma_radps = float(vqf.getBiasEstimate()[1])
         self._transient_rad *= math.exp(-dt_s / self._tilt_tau_s)
         tilt_sigma_rad = math.sqrt(
             TILT_SIGMA_RAD**2 + SWELL_SIGMA_RAD**2 + (bias_sigma_radps * self._tilt_tau_s) ** 2 + self._transient_rad**2
         )
-        self._heading.predict(dt_s, float(bias_sigma_radps))
-        yaw_rad = math.atan2(R_level_body[1, 0], R_level_body[0, 0])
+        self._heading.predict(dt_s, bias_sigma_radps)
+        yaw_rad = math.atan2(R_level_body[1][0], R_level_body[0][0])
         if sample.mag_t is not None:
-            seen_t = self._calibration.apply(sample.mag_t)
-            field_t = R_level_body @ (seen_t + cross(seen_t, turned_rad / 2))
+            x, y, z = seen_before(self._calibration.apply(sample.mag_t).tolist(), turned_rad)
+            field_t = [rx * x + ry * y + rz * z for rx, ry, rz in R_level_body]
             self._heading.update(dt_s, field_t, wrap(yaw_rad - self._yaw_rad))
         self._yaw_rad = yaw_rad
         return AttitudeEstimate(

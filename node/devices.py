@@ -86,10 +86,12 @@ class CameraDevice(Protocol):
 class Source(Protocol):
     """One sensor, or several that are read together; used by one thread.
 
-    problem: what is wrong, "" if all is well. retries: transfers on its bus that had to be repeated.
+    problem: what is wrong, "" if all is well. retries: transfers on its bus that had to be repeated. read_by: name of
+    the source that gives its messages, because both are on one bus; "" for none. Its name is then its topic's.
     """
 
     name: str
+    read_by: str
 
     @property
     def problem(self) -> str: ...  # noqa: D102

@@ -13,13 +13,10 @@ and before that, the strength and dip of the last steady twenty seconds are expe
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
-import numpy as np
 from buddyline.node.geomagnetism import EarthField
-from numpy.typing import NDArray
-
-Vector = NDArray[np.float64]
 
 # The field in a room without a magnet changes by 8 % within a metre.
 NORM_TOLERANCE: Final = 0.1
@@ -107,7 +104,7 @@ class HeadingFilter:
         self._doubt_rad = 0.0
         self._drift_radps = 0.0
         self._p = (UNKNOWN_SIGMA_RAD**2, 0.0, 0.0)  # angle's variance, covariance, drift's variance
-        self._smooth_t: Vector | None = None
+        self._smooth_t: Sequence[float] | None = None
         self._steady = _Steady()
 
     def predict(self, dt_s: float, bias_sigma_radps: float) -> None:
@@ -121,16 +118,18 @@ class HeadingFilter:
         self._p = (p00, p01, p11)
         self.delta_rad = wrap(self.delta_rad + self._drift_radps * dt_s)
 
-    def update(self, dt_s: float, mag_level_t: Vector, turn_rad: float) -> None:
+    def update(self, dt_s: float, mag_level_t: Sequence[float], turn_rad: float) -> None:
         """Update with one reading of the compass.
 
-        mag_level_t: (3,), calibrated field in the gyroscope's level frame (z up). turn_rad: turned about up
+        mag_level_t: calibrated field, x, y, z, in the gyroscope's level frame (z up). turn_rad: turned about up
         since the last reading.
         """
         if self._smooth_t is None:
             self._smooth_t = mag_level_t
-        self._smooth_t = self._smooth_t + min(1.0, dt_s / SMOOTHING_S) * (mag_level_t - self._smooth_t)
-        x, y, z = self._smooth_t.tolist()
+        share = min(1.0, dt_s / SMOOTHING_S)
+        x, y, z = self._smooth_t = [
+            old + share * (new - old) for old, new in zip(self._smooth_t, mag_level_t, strict=True)
+        ]
         horizontal_t = math.hypot(x, y)
         norm_t, dip_rad, delta_rad = math.hypot(horizontal_t, z), math.atan2(-z, horizontal_t), math.atan2(x, y)
         if math.isnan(self._norm_t):

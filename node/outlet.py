@@ -7,7 +7,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from buddyline.protocol.clock import Clock
-from buddyline.protocol.codec import encode, payload_stamp_ns
+from buddyline.protocol.codec import encode, message_stamp_ns
 from buddyline.protocol.digest import DigestBook, sealed
 from buddyline.protocol.messages import Message
 from buddyline.protocol.topics import Topic, key_of, topic_of
@@ -61,7 +61,7 @@ class Outlet:
     def _send(self, message: Message, payload: bytes, *, record: bool = True, publish: bool = True) -> None:
         """Send; the lock is held: of each topic, digest, log and bus have the same order."""
         topic = topic_of(message)
-        self._book.add(topic, payload_stamp_ns(payload) or 0, payload)
+        self._book.add(topic, message_stamp_ns(message), payload)
         if record:
             key = self._keys.get(topic.name)
             if key is None:

@@ -43,7 +43,7 @@ from buddyline.protocol.recorder import Recorder, RecordError
 from buddyline.protocol.security import SecurityError
 from buddyline.protocol.service import Service
 from buddyline.protocol.statusfile import StatusFile
-from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS
+from buddyline.protocol.topics import CANDIDATES, IMU, TOPICS, topic_of
 from msgspec import UNSET
 
 if TYPE_CHECKING:
@@ -177,7 +177,8 @@ class NodeService(Service):
         self.spawn("detect", self._detect_frames)
         self.spawn("camera", self._capture)
         for source in self.sources:
-            self.spawn(source.name, lambda source=source: self._read(source))  # type: ignore[misc]
+            if not source.read_by:
+                self.spawn(source.name, lambda source=source: self._read(source))  # type: ignore[misc]
         self.spawn("status", self._report)
         self.spawn("chrony", lambda: self._clock_sync.follow_chrony(self.stop))
         self.spawn("clock", lambda: self._clock_sync.send_beacons(self.outlet, self.stop))
@@ -294,13 +295,15 @@ class NodeService(Service):
         control.follow(self._exposure.update(frame, candidates, self.pipeline.expected))
 
     def _read(self, source: Source) -> None:
+        beside = [other.name for other in self.sources if other.read_by == source.name]
         while not self.stop.is_set():
             steps = self.clock.steps
             messages = source.next_messages(self.stop)
             if messages is None:
                 self._ended.add(source.name)
                 return
-            self._last_s[source.name] = time.monotonic()
+            heard = {topic_of(message).name for message in messages} if beside else {source.name}
+            self._last_s.update(dict.fromkeys(heard.intersection([source.name, *beside]), time.monotonic()))
             if steps != self.clock.steps:
                 # Some of their stamps are of the clock before it was set.
                 self.drops["clock_set"] += len(messages)

@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 from buddyline.protocol.errors import MessageError
-from buddyline.protocol.messages import FoxgloveTime, Message
+from buddyline.protocol.messages import CompressedImage, FoxgloveTime, Message
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 
@@ -84,6 +84,14 @@ def payload_stamp_ns(payload: bytes) -> int | None:
     if stamp.timestamp is not None:
         return stamp.timestamp.sec * 1_000_000_000 + stamp.timestamp.nsec
     return stamp.stamp_ns
+
+
+def message_stamp_ns(message: Message) -> int:
+    """Return the measurement time of a message, ns; 0 if it has none."""
+    if isinstance(message, CompressedImage):
+        return message.timestamp.sec * 1_000_000_000 + message.timestamp.nsec
+    stamp_ns: int = getattr(message, "stamp_ns", 0)
+    return stamp_ns
 
 
 def encode(message: Message) -> bytes:

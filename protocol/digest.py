@@ -20,7 +20,7 @@ _SIGNATURE: Final = b',"signature":"'
 
 def is_covered(topic: Topic) -> bool:
     """Return whether digests cover a topic: what only the node itself says. Surveyors set marks for a node, too."""
-    return topic.id_fields == ("node",) and not topic.solved and topic not in (DIGEST, MARK)
+    return topic.id_fields == ("node",) and not topic.solved and topic is not DIGEST and topic is not MARK
 
 
 def end_of(topic: Topic) -> str:

@@ -1,13 +1,12 @@
-"""Chips on the I2C bus as a node's sensors: two threads, one bus, and recovery from chips that fail."""
+"""Chips on the I2C bus as a node's sensors: one bus, one thread, and recovery from chips that fail."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 from buddyline.node.attitude import AttitudeEstimator, quaternion_to_matrix
@@ -29,16 +28,18 @@ from buddyline.node.drivers.samples import (
 )
 from buddyline.protocol.clock import MS_NS, S_NS, Clock
 from buddyline.protocol.messages import Depth, Imu, Message, Vector3
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 
 log = logging.getLogger(__name__)
 
-IMU_PERIOD_NS: Final = 10 * MS_NS
+TURN_NS: Final = 10 * MS_NS
 # So many readings are decoded, estimated, recorded and sent together, 50 ms: no later than the picture of the same
 # instant has been read out and searched.
 BLOCK: Final = 5
-LONGEST_WAIT_NS: Final = 50 * MS_NS
+ATTITUDE_EVERY: Final = 2
 REOPEN_NS: Final = 2 * S_NS
+
+D = TypeVar("D", ImuDevice, DepthDevice)
 
 
 class Metronome:
@@ -58,10 +59,40 @@ class Metronome:
         return self._clock.wait_until_ns(self._next_ns, stop)
 
 
+class Opener(Generic[D]):
+    """Opens a device at its first use. One that cannot be opened is tried again every REOPEN_NS."""
+
+    def __init__(self, open_device: Callable[[], D], clock: Clock) -> None:
+        self._open: Callable[[], D] = open_device
+        self._clock = clock
+        self._tried_ns = -REOPEN_NS
+        self._error = ""
+        self.device: D | None = None
+
+    def get(self) -> D:
+        """Return the device; raise DeviceError while there is none."""
+        if self.device is None:
+            now_ns = self._clock.now_ns()
+            if 0 <= now_ns - self._tried_ns < REOPEN_NS:
+                raise DeviceError(self._error)
+            self._tried_ns = now_ns
+            try:
+                self.device = self._open()
+            except DeviceError as error:
+                self._error = str(error)
+                raise
+        return self.device
+
+
 class ImuSource:
-    """The inertial unit at 100 Hz, and the attitude estimated from it, BLOCK samples at a time."""
+    """The inertial unit at 100 Hz, and 60 attitudes a second estimated from it, BLOCK samples at a time.
+
+    beside: a pressure sensor on the same bus. It is read in the same turns, because to wake a thread of its own would
+    cost more than to read it, and its samples come with the block that they end.
+    """
 
     name = "imu"
+    read_by = ""
 
     def __init__(
         self,
@@ -70,18 +101,19 @@ class ImuSource:
         open_device: Callable[[], ImuDevice],
         attitude: AttitudeEstimator,
         clock: Clock,
+        beside: DepthSource | None = None,
     ) -> None:
         self._node = node
         self._bus = bus
-        self._open = open_device
+        self._opener = Opener(open_device, clock)
         self._attitude = attitude
-        self._clock = clock
-        self._device: ImuDevice | None = None
+        self._beside = beside
         self._readings: list[ImuReading] = []
-        self._turn = Metronome(IMU_PERIOD_NS, clock)
+        self._turn = Metronome(TURN_NS, clock)
         self._health = DeviceHealth(self.name)
         self._compass = DeviceHealth("compass")
-        self._told_ns = 0
+        if beside is not None:
+            beside.read_by = self.name
 
     @property
     def problem(self) -> str:
@@ -94,26 +126,23 @@ class ImuSource:
         return self._bus.retries
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
-        """Wait for the next block of samples; a failure ends it early."""
+        """Wait for the next block of samples; a failure, or a sample of the sensor beside it, ends it early."""
         while not self._turn.wait(stop):
             failed = self._fetch()
-            if not failed and len(self._readings) < BLOCK:
+            beside = [] if self._beside is None else self._beside.step()
+            if not failed and not beside and len(self._readings) < BLOCK:
                 continue
             samples, problem = self._decode()
             self._health.update(failed or problem)
-            if samples:
-                return [message for sample in samples for message in self._messages(sample)]
-            if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
-                return None
+            if samples or beside:
+                return self._messages(samples) + beside
         samples, _ = self._decode()
-        return [message for sample in samples for message in self._messages(sample)] or None
+        return self._messages(samples) or None
 
     def _fetch(self) -> str:
         """Take a reading; return why there is none, "" if there is."""
         try:
-            if self._device is None:
-                self._device = self._open()
-            self._readings.append(self._device.fetch())
+            self._readings.append(self._opener.get().fetch())
         except DeviceError as error:
             return str(error)
         return ""
@@ -121,7 +150,7 @@ class ImuSource:
     def _decode(self) -> tuple[list[ImuSample], str]:
         """Return the samples of the readings, and what is wrong with the device ("" if nothing)."""
         readings, self._readings = self._readings, []
-        device, samples, settling = self._device, [], ""
+        device, samples, settling = self._opener.device, [], ""
         if device is None:
             return [], ""
         for reading in readings:
@@ -134,33 +163,30 @@ class ImuSource:
                 return samples, str(error)
         return samples, settling or device.problem
 
-    def _messages(self, sample: ImuSample) -> list[Message]:
-        # The attitude is to be the same from the log, which has no more than this.
-        degc = self._temperature(sample)
-        if degc != sample.temperature_degc:
-            sample = replace(sample, temperature_degc=None if degc is UNSET else degc)
-        messages: list[Message] = [
-            Imu(
-                node=self._node,
-                stamp_ns=sample.stamp_ns,
-                accel_mps2=_triple(sample.accel_mps2),
-                gyro_radps=_triple(sample.gyro_radps),
-                mag_t=UNSET if sample.mag_t is None else _triple(sample.mag_t),
-                temperature_degc=degc,
-            )
-        ]
-        estimate = self._attitude.update(sample)
-        if estimate is not None:
-            self._compass.update(estimate.problem)
-            messages.append(estimate.message(self._node))
+    def _messages(self, samples: list[ImuSample]) -> list[Message]:
+        """Return each sample as Imu, and the attitude at the last one and at every second before it.
+
+        All attitudes can be computed again from the Imu messages, and turning is smooth over 20 ms.
+        """
+        messages: list[Message] = []
+        for left, sample in zip(reversed(range(len(samples))), samples, strict=True):
+            messages.append(self._imu(sample))
+            estimate = self._attitude.update(sample)
+            if estimate is not None:
+                self._compass.update(estimate.problem)
+                if left % ATTITUDE_EVERY == 0:
+                    messages.append(estimate.message(self._node))
         return messages
 
-    def _temperature(self, sample: ImuSample) -> float | UnsetType:
-        """Return the temperature once a second: it changes slowly."""
-        if sample.temperature_degc is None or 0 <= sample.stamp_ns - self._told_ns < S_NS:
-            return UNSET
-        self._told_ns = sample.stamp_ns
-        return round(sample.temperature_degc, 2)
+    def _imu(self, sample: ImuSample) -> Imu:
+        return Imu(
+            node=self._node,
+            stamp_ns=sample.stamp_ns,
+            accel_mps2=_triple(sample.accel_mps2),
+            gyro_radps=_triple(sample.gyro_radps),
+            mag_t=UNSET if sample.mag_t is None else _triple(sample.mag_t),
+            temperature_degc=UNSET if sample.temperature_degc is None else sample.temperature_degc,
+        )
 
     def close(self) -> None:
         """Free the bus, for all of its sources."""
@@ -168,7 +194,10 @@ class ImuSource:
 
 
 class DepthSource:
-    """The pressure sensor, and the depth computed from it once the surface is known."""
+    """The pressure sensor, and the depth computed from it once the surface is known.
+
+    read_by: the source that calls `step`; "" where `next_messages` does.
+    """
 
     name = "depth"
 
@@ -182,13 +211,14 @@ class DepthSource:
         clock: Clock,
     ) -> None:
         self._node = node
+        self.read_by = ""
         self._bus = bus
-        self._open = open_device
+        self._opener = Opener(open_device, clock)
         self._density_kgpm3 = density_kgpm3
         self._zero_path = zero_path
         self._zero = SurfaceZero(load_zero(zero_path, clock.now_ns()))
         self._clock = clock
-        self._device: DepthDevice | None = None
+        self._turn = Metronome(TURN_NS, clock)
         self._health = DeviceHealth(self.name)
 
     @property
@@ -203,29 +233,23 @@ class DepthSource:
 
     def next_messages(self, stop: threading.Event) -> list[Message] | None:
         """Wait for the next sample."""
-        while not self._wait(stop):
-            try:
-                if self._device is None:
-                    self._device = self._open()
-                sample = self._device.step(self._clock.now_ns())
-            except DeviceError as error:
-                self._health.update(str(error))
-                if self._device is None and self._clock.wait_until_ns(self._clock.now_ns() + REOPEN_NS, stop):
-                    return None
-                continue
-            if sample is None:
-                continue
-            self._health.update("")
-            if self._find_zero(sample):
-                return [self._message(sample)]
+        while not self._turn.wait(stop):
+            messages = self.step()
+            if messages:
+                return messages
         return None
 
-    def _wait(self, stop: threading.Event) -> bool:
-        """Wait until the device is due, for at most LONGEST_WAIT_NS: the clock may be set."""
-        if self._device is None:
-            return stop.is_set()
-        now_ns = self._clock.now_ns()
-        return self._clock.wait_until_ns(min(self._device.next_due_ns, now_ns + LONGEST_WAIT_NS), stop)
+    def step(self) -> list[Message]:
+        """Take the sensor's next step if one is due; return its sample if one is complete."""
+        try:
+            sample = self._opener.get().step(self._clock.now_ns())
+        except DeviceError as error:
+            self._health.update(str(error))
+            return []
+        if sample is None:
+            return []
+        self._health.update("")
+        return [self._message(sample)] if self._find_zero(sample) else []
 
     def _find_zero(self, sample: DepthSample) -> bool:
         """Return whether the search for the surface is over."""
@@ -278,27 +302,29 @@ def open_sensors(config: NodeConfig, clock: Clock) -> list[ImuSource | DepthSour
     check_names(sensors.imu, sensors.depth)
     x, y, z, w = sensors.mount_xyzw
     R_body_chip = quaternion_to_matrix(np.array([w, x, y, z]))
-    sources: list[ImuSource | DepthSource] = []
     bus = I2cBus(sensors.i2c_bus)
+    imu: ImuSource | None = None
+    depth: DepthSource | None = None
     try:
-        if sensors.imu != NONE:
-            attitude = attitude_estimator(config, clock.now_ns())
-            sources.append(
-                ImuSource(config.node, bus, lambda: open_imu(bus, sensors.imu, R_body_chip, clock), attitude, clock)
-            )
         if sensors.depth != NONE:
-            zero_path = Path(config.record.directory) / f"{config.node}-surface.json"
-            sources.append(
-                DepthSource(
-                    config.node,
-                    bus,
-                    lambda: open_depth(bus, sensors.depth, clock),
-                    sensors.water_density_kgpm3,
-                    zero_path,
-                    clock,
-                )
+            depth = DepthSource(
+                config.node,
+                bus,
+                lambda: open_depth(bus, sensors.depth, clock),
+                sensors.water_density_kgpm3,
+                Path(config.record.directory) / f"{config.node}-surface.json",
+                clock,
+            )
+        if sensors.imu != NONE:
+            imu = ImuSource(
+                config.node,
+                bus,
+                lambda: open_imu(bus, sensors.imu, R_body_chip, clock),
+                attitude_estimator(config, clock.now_ns()),
+                clock,
+                depth,
             )
     except BaseException:
         bus.close()
         raise
-    return sources
+    return [source for source in (imu, depth) if source is not None]

@@ -43,7 +43,7 @@ class I2cBus:
         self._new_bus: Any = SMBus
         self._message: Any = i2c_msg
         self._bus: Any = None
-        self._messages: dict[tuple[int, int, int], tuple[Any, Any]] = {}
+        self._messages: dict[tuple[int, int, int], tuple[Any, ...]] = {}
 
     def open(self) -> None:
         """Open the adapter if it is not open; raise DeviceError if it cannot be. The next call tries again."""
@@ -86,12 +86,7 @@ class I2cBus:
     def read(self, address: int, register: int, count: int) -> bytes:
         """Read count bytes from a register on, in one transfer."""
         with self._lock:
-            key = address, register, count
-            # Making them costs more than the transfer; the kernel fills the same reply again.
-            kept = self._messages.get(key)
-            if kept is None:
-                made = self._message.write(address, [register]), self._message.read(address, count)
-                kept = self._messages[key] = made
+            kept = self._kept(address, register, count)
             self._transfer(address, register, *kept)
             return bytes(kept[1])
 
@@ -103,7 +98,16 @@ class I2cBus:
     def command(self, address: int, command: int) -> None:
         """Send a command byte without data."""
         with self._lock:
-            self._transfer(address, command, self._message.write(address, [command]))
+            self._transfer(address, command, *self._kept(address, command, 0))
+
+    def _kept(self, address: int, register: int, count: int) -> tuple[Any, ...]:
+        """Return the messages of a transfer: making them costs more than the transfer; the reply is filled again."""
+        key = address, register, count
+        kept = self._messages.get(key)
+        if kept is None:
+            ask = self._message.write(address, [register])
+            kept = self._messages[key] = (ask, self._message.read(address, count)) if count else (ask,)
+        return kept
 
     def _transfer(self, address: int, register: int, *messages: object) -> None:
         """Transfer messages, with the lock held."""

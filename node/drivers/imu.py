@@ -140,6 +140,7 @@ class ImuBoard:
         self._mag_problem = ""
         self._saturated = ""
         self._saturated_ns = 0
+        self._told_ns = 0
         self._motion = motion
         self._accel_watch, self._gyro_watch = motion.watches
         self._settings = SettingsWatch(motion.chips)
@@ -190,37 +191,39 @@ class ImuBoard:
         stamp_ns, R = reading.stamp_ns, self._R_body_chip
         accel_mps2, gyro_radps, temperature_degc = self._motion.decode(reading.motion)
         try:
-            saturated = [
-                name
-                for name, watch, values in (
-                    ("accelerometer", self._accel_watch, accel_mps2),
-                    ("gyroscope", self._gyro_watch, gyro_radps),
-                )
-                if watch.is_saturated(values, stamp_ns)
-            ]
+            accel_full = self._accel_watch.is_saturated(accel_mps2, stamp_ns)
+            gyro_full = self._gyro_watch.is_saturated(gyro_radps, stamp_ns)
         except SettlingError:
             raise
         except DeviceError:
             self._lose_motion()
             raise
-        self._note_saturation(saturated, stamp_ns)
+        self._note_saturation(accel_full, gyro_full, stamp_ns)
         mag = self._magnetometer
         return ImuSample(
             stamp_ns,
             R @ accel_mps2,
             R @ gyro_radps,
             None if mag is None or reading.mag is None else R @ mag.decode_mag(reading.mag),
-            bool(saturated),
-            temperature_degc,
+            accel_full or gyro_full,
+            self._told(temperature_degc, stamp_ns),
         )
+
+    def _told(self, temperature_degc: float, now_ns: int) -> float | None:
+        """Return the temperature once a second, else None: it changes slowly."""
+        if 0 <= now_ns - self._told_ns < S_NS:
+            return None
+        self._told_ns = now_ns
+        return round(temperature_degc, 2)
 
     def _lose_motion(self) -> None:
         # The cause may have reset the board's other chips as well.
         self._motion_ready = self._mag_ready = False
         self._mag_retry_ns = 0
 
-    def _note_saturation(self, names: list[str], now_ns: int) -> None:
-        if names:
+    def _note_saturation(self, accel_full: bool, gyro_full: bool, now_ns: int) -> None:
+        if accel_full or gyro_full:
+            names = ["accelerometer"] * accel_full + ["gyroscope"] * gyro_full
             self._saturated, self._saturated_ns = f"{' and '.join(names)} at full scale", now_ns
         elif self._saturated and not 0 <= now_ns - self._saturated_ns < SATURATION_SHOWN_NS:
             self._saturated = ""

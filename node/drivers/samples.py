@@ -40,7 +40,7 @@ class ImuSample:
 
     accel_mps2: specific force, so (0, 0, -9.8) of a level node at rest. mag_t: None without a magnetometer.
     saturated: acceleration or rate was at full scale, so that the true one may be larger. temperature_degc: of the
-    gyroscope; None where it is not known.
+    gyroscope, once a second; else None.
     """
 
     stamp_ns: int
@@ -96,8 +96,6 @@ class ImuDevice(Protocol):
 
 class DepthDevice(Protocol):
     """A pressure sensor that converts while the caller does other work: no method waits."""
-
-    next_due_ns: int
 
     @property
     def name(self) -> str:

@@ -192,6 +192,7 @@ class DiveSensors:
     """Attitude, depth and inertial samples of one node in a dive log."""
 
     name = "stored sensors"
+    read_by = ""
     problem = ""
     retries = 0
 

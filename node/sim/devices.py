@@ -96,6 +96,7 @@ class SimulatedCamera:
 class SimulatedSensor:
     """One sensor of the simulated node at a constant rate."""
 
+    read_by = ""
     problem = ""
     retries = 0
 

@@ -23,7 +23,7 @@ class Message(Struct, frozen=True, kw_only=True):
 
 def check_unit(field: str, q_xyzw: Quaternion) -> None:
     """Raise ValueError if a quaternion's norm is not 1 within 1e-3."""
-    norm = math.sqrt(sum(x * x for x in q_xyzw))
+    norm = math.hypot(*q_xyzw)
     if not abs(norm - 1.0) <= 1e-3:
         raise ValueError(f"{field}: norm {norm:.6g} is not 1")
 

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from buddyline.node.time_base import NodeClock
 from buddyline.protocol.clock import MS_NS, S_NS
 from buddyline.protocol.codec import decode
 from buddyline.protocol.divelog import DiveLogReader
-from buddyline.protocol.messages import NodeStatus
+from buddyline.protocol.messages import Depth, Imu, NodeStatus
 from buddyline.tools.dives import Dive
 from msgspec.structs import replace
 
@@ -271,6 +272,7 @@ class SilentSensor:
     """A sensor that gives nothing."""
 
     name = "depth"
+    read_by = ""
     retries = 7
 
     def __init__(self, problem):
@@ -284,6 +286,36 @@ def test_a_sensor_that_says_what_is_wrong_does_not_restart_the_node(tmp_path, mo
     service = NodeService(config)
     service.sources = [SilentSensor(problem)]
     assert service.progressing() is progresses
+
+
+class Giving:
+    """A sensor that gives these blocks of messages."""
+
+    problem, retries, read_by = "", 0, ""
+
+    def __init__(self, name, read_by="", blocks=()):
+        self.name, self.read_by, self._blocks = name, read_by, list(blocks)
+
+    def next_messages(self, stop):
+        return self._blocks.pop(0) if self._blocks else None
+
+    def close(self):
+        pass
+
+
+def test_of_two_sensors_on_one_bus_each_is_known_to_have_given_by_its_own_messages(tmp_path):
+    config = NodeConfig(node="a", camera=CameraConfig(name="stored"), record=RecordConfig(directory=str(tmp_path)))
+    service = NodeService(config)
+    sent = []
+    service.outlet = SimpleNamespace(send=sent.append)
+    depth = Depth(node="a", stamp_ns=1, depth_m=1.0, sigma_m=0.1, pressure_pa=1e5, temperature_degc=5.0)
+    inertial = Imu(node="a", stamp_ns=1, accel_mps2=(0.0, 0.0, -9.8), gyro_radps=(0.0, 0.0, 0.0))
+    for given, heard in ([depth], {"depth"}), ([inertial], {"imu"}), ([inertial, depth], {"imu", "depth"}):
+        service.sources = [imu := Giving("imu", blocks=[given]), Giving("depth", read_by="imu")]
+        service._last_s.clear()
+        service._read(imu)
+        assert service._last_s.keys() == heard
+    assert len(sent) == 4
 
 
 class NewCamera:

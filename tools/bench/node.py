@@ -162,10 +162,8 @@ def _sensors(config: NodeConfig, clock: Clock) -> list[Source]:
     zero_path = Path(config.record.directory) / "surface.json"
     attitude = VqfAttitude(MagnetometerCalibration(np.full(3, 1e-12), np.eye(3)))
     density_kgpm3 = config.sensors.water_density_kgpm3
-    return [
-        ImuSource(config.node, bus, lambda: open_imu(bus, clock=clock), attitude, clock),
-        DepthSource(config.node, bus, lambda: open_depth(bus, clock=clock), density_kgpm3, zero_path, clock),
-    ]
+    depth = DepthSource(config.node, bus, lambda: open_depth(bus, clock=clock), density_kgpm3, zero_path, clock)
+    return [ImuSource(config.node, bus, lambda: open_imu(bus, clock=clock), attitude, clock, depth), depth]
 
 
 def _watch(service: MeasuredNode, seconds: float) -> dict[str, Any]:
