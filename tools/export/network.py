@@ -106,12 +106,12 @@ def _trc_lines(markers: Markers, name: str) -> Iterator[str]:
     rate_hz, count, names = markers.rate_hz, len(markers.stamps_ns), markers.names
     yield f"PathFileType\t4\t(X/Y/Z)\t{name}\n"
     yield "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
-    yield f"{rate_hz:g}\t{rate_hz:g}\t{count}\t{len(names)}\tmm\t{rate_hz:g}\t1\t{count}\n"
+    yield f"{rate_hz:.17g}\t{rate_hz:.17g}\t{count}\t{len(names)}\tmm\t{rate_hz:.17g}\t1\t{count}\n"
     yield "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t\n"
     yield "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, len(names) + 1)) + "\n\n"
     for frame, (stamp_ns, places_m) in enumerate(zip(markers.stamps_ns, markers.places_m, strict=True), start=1):
-        cells = [str(frame), f"{(stamp_ns - markers.stamps_ns[0]) / S_NS:.6f}"]
-        cells += ["" if math.isnan(value) else f"{1e3 * value:.3f}" for value in places_m.ravel().tolist()]
+        cells = [str(frame), f"{(stamp_ns - markers.stamps_ns[0]) / S_NS:.9f}"]
+        cells += ["" if math.isnan(value) else repr(1e3 * value) for value in places_m.ravel().tolist()]
         yield "\t".join(cells) + "\n"
 
 
