@@ -1,6 +1,6 @@
 """Cut what the page's green stands on, again and again, and time until the screen is green no longer.
 
-    python -m tests.cuts --times 20 [monitor solver node hub network tab]
+    python -m tests.cuts --times 20 [monitor solver b hub network tab]
 
 Two simulated nodes at 2 Hz, solver, hub and monitor run as processes, the page in a headless Chromium (playwright). A
 process is stopped, not killed: its connections stay open, and only its silence tells. The network is a line that
@@ -29,11 +29,9 @@ from tests.tools.browsed import (
     free_port,
     hold,
     looking,
-    wait_for_server,
-    write_nodes,
 )
 
-CUTS = ("monitor", "solver", "node", "hub", "network", "tab")
+CUTS = ("monitor", "solver", "b", "hub", "network", "tab")
 # Longer than green may stay.
 HELD_S = 6.0
 
@@ -43,15 +41,10 @@ def time_cuts(cuts: list[str], times: int) -> dict[str, list[float]]:
     endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        write_nodes(folder, endpoint)
         processes = Processes()
         stack.callback(processes.end)
-        processes.start("hub", "hub", "--listen", endpoint)
-        processes.start("a", "node", "--config", str(folder / "a.toml"))
-        processes.start("node", "node", "--config", str(folder / "b.toml"))
-        processes.start("solver", "solver", "--connect", endpoint)
-        processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
-        wait_for_server(f"http://127.0.0.1:{port}")
+        processes.start_pair(folder, endpoint)
+        processes.start_monitor(endpoint, port)
         line = stack.enter_context(closing(CuttableLine(port)))
         chromium = stack.enter_context(chromium_browser())
         seen = stack.enter_context(looking(chromium, "cuts"))
@@ -63,7 +56,7 @@ def time_cuts(cuts: list[str], times: int) -> dict[str, list[float]]:
             return lambda: child.send(signal.SIGSTOP), lambda: child.send(signal.SIGCONT)
 
         ways: dict[str, tuple[Callable[[], None], Callable[[], None]]] = {
-            **{name: stop_and_go(name) for name in ("monitor", "solver", "node", "hub")},
+            **{name: stop_and_go(name) for name in ("monitor", "solver", "b", "hub")},
             "network": (line.cut, line.mend),
             "tab": (lambda: hold(seen, HELD_S), lambda: None),
         }

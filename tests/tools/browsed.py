@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import shutil
 import signal
 import socket
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from buddyline.node.sim.scenario import Scenario
+from buddyline.tools.demo.command import write_nodes
 
 from tests.processes import REPOSITORY, Process, free_endpoint, until
 
@@ -35,21 +36,6 @@ PATIENCE_MS = 240_000
 GREEN = """() => document.getElementById("banner").className === "ok"
     && Number(getComputedStyle(document.getElementById("well")).opacity) > 0.5"""
 WELL_BGR = [160, 224, 127]
-NODE_TOML = """
-node = "{node}"
-connect = "{endpoint}"
-rate_hz = 2.0
-[camera]
-name = "simulated"
-[sensors]
-name = "simulated"
-[record]
-directory = {directory}
-[simulation]
-environment = "cavern"
-seed = 1
-start_ns = {start_ns}
-"""
 
 
 class Browser:
@@ -160,14 +146,6 @@ def hold(seen: Browser, seconds: float) -> None:
     seen.page.evaluate(f"setTimeout(() => {{ {held} }}, 9)")
 
 
-def write_nodes(folder: Path, endpoint: str) -> None:
-    """Write the configurations of two simulated nodes, a.toml and b.toml."""
-    start_ns = time.time_ns()
-    for node in "ab":
-        text = NODE_TOML.format(node=node, endpoint=endpoint, directory=json.dumps(str(folder)), start_ns=start_ns)
-        (folder / f"{node}.toml").write_text(text)
-
-
 class Processes:
     """`buddyline` commands by name, ended with the test."""
 
@@ -176,6 +154,19 @@ class Processes:
 
     def start(self, name: str, *words: str) -> None:
         self.running[name] = Process(*words)
+
+    def start_pair(self, folder: Path, endpoint: str) -> None:
+        """Start hub, two simulated nodes at 2 Hz, a and b, and the solver."""
+        self.start("hub", "hub", "--listen", endpoint)
+        scenario = Scenario(environment="cavern", seed=1, start_ns=time.time_ns())
+        for node, config in write_nodes(folder, folder, endpoint, scenario, 2.0):
+            self.start(node, "node", "--config", str(config))
+        self.start("solver", "solver", "--connect", endpoint)
+
+    def start_monitor(self, endpoint: str, port: int) -> None:
+        """Start the monitor, and wait for its page."""
+        self.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
+        wait_for_server(f"http://127.0.0.1:{port}")
 
     def kill(self, name: str) -> None:
         self.running.pop(name).end(signal.SIGKILL)

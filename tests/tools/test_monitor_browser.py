@@ -27,7 +27,6 @@ from tests.tools.browsed import (
     hold,
     looking,
     wait_for_server,
-    write_nodes,
 )
 from tests.tools.evaluated import INFOS, rejection, write_log
 from tests.tools.watched import at, image, tick
@@ -67,18 +66,13 @@ def box_of(part: Any) -> dict[str, float]:
 def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Processes, tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     port = free_port()
-    write_nodes(tmp_path, endpoint)
     # The page is there before the hub is, and finds it by itself.
-    processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
-    wait_for_server(f"http://127.0.0.1:{port}")
+    processes.start_monitor(endpoint, port)
     line = CuttableLine(port)
     with looking(chromium, "live") as seen, closing(line):
         seen.page.goto(f"http://127.0.0.1:{line.port}")
         seen.wait_for("Nothing has come over the bus yet")
-        processes.start("hub", "hub", "--listen", endpoint)
-        processes.start("a", "node", "--config", str(tmp_path / "a.toml"))
-        processes.start("b", "node", "--config", str(tmp_path / "b.toml"))
-        processes.start("solver", "solver", "--connect", endpoint)
+        processes.start_pair(tmp_path, endpoint)
         seen.wait_for("Pose at ")
         seen.wait_for_green()
         assert seen.colours("#scene") > 50
@@ -122,7 +116,7 @@ def test_a_running_pair_is_watched_through_faults(chromium: Any, processes: Proc
         seen.wait_for_green()
         processes.kill("monitor")
         seen.wait_for("No news from the monitor")
-        processes.start("monitor", "monitor", "--connect", endpoint, "--port", str(port))
+        processes.start_monitor(endpoint, port)
         seen.wait_for_green()
         # While the monitor was away the browser has said, in its console, that nobody answers.
         seen.complaints = [said for said in seen.complaints if "WebSocket connection to" not in said]

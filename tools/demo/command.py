@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--monitor", action="store_true", help="watch it on the monitor's page, in the browser")
 
 
-NODE_TOML: Final = """\
+_NODE_TOML: Final = """\
 node = "{node}"
 connect = "{endpoint}"
 rate_hz = {rate}
@@ -128,6 +128,29 @@ def run(args: argparse.Namespace) -> int:
     return 1 if over and not summary["poses"] else status
 
 
+def write_nodes(
+    work: Path, records: Path, endpoint: str, scenario: Scenario, rate_hz: float, *, blink: bool = False
+) -> Iterator[tuple[str, Path]]:
+    """Write each simulated node's configuration into work, for logs in records; yield its id and the file."""
+    for node in scenario.nodes:
+        config = work / f"{node}.toml"
+        config.write_text(
+            _NODE_TOML.format(
+                node=node,
+                endpoint=endpoint,
+                rate=float(rate_hz),
+                directory=json.dumps(str(records)),
+                environment=scenario.environment,
+                seed=scenario.seed,
+                start_ns=scenario.start_ns,
+                more_nodes=json.dumps(scenario.more_nodes),
+                fixed_nodes=json.dumps(scenario.fixed_nodes),
+                blinking=json.dumps(blink),
+            )
+        )
+        yield node, config
+
+
 def _start(
     children: list[Child], args: argparse.Namespace, work: Path, records: Path, endpoint: str, scenario: Scenario
 ) -> None:
@@ -136,22 +159,7 @@ def _start(
 
     hub = Child("hub", "--listen", endpoint)
     try:
-        for node in scenario.nodes:
-            config = work / f"{node}.toml"
-            config.write_text(
-                NODE_TOML.format(
-                    node=node,
-                    endpoint=endpoint,
-                    rate=float(args.rate),
-                    directory=json.dumps(str(records)),
-                    environment=args.environment,
-                    seed=args.seed,
-                    start_ns=scenario.start_ns,
-                    more_nodes=json.dumps(scenario.more_nodes),
-                    fixed_nodes=json.dumps(scenario.fixed_nodes),
-                    blinking=json.dumps(args.blink),
-                )
-            )
+        for node, config in write_nodes(work, records, endpoint, scenario, args.rate, blink=args.blink):
             children.append(Child("node", "--config", str(config), name=f"node {node}"))
         children.append(Child("solver", "--connect", endpoint))
         if args.monitor:
