@@ -169,18 +169,18 @@ def _steady(seen: list[Floats], ages_s: list[float], axis: Floats, half_rad: Flo
     seen: directions and radii in each frame, the newest first. Of what should be in the picture now only the
     present counts.
     """
-    steady: list[Floats] = []
+    steady: list[tuple[Floats, float]] = []
     for k, directions in enumerate(seen):
         beside = [j for j in range(max(k - 2, 0), min(k + 3, len(seen))) if j != k]
         for one in directions:
             inside = bool((np.abs(_between(one, axis)) < 0.9 * half_rad).all())
-            known = any(_near(one, np.array([other]), ages_s[k]) for other in steady)
+            known = any(_near(one, other[None], ages_s[k] - age_s) for other, age_s in steady if age_s < ages_s[k])
             if known or (inside and ages_s[k] > NOW_NS / S_NS):
                 continue
             agree = sum(_near(one, seen[j], abs(ages_s[j] - ages_s[k])) for j in beside)
             if agree >= max(STAYING_SHARE * len(beside), 2):
-                steady.append(one)
-    return steady
+                steady.append((one, ages_s[k]))
+    return [one for one, _ in steady]
 
 
 def _between(one: Floats, other: Floats) -> Floats:
