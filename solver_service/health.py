@@ -23,7 +23,8 @@ _RELEASE: Final = re.compile(r"buddyline (\d{1,4}\.\d{1,4})(?!\d)")
 class Runs:
     """The run (boot) that a node's newest frame is of, that frame's stamp, and the run before.
 
-    returns: how often the run before was back, later by stamp. now_ns: when it was last.
+    returns: how often the run before was back, later by stamp. now_ns: when it was last. twins: whether it ever was so
+    often that there were two nodes.
     """
 
     boot: str
@@ -31,6 +32,7 @@ class Runs:
     before: str | None = None
     returns: int = 0
     now_ns: int = 0
+    twins: bool = False
 
 
 class Health:
@@ -60,6 +62,7 @@ class Health:
         if boot != runs.boot:
             if boot == runs.before:
                 runs.returns, runs.now_ns = runs.returns + 1, now_ns
+                runs.twins |= runs.returns >= TWINS
             else:
                 runs.returns = 0
             runs.boot, runs.before = boot, runs.boot
@@ -108,8 +111,13 @@ class Health:
                     f"frames of {first} are {abs(ahead_ns) / S_NS:.1f} s ahead of those of {second}: "
                     "do their clocks agree?"
                 )
-        twins = [f"two nodes have the id {node}: give each its own" for node in nodes if self._twins(node, now_ns)]
+        twins = [_twins_text(node) for node in nodes if self._twins(node, now_ns)]
         return found + others + twins + self._one_code(nodes)
+
+    def of_dive(self, nodes: tuple[str, str]) -> list[str]:
+        """Return what a dive that is over told of a pair of nodes: two have one id, or one code."""
+        twins = [node for node in nodes if (runs := self._runs.get(node)) is not None and runs.twins]
+        return [*map(_twins_text, twins), *self._one_code(nodes)]
 
     def _twins(self, node: str, now_ns: int) -> bool:
         runs = self._runs.get(node)
@@ -135,6 +143,10 @@ class Health:
         if silent_s > stale_after_s(CANDIDATES, self._period_s.get(node, 0.0)):
             return f"no frame of node {node} for {silent_s:.0f} s"
         return None
+
+
+def _twins_text(node: str) -> str:
+    return f"two nodes have the id {node}: give each its own"
 
 
 def _alike(one: Blink, other: Blink) -> bool:

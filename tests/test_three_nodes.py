@@ -80,6 +80,20 @@ def test_offline_the_given_nodes_restrict_the_pairs(three_logs, offline, tmp_pat
         assert not any(key.startswith("buddyline/node/b/") for key in reader.keys)
 
 
+def test_offline_two_nodes_of_one_id_are_named(three_logs, tmp_path):
+    *logs, third = three_logs[0]
+    twin = tmp_path / "twin.mcap"
+    with DiveLogReader(third) as reader, DiveLogWriter(twin) as writer:
+        for record in reader.records():
+            one = replace(record.open().message, node="b", stamp_ns=record.open().message.stamp_ns + 3_000_000)
+            writer.write_message(replace(one, boot="another") if isinstance(one, Candidates) else one)
+    done = buddyline("solve", *logs, twin, "-o", tmp_path / "out.mcap", "--track", "none")
+    said = "two nodes have the id b: give each its own"
+    assert done.stderr.count(said) == 1
+    (status,) = log_of(tmp_path / "out.mcap")[2]
+    assert said in status.problem
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not THIRD_BAR.exists(), reason="the shared sample dives are not here")
 def test_offline_a_third_bar_takes_no_outcome_from_a_pair(tmp_path):

@@ -85,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
             bad = dive.refused
             for pair in core.pairs.values():
                 # What the whole dive told: counts, the clocks' offset, problems. There is no diver left to advise.
-                status = pair.report(dive.end_ns, dive.end_ns, [], bad, sorted(core.unused))
+                problems = core.health.of_dive(pair.nodes)
+                status = pair.report(dive.end_ns, dive.end_ns, problems, bad, sorted(core.unused))
                 writer.write_message(replace(status, advice=UNSET), dive.end_ns)
     _summarize(args, core, tracks, bad, time.monotonic() - began_s)
     if not core.counts.total():
@@ -235,6 +236,8 @@ def _write(writer: DiveLogWriter, results: Iterable[Message], tracks: dict[tuple
 def _summarize(
     args: argparse.Namespace, core: SolverCore, tracks: Mapping[tuple[str, ...], Tracked], bad: int, took_s: float
 ) -> None:
+    for problem in dict.fromkeys(one for pair in core.pairs for one in core.health.of_dive(pair)):
+        log.warning("%s", problem)
     for problem in core.network.problems if core.network is not None else ():
         log.warning("network: %s", problem)
     told = {ids[1:]: of for ids, of in sorted(tracks.items()) if len(ids) == 3}

@@ -76,6 +76,8 @@ def test_two_nodes_of_one_id_are_named_while_both_send(health):
         health.saw_run("b", ("first", "second")[k % 2], (100 + k) * S_NS, now_ns=50 * S_NS)
     assert health.problems(AB, 50500 * S_NS // 1000) == ["two nodes have the id b: give each its own"]
     assert "two nodes" not in "".join(health.problems(AB, 70 * S_NS))
+    # A dive that is over is judged as a whole.
+    assert health.of_dive(AB) == ["two nodes have the id b: give each its own"]
 
 
 def test_nodes_that_blink_by_one_code_are_named(health):
