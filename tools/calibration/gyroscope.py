@@ -9,12 +9,10 @@ from typing import Final
 import numpy as np
 from buddyline.node.attitude import REST_ACCEL_MPS2, REST_GYRO_RADPS
 from buddyline.protocol.clock import S_NS
-from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import Imu
+from buddyline.tools.calibration.leastsquares import Floats, require
 from msgspec import UNSET
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
 WINDOW_NS: Final = 10 * S_NS
 MIN_SAMPLES: Final = 200
 MIN_RESTS: Final = 6
@@ -38,30 +36,22 @@ class GyroscopeFit:
 
 
 def fit(samples: Sequence[Imu]) -> GyroscopeFit:
-    """Fit a line to bias over temperature; raise BuddylineError, saying what is missing, where it is not good enough.
+    """Fit a line to bias over temperature; raise PoorCalibration, saying what is missing, where it is not good enough.
 
     samples: of one node, in order of time. Only windows in which the node lies still count.
     """
     degc, bias = _rests(samples)
-    if len(degc) < MIN_RESTS:
-        raise BuddylineError(
-            f"{len(degc)} rests of {WINDOW_NS // S_NS} s, at least {MIN_RESTS} are needed: let the node lie still"
-        )
+    few = f"{len(degc)} rests of {WINDOW_NS // S_NS} s, at least {MIN_RESTS} are needed: let the node lie still"
+    require((len(degc) >= MIN_RESTS, few))
     span_k = float(degc.max() - degc.min())
-    if span_k < MIN_SPAN_K:
-        raise BuddylineError(
-            f"the temperature changed by {span_k:.1f} K only, at least {MIN_SPAN_K:g} are needed: start with a node "
-            "that comes out of a refrigerator"
-        )
+    changed = f"the temperature changed by {span_k:.1f} K only, at least {MIN_SPAN_K:g} are needed"
+    require((span_k >= MIN_SPAN_K, f"{changed}: start with a node that comes out of a refrigerator"))
     lever = degc - degc.mean()
     slope = lever @ bias / (lever @ lever)
     left = bias - bias.mean(0) - lever[:, None] * slope
     left_radps = float(np.sqrt((left**2).mean()))
-    if left_radps > MAX_LEFT_RADPS:
-        raise BuddylineError(
-            f"a line leaves {np.degrees(left_radps):.3f} deg/s of the bias, rms: the node was turned, or its chip is "
-            "heated from one side"
-        )
+    leaves = f"a line leaves {np.degrees(left_radps):.3f} deg/s of the bias, rms"
+    require((bool(left_radps <= MAX_LEFT_RADPS), f"{leaves}: the node was turned, or its chip is heated from one side"))
     sigma = np.sqrt((left**2).sum(0) / (len(degc) - 2) / (lever @ lever))
     return GyroscopeFit(slope, sigma, left_radps, len(degc), span_k)
 

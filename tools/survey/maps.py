@@ -171,7 +171,7 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT PRIMARY KEY REFERENCES gpkg_
 def control_csv(sheet: Sheet) -> str:
     """Return stations and points as control points of photogrammetry: places and 1 sd, m, as Metashape reads them."""
     rows = [
-        [one.name, *(f"{value:z.4f}" for value in (*one.position_m.tolist(), *np.maximum(one.sigmas_m, 1e-4).tolist()))]
+        [one.name, *(f"{value:z.4f}" for value in (*one.position_m, *np.maximum(one.sigmas_m, 1e-4)))]
         for one in [*sheet.adjusted.positions.values(), *sheet.adjusted.points]
     ]
     return "".join(csv_lines(("label", "x_m", "y_m", "z_m", "accuracy_x_m", "accuracy_y_m", "accuracy_z_m"), rows))

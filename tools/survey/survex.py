@@ -211,9 +211,7 @@ def _svx_file(sheet: Sheet, body: list[str]) -> str:
         sd = f" {max(sigma_m[0], 0.001):.3f} {max(sigma_m[2], 0.001):.3f}" if sigma_m.any() else ""
         lines.append(f"*fix {name} reference {position[0]:.4f} {position[1]:.4f} {position[2]:.4f}{sd}")
     lines += [f"*entrance {name}" for name in sorted(sheet.entrances) if name in fixed]
-    lines += [
-        *(f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out),
-    ]
+    lines += [f"; left out: {leg.name} {leg.distance_m:.2f} m, {why}" for leg, why in sheet.adjusted.left_out]
     if sheet.olds and not sheet.readings:
         return "\n".join([*lines[: lines.index(f"*begin {sheet.name}")], *_svx_olds(sheet, grid), ""])
     return "\n".join([*lines, *body, f"*end {sheet.name}", *_svx_olds(sheet, grid), ""])
