@@ -45,12 +45,12 @@ def _derivatives(t_a_b_m: Floats, q_a_b_xyzw: Floats, info_a: NodeInfo, info_b: 
     turns = np.concatenate([0.5 * steps[..., 3:], np.ones((12, 1, 1))], axis=-1)
     t_m = t_a_b_m + steps[..., :3]
     q = normalized(multiply(turns, q_a_b_xyzw[None]))
-    images = _images(t_m.reshape(-1, 3), q.reshape(-1, 4), info_a, info_b).reshape(12, -1, 8)
+    images = light_images(t_m.reshape(-1, 3), q.reshape(-1, 4), info_a, info_b).reshape(12, -1, 8)
     J = np.moveaxis((images[:6] - images[6:]) / (2.0 * _STEP), 0, -1)
     return J, images.mean(axis=0)
 
 
-def _images(t_m: Floats, q_xyzw: Floats, info_a: NodeInfo, info_b: NodeInfo) -> Floats:
+def light_images(t_m: Floats, q_xyzw: Floats, info_a: NodeInfo, info_b: NodeInfo) -> Floats:
     """Return the eight image coordinates of each of n poses, (n, 8)."""
     lights_b, lights_a = (np.array([info.light_left_m, info.light_right_m]) for info in (info_b, info_a))
     t, q = t_m[:, None], q_xyzw[:, None]

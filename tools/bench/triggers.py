@@ -13,6 +13,7 @@ from buddyline.protocol.messages import CameraModel, NodeInfo
 from buddyline.solver_service.geometry.rotation import matrix_to_quat
 from buddyline.solver_service.geometry.trigger import Fix, NoFix, Observation, Sensed, Settings, View, solve_triggers
 from buddyline.solver_service.results import rig_of
+from buddyline.tools.bound import light_images
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -101,10 +102,7 @@ def simulate(rng: np.random.Generator, range_m: tuple[float, float], false: int 
 
 def images(t_a_b_m: Floats, R_a_b: Floats) -> Floats:
     """Project B's left and right light into A's picture, and A's into B's (4, 2); NaN behind a camera."""
-    points_m = np.concatenate((RIG.lights_m @ R_a_b.T + t_a_b_m, (RIG.lights_m - t_a_b_m) @ R_a_b))
-    z = np.where(points_m[:, 2:] > 0.1, points_m[:, 2:], np.nan)
-    pixels: Floats = points_m[:, :2] / z * CAMERA.fx_px + (CAMERA.cx_px, CAMERA.cy_px)
-    return pixels
+    return light_images(t_a_b_m[None], matrix_to_quat(R_a_b)[None], INFO, INFO).reshape(4, 2)
 
 
 def _upright(rng: np.random.Generator, heading_rad: float) -> Floats:
