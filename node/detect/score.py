@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 WEIGHTS: Final = Path(__file__).with_name("score.toml")
 LIMITS: Final[Mapping[str, tuple[float, float]]] = {
     "stands_out": (-1.0, 3.5),
-    "texture": (-0.7, 2.0),
+    "texture": (-1.2, 2.0),
     "height": (-3.0, 1.7),
     "size": (-0.5, 4.0),
+    "largest": (-0.5, 4.0),
     "plateau": (-1.2, 0.0),
     "halo": (0.0, 1.2),
     "out_of_round": (0.0, 1.0),
@@ -31,12 +32,14 @@ LIMITS: Final[Mapping[str, tuple[float, float]]] = {
 """The features, with the limits to which they are clipped: nothing is extrapolated beyond what the fit has seen.
 
 For the logarithm of the odds of a lamp:
-stands_out: log of the contrast over noise plus clutter. texture: log of the same of the picture's ninth to sixteenth
-lights, which are no lamps as a rule: shells and caustics come in fields. height: log of the peak above the ground over
-50 levels. out_of_round: least elongation of the outlines from half height upward, minus 1; lower down, a bar that a
-lamp lights may hang on to it. size: log of the radius at half height in px at FOCAL_PX. plateau: log of the radius at
-0.9 of the height over that at 0.5; 0 for a flat top with sharp edges. halo: log of the radius at 0.3 over that at 0.5;
-0 for a sharp edge. unclipped: how far the peak is below 240, in 100 levels.
+stands_out: log of the contrast over noise plus clutter. texture: log of the same of the picture's fifth to sixteenth
+lights, which are no lamps as a rule: shells and caustics come in fields, and an exposure for lamps shows nothing else.
+height: log of the peak above the ground over 50 levels. out_of_round: least elongation of the outlines from half height
+upward, minus 1; lower down, a bar that a lamp lights may hang on to it. size: log of the radius at half height in px at
+FOCAL_PX. largest: the size of the picture's largest light: small lights are particles beside a lamp's large glow, and
+lamps where the exposure is so short that nothing glows. plateau: log of the radius at 0.9 of the height over that at
+0.5; 0 for a flat top with sharp edges. halo: log of the radius at 0.3 over that at 0.5; 0 for a sharp edge.
+unclipped: how far the peak is below 240, in 100 levels.
 """
 PRODUCTS: Final = (
     ("size", "size"),
@@ -55,11 +58,11 @@ _SECOND: Final = np.array([list(LIMITS).index(b) for _, b in PRODUCTS])
 
 
 def texture(outstanding: NDArray[np.float32]) -> float:
-    """Return how much a picture's ninth to sixteenth most outstanding lights stand out.
+    """Return how much a picture's fifth to sixteenth most outstanding lights stand out.
 
-    outstanding: (N,), falling, one place of each light: many lamps are no texture.
+    outstanding: (N,), falling, one place of each light.
     """
-    return (float(outstanding[8:16].sum()) + 0.5 * max(16 - max(len(outstanding), 8), 0)) / 8.0
+    return (float(outstanding[4:16].sum()) + 0.3 * min(max(16 - len(outstanding), 0), 12)) / 12.0
 
 
 def features(lights: Lights, focal_px: float, textured: float) -> Floats:
@@ -71,11 +74,12 @@ def features(lights: Lights, focal_px: float, textured: float) -> Floats:
     alone[:, 1] = textured
     alone[:, 2] = np.maximum(lights.height, 1.0) / 50.0
     alone[:, 3] = r50 * (FOCAL_PX / focal_px)
-    alone[:, 4] = r90 / r50
-    alone[:, 5] = r30 / r50
-    np.log(alone[:, :6], out=alone[:, :6])
-    alone[:, 6] = lights.roundest - 1.0
-    alone[:, 7] = (240.0 - lights.peak) / 100.0
+    alone[:, 4] = alone[:, 3].max()
+    alone[:, 5] = r90 / r50
+    alone[:, 6] = r30 / r50
+    np.log(alone[:, :7], out=alone[:, :7])
+    alone[:, 7] = lights.roundest - 1.0
+    alone[:, 8] = (240.0 - lights.peak) / 100.0
     np.minimum(np.maximum(alone, _LOWEST, out=alone), _HIGHEST, out=alone)
     found[:, 0] = 1.0
     found[:, 1 + len(LIMITS) :] = alone[:, _FIRST] * alone[:, _SECOND]

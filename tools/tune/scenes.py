@@ -33,9 +33,9 @@ FAR: Final = (0.6, 1.4)
 DARK_SHARE: Final = 0.2
 """Share of the scenes in which the nodes' lamps are dark: pictures without lamps, or with other divers' alone."""
 STOPS: Final = (0.0, 0.0, 1.0, -1.0, -2.0, -3.0)
-LAMPS_SHARE, LAMPS_MS = 0.5, (0.015, 0.25)
-"""Half of the scenes are exposed relative to the scene's exposure, half for lamps, as a node does nearly always: so
-many ms, evenly on a logarithmic scale."""
+LAMPS_SHARE, LAMPS_MS = 0.65, (0.014, 0.15)
+"""So many scenes are exposed for lamps, as a node does nearly always: so many ms, evenly on a logarithmic scale, which
+is what its loop comes to. The others are exposed relative to the scene's exposure."""
 OTHER_LAMPS: Final = (0, 0, 1, 2, 4, 8)
 SIZES: Final = ((820, 616), (820, 616), (820, 616), (1640, 1232))
 GREY_SHARE: Final = 0.15
