@@ -6,11 +6,12 @@ import threading
 from collections import Counter
 from typing import TYPE_CHECKING
 
+from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.clock import Clock
 from buddyline.protocol.codec import encode, message_stamp_ns
 from buddyline.protocol.digest import DigestBook, sealed
-from buddyline.protocol.messages import Message
-from buddyline.protocol.topics import Topic, key_of, topic_of
+from buddyline.protocol.messages import Imu, Message
+from buddyline.protocol.topics import IMU, Topic, key_of, topic_of
 
 if TYPE_CHECKING:
     from buddyline.protocol.bus import Bus, Publisher
@@ -39,6 +40,7 @@ class Outlet:
         self._latest: dict[str, Message] = {}
         self._keys: dict[str, str] = {}
         self._book = DigestBook(node, boot, clock.now_ns())
+        self._packer = ImuPacker()
         self._sign = None if signer is None else signer.sign
 
     def send(self, message: Message, *, record: bool = True, publish: bool = True) -> None:
@@ -71,7 +73,17 @@ class Outlet:
         if topic.latest_only:
             self._latest[topic.name] = message
         if publish and self._bus is not None:
-            self._publisher(topic).put_bytes(payload)
+            if isinstance(message, Imu):
+                self._publish_sample(message, payload)
+            else:
+                self._publisher(topic).put_bytes(payload)
+
+    def _publish_sample(self, sample: Imu, payload: bytes) -> None:
+        """Publish an inertial sample, or, where the link leaves it out, means of it and the next."""
+        if self._packer.is_packing or not self._publisher(IMU).put_bytes(payload):
+            means = self._packer.add(sample)
+            if means is not None:
+                self._send(means, encode(means))
 
     @property
     def connected(self) -> bool:

@@ -18,6 +18,7 @@ from buddyline.protocol.messages import (
     Candidates,
     Depth,
     Imu,
+    ImuMeans,
     Message,
     NodeInfo,
     Rejected,
@@ -36,7 +37,7 @@ from buddyline.solver_service.tracking import TrackSettings
 from msgspec import UNSET
 from msgspec.structs import replace
 
-NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu
+NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu | ImuMeans
 
 # If the receive time goes back by more than this, the receiver's clock was set back.
 SET_BACK_NS: Final = 1 * S_NS
@@ -267,8 +268,9 @@ class SolverCore:
             for pair in self._pairs_of.get(stream.node, ()):
                 pair.take(message, arrival, now_ns, live=live)
         else:
-            stream.add_sample(message)
-        if isinstance(message, Imu):
+            for sample in message.samples() if isinstance(message, ImuMeans) else (message,):
+                stream.add_sample(sample)
+        if isinstance(message, Imu | ImuMeans):
             return ()  # No trigger waits for inertial samples.
         pairs = self._pairs_of.get(stream.node, ())
         for pair in pairs:

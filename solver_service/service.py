@@ -22,6 +22,7 @@ from buddyline.protocol.topics import (
     CANDIDATES,
     DEPTH,
     IMU,
+    IMU_MEANS,
     INFO,
     NET_POSE,
     POSE,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+# Live also from IMU_MEANS: a stored dive has the samples themselves.
 SOLVED_FROM: Final = (INFO, IMU, ATTITUDE, DEPTH, CANDIDATES)
 # The core gets the time, and the status is published, at these intervals.
 TICK_S: Final = 0.25
@@ -218,7 +220,7 @@ class SolverService(Service):
         self._expect_again(past)
         # One subscription for all topics, so that cached messages come in the order of their stamps. A frame would
         # not wait for an attitude that comes a minute later.
-        bus.subscribe(tuple(topic.key_any() for topic in SOLVED_FROM), self.receive, capacity=32768)
+        bus.subscribe(tuple(topic.key_any() for topic in (*SOLVED_FROM, IMU_MEANS)), self.receive, capacity=32768)
         self._joined_ns = self._attached_ns = self.clock.now_ns()
 
     def receive(self, received: Received) -> None:

@@ -22,6 +22,7 @@ from buddyline.protocol.topics import (
     CLOCK_SET,
     DIGEST,
     IMAGE,
+    IMU_MEANS,
     INFO,
     POSE,
     REJECTED,
@@ -41,8 +42,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 # Results are not sent, because a solver on the bus computes them again. Clock beacons are not sent, because they say
-# nothing about the clocks of the nodes that are on the bus now. Digests are not sent, because not all is sent.
-SENT: Final = tuple(topic.name for topic in TOPICS if not topic.solved and topic not in (CLOCK, CLOCK_SET, DIGEST))
+# nothing about the clocks of the nodes that are on the bus now. Digests are not sent, because not all is sent. The log
+# has the samples themselves that a slow link had means of.
+SENT: Final = tuple(
+    topic.name for topic in TOPICS if not topic.solved and topic not in (CLOCK, CLOCK_SET, DIGEST, IMU_MEANS)
+)
 # Pictures are sent as previews only, to leave the bus to the solver's data.
 IMAGES_HZ: Final = 2.0
 # At --speed 0, the dive may run ahead of the solver's outcomes by this much of the dive's time. It is less than the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Annotated, Final, Literal, TypeAlias
 
 from buddyline.protocol.messages.fields import (
@@ -20,6 +21,7 @@ from buddyline.protocol.messages.fields import (
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 MAX_HEARD: Final = 16
+MAX_MEANS: Final = 32
 Role: TypeAlias = Literal["full", "lights", "camera"]
 
 
@@ -151,6 +153,34 @@ class Imu(Message, frozen=True, kw_only=True):
     gyro_radps: Vector3
     mag_t: Vector3 | UnsetType = UNSET
     temperature_degc: float | UnsetType = UNSET
+
+
+class ImuMeans(Message, frozen=True, kw_only=True):
+    """Means of inertial samples over consecutive spans, in the body frame, where a link does not carry the samples.
+
+    ages_ns: how long before stamp_ns the middle of each span was; the last is 0. accel_mps2, gyro_radps: what, constant
+    over the span, turns and pushes as much as the samples (coning and sculling are counted).
+    """
+
+    node: NodeId
+    stamp_ns: StampNs
+    ages_ns: Annotated[list[Count], Meta(min_length=1, max_length=MAX_MEANS)]
+    accel_mps2: list[Vector3]
+    gyro_radps: list[Vector3]
+
+    def __post_init__(self) -> None:
+        """Check that there are as many of each, in order, and that all are finite."""
+        if not len(self.ages_ns) == len(self.accel_mps2) == len(self.gyro_radps):
+            raise ValueError("ages_ns, accel_mps2, gyro_radps: not of one length")
+        if self.ages_ns[0] > self.stamp_ns or any(a <= b for a, b in pairwise(self.ages_ns)):
+            raise ValueError("ages_ns: not falling, or beyond the epoch")
+
+    def samples(self) -> list[Imu]:
+        """Return the means as samples in the middle of their spans."""
+        return [
+            Imu(node=self.node, stamp_ns=self.stamp_ns - age_ns, accel_mps2=accel_mps2, gyro_radps=gyro_radps)
+            for age_ns, accel_mps2, gyro_radps in zip(self.ages_ns, self.accel_mps2, self.gyro_radps, strict=True)
+        ]
 
 
 class Attitude(Message, frozen=True, kw_only=True):

@@ -62,6 +62,7 @@ SOUND: tuple[m.Message, ...] = (
     m.Imu(
         **_NODE, accel_mps2=(0.0, 0.0, -9.8), gyro_radps=(0.0, 0.0, 0.0), mag_t=(2e-5, 0.0, 4e-5), temperature_degc=21.5
     ),
+    m.ImuMeans(**_NODE, ages_ns=[50_000_000, 0], accel_mps2=[(0.0, 0.0, -9.8)] * 2, gyro_radps=[(0.1, 0.0, 0.0)] * 2),
     m.Attitude(**_NODE, q_ned_body_xyzw=_UNIT, sigma_rad=(0.02, 0.02, 0.1)),
     m.Depth(**_NODE, depth_m=5.0, sigma_m=0.02, pressure_pa=150000.0, temperature_degc=8.0),
     m.CompressedImage(

@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from buddyline.node.imu_means import ImuPacker
+from buddyline.protocol.messages import Imu
 from buddyline.solver_service.track.dive import NodeRecord, in_pieces, last_ns, parts_of, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
@@ -48,6 +50,39 @@ def test_filter_covers_the_dive(dive: KnownDive) -> None:
     assert judged.wrong == 0
     assert np.percentile(judged.errors_m, 95) < np.percentile(fix_errors(dive), 95)
     assert 0.4 < judged.nees < 2.0
+
+
+def of_means(record: NodeRecord) -> NodeRecord:
+    """What is left of a node's inertial samples on a slow link."""
+    packer = ImuPacker()
+    samples = zip(record.imu_stamps_ns.tolist(), record.accel_mps2.tolist(), record.gyro_radps.tolist(), strict=True)
+    packed = [
+        packer.add(Imu(node="a", stamp_ns=stamp_ns, accel_mps2=tuple(accel), gyro_radps=tuple(gyro)))
+        for stamp_ns, accel, gyro in samples
+    ]
+    means = [one for message in packed if message is not None for one in message.samples()]
+    return replace(
+        record,
+        imu_stamps_ns=np.array([one.stamp_ns for one in means]),
+        accel_mps2=np.array([one.accel_mps2 for one in means]),
+        gyro_radps=np.array([one.gyro_radps for one in means]),
+    )
+
+
+@pytest.mark.parametrize("poor", [False, True])
+def test_means_of_the_samples_carry_the_filter_as_the_samples_do(poor: bool) -> None:
+    """Five frames a second, as over a poor tether."""
+    dive = make(2, replace(SHORT, rate_hz=5.0, poor=poor))
+    a, b = map(of_means, dive.records)
+    assert len(a.imu_stamps_ns) < 0.21 * len(dive.records[0].imu_stamps_ns)
+    by = [
+        score(dive, filter_of(records, dive.fixes).advance(last_ns(dive.records), dive.stamps_ns))
+        for records in (dive.records, (a, b))
+    ]
+    assert [one.wrong for one in by] == [0, 0]
+    assert by[1].covered >= by[0].covered - 0.05
+    assert np.median(by[1].errors_m) < 1.2 * np.median(by[0].errors_m)
+    assert 0.4 < by[1].nees < 2.0
 
 
 def test_without_attitudes_a_track_starts_with_the_first_fix(dive: KnownDive) -> None:
