@@ -179,10 +179,12 @@ def test_compasses_that_wander_within_seconds_give_no_wrong_track() -> None:
     assert judged.nees < 1.6
 
 
-def test_two_seconds_of_darkness() -> None:
-    dive = make(4, replace(SHORT, seconds=16.0, dark_s=(8.0, 10.0), near_m=4.0))
+@pytest.mark.parametrize(("dark_s", "worst_m"), [(2.0, 0.06), (5.0, 0.15)])
+def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
+    dive = make(4, replace(SHORT, seconds=14.0 + dark_s, dark_s=(8.0, 8.0 + dark_s), near_m=4.0, far_m=8.0))
     judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
-    assert judged.errors_m.max() < 0.06
+    assert judged.wrong == 0
+    assert judged.errors_m.max() < worst_m
 
 
 def test_a_wrong_fix_changes_nothing_for_long(dive: KnownDive) -> None:
