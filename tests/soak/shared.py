@@ -34,6 +34,8 @@ from tests.processes import Process, free_endpoint, until
 START_NS = 1_764_000_000_000_000_000
 # From the last frame on; longer than a solver waits for anything.
 REST_S = 6.0
+# From a kill to the start of another solver.
+TAKEN_UP_S = 3.0
 
 
 def simulated(nodes: int, rate_hz: float, seconds: float, *, imu: bool) -> list[Message]:
@@ -128,13 +130,14 @@ class LiveDive:
 
 @dataclass
 class SharedSoak:
-    """How it went."""
+    """How it went. gaps_s: longest time without an outcome after each kill; joined_s: as another solver joins."""
 
     triggers: int
     missing: int
     doubled: int
     poses: int
     gaps_s: list[float]
+    joined_s: list[float]
     net_rows: int
 
 
@@ -163,16 +166,20 @@ def soak(
                 until(lambda: len({key[:2] for key in list(dive.told.outcomes)}) == pairs, 0.05)
                 until(lambda: dive.told.net or not track_hz, 0.05)
                 time.sleep(again_s)
-                gaps_s = []
+                gaps_s, joined_s = [], []
                 for _ in range(kills):
                     killed = running.pop(pick.randrange(len(running)))
                     time.sleep(pick.random())
                     killed_s = time.monotonic()
                     killed.end(signal.SIGKILL)
+                    time.sleep(TAKEN_UP_S)
+                    # Another one begins later: it fetches a minute of all nodes, which are one process here.
+                    gaps_s.append(dive.told.longest_gap_s(killed_s, time.monotonic()))
+                    again = time.monotonic()
                     running.append(Process(*words))
                     running[-1].wait_for("shares the work")
                     time.sleep(again_s)
-                    gaps_s.append(dive.told.longest_gap_s(killed_s, time.monotonic()))
+                    joined_s.append(dive.told.longest_gap_s(again, time.monotonic()))
                 dive.end()
                 due = set(dive.expected)
                 ends_s = time.monotonic() + REST_S
@@ -188,6 +195,7 @@ def soak(
         doubled=sum(count > 1 for count in came.values()),
         poses=dive.told.poses,
         gaps_s=gaps_s,
+        joined_s=joined_s,
         net_rows=len(dive.told.net),
     )
 
@@ -218,7 +226,8 @@ def main() -> int:
     print(
         f"{len(found.gaps_s)} kills among {args.solvers}: of {found.triggers} outcomes {found.missing} missing, "
         f"{found.doubled} doubled; longest time without one, of each kill: "
-        f"median {statistics.median(found.gaps_s):.2f} s, worst {max(found.gaps_s):.2f} s"
+        f"median {statistics.median(found.gaps_s):.2f} s, worst {max(found.gaps_s):.2f} s; while another one joins: "
+        f"median {statistics.median(found.joined_s):.2f} s, worst {max(found.joined_s):.2f} s"
     )
     return 1 if found.missing or found.doubled else 0
 
