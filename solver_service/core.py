@@ -270,12 +270,19 @@ class SolverCore:
         else:
             for sample in message.samples() if isinstance(message, ImuMeans) else (message,):
                 stream.add_sample(sample)
+                if isinstance(sample, Imu):
+                    self._note_late(sample)
         if isinstance(message, Imu | ImuMeans):
             return ()  # No trigger waits for inertial samples.
         pairs = self._pairs_of.get(stream.node, ())
         for pair in pairs:
             pair.resolve(now_ns)
         return pairs
+
+    def _note_late(self, sample: Imu) -> None:
+        for pair in self._pairs_of.get(sample.node, ()):
+            if pair.tracker is not None:
+                pair.tracker.note_late(sample)
 
     def _stream(self, node: str) -> NodeStream | None:
         """Return a node's stream; None if the node is not used."""

@@ -193,6 +193,7 @@ class PairCore:
             ),
             unused=unused or UNSET,
             advice=self.advice() or UNSET,
+            late_imu=(self.tracker.late_imu if self.tracker else 0) or UNSET,
         )
 
     def advice(self) -> list[str]:

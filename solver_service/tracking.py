@@ -18,6 +18,7 @@ from buddyline.protocol.messages import (
     Attitude,
     Expect,
     ExpectedLight,
+    Imu,
     Message,
     NodeInfo,
     Rejected,
@@ -39,7 +40,7 @@ from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
 from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
-from buddyline.solver_service.track.problems import as_ended
+from buddyline.solver_service.track.problems import ENDED_S, as_ended
 from msgspec import UNSET
 from msgspec.structs import replace
 
@@ -67,6 +68,9 @@ class PairTracker:
         self._filter: TrackFilter | None = None
         self.crowded = False
         self._past: list[str] = []
+        # Inertial samples that came too late, and each node's newest trigger when its last one did.
+        self.late_imu = 0
+        self._late_ns: dict[str, int] = {}
         self._streams = stream_a, stream_b
         self._settings = settings
         self._period_ns = round(S_NS / settings.rate_hz)
@@ -97,9 +101,22 @@ class PairTracker:
     def problems(self) -> list[str]:
         """What is wrong, what was (it says so), and the lamps that are dark now."""
         if self._filter is None:
-            return self._past
+            return self._past + self._late()
         found = [problem for problem in self._filter.problems if problem not in self._past]
-        return self._past + found + self._dark_lamps(self._filter.lamps.dark())
+        return self._past + self._late() + found + self._dark_lamps(self._filter.lamps.dark())
+
+    def note_late(self, sample: Imu) -> None:
+        """Count an inertial sample that comes after the track has passed its time; it has no effect any more."""
+        if self._first_ns is not None and self._first_ns <= sample.stamp_ns <= self._taken_ns:
+            self.late_imu += 1
+            self._late_ns[sample.node] = self._settled_ns
+
+    def _late(self) -> list[str]:
+        return [
+            f"inertial samples of node {node} come too late: the track does without them"
+            for node, late_ns in sorted(self._late_ns.items())
+            if self._settled_ns - late_ns <= ENDED_S * S_NS
+        ]
 
     def dark_lamps(self) -> list[tuple[int, int]]:
         """Return the lamps that are dark now, as node (0: A) and light (0: left)."""

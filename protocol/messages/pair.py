@@ -142,6 +142,7 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     clock_skew_s: B's clock minus A's, estimated from the dive's own messages; absent until there is an estimate.
     unused: nodes that the solver receives but is configured not to use; absent if there are none.
     advice: what the divers should do for a fix or a better one, a phrase each; absent if there is nothing to do.
+    late_imu: inertial samples that came after the track had passed their time, without effect; absent if none did.
     """
 
     node_a: NodeId
@@ -163,3 +164,4 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     problem: str = ""
     unused: list[NodeId] | UnsetType = UNSET
     advice: list[str] | UnsetType = UNSET
+    late_imu: Count | UnsetType = UNSET

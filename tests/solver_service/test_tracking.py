@@ -12,6 +12,7 @@ from buddyline.solver_service.core import SolverCore
 from buddyline.solver_service.geometry.trigger import Settings
 from buddyline.solver_service.streams import NodeStream
 from buddyline.solver_service.tracking import PairTracker, TrackSettings
+from msgspec import UNSET
 from msgspec.structs import replace
 
 from tests.solver_service.conftest import dive_messages
@@ -66,6 +67,28 @@ def test_a_track_waits_for_inertial_samples_that_come_after_the_pictures(inertia
     for one, other in zip(*([row for row in rows if row.mode == "filter"] for rows in (found, expected)), strict=True):
         np.testing.assert_allclose(one.t_a_b_m, other.t_a_b_m, atol=1e-9)
     assert core.pairs["a", "b"].tracker.problems == []
+
+
+def test_inertial_samples_that_come_too_late_are_counted_and_named_while_they_do(inertial_dive):
+    messages, _ = inertial_dive
+    began_ns = messages[0].stamp_ns
+
+    def arrival_ns(message):
+        late = isinstance(message, Imu) and message.node == "a" and message.stamp_ns < began_ns + 3 * S_NS // 2
+        return message.stamp_ns + (4 * S_NS if late else 0)
+
+    seen = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("filter",)), 20.0))
+    statuses = {}
+    for message in sorted(messages, key=arrival_ns):
+        seen.handle(message)
+        second = (arrival_ns(message) - began_ns) // S_NS
+        if second not in statuses:
+            statuses[second] = seen.report(message.stamp_ns, 0, 0, [])[0]
+    named = [second for second, status in statuses.items() if "samples of node a come too late" in status.problem]
+    assert not any("samples of node b" in status.problem for status in statuses.values())
+    assert named == list(range(5, 11))
+    assert statuses[3].late_imu is UNSET
+    assert 50 < statuses[5].late_imu < statuses[11].late_imu <= 150
 
 
 def test_a_track_goes_on_without_inertial_samples_and_says_so(inertial_dive):
