@@ -20,7 +20,7 @@ from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSe
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.smoother import Path, rows_between, smoothed
 from buddyline.solver_service.track.start import CLOCK_S, broad_start
-from buddyline.solver_service.track.state import CLOCK, NAV, R_
+from buddyline.solver_service.track.state import CLOCK, NAV
 from buddyline.solver_service.track.stepping import KNOWN_CLOCK_S, PassGuide
 from buddyline.solver_service.track.trail import Trail
 from buddyline.solver_service.track.vibration import Shares, fast_part, sudden_turn
@@ -37,8 +37,6 @@ MOST_LEFT_S: Final = 0.06
 CLOCK_ROUNDS: Final = 4
 # A track whose start is so near to the dive's is left as it is.
 LEAST_EARLIER_S: Final = 0.15
-# Beyond this share of the range, 1 sd of its place at its start, a path before a track would mislead the second pass.
-KNOWN_SHARE: Final = 0.1
 # An offset differs from the assumed one where it is so many sigmas off.
 TOLD_SIGMAS: Final = 6.0
 # Offsets that are tried where a first pass gives more than one track; a pass finds one up to 0.3 s from each. There is
@@ -199,7 +197,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         path = smoothed(part.steps)
         guide_by(second, path)
         earlier = _path_before(records, clock_ns, path, since_s, shares)
-        if earlier is not None and _is_known(earlier):
+        if earlier is not None:
             guide_by(second, earlier)
             path = earlier
         state = replace(path.state(0), clock_s=0.0)
@@ -230,11 +228,6 @@ def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, sh
         shift_ns = clock_ns if node else 0
         feed(track, node, record.between(start_ns - before_ns + shift_ns, start_ns - after_ns + shift_ns))
     return track.path_before(path, begin_s)
-
-
-def _is_known(path: Path) -> bool:
-    variance_m2 = float(np.trace(path.covariance(0)[R_, R_]))
-    return variance_m2 < (KNOWN_SHARE * float(np.linalg.norm(path.state(0).r_m))) ** 2
 
 
 def _first_pass(
