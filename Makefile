@@ -12,10 +12,6 @@ PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off 
 # picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
 VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
-# Python looks for an editable package last, after folders of its name: beside the copy of the repository, which often
-# has it, `import buddyline` gave an empty package. This line, which Python runs at its start, turns the order round.
-FIRST := import sys; sys.meta_path.sort(key=lambda one: not getattr(one, "__module__", "").startswith("__editable__"))
-
 .PHONY: demo test matrix coverage docs release install names clean
 
 demo: .venv/.run
@@ -65,7 +61,6 @@ names:
 	@echo "== setting up .venv; this takes one to three minutes, once"
 	$(PYTHON) -c 'import sys; sys.exit("Buddyline needs Python 3.11 or newer: make PYTHON=python3.11 ..." if sys.version_info < (3, 11) else 0)'
 	$(VENV)
-	@for folder in .venv/lib/python3*/site-packages; do echo '$(FIRST)' > "$$folder/buddyline.pth"; done
 
 .venv/.run: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "== installing the packages that buddyline needs"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -55,15 +53,6 @@ class FakeInstallation:
 @pytest.fixture
 def checkout(tmp_path: Path) -> FakeInstallation:
     return FakeInstallation(tmp_path)
-
-
-def test_a_folder_of_its_name_does_not_hide_the_package(tmp_path: Path) -> None:
-    found = re.search(r"^FIRST := (.*)$", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
-    assert found is not None
-    (tmp_path / "buddyline").mkdir()
-    told = [sys.executable, "-c", f"{found[1]}\nimport buddyline; print(buddyline.__file__)"]
-    done = subprocess.run(told, capture_output=True, text=True, timeout=PATIENCE_S, check=True, cwd=tmp_path)
-    assert Path(done.stdout.strip()) == REPOSITORY / "buddyline" / "__init__.py"
 
 
 def test_extras_add_up_and_stay(checkout: FakeInstallation) -> None:
