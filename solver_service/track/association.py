@@ -119,7 +119,8 @@ def _weigh_single(
     det = a * c - b * b
     chi2 = (c * (u * u) - 2.0 * b * (u * v) + a * (v * v)) / det
     log_l = -0.5 * (chi2 + np.log(det)) - (math.log(2.0 * math.pi) + log_clutter) + _LOG_SHARES[:, None, None]
-    for mode, k, light in np.argwhere(chi2 < GATE).tolist():
+    # A lamp that is nowhere in the picture is no candidate's, however little the track knows.
+    for mode, k, light in np.argwhere((chi2 < GATE) & (np.abs(y).max(axis=-1) < NOWHERE_PX)).tolist():
         if detection[light] > 0.0:
             options[light].append((float(log_l[mode, k, light]) + math.log(detection[light]), k, mode))
     for found in options:

@@ -169,6 +169,7 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
         first, parts, clock_ns = _first_pass(records, fixes, clock_ns, CLOCK_TRIES_S)
     if not parts:
         return Smoothed([], clock_ns * 1e-9, math.inf, first.problems)
+    parts = of_one_clock(parts)
     without = any(any(part.without) for part in parts)
     off_s = (clock_ns - told_ns) * 1e-9
     far = in_pieces(parts) or clock_off_by(parts[-1], MOST_LEFT_S)
@@ -248,11 +249,30 @@ def _first_pass(
 
 def in_pieces(parts: Sequence[Estimate]) -> bool:
     """Whether a dive's tracks disagree on the clocks' offset: it is further off than was tried."""
-    told = [(part.state.clock_s, float(part.covariance[CLOCK, CLOCK])) for part in parts]
-    return any(
-        abs(one_s - other_s) > max(PIECES_S, PIECES_SIGMAS * math.sqrt(one_variance + other_variance))
-        for (one_s, one_variance), (other_s, other_variance) in combinations(told, 2)
-    )
+    return any(disagree(one, other, PIECES_S) for one, other in combinations(parts, 2))
+
+
+def disagree(one: Estimate, other: Estimate, limit_s: float) -> bool:
+    """Whether two tracks' clock offsets differ by more than limit_s, and more than PIECES_SIGMAS."""
+    variance = float(one.covariance[CLOCK, CLOCK] + other.covariance[CLOCK, CLOCK])
+    return abs(one.state.clock_s - other.state.clock_s) > max(limit_s, PIECES_SIGMAS * math.sqrt(variance))
+
+
+def of_one_clock(parts: Sequence[Estimate]) -> list[Estimate]:
+    """Leave out tracks that diverged: between one and the next the clocks' offset cannot have jumped.
+
+    Of two that disagree on it, the one that explains more is kept. Further apart than PIECES_S it is the offset that
+    is not known.
+    """
+    sound: list[Estimate] = []
+    for part in parts:
+        while sound and disagree(sound[-1], part, NEAR_CLOCK_S) and not disagree(sound[-1], part, PIECES_S):
+            if sound[-1].evidence > part.evidence:
+                break
+            sound.pop()
+        else:
+            sound.append(part)
+    return sound
 
 
 def _rounds(records: Records, fixes: Sequence[FixSeen], clock_ns: int) -> tuple[TrackFilter, list[Estimate], int]:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
-from buddyline.solver_service.track.dive import NodeRecord, in_pieces, last_ns, parts_of, smooth
+from buddyline.solver_service.track.association import weigh
+from buddyline.solver_service.track.dive import NodeRecord, in_pieces, last_ns, of_one_clock, parts_of, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
 from buddyline.solver_service.track.output import TrackRow
+from buddyline.solver_service.track.state import CLOCK
 
 from tests.solver_service.track.dives import KnownDive, Setting, filter_of, fix_errors, make, score
 
@@ -354,6 +356,44 @@ def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
     [part] = parts_of(first)
     parts = [replace(part, state=replace(part.state, clock_s=clock_s)) for clock_s in parts_clock_s]
     assert in_pieces(parts) is expected
+
+
+@pytest.mark.parametrize(
+    ("clocks_s", "evidence", "kept"),
+    [
+        ([0.001, 0.003], [400.0, 14000.0], [0, 1]),
+        ([0.057, 0.0], [400.0, 14000.0], [1]),
+        ([0.0, 0.057], [14000.0, 400.0], [0]),
+        ([0.0, 0.057, 0.0], [900.0, 400.0, 800.0], [0, 2]),
+        # What no track knows is not settled by the longest.
+        ([0.0, 0.2], [14000.0, 400.0], [0, 1]),
+    ],
+)
+def test_a_track_that_contradicts_the_others_on_the_clocks_is_left_out(
+    dive: KnownDive, clocks_s: list[float], evidence: list[float], kept: list[int]
+) -> None:
+    first = filter_of(dive.records, dive.fixes)
+    first.advance(dive.stamps_ns[0] + 3_000_000_000)
+    [part] = parts_of(first)
+    covariance = part.covariance.copy()
+    covariance[CLOCK, CLOCK] = 0.0025**2
+    parts = [
+        replace(part, state=replace(part.state, clock_s=clock_s), covariance=covariance, evidence=explained)
+        for clock_s, explained in zip(clocks_s, evidence, strict=True)
+    ]
+    assert [parts.index(one) for one in of_one_clock(parts)] == kept
+
+
+def test_a_lamp_behind_the_camera_is_no_candidates() -> None:
+    """However little a track knows: a covariance of kilometres once took all lights in the picture for such a lamp."""
+    y = np.full((3, 2, 2), np.nan)
+    y[:, 1] = 3.0
+    H = np.random.default_rng(1).normal(0.0, 1e11, (3, 2, 2, 13))
+    H[:, 1] = 1.0
+    cases, logs = weigh(y, H, 1e7 * np.eye(13), np.full(3, 0.02), np.full(2, 0.9), 1e-6)
+    assert all(of_first is None for of_first, _ in cases)
+    assert len(cases) > 1
+    assert np.isfinite(logs).all()
 
 
 @pytest.mark.slow
