@@ -44,6 +44,8 @@ TOLD_SIGMAS: Final = 6.0
 CLOCK_TRIES_S: Final = (0.4, -0.4, 0.8, -0.8)
 PIECES_S: Final = 0.1
 PIECES_SIGMAS: Final = 4.0
+# Two quartz clocks drift apart by less, s a second.
+MOST_DRIFT: Final = 100e-6
 HEAD_NS: Final = 90 * S_NS
 # Further off, there is no track where a node has no inertial unit: the offset that is found is itself off by a tenth.
 FAR_WITHOUT_S: Final = 0.05
@@ -253,7 +255,8 @@ def in_pieces(parts: Sequence[Estimate]) -> bool:
 
 
 def disagree(one: Estimate, other: Estimate, limit_s: float) -> bool:
-    """Whether two tracks' clock offsets differ by more than limit_s, and more than PIECES_SIGMAS."""
+    """Whether two tracks' clock offsets differ by more than limit_s beside drift, and more than PIECES_SIGMAS."""
+    limit_s += MOST_DRIFT * abs(one.t_s - other.t_s)
     variance = float(one.covariance[CLOCK, CLOCK] + other.covariance[CLOCK, CLOCK])
     return abs(one.state.clock_s - other.state.clock_s) > max(limit_s, PIECES_SIGMAS * math.sqrt(variance))
 

@@ -365,6 +365,8 @@ def test_tracks_that_disagree_on_the_clocks_are_in_pieces(
         ([0.057, 0.0], [400.0, 14000.0], [1]),
         ([0.0, 0.057], [14000.0, 400.0], [0]),
         ([0.0, 0.057, 0.0], [900.0, 400.0, 800.0], [0, 2]),
+        # Clocks that drift, and five minutes without a light between two tracks.
+        ([0.0, 0.02], [14000.0, 400.0], [0, 1]),
         # What no track knows is not settled by the longest.
         ([0.0, 0.2], [14000.0, 400.0], [0, 1]),
     ],
@@ -378,8 +380,14 @@ def test_a_track_that_contradicts_the_others_on_the_clocks_is_left_out(
     covariance = part.covariance.copy()
     covariance[CLOCK, CLOCK] = 0.0025**2
     parts = [
-        replace(part, state=replace(part.state, clock_s=clock_s), covariance=covariance, evidence=explained)
-        for clock_s, explained in zip(clocks_s, evidence, strict=True)
+        replace(
+            part,
+            t_s=part.t_s + (300.0 * k if clock_s == 0.02 else k),
+            state=replace(part.state, clock_s=clock_s),
+            covariance=covariance,
+            evidence=explained,
+        )
+        for k, (clock_s, explained) in enumerate(zip(clocks_s, evidence, strict=True))
     ]
     assert [parts.index(one) for one in of_one_clock(parts)] == kept
 
