@@ -109,16 +109,14 @@ EXPECT: Final = Topic(
 IMU: Final = Topic(
     "imu", "buddyline/node/{node}/imu", messages.Imu, 100.0, "data", stale_s=2.0, shed=2, max_bytes=SAMPLE_BYTES
 )
-# Only where a link leaves out samples: one in 50 ms, eight in a message. A live track needs them all.
+# Only where a link leaves out samples and has room for means: one in 50 ms, eight in a message.
 IMU_MEANS: Final = Topic(
     "imu_means",
     "buddyline/node/{node}/imu_means",
     messages.ImuMeans,
     2.5,
     "data",
-    shed=3,
-    # Above its rate: a message that comes a little early is kept, too.
-    keep_hz=4.0,
+    shed=2,
     max_bytes=SAMPLE_BYTES,
 )
 ATTITUDE: Final = Topic(
