@@ -31,10 +31,9 @@ from buddyline.protocol.topics import Topic
 from buddyline.protocol.zenoh_bus.alive import ALIVE, ZenohWatch
 from buddyline.protocol.zenoh_bus.answers import AnswerDesk, ask
 from buddyline.protocol.zenoh_bus.link import Bulk, Link
-from buddyline.protocol.zenoh_bus.questions import QUERY_S, Pace, Questions
 from buddyline.protocol.zenoh_bus.session import SecondLink, config_of, open_client
 from buddyline.protocol.zenoh_bus.settings import client_settings
-from buddyline.protocol.zenoh_bus.subscription import AGAIN, COPY, ZenohSubscription
+from buddyline.protocol.zenoh_bus.subscription import AGAIN, COPY, QUERY_S, ZenohSubscription
 from buddyline.protocol.zenoh_bus.watchdog import Watchdog
 
 HEARTBEAT_S: Final = 2.0
@@ -45,11 +44,6 @@ _PRIORITIES: Final = {
     "data_low": zenoh.Priority.DATA_LOW,
     "background": zenoh.Priority.BACKGROUND,
 }
-# Zenoh's answers from a cache would wait (BLOCK) for one who asks and takes nothing: with them the publisher, whose
-# cache is locked meanwhile, and in the hub all else that comes from this client.
-_REPLIES: Final = zenoh.ext.RepliesConfig(
-    congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA_LOW
-)
 
 
 def connect(
@@ -148,7 +142,6 @@ class ZenohBus(Bus):
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._answers: list[AnswerDesk] = []
         self._limits: list[RateLimit] = []
-        self._pace = Pace()
         # Processes that play stored dives, which may be faster than live ones.
         self._players: set[str] = set()
         session.liveliness().declare_subscriber(f"{ALIVE}/{PLAYER}/*", self._note_player, history=True)
@@ -178,7 +171,7 @@ class ZenohBus(Bus):
             return zenoh.ext.declare_advanced_publisher(
                 self._session,
                 key,
-                cache=zenoh.ext.CacheConfig(depth, replies_config=_REPLIES),
+                cache=zenoh.ext.CacheConfig(depth),
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
                 **settings,
             )
@@ -206,14 +199,7 @@ class ZenohBus(Bus):
         delivery = Delivery(f"bus {' '.join(key_exprs)}", handle, capacity, self._failures)
         limit = RateLimit(is_off=lambda: bool(self._players))
         subscription = ZenohSubscription(
-            self._session,
-            key_exprs,
-            delivery,
-            limit,
-            Questions(self._session, self._pace),
-            history=history,
-            clock=self.clock,
-            failures=self._failures,
+            self._session, key_exprs, delivery, limit, history=history, clock=self.clock, failures=self._failures
         )
         with self._lock:
             self._subscriptions.append(subscription)

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from buddyline.protocol.bus import CACHE_S, cache_depth
 from buddyline.protocol.codec import MAX_MESSAGE_BYTES
 from buddyline.protocol.endpoint import host_and_port
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.log_pages import MOST_PAGE_BYTES
 from buddyline.protocol.security import Tls
-from buddyline.protocol.topics import LOG, TOPICS, Topic
+from buddyline.protocol.topics import LOG, TOPICS
 
-# Of each client a hub passes on questions for so many held messages of a topic a second, and at most so many questions.
-HELD_HZ: Final = 12_000.0
-MOST_QUESTIONS_HZ: Final = 20.0
 # lease, ms: a link that is silent for this time counts as dead. open_timeout, ms: how long a client waits for a hub
 # that accepts the connection but does not answer; a slow link needs seconds for its five round trips. compression: for
 # slow links; both ends must have it.
@@ -40,7 +36,6 @@ def hub_settings(endpoint: str, tls: Tls | None = None, access: dict[str, object
         **_tls_settings(tls, "listen"),
         "low_pass_filter": size_limits(),
         "qos/network": own_urgency(),
-        "downsampling": question_limits(),
     }
     return settings if access is None else {**settings, "access_control": access}
 
@@ -65,27 +60,6 @@ def size_limits() -> list[dict[str, object]]:
         }
         for max_bytes, of_size in keys.items()
     ]
-
-
-def question_limits() -> list[dict[str, object]]:
-    """Return Zenoh's `downsampling` for a hub: how often each client may ask for what is held of a topic.
-
-    While Zenoh answers from a cache, nothing can be put into it: 6 us a message. A question too many gets no answer.
-    """
-    return [
-        {
-            "id": f"questions about {topic.name}",
-            "flows": ["ingress"],
-            "messages": ["query"],
-            "rules": [{"key_expr": f"**/{topic.key_any()}/@adv/**", "freq": questions_hz(topic)}],
-        }
-        for topic in TOPICS
-    ]
-
-
-def questions_hz(topic: Topic) -> float:
-    """Return how many questions a second about a topic each client may ask."""
-    return min(HELD_HZ / max(cache_depth(topic, CACHE_S), 1), MOST_QUESTIONS_HZ)
 
 
 def own_urgency() -> list[dict[str, object]]:

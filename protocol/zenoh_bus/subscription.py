@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 import zenoh
@@ -16,15 +16,18 @@ from buddyline.protocol.topics import parse_key
 from buddyline.protocol.zenoh_bus.alive import ALIVE
 from buddyline.protocol.zenoh_bus.intake import INTAKE, Intake, RingSubscriber
 from buddyline.protocol.zenoh_bus.narrowing import Narrowing
-from buddyline.protocol.zenoh_bus.questions import QUERY_S, Questions, number_of, source_of
+from buddyline.protocol.zenoh_bus.session import RETRY_S
 
 # Attachments of a sample. Of a copy the original comes by the reliable connection; what is sent again was sent by an
 # earlier publisher of its key.
 COPY: Final = b"copy"
 AGAIN: Final = b"again"
+QUERY_S: Final = 2.0
 # Gaps that are fetched at a time, each in a thread: of one owner of keys (protocol.sequence), and of all.
 MAX_OWNER_GAPS: Final = 8
 MAX_GAPS: Final = 64
+# Queries for one gap.
+FETCHES: Final = 16
 
 
 class ZenohSubscription:
@@ -41,7 +44,6 @@ class ZenohSubscription:
         key_exprs: Sequence[str],
         delivery: Delivery[Received],
         limit: RateLimit,
-        questions: Questions,
         *,
         history: bool,
         clock: Clock,
@@ -50,7 +52,6 @@ class ZenohSubscription:
         self._session = session
         self._delivery = delivery
         self._limit = limit
-        self._questions = questions
         self._history = history
         self._clock = clock
         self._failures = failures
@@ -64,9 +65,9 @@ class ZenohSubscription:
         if history:
             beside = [f"{key_expr}/@adv/pub/**" for key_expr in key_exprs]
             subscribers += [(selector, self._take_heartbeat, self._declare(selector)) for selector in beside]
-            held = [sample for key_expr in key_exprs for sample in questions.history(key_expr).values()]
-            for sample in sorted(held, key=number_of):
-                self._sequence.begin(source_of(sample), number_of(sample))
+            held = [sample for selector in beside for sample in self._query(selector)]
+            for sample in sorted(held, key=_number):
+                self._sequence.begin(_source(sample), _number(sample))
             for sample in sorted(held, key=_held_order):
                 self._accept(sample)
         wanted = [(key_expr, accept) for key_expr, accept, _ in subscribers]
@@ -106,7 +107,6 @@ class ZenohSubscription:
     def close(self) -> None:
         """Let the handler finish the queued messages, for one second at most, and end the threads."""
         self._stop.set()
-        self._questions.stop()
         self._narrowing.close()
         self._delivery.close()
         with self._lock:
@@ -122,7 +122,7 @@ class ZenohSubscription:
         self._narrowing.watch()
         if sample.source_info is not None:
             with self._lock:
-                self._sequence.skip(source_of(sample), number_of(sample))
+                self._sequence.skip(_source(sample), _number(sample))
         return False
 
     def _take_heartbeat(self, sample: zenoh.Sample) -> bool:
@@ -139,14 +139,14 @@ class ZenohSubscription:
         if sample.source_info is None:
             self._deliver(sample)
             return
-        source = source_of(sample)
+        source = _source(sample)
         with self._lock:
             if _attachment(sample) == COPY:
-                self._sequence.accept_copy(source, number_of(sample), sample)
+                self._sequence.accept_copy(source, _number(sample), sample)
                 return
             gap = self._sequence.accept(
                 source,
-                number_of(sample),
+                _number(sample),
                 sample,
                 size_bytes=len(sample.payload),
                 recover=self._history,
@@ -182,7 +182,7 @@ class ZenohSubscription:
         try:
             due: Gap | None = gap
             while due is not None:
-                found = self._questions.fetch(due)
+                found = self._fetch(due)
                 with self._lock:
                     due = self._sequence.close(due, found)
         except Exception as error:
@@ -191,6 +191,31 @@ class ZenohSubscription:
         finally:
             with self._lock:
                 self._fetching.pop(threading.current_thread(), None)
+
+    def _fetch(self, gap: Gap) -> list[tuple[int, zenoh.Sample]]:
+        """Return the samples of a gap that its publisher still holds; ask again for some time if it does not answer."""
+        # The gap's last sample, or the one after it, has been heard of: an answer that contains one is complete.
+        last = gap.missing[-1]
+        source = gap.source
+        selector = f"{source.key}/@adv/pub/{source.zid}/{source.eid}/**?_sn={gap.missing[0]}..{last + 1}"
+        found: dict[int, zenoh.Sample] = {}
+        for _ in range(FETCHES):
+            # An answer may come from anybody who may answer on this key, and say any source.
+            found.update((_number(sample), sample) for sample in self._query(selector) if _source(sample) == source)
+            if last in found or last + 1 in found or self._stop.wait(RETRY_S):
+                break
+        return list(found.items())
+
+    def _query(self, selector: str) -> Iterator[zenoh.Sample]:
+        for reply in self._session.get(
+            selector,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=QUERY_S,
+        ):
+            if reply.ok is not None and reply.ok.source_info is not None:
+                yield reply.ok
 
     def _deliver(self, sample: zenoh.Sample) -> None:
         key, payload = str(sample.key_expr), bytes(sample.payload)
@@ -207,6 +232,11 @@ class ZenohSubscription:
         self._delivery.offer(received, len(received.payload), queue)
 
 
+def _source(sample: zenoh.Sample) -> PublisherId:
+    key, info = str(sample.key_expr), sample.source_info
+    return PublisherId(key, "", 0) if info is None else PublisherId(key, str(info.source_id.zid), info.source_id.eid)
+
+
 def _attachment(sample: zenoh.Sample) -> bytes:
     return b"" if sample.attachment is None else sample.attachment.to_bytes()
 
@@ -217,5 +247,10 @@ def _newest_only(key: str) -> bool:
     return parsed is None or parsed[0].latest_only
 
 
+def _number(sample: zenoh.Sample) -> int:
+    info = sample.source_info
+    return -1 if info is None else info.source_sn
+
+
 def _held_order(sample: zenoh.Sample) -> tuple[bool, int, int]:
-    return (*held_order(str(sample.key_expr), bytes(sample.payload)), number_of(sample))
+    return (*held_order(str(sample.key_expr), bytes(sample.payload)), _number(sample))

@@ -21,9 +21,9 @@ from buddyline.protocol.connection import Connection
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.zenoh_bus import connect, open_hub, watchdog
 from buddyline.protocol.zenoh_bus import hub as hub_module
-from buddyline.protocol.zenoh_bus import questions as questions_module
+from buddyline.protocol.zenoh_bus import subscription as subscription_module
 from buddyline.protocol.zenoh_bus.session import config_of
-from buddyline.protocol.zenoh_bus.settings import client_settings, questions_hz
+from buddyline.protocol.zenoh_bus.settings import client_settings
 
 from tests.processes import PATIENCE_S, free_endpoint, until
 from tests.protocol.inbox import Inbox
@@ -360,7 +360,7 @@ def test_only_the_hub_listens_and_zenoh_prints_nothing() -> None:
 
 def test_lost_samples_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A foreign publisher whose numbers jump, and who cannot be asked for what is missing."""
-    monkeypatch.setattr(questions_module, "FETCHES", 2)
+    monkeypatch.setattr(subscription_module, "FETCHES", 2)
     inbox = Inbox()
     with open_hub(free_endpoint()) as hub, run_client(hub.endpoint) as bus:
         subscription = bus.subscribe("buddyline/node/*/depth", inbox)
@@ -418,26 +418,6 @@ def test_the_hub_passes_on_no_payload_above_its_topics_limit(namespace: str | No
         until(heard, 0.2)
         assert {len(received.payload) for received in inbox.received} == passed
         sender.close()  # type: ignore[no-untyped-call]
-
-
-@pytest.mark.parametrize("namespace", [None, "tether/two"])
-def test_a_client_that_asks_without_end_is_answered_seldom(namespace: str | None) -> None:
-    """While a cache answers, its publisher waits. Others still get all that is held."""
-    endpoint, asked, sent, any_key = free_endpoint(), 200, 50, zenoh.ReplyKeyExpr.ANY
-    with open_hub(endpoint), run_client(endpoint, namespace=namespace) as sender:
-        publisher = sender.publisher(topics.IMU, "a")
-        for number in range(sent):
-            publisher.put_bytes(b"%d" % number)
-        with zenoh.open(config_of(client_settings(endpoint, namespace))) as client:
-            begin_s = time.monotonic()
-            answers = [client.get("buddyline/**/@adv/**", accept_replies=any_key, timeout=1.0) for _ in range(asked)]
-            seconds = time.monotonic() - begin_s
-            with run_client(endpoint, namespace=namespace) as receiver:
-                inbox = Inbox()
-                receiver.subscribe(topics.IMU.key_any(), inbox)
-                until(lambda: len(inbox.received) == sent)
-            answered = sum(any(reply.ok is not None for reply in answer) for answer in answers)
-    assert 0 < answered <= 2.0 + seconds * questions_hz(topics.IMU)
 
 
 @pytest.mark.parametrize("namespace", [None, "tether/two"])
