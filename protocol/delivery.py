@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Final, Generic, TypeVar
 
 from buddyline.protocol.clock import S_NS, Clock
@@ -159,14 +159,17 @@ class Delivery(Generic[T]):
 class Repeats:
     """Knows the newest messages of each key, by their bytes, to leave out one that is sent again.
 
-    history: whether the subscriber wants what was sent before it came.
+    The first sending, by another, may come after the second: it may have waited for a lost message before it. A stored
+    dive that is played twice sends the same bytes twice, and neither is again. history: whether the subscriber wants
+    what was sent before it came.
     """
 
     def __init__(self, *, history: bool) -> None:
         self._history = history
-        self._known: OrderedDict[str, OrderedDict[int, None]] = OrderedDict()
+        # By key, and of each message who sent it again, if its first sending has not come.
+        self._known: OrderedDict[str, OrderedDict[int, Hashable]] = OrderedDict()
 
-    def is_wanted(self, key: str, payload: bytes, *, again: bool) -> bool:
+    def is_wanted(self, key: str, payload: bytes, source: Hashable, *, again: bool) -> bool:
         """Note a message; return whether to deliver it. again: its publisher says that it is sent again."""
         if again and not self._history:
             return False
@@ -174,9 +177,10 @@ class Repeats:
         # Of too many keys, those that have been silent longest are forgotten.
         self._known.move_to_end(key)
         number = hash(payload)
-        if again and number in known:
+        if number in known and (again or known[number] not in {None, source}):
+            known[number] = known[number] if again else None
             return False
-        known[number] = None
+        known[number] = source if again else None
         if len(known) > MAX_KNOWN:
             known.popitem(last=False)
         if len(self._known) > MAX_KNOWN_KEYS:

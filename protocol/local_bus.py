@@ -121,7 +121,7 @@ class LocalSubscription:
 
     def offer(self, publisher: LocalPublisher, payload: bytes, *, again: bool = False) -> None:
         """Queue a message of publisher; again: if it is wanted."""
-        if publisher.topic.repeated and not self._repeats.is_wanted(publisher.key, payload, again=again):
+        if publisher.topic.repeated and not self._repeats.is_wanted(publisher.key, payload, publisher, again=again):
             return
         now_ns = self._network.clock.now_ns()
         received = Received(publisher.key, payload, now_ns, publisher.topic.encoding)

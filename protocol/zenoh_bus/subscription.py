@@ -220,7 +220,8 @@ class ZenohSubscription:
     def _deliver(self, sample: zenoh.Sample) -> None:
         key, payload = str(sample.key_expr), bytes(sample.payload)
         parsed, again = parse_key(key), _attachment(sample) == AGAIN
-        if parsed is not None and parsed[0].repeated and not self._repeats.is_wanted(key, payload, again=again):
+        repeated = parsed is not None and parsed[0].repeated
+        if repeated and not self._repeats.is_wanted(key, payload, _source(sample), again=again):
             return
         received = Received(
             key=key,

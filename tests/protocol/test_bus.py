@@ -176,6 +176,24 @@ def test_what_is_sent_again_comes_to_those_who_have_missed_it(client: Connect) -
         second.publisher(topics.DEPTH, "a").repeat(b"{}")
 
 
+def test_the_first_sending_that_comes_after_the_second_is_left_out(client: Connect) -> None:
+    """What a killed publisher had sent may wait for a lost message before it, and its successor is heard first."""
+    first, second, known = client(), client(), Inbox()
+    client().subscribe("buddyline/pair/a/b/rejected", known)
+    after = second.publisher(topics.REJECTED, "a", "b")
+    assert after.repeat(encode(rejected(1)))
+    known.wait_for(1)
+    publisher = first.publisher(topics.REJECTED, "a", "b")
+    publisher.put(rejected(1))
+    publisher.put(rejected(2))
+    known.wait_for(2)
+    assert triggers(known) == [1, 2]
+    # The next time it is a dive that is played twice.
+    publisher.put(rejected(1))
+    known.wait_for(3)
+    assert triggers(known) == [1, 2, 1]
+
+
 def test_only_the_subscribed_keys_come(client: Connect) -> None:
     node, asked, all_of_b = client(), Inbox(), Inbox()
     bus = client()
