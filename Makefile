@@ -12,6 +12,13 @@ PIP_INSTALL = $(BIN)/pip install --disable-pip-version-check --progress-bar off 
 # picamera2 and libcamera come from Raspberry Pi OS: the environment must see the system's packages.
 VENV = $(PYTHON) -m venv $(if $(filter pi,$(WANTED)),--system-site-packages) .venv
 
+LINKS = mkdir -p $(1)/buddyline && ln -sfn $(addprefix ../../../,$(wildcard buddyline/*.py) buddyline/py.typed protocol \
+	node solver_service tools) $(1)/buddyline/
+# Python asks an editable package's finder last: a folder named buddyline beside a program, such as the clone itself,
+# would hide the package. A package on the path goes before such a folder. The line is relative to site-packages.
+ON_PATH = $(call LINKS,.venv/names) && \
+	for site in .venv/lib/python3*/site-packages; do echo ../../../names > "$$site/buddyline.pth"; done
+
 .PHONY: demo test matrix coverage docs release install names clean
 
 demo: .venv/.run
@@ -47,15 +54,14 @@ install: | .venv/bin/python
 	@echo "== installing buddyline$(if $(WANTED), with $(WANTED)) into .venv"
 	$(if $(filter pi,$(WANTED)),$(VENV))
 	$(PIP_INSTALL) '$(call DOTTED,$(WANTED))'
+	@$(ON_PATH)
 	@printf '%s\n' 'INSTALLED := $(WANTED)' 'CONSTRAINTS := $(CONSTRAINTS)' > .venv/installed.mk
 	@touch .venv/.run
 	@echo "== installed: $(BIN)/buddyline --help; or '. $(BIN)/activate' first, then 'buddyline --help'"
 
 # The four folders under their one import name, as an installation has them: what mypy and import-linter read.
 names:
-	mkdir -p build/names/buddyline
-	ln -sfn $(addprefix ../../../,buddyline/__init__.py buddyline/__main__.py buddyline/py.typed) build/names/buddyline/
-	ln -sfn $(addprefix ../../../,protocol node solver_service tools) build/names/buddyline/
+	@$(call LINKS,build/names)
 
 .venv/bin/python:
 	@echo "== setting up .venv; this takes one to three minutes, once"
@@ -65,11 +71,13 @@ names:
 .venv/.run: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "== installing the packages that buddyline needs"
 	$(PIP_INSTALL) '$(call DOTTED,$(WANTED))'
+	@$(ON_PATH)
 	@touch $@
 
 .venv/.test: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "== installing the packages that the tests need"
 	$(PIP_INSTALL) '$(call DOTTED,$(sort dev $(WANTED)))'
+	@$(ON_PATH)
 	@touch $@ .venv/.run
 
 clean:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,8 @@ class FakeInstallation:
         for name in ("pip", "buddyline", "python", "fake_python"):
             (self.programs / name).write_text(FAKE)
             (self.programs / name).chmod(0o755)
+        self.site = folder / ".venv" / "lib" / "python3.11" / "site-packages"
+        self.site.mkdir(parents=True)
 
     def make(self, *words: str) -> list[str]:
         """Run make; return the calls of its programs since the last time."""
@@ -53,6 +56,24 @@ class FakeInstallation:
 @pytest.fixture
 def checkout(tmp_path: Path) -> FakeInstallation:
     return FakeInstallation(tmp_path)
+
+
+@pytest.mark.parametrize("words", [("install",), ("demo",), (".venv/.test",)], ids=lambda words: words[0])
+def test_a_folder_of_its_name_does_not_hide_the_package(checkout: FakeInstallation, words: tuple[str, ...]) -> None:
+    shutil.copytree(REPOSITORY / "buddyline", checkout.folder / "buddyline")
+    checkout.make(*words)
+    beside = checkout.folder / "programs"
+    (beside / "buddyline").mkdir(parents=True)
+    program = f"import site; site.addsitedir({str(checkout.site)!r}); import buddyline; print(buddyline.__file__)"
+    told = subprocess.run(
+        [sys.executable, "-S", "-c", program],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+        cwd=beside,
+    )
+    assert Path(told.stdout.strip()).resolve() == checkout.folder / "buddyline" / "__init__.py"
 
 
 def test_extras_add_up_and_stay(checkout: FakeInstallation) -> None:
