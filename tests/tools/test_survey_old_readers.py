@@ -79,6 +79,16 @@ BAD_TH = {
 }
 
 
+@pytest.mark.parametrize("name", ["side.th", "SIDE.TH"])
+def test_therion_data_within_svx_are_refused_because_they_would_stand_at_the_root(tmp_path, name):
+    (tmp_path / name).write_text(TH)
+    with pytest.raises(BuddylineError) as refused:
+        read(tmp_path, f"*begin cave\n*include {name}\n*end cave\n")
+    said = str(refused.value)
+    assert f"cave.svx:2: *include {name}: Therion data would stand at the root" in said
+    assert "`survey import` that file as well" in said
+
+
 @pytest.mark.parametrize(("text", "said"), BAD_TH.values(), ids=BAD_TH)
 def test_bad_th_is_refused_by_file_line_and_value(tmp_path, text, said):
     with pytest.raises(BuddylineError) as refused:

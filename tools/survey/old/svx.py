@@ -219,6 +219,9 @@ class SvxReader:
         if self._deep > DEEPEST:
             raise line.error(f"{words[0]!r}: files include each other more than {DEEPEST} times")
         path, before = beside(line, words[0], ".svx"), self._scope.path
+        if path.suffix.lower() == ".th":
+            advice = "take this line out, `survey import` that file as well, and join both by [[equate]] in the project"
+            raise line.error(f"*include {words[0]}: Therion data would stand at the root of the survey; {advice}")
         if path.suffix.lower() in (".svx", ""):
             self.read(path)
         else:
