@@ -16,7 +16,7 @@ import msgspec
 from buddyline.node.detect import Detection, make_detector
 from buddyline.node.detect.masks import Corners
 from buddyline.node.devices import Frame
-from buddyline.node.drivers.stored import PictureError, decode_picture, picture_files
+from buddyline.node.drivers.stored import PICTURE_SUFFIXES, PictureError, decode_picture, picture_files
 from buddyline.node.pipeline import Pipeline
 from buddyline.protocol.codec import encode
 from buddyline.protocol.envelope import Envelope, envelope_of
@@ -137,7 +137,7 @@ def _detect_pictures(args: argparse.Namespace) -> int:
     for name in args.inputs:
         found = picture_files(Path(name))
         if not found:
-            raise BuddylineError(f"{name}: holds no pictures")
+            raise BuddylineError(f"{name}: holds no pictures; known: {', '.join(sorted(PICTURE_SUFFIXES))}")
         files += found
     detector = make_detector(args.method, args.environment, masks=_given_masks(args.mask))
     pipeline = Pipeline("picture", f"detect-{args.method}", FOLDER_PERIOD_NS, detector)

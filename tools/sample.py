@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     write_new(args.output, content)
     print(
         f"wrote {args.output}: 30 s of a simulated cavern, two nodes, with truth. Go on with\n"
-        f"  buddyline solve {args.output} -o poses.mcap      # a pose for each trigger, and the track\n"
-        f"  buddyline report poses.mcap -o report.html       # to look at (extra plots)"
+        f"  buddyline solve {args.output} -o solved.mcap     # a pose for each trigger, and the track\n"
+        f"  buddyline report solved.mcap -o sample.html      # to look at in a browser (extra plots)"
     )
     return 0

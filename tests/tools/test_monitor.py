@@ -245,7 +245,7 @@ class TestPanel:
         found = columns(list(watched(9).points), at(0))
         assert {title.split(",")[0] for title in found} == {
             "Range",
-            "Uncertainty of the position (1 sd)",
+            "Position's 1 sd",
             "Gap between both nodes' ranges",
         }
 

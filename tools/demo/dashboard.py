@@ -132,7 +132,7 @@ class Dashboard:
                 return f"{start}  no pose yet  {end}"
             off_m, _, turned_deg = self._off(shown)
             return (
-                f"{start}  range {shown.range_m:6.3f} m ± {range_sigma_m(shown) * 1e3:.0f} mm  {_direction(shown)}  "
+                f"{start}  range {shown.range_m:6.3f} m ± {range_sigma_m(shown) * 1e3:.1f} mm  {_direction(shown)}  "
                 f"off {off_m * 1e3:6.1f} mm {turned_deg:5.2f} deg  {self._age(shown)}{self._shares()}  {end}"
             )
 

@@ -33,6 +33,8 @@ def over_time(
 
     depths: by node, (ns, m). span_ns: the dive's start and end. without_ns: stretches without a pose, which are marked.
     """
+    from matplotlib.ticker import LogFormatter
+
     start_ns, end_ns = span_ns
     found = columns(points, start_ns)
     rows = max(len(found) + bool(depths), 1)
@@ -47,6 +49,9 @@ def over_time(
         outside = 0
         if title == UNCERTAINTY:
             axis.set_yscale("log")
+            # Plain numbers, and not powers of ten.
+            axis.yaxis.set_major_formatter(LogFormatter())
+            axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         elif (bounds := inner_limits(values)) is not None:
             axis.set_ylim(*bounds)
             outside = int(((values < bounds[0]) | (values > bounds[1])).sum())
@@ -149,7 +154,7 @@ def _ellipse(axis: Axes, at_m: tuple[float, float], x_m: float, y_m: float, at_d
     from matplotlib.patches import Ellipse
 
     size_m = 2 * ELLIPSE_SD * x_m, 2 * ELLIPSE_SD * y_m
-    axis.add_patch(Ellipse(at_m, *size_m, angle=at_deg, facecolor=COLOURS[1], edgecolor="none", alpha=0.25))
+    axis.add_patch(Ellipse(at_m, *size_m, angle=at_deg, color=COLOURS[1], linewidth=0.6, alpha=0.3))
 
 
 def _gap_s(points: Sequence[Point]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 import sys
 import warnings
@@ -64,6 +65,8 @@ def check() -> None:
     """Raise BuddylineError if matplotlib is missing. Call it before the work, not after."""
     mpl = needed("matplotlib", "drawing", "plots")
     mpl.rcParams.update(_STYLE)
+    # Its first start of all tells that it has listed the fonts.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
     from matplotlib import font_manager
 
     installed = set(font_manager.get_font_names())

@@ -67,7 +67,13 @@ def _ned_words(estimate: Estimate) -> str:
     if estimate.sigma_ned_m is UNSET:
         return ": " + ", ".join(f"{name} {x:+.2f} m" for name, x in named) + f", ± {length_words(sigma_m(estimate))}"
     both = zip(named, estimate.sigma_ned_m, strict=True)
-    return ": " + ", ".join(f"{name} {x:+.2f} ± {sigma:.2g} m" for (name, x), sigma in both)
+    return ": " + ", ".join(f"{name} {_with_sigma(x, sigma)} m" for (name, x), sigma in both)
+
+
+def _with_sigma(x_m: float, sigma_m: float) -> str:
+    """Return a length and its sigma in m, both with as many digits as the sigma needs."""
+    digits = 2 + (sigma_m < 0.01) + (sigma_m < 0.001)
+    return f"{x_m:+.{digits}f} ± {sigma_m:.{digits}f}"
 
 
 def _origin(estimate: Estimate) -> str:

@@ -91,7 +91,7 @@ class Column(NamedTuple):
     tracked: NDArray[np.bool_]
 
 
-UNCERTAINTY: Final = "Uncertainty of the position (1 sd), mm"
+UNCERTAINTY: Final = "Position's 1 sd, mm"
 # What is plotted over time: the title, the value of a point (NaN where it is not known).
 QUANTITIES: Final = (
     ("Range, m", lambda point: point.estimate.range_m),

@@ -177,7 +177,9 @@ def _maps(summary: Summary) -> str:
         else "Line: poses; the log holds no track of this pair"
     )
     by_compass = any(known(point.estimate, "sigma_azimuth_rad") for point in summary.tracks)
-    compass = ", which contain the compass's error" if by_compass else ""
+    compass = (
+        ", which contain the compass's error. A dot is turned by A's attitude of that instant" if by_compass else ""
+    )
     return f'<div class="two">{plan}{profile}</div><p class="dim">{said}{compass}.</p>'
 
 

@@ -82,7 +82,7 @@ def budget_html(numbers: dict[str, Any]) -> str:
         ("depth", budget["depth_m"], "both gauges' stated sigma, on the difference of depth alone"),
         ("clock", budget["clock_m"], _clock(budget)),
     ):
-        rows.append((name, "not known" if size_m is None else length_words(size_m), basis))
+        rows.append((name, "not known" if size_m is None else f"{size_m * 1e3:.1f} mm", basis))
     said = f"1 sd, medians over the poses, at a median range of {poses['range_median_m']:.2f} m."
     return table(rows, ("source", "error of B's place", "from")) + f'<p class="dim">{said}</p>'
 

@@ -5,7 +5,7 @@
 const PROOF_MS = 2000, ASK_MS = 250, SILENT_MS = 1500, DEAD_MS = 6000, KEPT_MS = 150e3, SHOWN_S = 120;
 const byId = (id) => document.getElementById(id);
 const QUANTITIES = ["Range, m", "Azimuth, deg from north, clockwise", "Inclination, deg, up positive",
-  "Uncertainty of the position (1 sd), mm", "Gap between both nodes' ranges, mm", "Latency from exposure to here, ms"];
+  "Position's 1 sd, mm", "Gap between both nodes' ranges, mm", "Latency from exposure to here, ms"];
 const FIRST = 5, NED = ["North, m", "East, m", "Down, m"], MISSES = "Triggers without a pose, a second";
 const state = { scene: { nodes: [], seen: null }, rigs: {}, points: [], misses: [], probes: {}, now: 0, playback: null,
   live: true, banner: null };
@@ -228,6 +228,11 @@ function limits(values) {
   const pad = 0.08 * (high - low) || Math.max(1e-3 * Math.abs(high), 1e-3);
   return { low: low - pad, high: high + pad, outside };
 }
+// So many seconds are drawn: what there is, in steps of ten.
+function shownSeconds() {
+  const first = state.points.reduce((least, p) => Math.min(least, p[0]), state.now);
+  return Math.min(SHOWN_S, Math.max(20, 10 * Math.ceil((state.now - first) / 1e4)));
+}
 function drawPlot(plot) {
   const width = plot.holder.clientWidth, height = plot.holder.clientHeight;
   if (width < 60 || height < 50) return;
@@ -240,12 +245,13 @@ function drawPlot(plot) {
     plot.chart = new uPlot({
       width, height, legend: { show: false }, cursor: { drag: { x: true, y: false } }, padding: [8, 6, 0, 0],
       scales: { x: { time: false }, y: {} },
-      axes: [{ ...axis, size: 24 }, { ...axis, size: 52 }],
+      axes: [{ ...axis, size: 24, values: (_, ages) => ages.map((age) => `${age} s`) }, { ...axis, size: 52 }],
       series: [{}, { stroke: colours.pose, paths: () => null, points: { show: true, size: 4, fill: colours.pose } },
         { stroke: colours.track, width: 2, points: { show: false }, spanGaps: true }],
       hooks: { draw: [(u) => {
         if (!u.outside) return;
         u.ctx.fillStyle = colours.text;
+        u.ctx.textAlign = "left";
         u.ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
         u.ctx.fillText(`${u.outside} outside`, u.bbox.left + 6, u.bbox.top + 14 * devicePixelRatio);
       }] },
@@ -265,7 +271,7 @@ function drawPlot(plot) {
   });
   plot.chart.batch(() => {
     plot.chart.setData(gapped, false);
-    plot.chart.setScale("x", { min: -SHOWN_S, max: 0 });
+    plot.chart.setScale("x", { min: -shownSeconds(), max: 0 });
     plot.chart.setScale("y", { min: bounds.low, max: bounds.high });
   });
 }
