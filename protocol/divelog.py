@@ -378,7 +378,7 @@ class DiveLogReader:
         declared: list[object] = []
         for found in walk(self._file, self._size, self._note):
             if isinstance(found, ChunkAt):
-                contents.chunks.append((found.start_ns, found.end_ns, found.offset, None))
+                contents.chunks.append(self._span(found))
             elif isinstance(found, McapMessage):
                 contents.loose.append(found)
             elif isinstance(found, Metadata):
@@ -386,10 +386,20 @@ class DiveLogReader:
             else:
                 declared.append(found)
         self._declare(declared)
-        if not contents.channels:
-            for start_ns, end_ns, offset, _ in contents.chunks:
-                self._chunk_messages(offset, start_ns, end_ns)
         return contents
+
+    def _span(self, chunk: ChunkAt) -> tuple[int, int, int, frozenset[int] | None]:
+        """Return a chunk's entry by its messages: its head has no checksum, and wrong times there would mix the order."""
+        try:
+            records = read_chunk(self._file, chunk.offset, self._size)
+        except _DAMAGE:
+            return chunk.start_ns, chunk.end_ns, chunk.offset, None
+        self._declare(records)
+        messages = [record for record in records if isinstance(record, McapMessage)]
+        if not messages:
+            return chunk.start_ns, chunk.end_ns, chunk.offset, None
+        times_ns = [message.log_time for message in messages]
+        return min(times_ns), max(times_ns), chunk.offset, frozenset(message.channel_id for message in messages)
 
     def _take_note(self, note: Metadata) -> None:
         if note.name == LOG_NOTE:

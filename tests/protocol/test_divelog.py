@@ -106,6 +106,22 @@ def test_a_damaged_chunk_is_left_out_and_reported(tmp_path):
         assert "; 0.90 s of messages are lost, from 1.00 s on" in reader.damage[0]
 
 
+def test_a_chunk_whose_head_has_wrong_times_comes_in_order(tmp_path):
+    path = tmp_path / "a.mcap"
+    write(path, range(50))
+    content = bytearray(path.read_bytes())
+    with DiveLogReader(path) as reader:
+        second = sorted(chunk[2] for chunk in reader._contents.chunks)[1]
+    head = slice(second + 9, second + 25)
+    assert struct.unpack("<QQ", content[head]) == (10 * TICK_NS, 19 * TICK_NS)
+    content[head] = struct.pack("<QQ", 35 * TICK_NS, 2**63)
+    path.write_bytes(content)
+    with DiveLogReader(path, trust_index=False) as reader:
+        assert (reader.start_ns, reader.end_ns) == (0, 49 * TICK_NS)
+        assert ticks_of(reader) == list(range(50))
+        assert [record.log_time_ns // TICK_NS for record in reader.records(since_ns=15 * TICK_NS)] == list(range(15, 50))
+
+
 @pytest.mark.parametrize("megabytes", [60, 200])
 def test_a_chunk_that_unpacks_to_nothing_but_zeros_is_refused_at_once(tmp_path, megabytes):
     """A zstd bomb: some kilobytes that would unpack to millions of records."""
