@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 from collections import deque
 
-import msgspec
 from buddyline.node.detect import Detection, Detector, GuidedDetector
 from buddyline.node.devices import Frame
 from buddyline.node.guide import Guide, expected_first
@@ -21,11 +20,25 @@ def blobs_of(detections: list[Detection], frame: Frame) -> tuple[list[Blob], int
     height, width = frame.image.shape[:2]
     middle_row = (height - 1) / 2
     blobs = [
-        msgspec.structs.replace(d.blob, dt_ns=round((d.blob.v_px - middle_row) * frame.row_time_ns))
+        _rounded(d.blob, dt_ns=round((d.blob.v_px - middle_row) * frame.row_time_ns))
         for d in detections
         if -0.5 <= d.blob.u_px <= width - 0.5 and -0.5 <= d.blob.v_px <= height - 0.5 and d.blob.sigma_px > 0
     ]
     return blobs[:MAX_BLOBS], max(len(blobs) - MAX_BLOBS, 0)
+
+
+def _rounded(blob: Blob, dt_ns: int) -> Blob:
+    """Return a blob without digits far below its errors: they would be half of the message, on a slow link as well."""
+    return Blob(
+        u_px=round(blob.u_px, 4),
+        v_px=round(blob.v_px, 4),
+        sigma_px=float(f"{blob.sigma_px:.4g}"),
+        area_px=float(f"{blob.area_px:.4g}"),
+        peak=round(blob.peak, 1),
+        elongation=round(blob.elongation, 3),
+        dt_ns=dt_ns,
+        score=UNSET if blob.score is UNSET else round(blob.score, 4),
+    )
 
 
 class Pipeline:

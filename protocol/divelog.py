@@ -389,7 +389,7 @@ class DiveLogReader:
         return contents
 
     def _span(self, chunk: ChunkAt) -> tuple[int, int, int, frozenset[int] | None]:
-        """Return a chunk's entry by its messages: its head has no checksum, and wrong times there would mix the order."""
+        """Return a chunk's entry by its messages: its head has no checksum, and damaged times would mix the order."""
         try:
             records = read_chunk(self._file, chunk.offset, self._size)
         except _DAMAGE:

@@ -7,6 +7,7 @@ from buddyline.node.devices import CAMERAS, Frame, load
 from buddyline.node.pipeline import Pipeline, blobs_of
 from buddyline.protocol.errors import BuddylineError
 from buddyline.protocol.messages import MAX_BLOBS, Blob
+from msgspec.json import encode
 
 PERIOD_NS = 100_000_000
 NOTHING = np.zeros((0, 2))
@@ -24,6 +25,24 @@ def frame(stamp_ns=0, row_time_ns=0):
 def test_each_blob_has_its_rows_exposure_time():
     blobs, _ = blobs_of([detection(5.0, 0.0), detection(5.0, 50.0), detection(5.0, 100.0)], frame(row_time_ns=1000))
     assert [blob.dt_ns for blob in blobs] == [-50_000, 0, 50_000]
+
+
+def test_digits_far_below_the_errors_are_not_sent():
+    blob = Blob(
+        u_px=12.345678901234,
+        v_px=0.1 + 0.2,
+        sigma_px=0.0123456789,
+        area_px=458.0346984863281,
+        peak=254.97,
+        elongation=1.0292036533355713,
+        score=0.9588340520858765,
+    )
+    (sent,), _ = blobs_of([Detection(blob, NOTHING, NOTHING, "")], frame())
+    assert abs(sent.u_px - blob.u_px) < 0.01 * blob.sigma_px
+    assert abs(sent.v_px - blob.v_px) < 0.01 * blob.sigma_px
+    assert len(encode(sent)) < 125
+    assert len(encode(blob)) > 180
+    assert sent == blobs_of([Detection(sent, NOTHING, NOTHING, "")], frame())[0][0]
 
 
 def test_blobs_outside_the_picture_are_left_out_and_surplus_ones_counted():

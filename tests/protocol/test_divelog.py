@@ -119,7 +119,9 @@ def test_a_chunk_whose_head_has_wrong_times_comes_in_order(tmp_path):
     with DiveLogReader(path, trust_index=False) as reader:
         assert (reader.start_ns, reader.end_ns) == (0, 49 * TICK_NS)
         assert ticks_of(reader) == list(range(50))
-        assert [record.log_time_ns // TICK_NS for record in reader.records(since_ns=15 * TICK_NS)] == list(range(15, 50))
+        assert [record.log_time_ns // TICK_NS for record in reader.records(since_ns=15 * TICK_NS)] == list(
+            range(15, 50)
+        )
 
 
 @pytest.mark.parametrize("megabytes", [60, 200])
