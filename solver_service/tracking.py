@@ -38,7 +38,7 @@ from buddyline.solver_service.track.dive import NodeRecord, feed, joined, smooth
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.foresight import ForeseenLight, foresee
 from buddyline.solver_service.track.inputs import AttitudeSeen, DepthSeen, FixSeen, FrameSeen, TrackNode
-from buddyline.solver_service.track.lag import EVERY_S, LAG_S, TrackLag
+from buddyline.solver_service.track.lag import EVERY_S, KEPT_S, TrackLag
 from buddyline.solver_service.track.output import TrackRow
 from buddyline.solver_service.track.problems import ENDED_S, as_ended
 from msgspec import UNSET
@@ -253,7 +253,7 @@ class PairTracker:
     def _make_filter(self, nodes: tuple[TrackNode, TrackNode]) -> None:
         live = self._settings.modes & {"filter", "lag"}
         if live:
-            self._filter = TrackFilter(*nodes, keep_s=LAG_S + 2 * EVERY_S if "lag" in live else 0.0)
+            self._filter = TrackFilter(*nodes, keep_s=KEPT_S if "lag" in live else 0.0)
             self._lag = TrackLag(self._filter) if "lag" in live else None
 
     def _frontier_ns(self) -> int:

@@ -12,10 +12,12 @@ from buddyline.solver_service.track.smoother import rows_between, smoothed
 LAG_S: Final = 1.0
 # A pass backward serves all rows that have come due; so seldom it is cheap.
 EVERY_S: Final = 0.5
+# What the filter keeps: a lost picture may put a pass off once more, and a row stands between two steps.
+KEPT_S: Final = LAG_S + 4.0 * EVERY_S
 
 
 class TrackLag:
-    """Rows of a filter, LAG_S after their stamps. The filter must keep at least LAG_S + EVERY_S of steps."""
+    """Rows of a filter, LAG_S after their stamps. The filter must keep KEPT_S of steps."""
 
     def __init__(self, track: TrackFilter) -> None:
         self._track = track
@@ -45,4 +47,6 @@ class TrackLag:
         self._done_s = ready_s
         self._due = self._due[len(ready) :]
         times_s = np.array([self._track.between(stamp) for stamp in ready])
-        return list(rows_between(smoothed(main.steps), times_s, ready))
+        rows = list(rows_between(smoothed(main.steps), times_s, ready))
+        main.steps.drop_before(ready_s - EVERY_S)
+        return rows

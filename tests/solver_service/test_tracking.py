@@ -69,6 +69,22 @@ def test_a_track_waits_for_inertial_samples_that_come_after_the_pictures(inertia
     assert core.pairs["a", "b"].tracker.problems == []
 
 
+def test_no_row_of_the_lag_is_left_out_however_many_messages_come_at_once(inertial_dive):
+    # Some pictures are lost, and others come a little early or late.
+    rng = random.Random(2)
+    triggers = sorted({m.trigger for m in inertial_dive[0] if isinstance(m, Candidates)})
+    late_ns = {trigger: rng.randrange(-S_NS // 100, S_NS // 100) for trigger in triggers}
+    messages = [
+        replace(m, stamp_ns=m.stamp_ns + late_ns[m.trigger]) if isinstance(m, Candidates) else m
+        for m in inertial_dive[0]
+        if not (isinstance(m, Candidates) and late_ns[m.trigger] % 8 == 0)
+    ]
+    core = SolverCore(Settings(), [("a", "b")], track=TrackSettings(frozenset(("lag",)), 20.0))
+    stamps_ns = [one.stamp_ns for one in core.handle_many(messages) + core.flush() if isinstance(one, Track)]
+    assert stamps_ns[-1] - stamps_ns[0] > 9 * S_NS
+    assert np.diff(stamps_ns).tolist() == [S_NS // 20] * (len(stamps_ns) - 1)
+
+
 def test_inertial_samples_that_come_too_late_are_counted_and_named_while_they_do(inertial_dive):
     messages, _ = inertial_dive
     began_ns = messages[0].stamp_ns
