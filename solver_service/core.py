@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Final, TypeAlias
 
-from buddyline.protocol.clock import LIVE_WITHIN_NS, S_NS, trigger_index
+from buddyline.protocol.clock import LIVE_WITHIN_NS, MS_NS, S_NS, trigger_index
 from buddyline.protocol.messages import (
     Attitude,
     Candidates,
@@ -41,6 +41,8 @@ NodeMessage: TypeAlias = NodeInfo | Candidates | Attitude | Depth | Imu | ImuMea
 
 # If the receive time goes back by more than this, the receiver's clock was set back.
 SET_BACK_NS: Final = 1 * S_NS
+# As much time is taken to have passed meanwhile: the service tells the time as often.
+UNSEEN_NS: Final = 250 * MS_NS
 # Limits memory: a sender that invents node ids must not get a stream for each.
 MAX_NODES: Final = 16
 
@@ -232,7 +234,8 @@ class SolverCore:
             return None
         now_ns = receive_ns + self._set_back_ns
         if now_ns < self._now_ns - SET_BACK_NS:
-            self._set_back_ns += self._now_ns - now_ns
+            self._set_back_ns += self._now_ns + UNSEEN_NS - now_ns
+            now_ns = self._now_ns + UNSEEN_NS
         self._now_ns = max(self._now_ns, now_ns)
         return self._now_ns
 

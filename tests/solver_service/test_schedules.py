@@ -287,6 +287,12 @@ def test_a_node_that_reaches_what_the_other_had_alone_gives_no_second_outcome():
     play(2500, ("go_on", 0.5), ("set_the_clock_of_a_node", "b", -30), ("go_on", 7.2), *away, ("go_on", 3.75))
 
 
+def test_a_clock_of_the_solver_that_is_set_back_again_and_again_prolongs_no_waiting():
+    back = ("set_the_clock_of_the_solver", -3600)
+    alone = [("cut_the_link", "a"), ("cut_the_link", "c"), back, ("go_on", 1.0), ("cut_the_link", "b")]
+    play(33, *alone, *[back, ("go_on", 0.45)] * 8)
+
+
 def test_an_old_frame_that_comes_again_and_again_is_no_new_time():
     again = [("deliver_again", 10)] * 6
     played = play(2500, ("go_on", 20.0), *again, ("go_on", 8.0))
