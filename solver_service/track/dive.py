@@ -211,7 +211,11 @@ def smooth(records: Records, fixes: Sequence[FixSeen], outputs_ns: Sequence[int]
     # Every step of the first pass holds a covariance: both passes at once take twice the memory.
     del first, parts, part, learned, path, earlier
     pass_over(second, records, ())
-    return _smoothed(second, parts_of(second), outputs_ns)
+    found = parts_of(second)
+    if any(clock_off_by(one, MOST_LEFT_S) for one in found):
+        said = f"{second.both}: the second pass contradicts the first on the clocks, so it has diverged: no track"
+        return Smoothed([], clock_ns * 1e-9, math.inf, [*second.problems, said])
+    return _smoothed(second, found, outputs_ns)
 
 
 def _path_before(records: Records, clock_ns: int, path: Path, since_s: float, shares: Floats) -> Path | None:

@@ -77,6 +77,8 @@ STARTLED: Final = 11.3
 LASTING: Final = 0.6
 SUMMED: Final = 1.0 / (1.0 - LASTING**2)
 MOST_GAP_RATE: Final = 4.0
+# A wide estimate takes its lights in so many steps.
+ABOUT_STEPS: Final = 4
 _STILL: Final = np.eye(MOVING)
 
 
@@ -298,6 +300,8 @@ class TrackSteps(TrackIntake):
             found = associate(y, H, estimate.covariance[BLOCK], sight.sigma_px, detection, clutter)
         else:
             found = associate(*self._without(guide, sight), sight.sigma_px, detection, clutter)
+        if wide and found.chosen:
+            y, H = self._about(estimate, sight, found.chosen, guide)
         # What another estimate chose may be behind the camera by this one.
         found = replace(found, chosen=_in_front(found.chosen, y))
         estimate.evidence += found.evidence
@@ -358,11 +362,26 @@ class TrackSteps(TrackIntake):
             y = y + H @ (gain @ y_used)
         return y, H, P
 
+    def _about(
+        self, estimate: Estimate, sight: Sight, chosen: Chosen, guide: PassGuide | None
+    ) -> tuple[Floats, Floats]:
+        """Give residuals and Jacobians by the estimate's errors, but linear where the chosen lights say it is.
+
+        After seconds without light one linear step from the prediction ends far from the lights, with the sigma of a
+        sound one. These steps (Gauss-Newton, the iterated update) begin where an earlier pass, if any, had the nodes.
+        """
+        error = np.zeros(SIZE) if guide is None else guide.path.state(guide.step).minus(estimate.state)
+        error[NAV:] = 0.0
+        for left in reversed(range(ABOUT_STEPS)):
+            state, after_s = estimate.state.plus(error), sight.t_s - estimate.t_s
+            _, y, H = self._compared(sight, state, estimate.rates_radps, after_s)
+            y = y + H @ error[COLUMNS]
+            if left and (near := _in_front(chosen, y)):
+                error = anchors.kalman(estimate.covariance, *_rows(near, y, H))[0]
+        return y, H
+
     def _update_lights(self, estimate: Estimate, found: Association, y: Floats, H: Floats, sight: Sight) -> None:
-        rows_y = np.concatenate([y[k, light] for k, light, _ in found.chosen])
-        rows_H = np.zeros((len(rows_y), SIZE))
-        rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in found.chosen])
-        noise = np.diag(np.repeat([variance for _, _, variance in found.chosen], 2))
+        rows_H, rows_y, noise = _rows(found.chosen, y, H)
         if estimate.searched and not estimate.confirmed:
             _, log_det = np.linalg.slogdet(rows_H @ estimate.covariance @ rows_H.T + noise)
             estimate.fit -= 0.5 * float(log_det)
@@ -466,6 +485,14 @@ class TrackSteps(TrackIntake):
         shaking = self._with_sudden(estimate.shaking.variances, parts)
         Q, walk, _ = process_noise(after, parts, self._noises(estimate, t_s), shaking, span_s)
         return after, predicted(estimate.covariance, F, Q, walk)
+
+
+def _rows(chosen: Chosen, y: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
+    """Give Jacobians (2 N, SIZE), residuals (2 N,) and noise of the chosen candidates, of y and H of all."""
+    rows_H = np.zeros((2 * len(chosen), SIZE))
+    rows_H[:, COLUMNS] = np.concatenate([H[k, light] for k, light, _ in chosen])
+    rows_y = np.concatenate([y[k, light] for k, light, _ in chosen])
+    return rows_H, rows_y, np.diag(np.repeat([variance for _, _, variance in chosen], 2))
 
 
 def _in_front(chosen: Chosen, y: Floats) -> Chosen:

@@ -5,6 +5,7 @@ And when the biases' walk is learned.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from itertools import product
 
@@ -12,10 +13,11 @@ import numpy as np
 import pytest
 from buddyline.solver_service.geometry.rotation import Floats, rotation_exp
 from buddyline.solver_service.track import stepping
+from buddyline.solver_service.track.dive import last_ns
 from buddyline.solver_service.track.estimate import Estimate
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.lights import COLUMNS, Sight, light_positions, residuals, sight_of
-from buddyline.solver_service.track.state import CLOCK, MOVING, SIZE, V_, State
+from buddyline.solver_service.track.state import CLOCK, MOVING, PHI, R_, SIZE, V_, State
 from buddyline.solver_service.track.stepping import HOLD_S, KNOWN_CLOCK_S, _widened
 from buddyline.solver_service.track.strapdown import Noise
 from buddyline.solver_service.track.walking import Walking
@@ -148,3 +150,34 @@ def test_attitudes_that_are_only_noisy_seldom_startle() -> None:
     """A single one does by a chance of 0.01, their sum by another."""
     rng = np.random.default_rng(6)
     assert 0.005 < np.mean(startled(rng.normal(0.0, 1.0, (4000, 3)))) < 0.025
+
+
+def test_lights_after_seconds_of_darkness_are_believed_where_they_are() -> None:
+    """One linear step from a prediction that is a metre off ended up to 300 px beside the lights it had used."""
+    dive = make(1, Setting(seconds=3.0))
+    track = filter_of(dive.records, dive.fixes)
+    track.advance(last_ns(dive.records))
+    assert track.main is not None
+    known = track.main
+    known.rates_radps = np.zeros((2, 3))
+    sights = []
+    for node in (0, 1):
+        rig, lights_m = track.nodes[node].rig, track.nodes[1 - node].rig.lights_m
+        X, _ = light_positions(known.state, node, lights_m, known.rates_radps, np.zeros(1))
+        pixels = np.array((409.5, 307.5)) + 900.0 * X[0, :, :2] / X[0, :, 2:]
+        sights.append(sight_of(rig, node, 0, known.t_s, pixels, np.full(2, 0.7), np.zeros(2)))
+    roots = np.zeros(SIZE)
+    roots[R_], roots[PHI[0]], roots[PHI[1]] = 0.7, 0.03, 0.06
+    rng = np.random.default_rng(7)
+    for _ in range(10):
+        estimate = copy.deepcopy(known)
+        estimate.state = known.state.plus(roots * rng.normal(0.0, 1.0, SIZE))
+        estimate.covariance = known.covariance + np.diag(roots**2)
+        estimate.given = {(node, 0): ((0, 0, 0.49), (1, 1, 0.49)) for node in (0, 1)}
+        for sight in sights:
+            track._take_lights(estimate, sight)
+        for sight in sights:
+            lights_m = track.nodes[1 - sight.node].rig.lights_m
+            X, D = light_positions(estimate.state, sight.node, lights_m, estimate.rates_radps, sight.dt_s)
+            y, _ = residuals(sight.bearings, sight.tangents, X, D)
+            assert np.abs(np.array((y[0, 0], y[1, 1]))).max() < 5.0

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from buddyline.node.imu_means import ImuPacker
 from buddyline.protocol.messages import Imu
+from buddyline.solver_service.track import dive as dive_track
 from buddyline.solver_service.track.association import weigh
-from buddyline.solver_service.track.dive import NodeRecord, in_pieces, last_ns, of_one_clock, parts_of, smooth
+from buddyline.solver_service.track.dive import (
+    NodeRecord,
+    Records,
+    in_pieces,
+    last_ns,
+    of_one_clock,
+    parts_of,
+    pass_over,
+    smooth,
+)
 from buddyline.solver_service.track.filter import TrackFilter
 from buddyline.solver_service.track.inputs import FixSeen
 from buddyline.solver_service.track.lag import TrackLag
@@ -187,6 +198,21 @@ def test_seconds_of_darkness(dark_s: float, worst_m: float) -> None:
     judged = score(dive, smooth(dive.records, dive.fixes, dive.stamps_ns).rows)
     assert judged.wrong == 0
     assert judged.errors_m.max() < worst_m
+
+
+def test_a_second_pass_that_diverges_is_no_track(monkeypatch: pytest.MonkeyPatch) -> None:
+    short = make(4, replace(SHORT, seconds=6.0))
+
+    def diverging(track: TrackFilter, records: Records, fixes: Sequence[FixSeen]) -> None:
+        pass_over(track, records, fixes)
+        if not track.restarts and track.main is not None:
+            track.main.state = replace(track.main.state, clock_s=-0.7)
+
+    assert list(smooth(short.records, short.fixes, short.stamps_ns).rows)
+    monkeypatch.setattr(dive_track, "pass_over", diverging)
+    found = smooth(short.records, short.fixes, short.stamps_ns)
+    assert not list(found.rows)
+    assert "it has diverged: no track" in found.problems[-1]
 
 
 def test_a_wrong_fix_changes_nothing_for_long(dive: KnownDive) -> None:
