@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -51,8 +51,18 @@ CROWD: Final = 20
 SEARCHED_NS: Final = 20 * S_NS
 SEARCH_STEP_NS: Final = S_NS // 4
 LEVEL_RAD: Final = math.radians(25.0)
-# The search goes on by this much beyond the next direction, so that the divers need not stop and listen.
-ONWARD_RAD: Final = math.radians(20.0)
+# A search is said anew each second; until then it goes on by this much, so that the divers need not stop and listen.
+ONWARD_RAD: Final = math.radians(180.0)
+# What a diver turns too far before he hears that the other was found, and what it costs to turn back.
+HEARD_RAD: Final = math.radians(45.0)
+# Who looks toward the other still misses it so often: a body hides the lamps, or they shine elsewhere.
+MISSED_SHARE: Final = 0.25
+# How much likelier the other is where one light stands that only one of them sees.
+LONE_ODDS: Final = 10.0
+# Two lone lights further than this from lying face to face are not both of this pair, however near it is.
+CONTRADICTS_RAD: Final = math.radians(45.0)
+SLOW_RADPS: Final = math.radians(10.0)
+WAYS: Final = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
 GRID_RAD: Final = np.radians(np.arange(0.0, 360.0, 5.0))
 
 
@@ -117,9 +127,10 @@ def advise_first(infos: Sequence[NodeInfo], looks: Sequence[NodeLook]) -> list[s
         for name, look in zip(names, looks, strict=True)
         if look.shown > CROWD
     ]
+    looks = _agreeing(looks)
     lengths_m = [math.dist(info.light_left_m, info.light_right_m) for info in infos]
     goals = [_goal(looks[k], looks[1 - k], lengths_m[1 - k] / lengths_m[k]) for k in range(2)]
-    if goals[0] is None and goals[1] is None:
+    if (goals[0] is None and goals[1] is None) or _doubtful(looks):
         return said + _search(names, looks)
     turns = [
         f"turn {name} {words}"
@@ -200,13 +211,15 @@ def _bar(lights: list[Floats]) -> Floats:
     if len(lights) < 3:
         return np.array(lights).reshape(-1, 3)
 
-    def steepness(pair: tuple[Floats, Floats]) -> float:
-        right_rad, down_rad = np.abs(_between(*pair)).tolist()
-        return float(down_rad / max(right_rad, 1e-6))
-
     pairs = [(one, other) for at, one in enumerate(lights) for other in lights[:at]]
-    best = min(pairs, key=steepness)
-    return np.array(best) if steepness(best) < STEEPEST else np.array(lights[:1])
+    best = min(pairs, key=lambda pair: _steepness(*pair))
+    return np.array(best) if _steepness(*best) < STEEPEST else np.array(lights[:1])
+
+
+def _steepness(one: Floats, other: Floats) -> float:
+    """Return how much two lights rise, over how far they reach to the side."""
+    right_rad, down_rad = np.abs(_between(one, other)).tolist()
+    return float(down_rad / max(right_rad, 1e-6))
 
 
 def _path(stream: NodeStream, rig: Rig) -> Floats:
@@ -221,6 +234,37 @@ def _path(stream: NodeStream, rig: Rig) -> Floats:
     return np.array(rows).reshape(-1, 3)
 
 
+def _back(look: NodeLook) -> Floats:
+    """Return the direction (2,) in which the other must look to see this node, by the lights that this node sees."""
+    back: Floats = look.middle * (1.0, -1.0) + np.array((math.pi, 0.0))
+    return back
+
+
+def _agreeing(looks: Sequence[NodeLook]) -> Sequence[NodeLook]:
+    """Return both looks; of two bars that contradict each other, without the one that is less level.
+
+    Reflections stand above, and strangers' lamps at any height.
+    """
+    if not all(look.oriented and len(look.lights) == 2 for look in looks):
+        return looks
+    if float(np.abs(_between(_back(looks[0]), looks[1].middle)).max()) <= 2.0 * ASTRAY_RAD:
+        return looks
+    worse = max(looks, key=lambda look: abs(look.middle[1]) + math.atan(_steepness(*look.lights)))
+    return [replace(look, lights=np.zeros((0, 3))) if look is worse else look for look in looks]
+
+
+def _doubtful(looks: Sequence[NodeLook]) -> bool:
+    """Return whether all that is seen are lone lights that may be a stranger's: the other does not see its part."""
+    if not all(look.oriented for look in looks) or max(len(look.lights) for look in looks) != 1:
+        return False
+    seer, other = sorted(looks, key=lambda look: -len(look.lights))
+    if len(other.lights):
+        return float(np.abs(_between(_back(seer), other.lights[0])).max()) > CONTRADICTS_RAD
+    in_view = bool((np.abs(_between(_back(seer), other.axis)) < WELL_INSIDE * other.half_rad).all())
+    # The lamps of two who look at each other may be too faint for one of them, but not where they are near.
+    return not in_view or bool(seer.lights[0, 2] > NEAR_RAD)
+
+
 def _goal(look: NodeLook, other: NodeLook, size: float) -> Floats | None:
     """Return the directions (n, 2) in which the other's lamps, or its camera, must be; None where nothing says it.
 
@@ -230,7 +274,7 @@ def _goal(look: NodeLook, other: NodeLook, size: float) -> Floats | None:
         return look.lights[:, :2]
     facing = None
     if look.oriented and other.oriented and len(other.lights):
-        facing = other.middle * (1.0, -1.0) + np.array((math.pi, 0.0))
+        facing = _back(other)
     if len(look.lights) == 0:
         return None if facing is None else facing[None]
     light = look.lights[0, :2]
@@ -255,7 +299,12 @@ def _turn(look: NodeLook, goal: Floats) -> str:
     """Return the turn to the middle of a goal (n, 2); "" if all of it is well in the picture."""
     offs = np.array([_between(one, look.axis) for one in goal])
     inside = np.abs(offs).max(axis=0) <= WELL_INSIDE * look.half_rad
-    right_rad, down_rad = np.where(inside, 0.0, offs.mean(axis=0)).tolist()
+    right_rad = 0.0 if inside[0] else float(np.angle(np.exp(1j * offs[:, 0]).sum()))
+    down_rad = 0.0 if inside[1] else float(offs[:, 1].mean())
+    # Almost half a turn goes on the way that the node turns, or else to the right: the words must not alternate.
+    way = math.copysign(1.0, _turning(look))
+    if right_rad * way < 0.0 and 2.0 * (math.pi - abs(right_rad)) < HEARD_RAD:
+        right_rad += way * 2.0 * math.pi
     return turn_words(right_rad, down_rad)
 
 
@@ -278,39 +327,57 @@ def _distance(names: list[str], looks: Sequence[NodeLook], lengths_m: list[float
 
 
 def _search(names: list[str], looks: Sequence[NodeLook]) -> list[str]:
-    """Return where two nodes should look that see nothing of each other.
+    """Return where two nodes should look that see nothing of each other: each turns to one side, or holds still.
 
-    By their compasses they are turned face to face, whatever lies between them, then on together.
+    Lamps shine to all sides, if weakly, so who looks toward the other finds it, and then the other is told where to
+    turn. Of all ways the one that is the shortest in the mean, over the directions in which the other may be, is said.
     """
-    words = [f"{names[0]} and {names[1]} do not see each other"]
+    words = [f"{name} sees one light" for name, look in zip(names, looks, strict=True) if len(look.lights)]
+    words = words or [f"{names[0]} and {names[1]} do not see each other"]
     blind = [name for name, look in zip(names, looks, strict=True) if not look.oriented]
     if blind:
         return [*words, f"turn {blind[0]} slowly left"]
-    a, b = looks
-    turns = np.array([wrap(GRID_RAD - a.axis[0]), wrap(GRID_RAD + math.pi - b.axis[0])])
-    cost = np.abs(turns).max(axis=0) + np.where(_searched(a, b), 2.0 * math.pi, 0.0)
-    right = turns[:, int(np.argmin(cost))]
-    if right[0] * right[1] > 0.0:
-        right = right + math.copysign(ONWARD_RAD, right[0])
-    for name, look, angle_rad in zip(names, looks, right.tolist(), strict=True):
+    ways = _ways(looks)
+    for name, look, way in zip(names, looks, ways, strict=True):
         down_rad = -float(look.axis[1]) if abs(look.axis[1]) > LEVEL_RAD else 0.0
-        if turn := turn_words(angle_rad, down_rad):
+        if turn := turn_words(way * ONWARD_RAD, down_rad):
             words.append(f"turn {name} {turn}")
+        else:
+            words.append(f"hold {name} still")
     return words
 
 
-def _searched(a: NodeLook, b: NodeLook) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return, of each direction from A to B on the grid, whether both have looked along it lately."""
-    if len(a.path) < 1 or len(b.path) < 1:
-        return np.zeros(len(GRID_RAD), bool)
-    # Rows are the newest first; a heading is unwrapped before it is taken between samples.
-    later = b.path[::-1]
-    of_b = [
-        np.interp(a.path[:, 2], later[:, 2], np.unwrap(later[:, 0])),
-        np.interp(a.path[:, 2], later[:, 2], later[:, 1]),
-    ]
-    along = np.abs(wrap(GRID_RAD[:, None] - a.path[:, 0])) < WELL_INSIDE * a.half_rad[0]
-    back = np.abs(wrap(GRID_RAD[:, None] + math.pi - of_b[0])) < WELL_INSIDE * b.half_rad[0]
-    level = (np.abs(a.path[:, 1]) < LEVEL_RAD) & (np.abs(of_b[1]) < LEVEL_RAD)
-    searched: np.ndarray[tuple[int], np.dtype[np.bool_]] = (along & back & level).any(axis=1)
-    return searched
+def _ways(looks: Sequence[NodeLook]) -> tuple[int, int]:
+    """Return the way that each node should turn: 1 for right, -1 for left, 0 for none."""
+    off = np.array([wrap(GRID_RAD + k * math.pi - look.axis[0]) for k, look in enumerate(looks)])
+    likely = np.prod([_likely(look, k * math.pi) for k, look in enumerate(looks)], axis=0)
+    half = np.array([[WELL_INSIDE * look.half_rad[0]] for look in looks])
+    rates = [_turning(look) for look in looks]
+
+    def cost(ways: tuple[int, int]) -> float:
+        turned = np.array(ways)[:, None]
+        # By how much each turns until the other is in its picture; who holds still waits.
+        until = np.where(np.abs(off) <= half, 0.0, np.where(turned == 0, np.inf, (turned * off) % (2 * math.pi) - half))
+        first = until.min(axis=0)
+        rest = np.maximum(np.abs(wrap(off - turned * first)) - half, 0.0).max(axis=0)
+        back = sum(rate * way < 0.0 for rate, way in zip(rates, ways, strict=True)) * HEARD_RAD
+        return float(likely @ (first + rest + np.where(rest > 0.0, HEARD_RAD, 0.0))) + back * float(likely.sum())
+
+    return min(WAYS, key=cost)
+
+
+def _likely(look: NodeLook, behind_rad: float) -> Floats:
+    """Return how likely this node makes each direction from A to B on the grid: it missed the other, or saw a light."""
+    seen = np.abs(wrap(GRID_RAD[:, None] + behind_rad - look.path[:, 0])) < WELL_INSIDE * look.half_rad[0]
+    likely: Floats = np.where((seen & (np.abs(look.path[:, 1]) < LEVEL_RAD)).any(axis=1), MISSED_SHARE, 1.0)
+    for light in look.lights:
+        likely[np.abs(wrap(GRID_RAD + behind_rad - light[0])) < ASTRAY_RAD] = LONE_ODDS
+    return likely
+
+
+def _turning(look: NodeLook) -> float:
+    """Return how fast a node turns to the right, rad/s; 0 where that is slow."""
+    if len(look.path) < 2:
+        return 0.0
+    rate_radps = float(wrap(look.path[0, 0] - look.path[1, 0]) / (look.path[0, 2] - look.path[1, 2]))
+    return rate_radps if abs(rate_radps) > SLOW_RADPS else 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -58,6 +59,15 @@ def test_a_stranger_s_lamp_does_not_lead_astray() -> None:
     assert words == ["turn b 80 deg right"]
 
 
+def test_of_two_bars_that_contradict_each_other_the_level_one_counts() -> None:
+    # B looks up, and sees A's lamps mirrored in the surface; A sees B.
+    seen, mirrored = look(0.0, ((-3.0, 2.0), (3.0, 2.0))), look(180.0, ((177.0, -50.0), (183.0, -48.0)), down=-45.0)
+    assert said(seen, mirrored) == ["turn b 45 deg down"]
+    assert said(mirrored, seen) == ["turn a 45 deg down"]
+    # What they see of each other agrees: nothing is left out.
+    assert said(seen, look(180.0, ((177.0, -2.0), (183.0, -2.0)))) == []
+
+
 def test_lights_that_fill_the_picture_are_too_near_and_faint_ones_too_far() -> None:
     wide = ((-21.0, 0.0), (21.0, 0.0))
     assert said(look(0.0, wide), look(180.0, ((159.0, 0.0), (201.0, 0.0)))) == ["move 0.5 m apart"]
@@ -67,15 +77,65 @@ def test_lights_that_fill_the_picture_are_too_near_and_faint_ones_too_far() -> N
     assert far == ["a sees one lamp of b", "b sees one lamp of a", "come 1.0 m closer"]
 
 
-def test_two_that_see_nothing_are_turned_face_to_face_and_then_on_together() -> None:
+def test_two_that_see_nothing_search_the_shortest_way() -> None:
     blind = "a and b do not see each other"
-    assert said(look(60.0), look(140.0)) == [blind, "turn a 50 deg left", "turn b 50 deg right"]
-    # There they have looked: they go on, and not back.
-    along, back = (10.0, 10.0, 30.0, 60.0), (190.0, 190.0, 170.0, 140.0)
+    # Face to face but for what lies between: turning the same way they stay so.
+    sides = [one.rsplit(" ", 1)[1] for one in said(look(0.0), look(180.0))[1:]]
+    assert sides in (["left", "left"], ["right", "right"])
+    # They have looked to the right of where A looks now: they go on to the left, and not back.
+    along, back = (10.0, 10.0, 30.0, 60.0), (190.0, 190.0, 210.0, 240.0)
     words = said(look(10.0, path=along), look(190.0, path=back))
-    assert [one.rsplit(" ", 1)[1] for one in words[1:]] in (["left", "left"], ["right", "right"])
+    assert words == [blind, "turn a 180 deg left", "turn b 180 deg left"]
     assert said(look(0.0, oriented=False), look(0.0)) == [blind, "turn a slowly left"]
-    assert said(look(0.0, down=45.0), look(180.0)) == [blind, "turn a 45 deg up"]
+    assert "45 deg up" in said(look(0.0, down=45.0), look(180.0))[1]
+
+
+def search(seed: int, turn_deg: float) -> int:
+    """Return how many words it takes until both look at each other, whose headings and line are anything."""
+    rng = np.random.default_rng(seed)
+    line, headings = float(rng.uniform(0, 360)), rng.uniform(0, 360, 2)
+    paths: list[list[float]] = [[], []]
+    for count in range(40):
+        lines = (line, line + 180.0)
+        off = [(to - heading + 180) % 360 - 180 for to, heading in zip(lines, headings, strict=True)]
+        if max(map(abs, off)) < 20.0:
+            return count
+        seen = [((to - 3.0, 0.0), (to + 3.0, 0.0)) if abs(o) < 20 else () for to, o in zip(lines, off, strict=True)]
+        a, b = (look(h, s, path=(h, *p)) for h, s, p in zip(headings, seen, paths, strict=True))
+        for node, path in enumerate(paths):
+            path.insert(0, float(headings[node]))
+        for words in said(a, b):
+            if turned := re.match(r"turn (.) (\d+) deg (left|right)", words):
+                amount = min(float(turned[2]), turn_deg)
+                headings["ab".index(turned[1])] += amount if turned[3] == "right" else -amount
+    return 40
+
+
+def test_a_search_finds_the_other_within_a_turn() -> None:
+    # With 20 degrees a time, and half a second each as in a look's path, nobody turns more than once around.
+    counts = [search(seed, 20.0) for seed in range(200)]
+    assert max(counts) <= 18
+    assert np.mean(counts) < 10
+
+
+def test_a_lone_light_that_the_other_does_not_answer_is_searched_for_but_not_trusted() -> None:
+    # A sees one light. B has searched all but where A would then be, so it turns there.
+    words = said(look(0.0, ((10.0, 0.0),)), look(120.0, path=tuple(np.arange(120.0, -120.0, -20.0))))
+    assert (words[0], words[-1]) == ("a sees one light", "turn b 180 deg right")
+    # B looks along it and sees nothing: near as it is, it is a stranger's lamp, and the search goes on.
+    near = look(0.0, ((2.0, 0.0),), radius=0.03)
+    assert any(one.startswith("turn") for one in said(near, look(180.0)))
+    # A faint one may be too far for B to see A's.
+    assert said(look(0.0, ((2.0, 0.0),)), look(180.0))[-1] == "come 1.0 m closer"
+
+
+def test_almost_half_a_turn_is_told_to_the_same_side_again() -> None:
+    bar = ((177.0, 0.0), (183.0, 0.0))
+    assert said(look(180.0, bar), look(170.0)) == ["turn b 190 deg right"]
+    assert said(look(180.0, bar), look(190.0)) == ["turn b 170 deg right"]
+    # Who turns left already goes on so.
+    assert said(look(180.0, bar), look(190.0, path=(190.0, 200.0))) == ["turn b 190 deg left"]
+    assert said(look(180.0, bar), look(150.0)) == ["turn b 150 deg left"]
 
 
 def test_a_crowd_of_lights_is_named() -> None:

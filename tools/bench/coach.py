@@ -51,8 +51,6 @@ TRIES: Final = 40
 REACTION_S: Final = 0.5
 TURN_DEGPS: Final = 45.0
 SWIM_MPS: Final = 0.5
-MOST: Final = np.array([TURN_DEGPS] * 4 + [SWIM_MPS])
-"""The greatest rates of what is steered, in the order of `Steering`."""
 # In this time a diver reaches a rate, and gives it up.
 RAMP_S: Final = 0.4
 
@@ -63,17 +61,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dives", type=int, default=20, help="of each case; default: 20")
     parser.add_argument("--no-imu", action="store_true", help="nodes have attitude and depth, no inertial samples")
     parser.add_argument("--seed", type=int, default=1, help="default: 1")
+    parser.add_argument("--turn", type=float, default=TURN_DEGPS, metavar="DEG", help="a second; default: %(default)g")
 
 
 class Steering(NodesMotion):
     """A motion, and what the divers add to it: A's turn right and down, B's turn right and down, B's way away from A.
 
-    begin (5,): what is added from the start on. rates (5,): of what is added, deg/s and m/s. They change as smoothly as
-    divers can change them.
+    begin (5,): what is added from the start on. rates (5,): of what is added, deg/s and m/s; most (5,): the greatest.
+    They change as smoothly as divers can change them.
     """
 
-    def __init__(self, base: NodesMotion, begin: Vector | None = None) -> None:
+    def __init__(self, base: NodesMotion, begin: Vector | None = None, turn_degps: float = TURN_DEGPS) -> None:
         self._base = base
+        self.most = np.array([turn_degps] * 4 + [SWIM_MPS])
         self._until_s = 0.0
         self._pieces = [(0.0, np.zeros(5) if begin is None else begin, np.zeros(5), np.zeros(5))]
         self.rates = np.zeros(5)
@@ -82,7 +82,7 @@ class Steering(NodesMotion):
         """Go on by a tick, toward these rates."""
         _, value, rates, change = self._pieces[-1]
         value, rates = value + rates * TICK_S + change * TICK_S**2 / 2, rates + change * TICK_S
-        most = MOST / RAMP_S
+        most = self.most / RAMP_S
         self._pieces.append((self._until_s, value, rates, np.clip((wanted - rates) / TICK_S, -most, most)))
         self._until_s += TICK_S
         self.rates = rates
@@ -109,9 +109,17 @@ class Steering(NodesMotion):
 class SteeredDive:
     """A simulated dive that goes on tick by tick, with the solver that sees it."""
 
-    def __init__(self, environment: Environment, seed: int, *, imu: bool, begin: Vector | None = None) -> None:
+    def __init__(
+        self,
+        environment: Environment,
+        seed: int,
+        *,
+        imu: bool,
+        begin: Vector | None = None,
+        turn_degps: float = TURN_DEGPS,
+    ) -> None:
         scenario = Scenario(environment=environment, seed=seed, start_ns=START_NS, interruptions=False)
-        self.motion = Steering(PairMotion(scenario), begin)
+        self.motion = Steering(PairMotion(scenario), begin, turn_degps)
         self._world, self._imu, self._seq = World(scenario, self.motion), imu, 0
         settings = TrackSettings(modes=frozenset(("filter",)), rate_hz=20.0)
         self._core = SolverCore(SolveConfig().settings("bench"), [("a", "b")], track=settings)
@@ -211,18 +219,20 @@ def beginning(environment: Environment, case: str, seed: int, rng: np.random.Gen
     return None
 
 
-def lose(environment: Environment, case: str, seed: int, *, imu: bool) -> SteeredDive | None:
+def lose(
+    environment: Environment, case: str, seed: int, *, imu: bool, turn_degps: float = TURN_DEGPS
+) -> SteeredDive | None:
     """Return a dive that has lost its fix, or never had one; None where the case does not come about."""
     rng, still = np.random.default_rng(seed), np.zeros(5)
     if case.startswith(NEVER):
         begin = beginning(environment, case, seed, rng)
         if begin is None:
             return None
-        dive = SteeredDive(environment, seed, imu=imu, begin=begin)
+        dive = SteeredDive(environment, seed, imu=imu, begin=begin, turn_degps=turn_degps)
         while dive.t_s < WATCHED_S:
             dive.tick(still)
         return dive if dive.posed_ns == START_NS else None
-    dive = SteeredDive(environment, seed, imu=imu)
+    dive = SteeredDive(environment, seed, imu=imu, turn_degps=turn_degps)
     while dive.t_s < SETTLE_S or dive.without_s() > 0.3:
         dive.tick(still)
         if dive.t_s > LOSE_WITHIN_S:
@@ -235,9 +245,11 @@ def lose(environment: Environment, case: str, seed: int, *, imu: bool) -> Steere
     return dive
 
 
-def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> float | None:
+def follow(
+    environment: Environment, case: str, seed: int, *, imu: bool, turn_degps: float = TURN_DEGPS
+) -> float | None:
     """Return the time from the first words to a fix, s; inf if there were none in time, None if no fix was missing."""
-    dive = lose(environment, case, seed, imu=imu)
+    dive = lose(environment, case, seed, imu=imu, turn_degps=turn_degps)
     if dive is None:
         return None
     told_s, asked, heard = dive.t_s, np.zeros(5), np.zeros(5)
@@ -250,7 +262,7 @@ def follow(environment: Environment, case: str, seed: int, *, imu: bool) -> floa
         if heard.any() and dive.t_s - heard_s > REACTION_S - TICK_S / 2:
             asked, heard = heard, np.zeros(5)
         # The rate falls toward the end, so that it is reached without going too far.
-        dive.tick(np.clip(asked / RAMP_S, -MOST, MOST))
+        dive.tick(np.clip(asked / RAMP_S, -dive.motion.most, dive.motion.most))
         for still_to_do in (asked, heard):
             np.subtract(still_to_do, dive.motion.rates * TICK_S, out=still_to_do, where=still_to_do != 0.0)
         asked[np.abs(asked) < (1.0, 1.0, 1.0, 1.0, 0.05)] = 0.0
@@ -262,7 +274,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for case in args.case or CASES:
         times_s = [
-            follow(WATERS[k % len(WATERS)], case, 1000 * args.seed + k, imu=not args.no_imu) for k in range(args.dives)
+            follow(WATERS[k % len(WATERS)], case, 1000 * args.seed + k, imu=not args.no_imu, turn_degps=args.turn)
+            for k in range(args.dives)
         ]
         counted = [one for one in times_s if one is not None]
         fixed = [one for one in counted if one < math.inf]
